@@ -1,0 +1,72 @@
+# Everything that a fresh clone needs: each target sets up what it uses, in .venv, the first time
+# and again whenever the native code or the dependencies change.
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+
+# Both stand inside the environment, so that they go when it goes.
+INSTALLED_FIGURES := $(VENV)/.installed-figures
+INSTALLED_DEV := $(VENV)/.installed-dev
+
+NATIVE_SOURCES := $(wildcard CMakeLists.txt) $(shell find cpp -type f)
+CPP_FILES := $(shell find cpp -name '*.hpp' -o -name '*.cpp')
+
+.DEFAULT_GOAL := help
+.PHONY: help demo test test-slow lint format bench clean
+
+help: ## what there is to make
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+
+demo: $(INSTALLED_FIGURES) ## ten trials of peg-in-hole, with their tables and a figure, in demo-run
+	rm -rf demo-run
+	$(BIN)/holdfast run examples/peg_in_hole_2d.yaml --out demo-run
+
+test: $(INSTALLED_DEV) ## the quick tests
+	$(BIN)/pytest -q
+
+test-slow: $(INSTALLED_DEV) ## the tests that take minutes
+	$(BIN)/pytest -q -m slow
+
+lint: $(INSTALLED_DEV) ## style, types and layers
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+	$(BIN)/clang-format --dry-run -Werror $(CPP_FILES)
+
+format: $(INSTALLED_DEV) ## rewrite the code in the common style
+	$(BIN)/ruff check --fix-only .
+	$(BIN)/ruff format .
+	$(BIN)/clang-format -i $(CPP_FILES)
+
+bench: $(INSTALLED_DEV) ## the benchmarks
+	$(BIN)/python benchmarks/run.py
+
+clean: ## remove what was built or run here, but keep .venv
+	rm -rf build dist demo-run .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis
+	rm -f $(INSTALLED_FIGURES) $(INSTALLED_DEV)
+
+# The interpreter is looked at first: without this, what is missing shows only as an error deep in
+# pip or CMake.
+$(BIN)/python:
+	@command -v $(PYTHON) >/dev/null || { \
+	    echo "make: no $(PYTHON) here; install Python 3.11 or newer, or say make PYTHON=..." >&2; exit 1; }
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
+	    echo "make: $(PYTHON) is older than 3.11; say make PYTHON=python3.11, for example" >&2; exit 1; }
+	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || { \
+	    echo "make: $(PYTHON) has no venv module; on Debian: apt-get install python3-venv" >&2; exit 1; }
+	@$(PYTHON) -c 'import pathlib, sys, sysconfig; \
+	    sys.exit(not (pathlib.Path(sysconfig.get_path("include")) / "Python.h").exists())' || { \
+	    echo "make: $(PYTHON) has no headers; on Debian: apt-get install python3-dev" >&2; exit 1; }
+	@command -v "$${CXX:-c++}" >/dev/null || { \
+	    echo "make: no C++ compiler; install gcc or clang (with OpenMP), or set CXX" >&2; exit 1; }
+	$(PYTHON) -m venv $(VENV)
+
+$(INSTALLED_FIGURES): pyproject.toml $(NATIVE_SOURCES) | $(BIN)/python
+	$(BIN)/python -m pip install --disable-pip-version-check -q -e ".[figures]"
+	@touch $@
+
+$(INSTALLED_DEV): pyproject.toml $(NATIVE_SOURCES) | $(BIN)/python
+	$(BIN)/python -m pip install --disable-pip-version-check -q -e ".[dev]"
+	@touch $(INSTALLED_FIGURES) $@

@@ -1,0 +1,145 @@
+#include "entropy.hpp"
+
+#include <nanobind/stl/array.h>
+#include <nanobind/stl/vector.h>
+
+#include <chrono>
+#include <cstring>
+#include <vector>
+
+#include "bindings.hpp"
+#include "sensing.hpp"
+#include "vector_kernels.hpp"
+
+namespace nb = nanobind;
+using namespace holdfast;
+using namespace holdfast::bindings;
+
+namespace {
+
+EntropySettings make_settings(bool mixture, std::uint32_t neighbors, double resolution,
+                              double exponent, double offset, int threads) {
+    return {mixture ? Estimator::gaussian_mixture : Estimator::nearest_neighbor,
+            neighbors,
+            resolution,
+            exponent,
+            offset,
+            threads};
+}
+
+HypothesisInput make_input(const Input<1>& weights, const std::vector<std::uint32_t>& sizes,
+                           const Input<2>& predicted, const Input<2>& variance,
+                           std::size_t samples, const StreamWords& stream) {
+    return {weights.shape(0),
+            weights.data(),
+            sizes.size(),
+            sizes.data(),
+            predicted.data(),
+            variance.data(),
+            variance.shape(1) != 1,
+            samples,
+            to_stream(stream)};
+}
+
+double seconds_since(std::chrono::steady_clock::time_point start) {
+    return std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count();
+}
+
+}  // namespace
+
+void holdfast::bind_entropy(nb::module_& module) {
+    module.def(
+        "entropies",
+        [](const Input<2>& points, const Input<2>& log_weights, bool normalized, bool mixture,
+           std::uint32_t neighbors, double resolution, double exponent, double offset, int threads) {
+            const std::size_t posteriors = log_weights.shape(0), count = points.shape(0);
+            double* out;
+            auto result = make_array<double>({posteriors}, out);
+            EntropyCounts counts;
+            {
+                nb::gil_scoped_release release;
+                const double log_negligible = holdfast::log(negligible_weight);
+                const VectorKernels& kernels = vector_kernels();
+                const double* rows = log_weights.data();
+                const auto source = [&](std::size_t index, double* weights) {
+                    if (normalized) {
+                        kernels.log(rows + index * count, weights, count);
+                        return kernels.normalize(weights, count, log_negligible, weights);
+                    }
+                    return kernels.normalize(rows + index * count, count, log_negligible, weights);
+                };
+                entropies(points.data(), count, points.shape(1), posteriors, source,
+                          make_settings(mixture, neighbors, resolution, exponent, offset, threads), out,
+                          counts);
+            }
+            return nb::make_tuple(result, counts.likelihoods, counts.visits);
+        });
+
+    module.def(
+        "hypothetical_entropies",
+        [](const Input<1>& weights, const std::vector<std::uint32_t>& sizes, const Input<2>& predicted,
+           const Input<2>& variance, std::size_t samples, const StreamWords& stream,
+           const Input<2>& points, bool mixture, std::uint32_t neighbors, double resolution,
+           double exponent, double offset, int threads) {
+            double* out;
+            auto result = make_array<double>({sizes.size(), samples}, out);
+            double* mean;
+            auto means = make_array<double>({sizes.size()}, mean);
+            EntropyCounts counts;
+            {
+                nb::gil_scoped_release release;
+                hypothetical_entropies(
+                    make_input(weights, sizes, predicted, variance, samples, stream), points.data(),
+                    points.shape(1),
+                    make_settings(mixture, neighbors, resolution, exponent, offset, threads), out,
+                    counts);
+                for (std::size_t j = 0; j < sizes.size(); ++j) {
+                    double total = 0.0;
+                    for (std::size_t i = 0; i < samples; ++i) total += out[j * samples + i];
+                    mean[j] = total / static_cast<double>(samples);
+                }
+            }
+            return nb::make_tuple(means, result, counts.likelihoods, counts.visits);
+        });
+
+    module.def("hypothetical_weights",
+               [](const Input<1>& weights, const std::vector<std::uint32_t>& sizes,
+                  const Input<2>& predicted, const Input<2>& variance, std::size_t samples,
+                  const StreamWords& stream) {
+                   double* out;
+                   auto result = make_array<double>({sizes.size(), samples, weights.shape(0)}, out);
+                   nb::gil_scoped_release release;
+                   hypothetical_weights(
+                       make_input(weights, sizes, predicted, variance, samples, stream), out);
+                   return result;
+               });
+
+    // For benchmarks: seconds that one vectorised exp, and one visit of a neighbour, take here.
+    module.def("measure_exp", [](std::size_t count, int repetitions) {
+        std::vector<double> in(count, -0.5), out(count);
+        const auto start = std::chrono::steady_clock::now();
+        for (int i = 0; i < repetitions; ++i) {
+            in[static_cast<std::size_t>(i) % count] = -0.25;
+            vector_kernels().exp(in.data(), out.data(), count);
+        }
+        return seconds_since(start) / (static_cast<double>(count) * repetitions);
+    });
+    module.def("measure_visit", [](std::size_t count, std::size_t dimension, int repetitions) {
+        // All pairs of `count` points, no selection: every neighbour lies within the resolution.
+        const std::size_t stride = (count + lane_count - 1) / lane_count * lane_count;
+        std::vector<double> coordinates(stride * dimension), weights(stride), scratch(stride + 1);
+        for (std::size_t i = 0; i < coordinates.size(); ++i) {
+            coordinates[i] = 1e-3 * static_cast<double>(i % 17);
+        }
+        for (std::size_t i = 0; i < stride; ++i) weights[i] = 1.0 / static_cast<double>(stride);
+        std::vector<double> bias(stride + 1, 0.0);
+        std::uint64_t visits = 0;
+        const auto start = std::chrono::steady_clock::now();
+        for (int i = 0; i < repetitions; ++i) {
+            vector_kernels().compact_nearest({stride, stride, dimension, coordinates.data(),
+                                              weights.data(), scratch.data()},
+                                             1, {1.0, 0.0, bias.data()}, &visits);
+        }
+        return seconds_since(start) / static_cast<double>(visits);
+    });
+}

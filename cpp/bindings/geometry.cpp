@@ -1,0 +1,162 @@
+// Python's view of the worlds of geometry_2d.hpp and geometry_3d.hpp and of motion.hpp.
+//
+// Callers go through holdfast/geometry.py. To cost nothing where all is well, a function here
+// checks its values while it has them at hand and returns false; the Python side then finds out
+// what is wrong and raises the error that says so.
+
+#include <nanobind/stl/array.h>
+
+#include <cmath>
+#include <optional>
+#include <stdexcept>
+#include <vector>
+
+#include "bindings.hpp"
+#include "geometry_2d.hpp"
+#include "geometry_3d.hpp"
+#include "motion.hpp"
+
+namespace nb = nanobind;
+using namespace holdfast;
+using namespace holdfast::bindings;
+
+namespace {
+
+// Results are written to arrays of the caller: NumPy makes a small array faster than nanobind does.
+template <class Value, std::size_t rank>
+using InPlace = nb::ndarray<Value, nb::ndim<rank>, nb::c_contig, nb::device::cpu>;
+
+void require(bool condition, const char* message) {
+    if (!condition) throw std::invalid_argument(message);
+}
+
+bool all_finite(const double* values, std::size_t count) {
+    bool finite = true;
+    for (std::size_t i = 0; i < count; ++i) finite &= std::isfinite(values[i]);
+    return finite;
+}
+
+bool all_non_negative(const double* values, std::size_t count) {
+    bool non_negative = true;
+    for (std::size_t i = 0; i < count; ++i) non_negative &= values[i] >= 0.0;
+    return non_negative;
+}
+
+// Lets other Python threads run while the work is long enough to be worth the switch.
+class ReleaseForLongWork {
+  public:
+    explicit ReleaseForLongWork(std::size_t count) {
+        if (count >= 1024) release_.emplace();
+    }
+
+  private:
+    std::optional<nb::gil_scoped_release> release_;
+};
+
+std::vector<AxisAlignedRectangle> rectangles(const Input<2>& limits) {
+    require(limits.shape(1) == 4, "a rectangle has four limits");
+    std::vector<AxisAlignedRectangle> result(limits.shape(0));
+    for (std::size_t i = 0; i < result.size(); ++i) {
+        const double* row = limits.data() + 4 * i;
+        result[i] = {row[0], row[1], row[2], row[3]};
+    }
+    return result;
+}
+
+std::vector<AxisAlignedBox> boxes(const Input<2>& limits) {
+    require(limits.shape(1) == 6, "a box has six limits");
+    std::vector<AxisAlignedBox> result(limits.shape(0));
+    for (std::size_t i = 0; i < result.size(); ++i) {
+        const double* row = limits.data() + 6 * i;
+        result[i] = {{row[0], row[1], row[2]}, {row[3], row[4], row[5]}};
+    }
+    return result;
+}
+
+template <class World>
+bool collides_batch(const World& world, const Input<2>& states, InPlace<bool, 1> result) {
+    const std::size_t count = states.shape(0);
+    require(states.shape(1) == World::dimension && result.shape(0) == count, "shapes differ");
+    const double* state = states.data();
+    if (!all_finite(state, count * World::dimension)) return false;
+    bool* out = result.data();
+    ReleaseForLongWork release(count);
+    for (std::size_t n = 0; n < count; ++n) out[n] = world.collides(state + n * World::dimension);
+    return true;
+}
+
+template <class World>
+bool move_batch(const World& world, const Input<2>& states, const Input<2>& actions,
+                const Input<1>& standard_deviation, double tolerance, const StreamWords& stream,
+                InPlace<double, 2> next) {
+    constexpr std::size_t d = World::dimension;
+    const std::size_t count = states.shape(0);
+    require(states.shape(1) == d && actions.shape(1) == d && next.shape(1) == d &&
+                next.shape(0) == count && (actions.shape(0) == count || actions.shape(0) == 1),
+            "shapes differ");
+    if (!all_finite(states.data(), count * d) ||
+        !all_finite(actions.data(), actions.shape(0) * d) || standard_deviation.shape(0) != d ||
+        !all_finite(standard_deviation.data(), d) ||
+        !all_non_negative(standard_deviation.data(), d) || !(tolerance > 0.0 && tolerance < 1.0)) {
+        return false;
+    }
+    const std::size_t action_stride = actions.shape(0) == count ? d : 0;
+    ReleaseForLongWork release(count);
+    move(world, count, states.data(), actions.data(), action_stride, standard_deviation.data(),
+         tolerance, to_stream(stream), next.data());
+    return true;
+}
+
+template <class World>
+std::size_t draw_free_batch(const World& world, const Input<1>& mean,
+                            const Input<1>& standard_deviation, const StreamWords& stream,
+                            InPlace<double, 2> states) {
+    constexpr std::size_t d = World::dimension;
+    require(mean.shape(0) == d && standard_deviation.shape(0) == d && states.shape(1) == d,
+            "shapes differ");
+    const std::size_t count = states.shape(0);
+    ReleaseForLongWork release(count);
+    return draw_free(world, count, mean.data(), standard_deviation.data(), to_stream(stream),
+                     states.data());
+}
+
+template <class World>
+nb::class_<World> bind_world(nb::module_& module, const char* name) {
+    return nb::class_<World>(module, name)
+        .def("collides", &collides_batch<World>, nb::arg("states").noconvert(),
+             nb::arg("result").noconvert())
+        .def("move", &move_batch<World>, nb::arg("states").noconvert(),
+             nb::arg("actions").noconvert(), nb::arg("standard_deviation").noconvert(),
+             nb::arg("tolerance"), nb::arg("stream"), nb::arg("next_states").noconvert())
+        .def("draw_free", &draw_free_batch<World>, nb::arg("mean").noconvert(),
+             nb::arg("standard_deviation").noconvert(), nb::arg("stream"),
+             nb::arg("states").noconvert());
+}
+
+}  // namespace
+
+void holdfast::bind_geometry(nb::module_& module) {
+    bind_world<DiscWorld>(module, "DiscWorld")
+        .def(
+            "__init__",
+            [](DiscWorld* self, double radius, const Input<2>& obstacles) {
+                new (self) DiscWorld(radius, rectangles(obstacles));
+            },
+            nb::arg("radius"), nb::arg("obstacles").noconvert());
+    bind_world<RectangleWorld>(module, "RectangleWorld")
+        .def(
+            "__init__",
+            [](RectangleWorld* self, double width, double height, const Input<2>& obstacles) {
+                new (self) RectangleWorld(width, height, rectangles(obstacles));
+            },
+            nb::arg("width"), nb::arg("height"), nb::arg("obstacles").noconvert());
+    bind_world<BoxWorld>(module, "BoxWorld")
+        .def(
+            "__init__",
+            [](BoxWorld* self, double size_x, double size_y, double size_z,
+               const Input<2>& obstacles) {
+                new (self) BoxWorld({size_x, size_y, size_z}, boxes(obstacles));
+            },
+            nb::arg("size_x"), nb::arg("size_y"), nb::arg("size_z"),
+            nb::arg("obstacles").noconvert());
+}

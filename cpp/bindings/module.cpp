@@ -1,0 +1,15 @@
+// The Python module holdfast._kernel: arrays in, arrays out, no logic.
+//
+// Private: holdfast's typed Python functions check shapes and values before they call in here.
+
+#include <nanobind/nanobind.h>
+
+#include "bindings.hpp"
+#include "vector_kernels.hpp"
+
+NB_MODULE(_kernel, module) {
+    module.def("simd", [] { return holdfast::vector_kernels().name; });
+    holdfast::bind_numerics(module);
+    holdfast::bind_entropy(module);
+    holdfast::bind_geometry(module);
+}

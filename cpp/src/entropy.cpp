@@ -1,0 +1,319 @@
+#include "entropy.hpp"
+
+#include <algorithm>
+#include <exception>
+#include <limits>
+#include <memory>
+#include <vector>
+
+#include "deterministic_math.hpp"
+#include "point_tree.hpp"
+#include "threads.hpp"
+#include "vector_kernels.hpp"
+
+namespace holdfast {
+
+namespace {
+
+constexpr double infinity = std::numeric_limits<double>::infinity();
+
+// The ways to an entropy and when which is taken. All give the same values up to rounding, and
+// the choice depends on counts alone, so the bits do not depend on threads or machines.
+//  - pair by pair: a posterior of few points, quadratic in them;
+//  - grouped: posteriors that keep a good part of the points share one tree over all of them;
+//  - own tree: many points, but few of all.
+constexpr std::size_t always_compact = 16;
+constexpr std::size_t compact_limit = 64;
+constexpr std::size_t always_group = 1024;
+constexpr double pair_cost = 2.0;          // ns
+constexpr double grouped_point_cost = 600; // ns, for all posteriors of a group together
+
+/// [q] = log q - psi(q), psi(q) = -gamma + 1 + 1/2 + ... + 1/(q - 1). Grows and is kept per thread.
+const double* bias_corrections(std::size_t largest) {
+    constexpr double euler_gamma = 0.57721566490153286061;
+    thread_local std::vector<double> table{0.0};
+    thread_local double harmonic = 0.0;  // 1 + ... + 1/(table.size() - 1)
+    while (table.size() <= largest) {
+        const auto q = static_cast<double>(table.size());
+        table.push_back(log(q) + euler_gamma - harmonic);
+        harmonic += 1.0 / q;
+    }
+    return table.data();
+}
+
+/// log of the unit ball's volume: c_0 = 1, c_1 = 2, c_d = c_{d-2} 2 pi / d.
+double log_unit_ball(std::size_t dimension) {
+    constexpr double two_pi = 6.28318530717958647693;
+    double volume = dimension % 2 == 0 ? 1.0 : 2.0;
+    for (std::size_t d = 2 + dimension % 2; d <= dimension; d += 2) {
+        volume = volume * two_pi / static_cast<double>(d);
+    }
+    return log(volume);
+}
+
+struct Task {
+    const double* points;
+    std::size_t count;
+    std::size_t dimension;
+    const EntropySettings* settings;
+    NearestNeighborConstants constants;
+    const VectorKernels* kernels;
+};
+
+std::uint32_t neighbors_among(const Task& task, std::size_t survivors) {
+    return static_cast<std::uint32_t>(
+        std::min<std::size_t>(task.settings->neighbors, survivors - 1));
+}
+
+/// A single surviving point: its action is known to within the resolution (or the motion noise).
+double entropy_of_one(const Task& task) {
+    if (task.settings->estimator == Estimator::gaussian_mixture) return 0.0;
+    return task.constants.log_ball_volume +
+           static_cast<double>(task.dimension) * log(task.constants.resolution);
+}
+
+/// The surviving points of one posterior, coordinate by coordinate, for `compact_*`.
+double compact_entropy(const Task& task, const double* weights, std::size_t survivors,
+                       std::uint64_t& visits) {
+    const std::size_t stride = (survivors + lane_count - 1) / lane_count * lane_count;
+    thread_local std::vector<double> buffer;
+    buffer.resize(stride * (task.dimension + 2) + task.settings->neighbors);
+    double* coordinates = buffer.data();
+    double* compact_weights = coordinates + stride * task.dimension;
+    std::size_t at = 0;
+    for (std::size_t n = 0; n < task.count; ++n) {
+        if (weights[n] == 0.0) continue;
+        for (std::size_t c = 0; c < task.dimension; ++c) {
+            coordinates[c * stride + at] = task.points[n * task.dimension + c];
+        }
+        compact_weights[at++] = weights[n];
+    }
+    for (; at < stride; ++at) {
+        for (std::size_t c = 0; c < task.dimension; ++c) coordinates[c * stride + at] = infinity;
+        compact_weights[at] = 0.0;
+    }
+    const CompactPosterior posterior{survivors,       stride,          task.dimension, coordinates,
+                                     compact_weights, compact_weights + stride};
+    if (task.settings->estimator == Estimator::gaussian_mixture) {
+        return task.kernels->compact_mixture(posterior, task.settings->exponent, &visits);
+    }
+    return task.kernels->compact_nearest(posterior, neighbors_among(task, survivors), task.constants,
+                                         &visits);
+}
+
+/// Posteriors side by side over one tree; owns what PosteriorGroup points to.
+class Group {
+public:
+    Group(const Task& task, const PointTree& tree, const std::vector<const double*>& weights,
+          const std::vector<std::size_t>& survivors)
+        : task_(task), tree_(tree), members_(weights.size()) {
+        const std::size_t vectors = (members_ + lane_count - 1) / lane_count;
+        const std::size_t columns = vectors * lane_count;
+        const std::size_t slots = tree.leaves * leaf_size;
+        weights_.resize(slots * columns);
+        significant_.resize(slots * columns);
+        for (std::size_t slot = 0; slot < tree.count; ++slot) {
+            const std::uint32_t point = tree.order[slot];
+            double* row = &weights_[slot * columns];
+            std::uint32_t* mask = &significant_[slot * columns];
+            for (std::size_t member = 0; member < members_; ++member) {
+                row[member] = weights[member][point];
+                mask[member] = row[member] != 0.0 ? 1 : 0;
+            }
+        }
+        node_weights_.resize(tree.nodes.size() * columns);
+        node_counts_.resize(tree.nodes.size() * columns);
+        for (std::size_t at = tree.nodes.size(); at-- > 0;) {
+            const TreeNode& node = tree.nodes[at];
+            double* mass = &node_weights_[at * columns];
+            std::uint32_t* number = &node_counts_[at * columns];
+            if (node.left == 0) {
+                for (std::size_t slot = node.first_leaf * leaf_size;
+                     slot < (node.first_leaf + 1) * leaf_size; ++slot) {
+                    for (std::size_t column = 0; column < columns; ++column) {
+                        mass[column] += weights_[slot * columns + column];
+                        number[column] += significant_[slot * columns + column];
+                    }
+                }
+            } else {
+                for (std::size_t column = 0; column < columns; ++column) {
+                    mass[column] = node_weights_[node.left * columns + column] +
+                                   node_weights_[node.right * columns + column];
+                    number[column] = node_counts_[node.left * columns + column] +
+                                     node_counts_[node.right * columns + column];
+                }
+            }
+        }
+        neighbors_.resize(columns);
+        for (std::size_t member = 0; member < members_; ++member) {
+            neighbors_[member] = neighbors_among(task, survivors[member]);
+        }
+        view_ = {tree.view(),         members_,             vectors,             weights_.data(),
+                 significant_.data(), node_weights_.data(), node_counts_.data(), neighbors_.data()};
+    }
+
+    /// One task per leaf; partial sums are added in the order of the leaves.
+    void run(int threads, double* out, std::uint64_t& visits) const {
+        const std::size_t columns = view_.vectors * lane_count;
+        const auto leaves = static_cast<std::ptrdiff_t>(tree_.leaves);
+        std::vector<double> partial(tree_.leaves * columns);
+        std::uint64_t visited = 0;
+#pragma omp parallel for schedule(dynamic, 4) num_threads(threads) reduction(+ : visited) \
+    if (threads > 1)
+        for (std::ptrdiff_t leaf = 0; leaf < leaves; ++leaf) {
+            const auto at = static_cast<std::size_t>(leaf);
+            double* terms = &partial[at * columns];
+            std::uint64_t mine = 0;
+            if (task_.settings->estimator == Estimator::gaussian_mixture) {
+                task_.kernels->group_mixture(view_, at, task_.settings->exponent, terms, &mine);
+            } else {
+                thread_local std::vector<double> scratch;
+                scratch.resize(task_.settings->neighbors);
+                task_.kernels->group_nearest(view_, at, task_.constants, scratch.data(), terms,
+                                             &mine);
+            }
+            visited += mine;
+        }
+        visits += visited;
+        for (std::size_t member = 0; member < members_; ++member) {
+            double sum = 0.0;
+            for (std::size_t leaf = 0; leaf < tree_.leaves; ++leaf) {
+                sum += partial[leaf * columns + member];
+            }
+            out[member] = sum;
+        }
+    }
+
+private:
+    const Task& task_;
+    const PointTree& tree_;
+    std::size_t members_;
+    std::vector<double> weights_, node_weights_;
+    std::vector<std::uint32_t> significant_, node_counts_, neighbors_;
+    PosteriorGroup view_{};
+};
+
+/// One posterior with many points, but few of all: a tree of its own.
+double own_tree_entropy(const Task& task, const double* weights, std::size_t survivors,
+                        std::uint64_t& visits) {
+    std::vector<double> points, kept;
+    points.reserve(survivors * task.dimension);
+    kept.reserve(survivors);
+    for (std::size_t n = 0; n < task.count; ++n) {
+        if (weights[n] == 0.0) continue;
+        points.insert(points.end(), task.points + n * task.dimension,
+                      task.points + (n + 1) * task.dimension);
+        kept.push_back(weights[n]);
+    }
+    Task own = task;
+    own.points = points.data();
+    own.count = survivors;
+    const PointTree tree(own.points, own.count, own.dimension);
+    const Group group(own, tree, {kept.data()}, {survivors});
+    double entropy;
+    group.run(1, &entropy, visits);
+    return entropy;
+}
+
+/// Runs `body(i)` for i < tasks on several threads and passes on the first exception.
+template <class Body>
+void parallel_for(std::size_t tasks, int threads, const Body& body) {
+    std::exception_ptr failure;
+    const auto last = static_cast<std::ptrdiff_t>(tasks);
+#pragma omp parallel for schedule(dynamic) num_threads(threads) if (threads > 1)
+    for (std::ptrdiff_t i = 0; i < last; ++i) {
+        try {
+            body(static_cast<std::size_t>(i));
+        } catch (...) {
+#pragma omp critical(holdfast_parallel_for)
+            if (!failure) failure = std::current_exception();
+        }
+    }
+    if (failure) std::rethrow_exception(failure);
+}
+
+}  // namespace
+
+void entropies(const double* points, std::size_t count, std::size_t dimension,
+               std::size_t posteriors, const PosteriorSource& source,
+               const EntropySettings& settings, double* out, EntropyCounts& counts) {
+    const bool mixture = settings.estimator == Estimator::gaussian_mixture;
+    const Task task{points,
+                    count,
+                    dimension,
+                    &settings,
+                    {settings.resolution, mixture ? 0.0 : log_unit_ball(dimension),
+                     mixture ? nullptr : bias_corrections(count)},
+                    &vector_kernels()};
+    // Posteriors are taken in batches so that their weights fit in 64 MB whatever their number.
+    const std::size_t batch = std::max<std::size_t>(max_group_lanes, (std::size_t{8} << 20) / count);
+    std::vector<double> weights(std::min(batch, posteriors) * count);
+    std::vector<std::size_t> survivors(std::min(batch, posteriors));
+    std::unique_ptr<PointTree> tree;
+
+    for (std::size_t first = 0; first < posteriors; first += batch) {
+        const std::size_t number = std::min(batch, posteriors - first);
+        // A likelihood takes about a nanosecond.
+        const double likelihoods = static_cast<double>(number) * static_cast<double>(count);
+        std::vector<std::uint64_t> visits(number);
+        parallel_for(number, threads_for(2.0 * likelihoods, number, settings.threads),
+                     [&](std::size_t i) { survivors[i] = source(first + i, &weights[i * count]); });
+        counts.likelihoods += number * count;
+
+        double middling = 0.0;  // what the posteriors of middling size would cost pair by pair
+        for (const std::size_t s : survivors) {
+            const auto size = static_cast<double>(s);
+            if (s > always_compact && s <= compact_limit) middling += pair_cost * size * size;
+        }
+        const std::size_t limit = count <= always_group &&
+                                          middling > grouped_point_cost * static_cast<double>(count)
+                                      ? always_compact
+                                      : compact_limit;
+        std::vector<std::size_t> alone, grouped;
+        double pairs = 0.0;
+        for (std::size_t i = 0; i < number; ++i) {
+            const std::size_t s = survivors[i];
+            if (s <= 1) {
+                out[first + i] =
+                    s == 0 ? std::numeric_limits<double>::quiet_NaN()
+                           : entropy_of_one(task) + settings.offset;
+            } else if (s > limit && (count <= always_group || 4 * s >= count)) {
+                grouped.push_back(i);
+            } else {
+                alone.push_back(i);
+                const auto size = static_cast<double>(s);
+                pairs += s <= compact_limit ? pair_cost * size * size : 300.0 * size;
+            }
+        }
+        parallel_for(alone.size(), threads_for(pairs, alone.size(), settings.threads),
+                     [&](std::size_t task_index) {
+                         const std::size_t i = alone[task_index];
+                         const double* w = &weights[i * count];
+                         out[first + i] = settings.offset +
+                                          (survivors[i] <= compact_limit
+                                               ? compact_entropy(task, w, survivors[i], visits[i])
+                                               : own_tree_entropy(task, w, survivors[i], visits[i]));
+                     });
+        for (const std::uint64_t v : visits) counts.visits += v;
+
+        if (!grouped.empty() && !tree) tree = std::make_unique<PointTree>(points, count, dimension);
+        for (std::size_t begin = 0; begin < grouped.size(); begin += max_group_lanes) {
+            const std::size_t end = std::min(begin + max_group_lanes, grouped.size());
+            std::vector<const double*> members;
+            std::vector<std::size_t> sizes;
+            for (std::size_t g = begin; g < end; ++g) {
+                members.push_back(&weights[grouped[g] * count]);
+                sizes.push_back(survivors[grouped[g]]);
+            }
+            const Group group(task, *tree, members, sizes);
+            double results[max_group_lanes];
+            const double work = grouped_point_cost * static_cast<double>(count);
+            group.run(threads_for(work, tree->leaves, settings.threads), results, counts.visits);
+            for (std::size_t g = begin; g < end; ++g) {
+                out[first + grouped[g]] = settings.offset + results[g - begin];
+            }
+        }
+    }
+}
+
+}  // namespace holdfast

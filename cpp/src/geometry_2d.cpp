@@ -1,0 +1,77 @@
+#include "geometry_2d.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <utility>
+
+#include "deterministic_math.hpp"
+
+namespace holdfast {
+
+DiscWorld::DiscWorld(double radius, std::vector<AxisAlignedRectangle> obstacles)
+    : radius_squared_(radius * radius), obstacles_(std::move(obstacles)) {}
+
+bool DiscWorld::collides(const double* state) const {
+    const double x = state[0];
+    const double y = state[1];
+    for (const AxisAlignedRectangle& obstacle : obstacles_) {
+        const double dx = x - std::min(std::max(x, obstacle.x_min), obstacle.x_max);
+        const double dy = y - std::min(std::max(y, obstacle.y_min), obstacle.y_max);
+        if (dx * dx + dy * dy < radius_squared_) return true;
+    }
+    return false;
+}
+
+RectangleWorld::RectangleWorld(double width, double height,
+                               std::vector<AxisAlignedRectangle> obstacles)
+    : half_width_(0.5 * width),
+      half_height_(0.5 * height),
+      bounding_radius_(std::sqrt(half_width_ * half_width_ + half_height_ * half_height_)),
+      obstacles_(std::move(obstacles)) {}
+
+bool RectangleWorld::collides(const double* state) const {
+    const double x = state[0];
+    const double y = state[1];
+    bool turned = false;  // sine and cosine are computed for the first obstacle that is near
+    double sine = 0.0, cosine = 1.0, reach_x = 0.0, reach_y = 0.0;
+
+    for (const AxisAlignedRectangle& obstacle : obstacles_) {
+        // The obstacle seen from the rectangle's centre. Differences of limits rather than centre
+        // and half size keep large obstacles (the ground) as exact as small ones.
+        const double left = obstacle.x_min - x;
+        const double right = obstacle.x_max - x;
+        const double bottom = obstacle.y_min - y;
+        const double top = obstacle.y_max - y;
+        if (left >= bounding_radius_ || right <= -bounding_radius_ || bottom >= bounding_radius_ ||
+            top <= -bounding_radius_) {
+            continue;
+        }
+        if (!turned) {
+            sincos(state[2], sine, cosine);
+            reach_x = std::abs(cosine) * half_width_ + std::abs(sine) * half_height_;
+            reach_y = std::abs(sine) * half_width_ + std::abs(cosine) * half_height_;
+            turned = true;
+        }
+        // The obstacle's edge directions.
+        if (left >= reach_x || right <= -reach_x || bottom >= reach_y || top <= -reach_y) continue;
+        // The rectangle's own: along its width (cos, sin), along its height (-sin, cos).
+        const double left_cosine = left * cosine, right_cosine = right * cosine;
+        const double bottom_sine = bottom * sine, top_sine = top * sine;
+        const double width_low =
+            std::min(left_cosine, right_cosine) + std::min(bottom_sine, top_sine);
+        const double width_high =
+            std::max(left_cosine, right_cosine) + std::max(bottom_sine, top_sine);
+        if (width_low >= half_width_ || width_high <= -half_width_) continue;
+        const double left_sine = left * -sine, right_sine = right * -sine;
+        const double bottom_cosine = bottom * cosine, top_cosine = top * cosine;
+        const double height_low =
+            std::min(left_sine, right_sine) + std::min(bottom_cosine, top_cosine);
+        const double height_high =
+            std::max(left_sine, right_sine) + std::max(bottom_cosine, top_cosine);
+        if (height_low >= half_height_ || height_high <= -half_height_) continue;
+        return true;
+    }
+    return false;
+}
+
+}  // namespace holdfast

@@ -1,0 +1,51 @@
+// Collision in the plane: a disc or a turned rectangle among axis-aligned rectangles.
+//
+// Two convex shapes are apart if and only if some line separates them. For a rectangle turned by
+// theta and an axis-aligned one, the lines to try are normal to the four edge directions
+// (Gottschalk, Lin and Manocha, "OBBTree", SIGGRAPH 1996, in two dimensions): project both shapes
+// on each direction and see whether the intervals overlap. A disc meets a rectangle where the
+// rectangle's point closest to the disc's centre is nearer than the radius.
+//
+// Shapes that touch without overlapping are free: every comparison is strict, in exact arithmetic.
+// Rounding moves the boundary by a few units in the last place of the coordinates.
+#pragma once
+
+#include <cstddef>
+#include <vector>
+
+namespace holdfast {
+
+struct AxisAlignedRectangle {
+    double x_min, y_min, x_max, y_max;
+};
+
+// A disc among rectangles; its state is (x, y).
+class DiscWorld {
+  public:
+    static constexpr std::size_t dimension = 2;
+
+    DiscWorld(double radius, std::vector<AxisAlignedRectangle> obstacles);
+
+    bool collides(const double* state) const;
+
+  private:
+    double radius_squared_;
+    std::vector<AxisAlignedRectangle> obstacles_;
+};
+
+// A rectangle among rectangles; its state is (x, y, theta) of its centre.
+class RectangleWorld {
+  public:
+    static constexpr std::size_t dimension = 3;
+
+    RectangleWorld(double width, double height, std::vector<AxisAlignedRectangle> obstacles);
+
+    bool collides(const double* state) const;
+
+  private:
+    double half_width_, half_height_;
+    double bounding_radius_;
+    std::vector<AxisAlignedRectangle> obstacles_;
+};
+
+}  // namespace holdfast

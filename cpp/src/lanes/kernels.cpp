@@ -1,0 +1,23 @@
+// One compilation of the inner loops: CMake sets HOLDFAST_ISA (the namespace) and the -m flags.
+//
+// No standard-library template is instantiated here: the linker would keep one copy of it for all
+// instruction sets, and it might be this one.
+
+#define HOLDFAST_LAMBDA __attribute__((always_inline))
+
+#include "compact_entropy.hpp"
+#include "elementwise.hpp"
+#include "group_entropy.hpp"
+#include "posterior.hpp"
+
+
+namespace holdfast::HOLDFAST_ISA {
+
+extern const VectorKernels table;
+const VectorKernels table = {
+    HOLDFAST_ISA_NAME, exp_array,      log_array,       sin_array,       cos_array,
+    normals_array,     sum_array,      weighted_sums,   posterior,       normalize,
+    compact_nearest,   compact_mixture, group_nearest,  group_mixture,
+};
+
+}  // namespace holdfast::HOLDFAST_ISA

@@ -1,0 +1,125 @@
+#include "motion.hpp"
+
+#include <algorithm>
+#include <array>
+
+#include "geometry_2d.hpp"
+#include "geometry_3d.hpp"
+
+namespace holdfast {
+namespace {
+
+// Particles are worked on in blocks: large enough that the first draw of noise is one call, small
+// enough that its numbers stay on the stack and in the cache.
+constexpr std::size_t block_size = 128;
+
+template <class World>
+void stop_at_contact(const World& world, const double* state, const double* action,
+                     double tolerance, double* next) {
+    constexpr std::size_t d = World::dimension;
+    for (std::size_t c = 0; c < d; ++c) next[c] = state[c] + action[c];
+    if (!world.collides(next)) return;
+
+    double reached = 0.0, blocked = 1.0;
+    while (blocked - reached > tolerance) {
+        const double fraction = 0.5 * (reached + blocked);
+        if (fraction <= reached || fraction >= blocked) break;  // no number lies between them
+        for (std::size_t c = 0; c < d; ++c) next[c] = state[c] + fraction * action[c];
+        (world.collides(next) ? blocked : reached) = fraction;
+    }
+    for (std::size_t c = 0; c < d; ++c) next[c] = state[c] + reached * action[c];
+}
+
+// Adds noise to the `count` states of one block, of which the first is particle `first`. Returns
+// how many found no free state; those are left as they are.
+template <class World>
+std::size_t add_noise(const World& world, std::size_t first, std::size_t count,
+                      const double* standard_deviation, const Stream& stream, double* states) {
+    constexpr std::size_t d = World::dimension;
+    std::array<double, block_size * d> noise;
+    std::array<std::size_t, block_size> pending;
+    std::size_t num_pending = 0;
+
+    const auto place = [&](double* state, const double* normal_numbers) {
+        std::array<double, d> candidate;
+        for (std::size_t c = 0; c < d; ++c) {
+            candidate[c] = state[c] + standard_deviation[c] * normal_numbers[c];
+        }
+        if (world.collides(candidate.data())) return false;
+        std::copy(candidate.begin(), candidate.end(), state);
+        return true;
+    };
+
+    normals(substream(stream, 0), first * d, count * d, noise.data());
+    for (std::size_t i = 0; i < count; ++i) {
+        if (!place(states + i * d, noise.data() + i * d)) pending[num_pending++] = i;
+    }
+    for (std::size_t attempt = 1; attempt < max_noise_attempts && num_pending > 0; ++attempt) {
+        const Stream draws = substream(stream, attempt);
+        std::size_t still_pending = 0;
+        for (std::size_t p = 0; p < num_pending; ++p) {
+            const std::size_t i = pending[p];
+            normals(draws, (first + i) * d, d, noise.data());
+            if (!place(states + i * d, noise.data())) pending[still_pending++] = i;
+        }
+        num_pending = still_pending;
+    }
+    return num_pending;
+}
+
+bool all_zero(const double* values, std::size_t count) {
+    return std::all_of(values, values + count, [](double value) { return value == 0.0; });
+}
+
+}  // namespace
+
+template <class World>
+void move(const World& world, std::size_t count, const double* states, const double* actions,
+          std::size_t action_stride, const double* standard_deviation, double tolerance,
+          const Stream& stream, double* next) {
+    constexpr std::size_t d = World::dimension;
+    const bool noisy = !all_zero(standard_deviation, d);
+    const std::size_t num_blocks = (count + block_size - 1) / block_size;
+
+#pragma omp parallel for schedule(static) if (count >= parallel_threshold)
+    for (std::size_t block = 0; block < num_blocks; ++block) {
+        const std::size_t first = block * block_size;
+        const std::size_t size = std::min(block_size, count - first);
+        for (std::size_t n = first; n < first + size; ++n) {
+            stop_at_contact(world, states + n * d, actions + n * action_stride, tolerance,
+                            next + n * d);
+        }
+        if (noisy) add_noise(world, first, size, standard_deviation, stream, next + first * d);
+    }
+}
+
+template <class World>
+std::size_t draw_free(const World& world, std::size_t count, const double* mean,
+                      const double* standard_deviation, const Stream& stream, double* states) {
+    constexpr std::size_t d = World::dimension;
+    const std::size_t num_blocks = (count + block_size - 1) / block_size;
+    std::size_t unplaced = 0;
+
+#pragma omp parallel for schedule(static) reduction(+ : unplaced) if (count >= parallel_threshold)
+    for (std::size_t block = 0; block < num_blocks; ++block) {
+        const std::size_t first = block * block_size;
+        const std::size_t size = std::min(block_size, count - first);
+        for (std::size_t n = first; n < first + size; ++n)
+            std::copy(mean, mean + d, states + n * d);
+        unplaced += add_noise(world, first, size, standard_deviation, stream, states + first * d);
+    }
+    return unplaced;
+}
+
+#define HOLDFAST_INSTANTIATE(World)                                                                \
+    template void move<World>(const World&, std::size_t, const double*, const double*,             \
+                              std::size_t, const double*, double, const Stream&, double*);         \
+    template std::size_t draw_free<World>(const World&, std::size_t, const double*, const double*, \
+                                          const Stream&, double*);
+
+HOLDFAST_INSTANTIATE(DiscWorld)
+HOLDFAST_INSTANTIATE(RectangleWorld)
+HOLDFAST_INSTANTIATE(BoxWorld)
+#undef HOLDFAST_INSTANTIATE
+
+}  // namespace holdfast

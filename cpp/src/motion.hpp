@@ -1,0 +1,40 @@
+// Motion that stops at contact, with noise that never ends inside an obstacle.
+//
+// A robot told to move into a wall moves up to the wall. The full action is tried first; if it ends
+// in collision, bisection finds the largest fraction of it that does not, to within a tolerance.
+// Then Gaussian noise is added, drawn again until the state is free of collision: the noise of a
+// robot at a wall is the Gaussian cut off by the wall (rejection sampling).
+//
+// Attempt a at coordinate c of particle n takes the normal number n * dimension + c of substream a.
+// So the bits of one particle depend neither on the others, nor on the order of work, nor on
+// the number of threads.
+#pragma once
+
+#include <cstddef>
+
+#include "philox.hpp"
+
+namespace holdfast {
+
+// Draws of the noise before the particle is left where it is without noise.
+inline constexpr std::size_t max_noise_attempts = 1000;
+
+// Below this number of particles one thread is faster than waking the others.
+inline constexpr std::size_t parallel_threshold = 4096;
+
+// Moves `count` states by executed actions. `action_stride` is the dimension, or 0 if there is one
+// action for all. `tolerance` is a fraction of the action. `next` does not overlap the inputs.
+//
+// A state that is free before is free after. A state in collision may stay in collision.
+template <class World>
+void move(const World& world, std::size_t count, const double* states, const double* actions,
+          std::size_t action_stride, const double* standard_deviation, double tolerance,
+          const Stream& stream, double* next);
+
+// Draws `count` states of N(mean, diag(standard_deviation^2)) that are free of collision. Returns
+// how many found no free state; those are set to the mean.
+template <class World>
+std::size_t draw_free(const World& world, std::size_t count, const double* mean,
+                      const double* standard_deviation, const Stream& stream, double* states);
+
+}  // namespace holdfast

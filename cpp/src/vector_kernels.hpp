@@ -1,0 +1,100 @@
+// The inner loops, compiled once for each instruction set and chosen at start-up.
+//
+// The files in lanes/ are compiled several times, each time in a namespace of its own and with
+// another -m flag; this table holds the entry points of one such compilation. All of them give the same
+// bits (tests/unit/test_kernel.py), only the speed differs.
+
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+
+#include "philox.hpp"
+#include "point_tree.hpp"
+
+namespace holdfast {
+
+/// The widest row of posteriors handled at once: 4 x 8.
+inline constexpr std::size_t max_group_lanes = 32;
+
+/// Everything that a hypothetical observation's posterior is made of.
+struct PosteriorInput {
+    std::size_t count;               // particles
+    const double* log_weights;       // [count] log prior weights
+    std::size_t observation_size;    // coordinates of the observation
+    const double* predicted;         // [observation_size][count] expected observations
+    const double* inverse_variance;  // [observation_size], or [observation_size][count]
+    const double* log_normalizer;    // null, or [count]: sum over coordinates of log(variance) / 2
+    const double* observation;       // [observation_size]
+    double log_negligible;           // weights below e^this of the largest count as zero
+};
+
+/// Posteriors over the points of one tree, side by side: row = slot of the tree, column = posterior.
+struct PosteriorGroup {
+    TreeView tree;
+    std::size_t members;               // posteriors; the other columns of a row are zero
+    std::size_t vectors;               // Lanes in a row, 1 to 4
+    const double* weights;             // [slots][vectors * 8], each column sums to 1
+    const std::uint32_t* significant;  // [slots][vectors * 8], 1 where the weight is not zero
+    const double* node_weights;        // [nodes][vectors * 8], sums below each node
+    const std::uint32_t* node_counts;  // [nodes][vectors * 8]
+    const std::uint32_t* neighbors;    // [vectors * 8] the k of each column, 0 in unused columns
+};
+
+struct NearestNeighborConstants {
+    double resolution;
+    double log_ball_volume;         // log c_d
+    const double* bias_correction;  // [q] log q - psi(q)
+};
+
+/// One posterior with few points: coordinates[c * stride + i], weights[i], i < count.
+/// The stride is a multiple of 8; coordinates beyond count are +infinity, weights zero.
+struct CompactPosterior {
+    std::size_t count;
+    std::size_t stride;
+    std::size_t dimension;
+    const double* coordinates;
+    const double* weights;
+    double* scratch;  // [stride + the k of the nearest neighbours]
+};
+
+struct VectorKernels {
+    const char* name;
+    void (*exp)(const double* in, double* out, std::size_t count);
+    void (*log)(const double* in, double* out, std::size_t count);
+    void (*sin)(const double* in, double* out, std::size_t count);
+    void (*cos)(const double* in, double* out, std::size_t count);
+    void (*normals)(const Stream&, std::uint64_t first, std::size_t count, double* out);
+    double (*sum)(const double* in, std::size_t count);
+    void (*weighted_sums)(const double* weights, const double* rows, std::size_t count,
+                          std::size_t dimension, double* out);
+    /// Normalised posterior weights; returns how many are not zero, 0 if there is no posterior.
+    std::size_t (*posterior)(const PosteriorInput&, double* weights);
+    /// Normalises weights e^log_weights likewise.
+    std::size_t (*normalize)(const double* log_weights, std::size_t count, double log_negligible,
+                             double* weights);
+    double (*compact_nearest)(const CompactPosterior&, std::uint32_t neighbors,
+                              const NearestNeighborConstants&, std::uint64_t* visits);
+    double (*compact_mixture)(const CompactPosterior&, double exponent, std::uint64_t* visits);
+    /// Adds the terms of the points of one leaf: out[vectors * 8].
+    /// `scratch` holds as many doubles as the largest k.
+    void (*group_nearest)(const PosteriorGroup&, std::size_t leaf, const NearestNeighborConstants&,
+                          double* scratch, double* out, std::uint64_t* visits);
+    void (*group_mixture)(const PosteriorGroup&, std::size_t leaf, double exponent, double* out,
+                          std::uint64_t* visits);
+};
+
+/// The best of the compiled sets that this processor runs; HOLDFAST_SIMD names another one.
+const VectorKernels& vector_kernels();
+
+namespace isa_baseline {
+extern const VectorKernels table;
+}
+namespace isa_avx2 {
+extern const VectorKernels table;
+}
+namespace isa_avx512 {
+extern const VectorKernels table;
+}
+
+}  // namespace holdfast

@@ -1,0 +1,253 @@
+"""The belief: weighted particles, and what can happen to them.
+
+A belief about the state is a set of states ("particles") with weights that sum to 1. Moving the
+robot moves every particle (*predict*); an observation multiplies each weight by how well that
+particle explains it (*update*); and when few particles carry most of the weight, the set is drawn
+anew from itself (*resample*). The functions are pure: they return a new belief and keep the old one.
+
+Weights are multiplied as logarithms, so an observation that every particle finds most unlikely still
+ranks them instead of turning every weight into zero.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from holdfast import _kernel, numerics
+from holdfast.errors import InvalidValueError, ProblemError
+from holdfast.randomness import Stream
+
+__all__ = [
+    "Belief",
+    "UpdateInfo",
+    "effective_sample_size",
+    "estimate",
+    "resample",
+    "standard_deviation",
+    "update",
+]
+
+FloatArray = npt.NDArray[np.float64]
+
+UNEXPLAINED_DEVIATIONS_SQUARED = 64.0
+"""An observation further than eight standard deviations from every particle is *unexplained*: a
+right model does so with probability below 2e-15 in one dimension."""
+
+
+class ObservationModel(Protocol):
+    """The part of a problem that an update needs."""
+
+    def observation_mean(self, states: FloatArray, sensing_action: int) -> FloatArray: ...
+
+    def observation_variance(self, states: FloatArray, sensing_action: int) -> FloatArray: ...
+
+
+class Belief(NamedTuple):
+    """Weighted particles.
+
+    Attributes
+    ----------
+    states : array of shape (num_particles, state_size)
+        C-contiguous, finite.
+    weights : array of shape (num_particles,)
+        Non-negative; their sum is 1 up to rounding.
+    """
+
+    states: FloatArray
+    weights: FloatArray
+
+    @classmethod
+    def uniform(cls, states: npt.ArrayLike) -> Belief:
+        """Return a belief of equally weighted particles.
+
+        Parameters
+        ----------
+        states : array of shape (num_particles, state_size)
+
+        Raises
+        ------
+        InvalidValueError
+            If there is no particle or a coordinate is not finite.
+        """
+        array = np.ascontiguousarray(states, dtype=np.float64)
+        if array.ndim != 2 or array.shape[0] == 0 or array.shape[1] == 0:
+            raise InvalidValueError(
+                f"states of shape {array.shape}: need (num_particles, state_size), at least 1 each"
+            )
+        if not np.isfinite(array).all():
+            bad = int(np.argmin(np.isfinite(array).all(axis=1)))
+            raise InvalidValueError(f"state of particle {bad} is {array[bad]}: must be finite")
+        return cls(array, uniform_weights(array.shape[0]))
+
+    @classmethod
+    def weighted(cls, states: npt.ArrayLike, weights: npt.ArrayLike) -> Belief:
+        """Return a belief of weighted particles; the weights are normalised.
+
+        Parameters
+        ----------
+        states : array of shape (num_particles, state_size)
+        weights : array of shape (num_particles,)
+            Non-negative and finite, not all zero.
+
+        Raises
+        ------
+        InvalidValueError
+            If a state or a weight is out of bounds or the shapes do not fit.
+        """
+        belief = cls.uniform(states)
+        array = np.ascontiguousarray(weights, dtype=np.float64)
+        count = belief.states.shape[0]
+        if array.shape != (count,):
+            raise InvalidValueError(f"weights of shape {array.shape}: need ({count},)")
+        if not np.isfinite(array).all() or (array < 0.0).any():
+            bad = int(np.argmin(np.isfinite(array) & (array >= 0.0)))
+            raise InvalidValueError(f"weight of particle {bad} is {array[bad]}: must be >= 0, finite")
+        total = numerics.sum(array)
+        if not 0.0 < total < np.inf:
+            raise InvalidValueError(f"sum of the weights is {total}: must be positive and finite")
+        return cls(belief.states, array / total)
+
+
+def uniform_weights(count: int) -> FloatArray:
+    """Return ``count`` weights of ``1 / count``."""
+    weights = np.empty(count)
+    weights.fill(1.0 / count)
+    return weights
+
+
+class UpdateInfo(NamedTuple):
+    """What an update found.
+
+    Attributes
+    ----------
+    effective_sample_size : float
+        ``1 / sum(weights**2)`` after the update, from 1 to the number of particles.
+    explained : bool
+        False if the observation is more than eight standard deviations from what every particle
+        expects (or, for a general likelihood, impossible under all of them).
+    """
+
+    effective_sample_size: float
+    explained: bool
+
+
+def estimate(belief: Belief) -> FloatArray:
+    """Return the mean state, shape ``(state_size,)``."""
+    return _kernel.weighted_sums(belief.weights, belief.states)
+
+
+def standard_deviation(belief: Belief) -> FloatArray:
+    """Return the standard deviation of each coordinate, shape ``(state_size,)``."""
+    difference = belief.states - estimate(belief)
+    return np.sqrt(_kernel.weighted_sums(belief.weights, difference * difference))
+
+
+def effective_sample_size(belief: Belief) -> float:
+    """Return ``1 / sum(weights**2)`` (Kong, Liu and Wong 1994)."""
+    return 1.0 / _kernel.sum(belief.weights * belief.weights)
+
+
+def update(
+    problem: ObservationModel, belief: Belief, sensing_action: int, observation: npt.ArrayLike
+) -> tuple[Belief, UpdateInfo]:
+    """Multiply the weights by the likelihood of an observation (Bayes' rule).
+
+    Parameters
+    ----------
+    problem : ObservationModel
+        Gives the mean and variance of the observation in each state, or a method
+        ``log_likelihood(states, sensing_action, observation)`` of its own.
+    belief : Belief
+    sensing_action : int
+    observation : array of shape (observation_size,)
+
+    Returns
+    -------
+    belief : Belief
+        The same states with new weights. If no particle can have made the observation at all (its
+        log-likelihood is minus infinity everywhere), the belief as it was.
+    info : UpdateInfo
+
+    Raises
+    ------
+    InvalidValueError
+        If the observation is not finite or of another size than the problem predicts.
+    ProblemError
+        If the problem's likelihood is NaN or plus infinity.
+    """
+    observed = np.ascontiguousarray(observation, dtype=np.float64).reshape(-1)
+    if not np.isfinite(observed).all():
+        raise InvalidValueError(f"observation {observed}: every coordinate must be finite")
+    general = getattr(problem, "log_likelihood", None)
+    if general is None:
+        mean = problem.observation_mean(belief.states, sensing_action)
+        variance = problem.observation_variance(belief.states, sensing_action)
+        if mean.shape[-1] != observed.shape[0]:
+            raise InvalidValueError(
+                f"observation of {observed.shape[0]} coordinates: sensing action {sensing_action} "
+                f"gives {mean.shape[-1]}"
+            )
+        log_likelihood, explained = _gaussian_log_likelihood(observed, mean, variance)
+    else:
+        log_likelihood = np.ascontiguousarray(
+            general(belief.states, sensing_action, observed), dtype=np.float64
+        )
+        if np.isnan(log_likelihood).any() or (log_likelihood == np.inf).any():
+            raise ProblemError(
+                f"log_likelihood of observation {observed} under sensing action {sensing_action} is "
+                "NaN or plus infinity for a particle"
+            )
+        explained = bool((log_likelihood > -np.inf).any())
+    weights, survivors = _kernel.normalize(numerics.log(belief.weights) + log_likelihood, -745.0)
+    if survivors == 0:
+        return belief, UpdateInfo(effective_sample_size(belief), explained=False)
+    after = Belief(belief.states, weights)
+    return after, UpdateInfo(effective_sample_size(after), explained)
+
+
+def _gaussian_log_likelihood(
+    observed: FloatArray, mean: FloatArray, variance: FloatArray
+) -> tuple[FloatArray, bool]:
+    """Return log p(observed | state) up to a constant, and whether a particle explains it."""
+    if not np.isfinite(mean).all():
+        raise ProblemError("observation_mean is not finite for a particle")
+    if not (variance > 0.0).all() or not np.isfinite(variance).all():
+        raise ProblemError(f"observation_variance {variance}: every entry must be > 0 and finite")
+    difference = observed - mean
+    squares = difference * difference / variance
+    # Added column by column: np.sum may add in another order on another machine.
+    distance = squares[..., 0].copy()
+    for coordinate in range(1, squares.shape[-1]):
+        distance += squares[..., coordinate]
+    explained = bool(distance.min() <= UNEXPLAINED_DEVIATIONS_SQUARED)
+    log_likelihood = -0.5 * distance
+    if variance.ndim > 1:
+        for coordinate in range(variance.shape[-1]):
+            log_likelihood -= 0.5 * numerics.log(variance[..., coordinate])
+    return log_likelihood, explained
+
+
+def resample(belief: Belief, stream: Stream) -> Belief:
+    """Draw as many particles from the belief as it has, by systematic resampling.
+
+    Parameters
+    ----------
+    belief : Belief
+    stream : Stream
+        Gives the one uniform offset.
+
+    Returns
+    -------
+    Belief
+        Equally weighted particles; particle n is there ``floor(N w_n)`` or ``ceil(N w_n)`` times.
+
+    Notes
+    -----
+    Carpenter, Clifford and Fearnhead (1999), "Improved particle filter for nonlinear problems".
+    """
+    offset = float(stream.uniform())
+    indices = _kernel.systematic_resample(belief.weights, offset)
+    return Belief(belief.states[indices], uniform_weights(belief.weights.shape[0]))

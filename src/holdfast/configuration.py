@@ -1,0 +1,629 @@
+"""The configuration file: from the thesis's YAML to a problem and validated settings.
+
+A run is described by one file, and whoever reads an error has that file open. So every complaint
+names the file, the line, the key with its section, the value and what is allowed instead, and it
+comes before anything is run. The sections and keys are the thesis's, so that its files load
+unchanged; ``problem: NAME`` on top and the section ``selector`` are ours, and optional. Missing
+sections and keys take their defaults, and :meth:`Configuration.to_yaml` writes down every value
+that is in use.
+
+The bounds themselves stand with the settings (:mod:`holdfast.settings`) and with each problem (its
+``Model`` and ``StateSpacePlanner``); what involves two keys is checked here.
+"""
+
+from __future__ import annotations
+
+import difflib
+import inspect
+import json
+import re
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeVar
+
+import msgspec
+import msgspec.inspect
+
+from holdfast.errors import ConfigurationError, HoldfastError, UnknownProblemError
+from holdfast.problems import registry
+from holdfast.problems.problem import Problem, ProblemBase
+from holdfast.settings import (
+    ActiveSensingSettings,
+    ParticleFilterSettings,
+    PlanningSettings,
+    SelectorSettings,
+    SimulatorSettings,
+)
+from holdfast.yaml_document import MAX_BYTES, Document, KeyPath, dotted, read, write
+
+__all__ = ["Configuration", "load"]
+
+_SETTINGS: Mapping[str, type[msgspec.Struct]] = {
+    "particle_filter": ParticleFilterSettings,
+    "active_sensing": ActiveSensingSettings,
+    "simulator": SimulatorSettings,
+    "selector": SelectorSettings,
+}
+
+# In the order in which a resolved configuration lists them.
+_SECTIONS = (
+    "model",
+    "particle_filter",
+    "state_space_planner",
+    "active_sensing",
+    "simulator",
+    "selector",
+)
+
+# The thesis's files do not name their problem; these keys of `model` do, together.
+_TELLING_KEYS: Mapping[str, frozenset[str]] = {
+    "peg_in_hole_2d": frozenset({"peg_width"}),
+    "multitier_peg_in_hole_2d": frozenset({"holes"}),
+    "capsule_robot": frozenset({"robot_radius"}),
+    "peg_in_hole_3d": frozenset({"peg_dim", "hole_tolerance"}),
+}
+
+_Struct = TypeVar("_Struct", bound=msgspec.Struct)
+
+
+@dataclass(frozen=True)
+class Configuration:
+    """Everything that a run depends on, validated.
+
+    Two configurations are equal if they say the same, wherever their files are.
+
+    Attributes
+    ----------
+    problem : Problem
+        The problem, built from ``model`` and ``state_space_planner``.
+    problem_name : str
+        Its registered name, or ``module:Class``.
+    planning : PlanningSettings
+        Settings of the planner.
+    simulator : SimulatorSettings
+        Trials, their length and their seed.
+    model, state_space_planner : mapping
+        The problem's two sections with all defaults filled in, as plain data.
+    path : Path
+        The file that this was read from.
+    """
+
+    problem: Problem = field(compare=False, repr=False)
+    problem_name: str
+    planning: PlanningSettings
+    simulator: SimulatorSettings
+    model: Mapping[str, Any]
+    state_space_planner: Mapping[str, Any]
+    path: Path = field(compare=False)
+
+    def to_yaml(self) -> str:
+        """Return the resolved configuration as a file that loads to an equal configuration.
+
+        Returns
+        -------
+        str
+            YAML with every key, those of the defaults included.
+        """
+        return (
+            "# The configuration of a holdfast run, resolved: every key, with the value in use.\n"
+            + write(self._sections())
+        )
+
+    def plain(self) -> dict[str, Any]:
+        """Return the configuration as plain data, from which another process can rebuild it.
+
+        Returns
+        -------
+        dict
+            Text, numbers, lists and mappings; see :meth:`from_plain`.
+        """
+        return {"path": str(self.path.absolute()), "configuration": self._sections()}
+
+    @classmethod
+    def from_plain(cls, plain: Mapping[str, Any]) -> Configuration:
+        """Rebuild a configuration from :meth:`plain`, in another process as well.
+
+        Parameters
+        ----------
+        plain : mapping
+            What :meth:`plain` returned.
+
+        Returns
+        -------
+        Configuration
+            An equal configuration.
+
+        Raises
+        ------
+        ConfigurationError
+            If the data is not that of a configuration.
+        """
+        if not isinstance(plain.get("path"), str) or "configuration" not in plain:
+            raise ConfigurationError(
+                "a configuration as plain data has the keys path and configuration"
+            )
+        return _build(Document(plain["configuration"], {}), Path(plain["path"]), None, {})
+
+    def _sections(self) -> dict[str, Any]:
+        sections: dict[str, Any] = {
+            "model": self.model,
+            "state_space_planner": self.state_space_planner,
+            "particle_filter": self.planning.particle_filter,
+            "active_sensing": self.planning.active_sensing,
+            "selector": self.planning.selector,
+            "simulator": self.simulator,
+        }
+        return {
+            "problem": self.problem_name,
+            **{name: msgspec.to_builtins(sections[name]) for name in _SECTIONS},
+        }
+
+
+def load(
+    path: str | Path,
+    *,
+    problem: str | None = None,
+    num_trials: int | None = None,
+    seed: int | None = None,
+) -> Configuration:
+    """Read a configuration file.
+
+    Parameters
+    ----------
+    path : str or Path
+        The YAML file.
+    problem : str, optional
+        Name of the problem, instead of the one that the file gives or implies.
+    num_trials, seed : int, optional
+        Instead of the file's ``simulator.num_trials`` and ``simulator.seed``.
+
+    Returns
+    -------
+    Configuration
+        The problem and the settings.
+
+    Raises
+    ------
+    ConfigurationError
+        If the file cannot be read or used.
+    UnknownProblemError
+        If it names a problem that is neither registered nor importable.
+    """
+    path = Path(path)
+    document = read(_content(path), str(path))
+    overrides = {"num_trials": num_trials, "seed": seed}
+    return _build(
+        document,
+        path,
+        problem,
+        {key: value for key, value in overrides.items() if value is not None},
+    )
+
+
+def _content(path: Path) -> bytes:
+    """Return what is in the file, but no more than one byte over the limit."""
+    try:
+        with path.open("rb") as file:
+            return file.read(MAX_BYTES + 1)
+    except FileNotFoundError:
+        raise ConfigurationError(f"{path}: there is no such file") from None
+    except IsADirectoryError:
+        raise ConfigurationError(f"{path}: is a directory, not a configuration file") from None
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else str(error)
+        raise ConfigurationError(f"{path}: cannot be read: {reason}") from None
+
+
+class _Source:
+    """A configuration before it is checked, and the way to say where in it something is wrong."""
+
+    def __init__(self, document: Document, path: Path, overrides: Mapping[str, Any]) -> None:
+        self.path = path
+        self._document = document
+        self._overrides = {("simulator", key) for key in overrides}
+        data = document.data
+        if data is None:
+            raise ConfigurationError(
+                f"{path}: is empty; a configuration has the sections {', '.join(_SECTIONS)}"
+            )
+        if not isinstance(data, Mapping):
+            raise ConfigurationError(
+                f"{path}: is {_kind(data)} at the top, where a mapping of the sections"
+                f" {', '.join(_SECTIONS)} is needed"
+            )
+        for name in data:
+            if name not in ("problem", *_SECTIONS):
+                raise self.unknown((name,), ("problem", *_SECTIONS))
+        self.problem: Any = data.get("problem")
+        self.sections: dict[str, dict[str, Any]] = {}
+        for name in _SECTIONS:
+            section = data.get(name)
+            if section is not None and not isinstance(section, Mapping):
+                raise self.error((name,), f"is {_shown(section)}; expected a mapping of keys")
+            self.sections[name] = dict(section or {})
+        self.sections["simulator"].update(overrides)
+
+    def place(self, path: KeyPath) -> str:
+        """Return the file, and the line of the value at ``path`` where there is one."""
+        line = self._document.line(path)
+        return f"{self.path}" if line is None else f"{self.path}, line {line}"
+
+    def error(self, path: KeyPath, message: str) -> ConfigurationError:
+        """Return an error about the value at ``path``."""
+        if path[:2] in self._overrides:
+            return ConfigurationError(
+                f"{dotted(path)}, given instead of what {self.path} says, {message}"
+            )
+        return ConfigurationError(f"{self.place(path)}: {dotted(path)} {message}")
+
+    def unknown(
+        self, path: KeyPath, allowed: Collection[str], belongs_to: Iterable[str] = ()
+    ) -> ConfigurationError:
+        """Return an error about a key that is not one of ``allowed``."""
+        what = "section" if len(path) == 1 else "key"
+        homes = [section for section in belongs_to if section != path[0]]
+        hint = (
+            f"is a key of {' and '.join(homes)}, not of {dotted(path[:-1])}"
+            if homes
+            else f"is not a known {what}{_close_match(str(path[-1]), allowed)}"
+        )
+        return self.error(path, f"{hint}\nallowed: {', '.join(allowed) or 'no keys'}")
+
+
+def _build(
+    document: Document, path: Path, problem_name: str | None, overrides: Mapping[str, Any]
+) -> Configuration:
+    """Check everything and build the problem."""
+    source = _Source(document, path, overrides)
+    name, problem_class = _find_problem(source, problem_name)
+    schemas: dict[str, type[msgspec.Struct]] = dict(_SETTINGS)
+    for section, attribute in (("model", "Model"), ("state_space_planner", "StateSpacePlanner")):
+        schema = getattr(problem_class, attribute, None)
+        if isinstance(schema, type) and issubclass(schema, msgspec.Struct):
+            schemas[section] = schema
+    particle_filter = _convert(source, "particle_filter", ParticleFilterSettings, schemas)
+    active_sensing = _convert(source, "active_sensing", ActiveSensingSettings, schemas)
+    selector = _convert(source, "selector", SelectorSettings, schemas)
+    simulator = _convert(source, "simulator", SimulatorSettings, schemas)
+    problem, model, planner = _build_problem(source, name, problem_class, schemas)
+
+    num_particles = particle_filter.num_particles
+    num_neighbors = active_sensing.num_nearest_neighbors
+    if (
+        selector.method in ("action_entropy", "state_entropy")
+        and selector.estimator == "nearest_neighbor"
+        and num_neighbors >= num_particles
+    ):
+        raise source.error(
+            ("active_sensing", "num_nearest_neighbors"),
+            f"is {num_neighbors}; the nearest_neighbor estimator needs it below"
+            f" particle_filter.num_particles, which is {num_particles}",
+        )
+    num_actions = len(problem.sensing_actions)
+    if selector.method == "fixed" and selector.sensing_action >= num_actions:
+        raise source.error(
+            ("selector", "sensing_action"),
+            f"is {selector.sensing_action}; {name} has the sensing actions 0 to {num_actions - 1}"
+            f" ({', '.join(problem.sensing_actions)})",
+        )
+    return Configuration(
+        problem=problem,
+        problem_name=name,
+        planning=PlanningSettings(
+            particle_filter=particle_filter,
+            active_sensing=active_sensing,
+            selector=selector,
+            sensing_interval=simulator.sensing_intervals,
+        ),
+        simulator=simulator,
+        model=model,
+        state_space_planner=planner,
+        path=path,
+    )
+
+
+def _find_problem(source: _Source, name: str | None) -> tuple[str, type]:
+    """Return the problem's name, given, written in the file or told by its keys, and its class."""
+    given = name is not None
+    if name is None:
+        if source.problem is None:
+            name = _infer_problem(source)
+        elif isinstance(source.problem, str):
+            name = source.problem
+        else:
+            raise source.error(
+                ("problem",),
+                f"is {_shown(source.problem)}; expected one of {', '.join(registry.names())},"
+                " or module:Class",
+            )
+    try:
+        return name, registry.problem_class(name, search_directory=source.path.absolute().parent)
+    except UnknownProblemError as error:
+        if given or source.problem is None:
+            raise
+        raise UnknownProblemError(f"{source.place(('problem',))}: {error}") from error
+
+
+def _infer_problem(source: _Source) -> str:
+    """Return the one problem that the keys of ``model`` tell."""
+    keys = set(source.sections["model"])
+    names = registry.names()
+    told = [name for name in names if name in _TELLING_KEYS and _TELLING_KEYS[name] <= keys]
+    if len(told) == 1:
+        return told[0]
+    why = (
+        f"the keys of its model belong to {' and '.join(told)}"
+        if told
+        else "the keys of its model do not tell it"
+    )
+    raise ConfigurationError(
+        f"{source.path}: names no problem, and {why}; put 'problem: NAME' on top\n"
+        f"problems: {', '.join(names)}"
+    )
+
+
+def _convert(
+    source: _Source,
+    section: str,
+    schema: type[_Struct],
+    schemas: Mapping[str, type[msgspec.Struct]],
+) -> _Struct:
+    """Return one section as its validated struct."""
+    data = source.sections[section]
+    try:
+        return msgspec.convert(data, type=schema)
+    except msgspec.ValidationError as error:
+        raise _explain(source, section, schema, schemas, str(error)) from None
+
+
+def _explain(
+    source: _Source,
+    section: str,
+    schema: type[msgspec.Struct],
+    schemas: Mapping[str, type[msgspec.Struct]],
+    text: str,
+) -> ConfigurationError:
+    """Turn msgspec's account of what is wrong in a section into ours.
+
+    Its texts are ``Expected `int` >= 1 - at `$.holes[2].depth```: the path is taken from there, the
+    value from the data, and what is allowed from the type.
+    """
+    found = re.search(r"^(?P<what>.*?)(?: - at (?:`key` in )?`\$(?P<path>.*)`)?$", text, re.DOTALL)
+    what = found["what"] if found else text
+    inner: list[str | int] = []
+    for key, index in re.findall(r"\.?([^.\[\]]+)|\[(\d+)\]", (found and found["path"]) or ""):
+        inner.append(int(index) if index else key)
+    path = (section, *inner)
+    if "[...]" in text or "`key` in" in text:
+        # msgspec does not say under which key of a free mapping the value stands.
+        return source.error(path, f"holds something that is not allowed: {what}")
+    field_type = _type_at(msgspec.inspect.type_info(schema), inner)
+
+    if named := re.match(r"Object contains unknown field `(.*)`", what, re.DOTALL):
+        key = named[1]
+        allowed = _keys(field_type)
+        homes = [] if inner else [name for name, other in schemas.items() if key in _fields(other)]
+        return source.unknown((*path, key), allowed, homes)
+    if named := re.match(r"Object missing required field `(.*)`", what):
+        return source.error((*path, named[1]), "is missing; it has no default")
+
+    value: Any = source.sections[section]
+    for part in inner:
+        try:
+            value = value[part]
+        except (KeyError, IndexError, TypeError):
+            return source.error(path, f"is not allowed: {what}")
+    choices = _choices(field_type)
+    close = _close_match(value, choices) if isinstance(value, str) else ""
+    length = f" (a list of {len(value)})" if isinstance(value, list) else ""
+    expected = _described(field_type) or what
+    return source.error(path, f"is {_shown(value)}{length}; expected {expected}{close}")
+
+
+def _build_problem(
+    source: _Source,
+    name: str,
+    problem_class: type,
+    schemas: Mapping[str, type[msgspec.Struct]],
+) -> tuple[Problem, dict[str, Any], dict[str, Any]]:
+    """Return the problem and its two sections with their defaults."""
+    resolved: dict[str, dict[str, Any]] = {}
+    for section in ("model", "state_space_planner"):
+        if section in schemas:
+            settings = _convert(source, section, schemas[section], schemas)
+            resolved[section] = msgspec.to_builtins(settings)
+        else:
+            resolved[section] = source.sections[section]
+    if "model" not in schemas and "state_space_planner" not in schemas:
+        given = {**resolved["model"], **resolved["state_space_planner"]}
+        defaults = _keyword_arguments(source, problem_class)
+        resolved["model"].update(
+            {key: value for key, value in defaults.items() if key not in given}
+        )
+    model, planner = resolved["model"], resolved["state_space_planner"]
+    # A class that only has the members of the protocol is built as ProblemBase builds.
+    build = getattr(problem_class, "from_settings", None)
+    try:
+        if build is None:
+            problem = ProblemBase.from_settings.__func__(problem_class, model, planner)  # type: ignore[attr-defined]
+        else:
+            problem = build(model, planner)
+    except (HoldfastError, msgspec.ValidationError, TypeError, ValueError) as error:
+        raise _at_mentioned_key(source, name, resolved, error) from error
+    missing = [member for member in _members(Problem) if not hasattr(problem, member)]
+    if missing:
+        raise ConfigurationError(
+            f"{source.path}: {name} is no problem: it lacks {', '.join(missing)}"
+        )
+    return problem, model, planner
+
+
+def _keyword_arguments(source: _Source, problem_class: type) -> dict[str, Any]:
+    """Check keys that are arguments of the constructor, and return those arguments' defaults.
+
+    Only defaults that a file can hold are returned; the constructor knows the others.
+    """
+    build = getattr(problem_class, "from_settings", None)
+    if getattr(build, "__func__", None) not in (None, ProblemBase.from_settings.__func__):  # type: ignore[attr-defined]
+        return {}
+    parameters = inspect.signature(problem_class).parameters.values()
+    named = {
+        parameter.name: parameter.default
+        for parameter in parameters
+        if parameter.kind in (parameter.POSITIONAL_OR_KEYWORD, parameter.KEYWORD_ONLY)
+    }
+    if not any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
+        for section in ("model", "state_space_planner"):
+            for key in source.sections[section]:
+                if key not in named:
+                    homes = [other for other, schema in _SETTINGS.items() if key in _fields(schema)]
+                    raise source.unknown((section, key), list(named), homes)
+    return {key: default for key, default in named.items() if _is_plain(default)}
+
+
+def _is_plain(value: Any) -> bool:
+    """Tell whether a file can hold a value so that the same value is read from it."""
+    if isinstance(value, list):
+        return all(map(_is_plain, value))
+    if isinstance(value, dict):
+        return all(isinstance(key, str) and _is_plain(item) for key, item in value.items())
+    if isinstance(value, float):
+        return abs(value) < float("inf")
+    return value is None or isinstance(value, bool | int | str)
+
+
+def _at_mentioned_key(
+    source: _Source, name: str, sections: Mapping[str, Mapping[str, Any]], error: Exception
+) -> ConfigurationError:
+    """Return the problem's own complaint, with the line of the first of its keys named there."""
+    text = str(error) or type(error).__name__
+    mentioned = [
+        (at.start(), (section, key))
+        for section, keys in sections.items()
+        for key in keys
+        if (at := re.search(rf"(?<!\w){re.escape(key)}(?!\w)", text))
+    ]
+    if mentioned:
+        return ConfigurationError(f"{source.place(min(mentioned)[1])}: {text}")
+    return ConfigurationError(f"{source.path}: {name} cannot be built: {text}")
+
+
+def _members(protocol: type) -> list[str]:
+    """Return the names of a protocol's public attributes and methods."""
+    names = [*protocol.__annotations__, *vars(protocol)]
+    return [name for name in names if not name.startswith("_")]
+
+
+def _fields(schema: type[msgspec.Struct]) -> list[str]:
+    return [field.encode_name for field in msgspec.structs.fields(schema)]
+
+
+def _alternatives(field_type: msgspec.inspect.Type | None) -> list[msgspec.inspect.Type]:
+    """Return the members of a union, or the type itself."""
+    while isinstance(field_type, msgspec.inspect.Metadata):
+        field_type = field_type.type
+    if isinstance(field_type, msgspec.inspect.UnionType):
+        return [inner for member in field_type.types for inner in _alternatives(member)]
+    return [] if field_type is None else [field_type]
+
+
+def _type_at(
+    field_type: msgspec.inspect.Type, path: Collection[str | int]
+) -> msgspec.inspect.Type | None:
+    """Return the type that a struct gives to the value at ``path``, None where that is unclear."""
+    current: msgspec.inspect.Type | None = field_type
+    for part in path:
+        following: msgspec.inspect.Type | None = None
+        for candidate in _alternatives(current):
+            if isinstance(candidate, msgspec.inspect.StructType):
+                fields = {field.encode_name: field.type for field in candidate.fields}
+                following = fields.get(str(part))
+            elif isinstance(candidate, msgspec.inspect.ListType | msgspec.inspect.VarTupleType):
+                following = candidate.item_type
+            elif isinstance(candidate, msgspec.inspect.TupleType) and isinstance(part, int):
+                following = candidate.item_types[part]
+        current = following
+    return current
+
+
+def _keys(field_type: msgspec.inspect.Type | None) -> list[str]:
+    """Return the keys of a mapping of that type."""
+    return [
+        field.encode_name
+        for candidate in _alternatives(field_type)
+        if isinstance(candidate, msgspec.inspect.StructType)
+        for field in candidate.fields
+    ]
+
+
+def _choices(field_type: msgspec.inspect.Type | None) -> list[str]:
+    """Return the texts of which a value of that type is one."""
+    return [
+        str(value)
+        for candidate in _alternatives(field_type)
+        if isinstance(candidate, msgspec.inspect.LiteralType)
+        for value in candidate.values
+    ]
+
+
+def _described(field_type: msgspec.inspect.Type | None) -> str:
+    """Return in words what a value of that type may be; empty where we have no words."""
+    words = []
+    for candidate in _alternatives(field_type):
+        match candidate:
+            case msgspec.inspect.IntType():
+                words.append(f"a whole number{_bounds(candidate)}")
+            case msgspec.inspect.FloatType():
+                words.append(f"a number{_bounds(candidate)}")
+            case msgspec.inspect.StrType():
+                words.append("text")
+            case msgspec.inspect.BoolType():
+                words.append("true or false")
+            case msgspec.inspect.NoneType():
+                words.append("null")
+            case msgspec.inspect.LiteralType():
+                choices = ", ".join(map(str, candidate.values))
+                words.append(f"one of {choices}" if len(candidate.values) > 1 else choices)
+            case msgspec.inspect.TupleType():
+                words.append(f"a list of {len(candidate.item_types)}")
+            case msgspec.inspect.ListType() | msgspec.inspect.VarTupleType():
+                words.append(f"a list{_lengths(candidate)}")
+            case msgspec.inspect.StructType():
+                words.append(f"a mapping with the keys {', '.join(_keys(candidate))}")
+            case _:
+                return ""
+    return " or ".join(words)
+
+
+def _bounds(number: msgspec.inspect.IntType | msgspec.inspect.FloatType) -> str:
+    bounds = ((">=", number.ge), (">", number.gt), ("<=", number.le), ("<", number.lt))
+    given = [
+        f"{sign} {f'{bound:g}' if isinstance(bound, float) else bound}"
+        for sign, bound in bounds
+        if bound is not None
+    ]
+    return f" {' and '.join(given)}" if given else ""
+
+
+def _lengths(items: msgspec.inspect.ListType | msgspec.inspect.VarTupleType) -> str:
+    bounds = (("at least", items.min_length), ("at most", items.max_length))
+    given = [f"{sign} {bound}" for sign, bound in bounds if bound is not None]
+    return f" of {' and '.join(given)}" if given else ""
+
+
+def _close_match(text: str, allowed: Iterable[str]) -> str:
+    """Return a question after the nearest of the allowed texts, or nothing."""
+    close = difflib.get_close_matches(text.lower(), list(allowed), n=1)
+    return f"; did you mean {close[0]}?" if close else ""
+
+
+def _kind(value: Any) -> str:
+    """Return in words what a value at the top of a file is."""
+    return "a list" if isinstance(value, list) else _shown(value)
+
+
+def _shown(value: Any) -> str:
+    """Return a value as the file may have it, on one line and not long."""
+    text = json.dumps(value, ensure_ascii=False, default=str)
+    return text if len(text) <= 60 else f"{text[:57]}..."

@@ -1,0 +1,187 @@
+"""How uncertain are weighted points? Differential entropy, estimated.
+
+Two estimates. *Nearest neighbour*: where the k-th neighbour is far, the density is low. Below a
+resolution distances are not looked at, so that equal points (a policy that says "do not move" to half
+of the particles) give a finite answer. *Gaussian mixture*: every point stands for a Gaussian of
+the motion noise, because that is what a robot that is told to do it will do; pairwise distances then
+bound the entropy of the mixture.
+
+Entropies are in nats. Those of continuous quantities may be negative.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from holdfast import _kernel, numerics
+from holdfast.errors import InvalidValueError
+
+__all__ = ["GaussianMixture", "NearestNeighbor", "entropy"]
+
+FloatArray = npt.NDArray[np.float64]
+
+MAX_DIMENSION = 64
+
+
+class NearestNeighbor(NamedTuple):
+    """The weighted nearest-neighbour estimate with a resolution.
+
+    With r_n the distance from point n to its k-th nearest other point, or the resolution if that is
+    larger; q_n the number of others within r_n (k where the k-th distance set it); m_n their weight over
+    ``1 - w_n``; and c_d the volume of the unit ball::
+
+        entropy = sum_n w_n (-log m_n + log c_d + d log r_n + log q_n - psi(q_n))
+
+    Points of less than a millionth of the largest weight are left out, because a neighbour of
+    weight 1e-200 says nothing about the density; with k or fewer others left, k is their number; and a
+    single point has the entropy of the ball of the resolution. On uniform weights and a small
+    resolution it is the estimate of Kozachenko and Leonenko (1987) in the form of Kraskov,
+    Stögbauer and Grassberger (2004), with ``log N`` in the place of ``psi(N)``.
+
+    Attributes
+    ----------
+    neighbors : int
+        The k, at least 1.
+    resolution : float
+        Positive, in the unit of the points.
+    """
+
+    neighbors: int = 5
+    resolution: float = 1e-3
+
+
+class GaussianMixture(NamedTuple):
+    """A bound on the entropy of the points blurred by Gaussian noise.
+
+    With S the noise's covariance (diagonal)::
+
+        d/2 log(2 pi e) + 1/2 log |S| - sum_i w_i log sum_j w_j exp(-c (u_i - u_j)' S^-1 (u_i - u_j))
+
+    Attributes
+    ----------
+    variance : array of shape (d,)
+        Positive: the diagonal of S.
+    upper : bool
+        True: c = 1/2, from above. False: c = 1/8, from below.
+
+    Notes
+    -----
+    Kolchinsky and Tracey (2017), "Estimating mixture entropy with pairwise distances", Entropy 19(7),
+    eqs. 10 and 11 with the Kullback-Leibler and the Bhattacharyya distance.
+    """
+
+    variance: FloatArray
+    upper: bool = True
+
+
+class KernelEstimator(NamedTuple):
+    """An estimator in the kernel's terms; the points are to be multiplied by ``scale``."""
+
+    mixture: bool
+    neighbors: int
+    resolution: float
+    exponent: float
+    offset: float
+    scale: FloatArray | None
+
+
+def kernel_estimator(
+    estimator: NearestNeighbor | GaussianMixture, dimension: int
+) -> KernelEstimator:
+    """Check an estimator and translate it.
+
+    Raises
+    ------
+    InvalidValueError
+        If a parameter is out of bounds.
+    """
+    if not 1 <= dimension <= MAX_DIMENSION:
+        raise InvalidValueError(f"points of {dimension} coordinates: allowed are 1 to {MAX_DIMENSION}")
+    if isinstance(estimator, NearestNeighbor):
+        if estimator.neighbors < 1:
+            raise InvalidValueError(f"neighbors {estimator.neighbors}: must be at least 1")
+        if not 0.0 < estimator.resolution < np.inf:
+            raise InvalidValueError(
+                f"resolution {estimator.resolution}: must be positive and finite"
+            )
+        return KernelEstimator(False, estimator.neighbors, estimator.resolution, 0.0, 0.0, None)
+    variance = np.ascontiguousarray(estimator.variance, dtype=np.float64).reshape(-1)
+    if variance.shape != (dimension,):
+        raise InvalidValueError(f"variance of shape {variance.shape}: need ({dimension},)")
+    if not (variance > 0.0).all() or not np.isfinite(variance).all():
+        raise InvalidValueError(f"variance {variance}: every entry must be > 0 and finite")
+    two_pi_e = 17.079468445347132
+    offset = 0.5 * dimension * float(numerics.log(two_pi_e))
+    offset += 0.5 * numerics.sum(numerics.log(variance))
+    scale = 1.0 / np.sqrt(variance)
+    return KernelEstimator(True, 1, 1.0, 0.5 if estimator.upper else 0.125, offset, scale)
+
+
+def entropy(
+    points: npt.ArrayLike,
+    weights: npt.ArrayLike | None = None,
+    estimator: NearestNeighbor | GaussianMixture | None = None,
+    *,
+    threads: int = 0,
+) -> float | FloatArray:
+    """Estimate the differential entropy of weighted points.
+
+    Parameters
+    ----------
+    points : array of shape (n, d)
+        Finite.
+    weights : array of shape (n,) or (b, n), optional
+        Non-negative, not all zero; need not sum to 1. With ``b`` rows, ``b`` entropies of the same
+        points under different weights, much faster than one by one. Default: equal weights.
+    estimator : NearestNeighbor or GaussianMixture, optional
+        Default: ``NearestNeighbor()``.
+    threads : int
+        At most so many; 0 means all cores. The result does not depend on it.
+
+    Returns
+    -------
+    float or array of shape (b,)
+        In nats.
+
+    Raises
+    ------
+    InvalidValueError
+        If an argument is out of bounds; the message names it.
+    """
+    estimator = NearestNeighbor() if estimator is None else estimator
+    array = np.ascontiguousarray(points, dtype=np.float64)
+    if array.ndim != 2 or array.shape[0] == 0:
+        raise InvalidValueError(f"points of shape {array.shape}: need (n, d) with n >= 1")
+    count = array.shape[0]
+    if not np.isfinite(array).all():
+        bad = int(np.argmin(np.isfinite(array).all(axis=1)))
+        raise InvalidValueError(f"point {bad} is {array[bad]}: every coordinate must be finite")
+    kernel = kernel_estimator(estimator, array.shape[1])
+    if isinstance(estimator, NearestNeighbor) and estimator.neighbors >= count > 1:
+        raise InvalidValueError(
+            f"neighbors {estimator.neighbors}: must be below the number of points, {count}"
+        )
+    rows = np.ones((1, count)) if weights is None else np.ascontiguousarray(weights, np.float64)
+    single = rows.ndim == 1 or weights is None
+    rows = rows.reshape(1, -1) if rows.ndim == 1 else rows
+    if rows.ndim != 2 or rows.shape[1] != count:
+        raise InvalidValueError(f"weights of shape {rows.shape}: need ({count},) or (b, {count})")
+    if not np.isfinite(rows).all() or (rows < 0.0).any() or not (rows > 0.0).any(axis=1).all():
+        raise InvalidValueError("weights must be finite, >= 0 and not all zero")
+    if kernel.scale is not None:
+        array = array * kernel.scale
+    result, _, _ = _kernel.entropies(
+        array,
+        rows,
+        True,
+        kernel.mixture,
+        kernel.neighbors,
+        kernel.resolution,
+        kernel.exponent,
+        kernel.offset,
+        threads,
+    )
+    return float(result[0]) if single else result

@@ -1,0 +1,320 @@
+"""A robot's body among obstacles: whether it collides, and where it ends up when told to move.
+
+A *world* is one body and the obstacles that it must not enter. Three questions are asked of it:
+which states collide; where do states end up after an action, when motion stops at contact and then
+gets noise that never ends inside an obstacle; and which states drawn from a Gaussian are free. The
+answers come from the kernel by separating axes and have the same bits on every machine.
+
+A state that touches an obstacle without overlapping it is free. Obstacles are finite: make what
+has no end, like the ground, large (:data:`FAR`).
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, NoReturn
+
+import numpy as np
+import numpy.typing as npt
+
+from holdfast import _kernel
+from holdfast.errors import InvalidValueError
+
+if TYPE_CHECKING:
+    from holdfast.randomness import Stream
+
+__all__ = ["FAR", "MAX_NOISE_ATTEMPTS", "BoolArray", "BoxWorld", "DiscWorld", "RectangleWorld"]
+
+FAR = 1.0e6
+"""How far an obstacle reaches (in metres) that in idea has no end."""
+
+MAX_NOISE_ATTEMPTS = 1000
+"""Draws of noise, the first included, before a state is left as it is without noise."""
+
+FloatArray = npt.NDArray[np.float64]
+BoolArray = npt.NDArray[np.bool_]
+
+
+class _World:
+    """What the worlds have in common: the checks and the calls into the kernel."""
+
+    _DIMENSION: int
+    _SPACE_DIMENSION: int
+    _kernel: Any  # one of the kernel's three worlds, which have the same methods
+    obstacles: FloatArray
+
+    def _check_obstacles(self, obstacles: npt.ArrayLike) -> FloatArray:
+        size = 2 * self._SPACE_DIMENSION
+        limits = np.array(obstacles, dtype=np.float64, order="C")
+        if limits.size == 0:
+            limits = limits.reshape(0, size)
+        if limits.ndim != 2 or limits.shape[1] != size:
+            raise InvalidValueError(f"obstacles: shape {limits.shape}, must be (m, {size})")
+        if not np.isfinite(limits).all():
+            raise InvalidValueError(f"obstacles: a limit is not finite; use {FAR:g} for far away")
+        half = self._SPACE_DIMENSION
+        empty = (limits[:, :half] >= limits[:, half:]).any(axis=1)
+        if empty.any():
+            index = int(np.argmax(empty))
+            raise InvalidValueError(
+                f"obstacles[{index}]: {limits[index].tolist()}, the minima must be below the maxima"
+            )
+        limits.setflags(write=False)
+        return limits
+
+    def collides(self, states: FloatArray) -> BoolArray:
+        """Tell which states overlap an obstacle.
+
+        Parameters
+        ----------
+        states : array of shape (..., d)
+
+        Returns
+        -------
+        array of bool of the leading shape
+
+        Raises
+        ------
+        InvalidValueError
+            If the last axis is not d long, or a state is not finite.
+        """
+        dimension = self._DIMENSION
+        states = np.ascontiguousarray(states, dtype=np.float64)
+        if states.shape[-1] != dimension:
+            raise InvalidValueError(f"states: shape {states.shape}, must be (..., {dimension})")
+        result = np.empty(states.shape[:-1], dtype=np.bool_)
+        if not self._kernel.collides(states.reshape(-1, dimension), result.reshape(-1)):
+            _raise_not_finite("states", states)
+        return result
+
+    def move(
+        self,
+        states: FloatArray,
+        actions: FloatArray,
+        standard_deviation: FloatArray,
+        tolerance: float,
+        stream: Stream,
+    ) -> FloatArray:
+        """Move each state by its action, stopped at contact, and add noise that keeps it free.
+
+        The full action is tried first. If it ends in collision, the fraction of it is bisected
+        until the bounds are ``tolerance`` apart, and the last free one is taken. Then noise is
+        drawn, again if it ends in collision, up to :data:`MAX_NOISE_ATTEMPTS` times; failing that
+        there is none. States are independent of each other: state n of the flattened batch takes
+        the same random numbers whatever else is in the batch.
+
+        Parameters
+        ----------
+        states : array of shape (..., d)
+            Free states. (One that collides may stay where it is.)
+        actions : array of shape (..., d)
+            Executed actions; they broadcast against ``states``.
+        standard_deviation : array of shape (d,)
+            Of the noise, per coordinate; zero is allowed.
+        tolerance : float
+            Fraction of the action, above 0 and below 1.
+        stream : Stream
+            Source of the noise.
+
+        Returns
+        -------
+        array of the broadcast shape
+
+        Raises
+        ------
+        InvalidValueError
+            If shapes do not fit, or a value is not finite or out of bounds.
+        """
+        dimension = self._DIMENSION
+        states = np.ascontiguousarray(states, dtype=np.float64)
+        actions = np.ascontiguousarray(actions, dtype=np.float64)
+        if states.shape[-1] != dimension or actions.shape[-1] != dimension:
+            raise InvalidValueError(
+                f"states: shape {states.shape}, actions: shape {actions.shape}; "
+                f"both must be (..., {dimension})"
+            )
+        if actions.size != dimension and actions.shape != states.shape:
+            states, actions = _broadcast(states, actions)
+        next_states = np.empty(np.broadcast_shapes(states.shape, actions.shape))
+        moved = self._kernel.move(
+            states.reshape(-1, dimension),
+            actions.reshape(-1, dimension),
+            np.ascontiguousarray(standard_deviation, dtype=np.float64),
+            tolerance,
+            stream.words,
+            next_states.reshape(-1, dimension),
+        )
+        if not moved:
+            _explain_move(states, actions, standard_deviation, tolerance)
+        return next_states
+
+    def draw_free(
+        self, mean: FloatArray, standard_deviation: FloatArray, count: int, stream: Stream
+    ) -> tuple[FloatArray, int]:
+        """Draw states of a Gaussian until each is free of collision.
+
+        Parameters
+        ----------
+        mean, standard_deviation : array of shape (d,)
+        count : int
+            Number of states.
+        stream : Stream
+            Source of the draws; state n takes the same ones whatever ``count`` is.
+
+        Returns
+        -------
+        states : array of shape (count, d)
+        num_unplaced : int
+            How many of them were in collision at all of :data:`MAX_NOISE_ATTEMPTS` draws. These
+            are set to the mean, which may collide.
+
+        Raises
+        ------
+        InvalidValueError
+            If shapes do not fit, or a value is not finite or out of bounds.
+        """
+        dimension = self._DIMENSION
+        if count < 0:
+            raise InvalidValueError(f"count: {count}, must be at least 0")
+        for name, values in (("mean", mean), ("standard_deviation", standard_deviation)):
+            if values.shape != (dimension,):
+                raise InvalidValueError(f"{name}: shape {values.shape}, must be ({dimension},)")
+            if not np.isfinite(values).all():
+                _raise_not_finite(name, values)
+        if (standard_deviation < 0.0).any():
+            raise InvalidValueError(
+                f"standard_deviation: {standard_deviation.tolist()}, must not be negative"
+            )
+        states = np.empty((count, dimension))
+        num_unplaced = self._kernel.draw_free(
+            np.ascontiguousarray(mean, dtype=np.float64),
+            np.ascontiguousarray(standard_deviation, dtype=np.float64),
+            stream.words,
+            states,
+        )
+        return states, int(num_unplaced)
+
+
+class DiscWorld(_World):
+    """A disc among axis-aligned rectangles; a state is the centre (x, y).
+
+    Parameters
+    ----------
+    radius : float
+        Of the disc, above 0.
+    obstacles : array of shape (m, 4)
+        Rectangles as ``x_min, y_min, x_max, y_max``.
+
+    Raises
+    ------
+    InvalidValueError
+        If a value is not finite or out of bounds.
+    """
+
+    _DIMENSION = 2
+    _SPACE_DIMENSION = 2
+
+    def __init__(self, radius: float, obstacles: npt.ArrayLike) -> None:
+        self.radius = _check_length("radius", radius)
+        self.obstacles = self._check_obstacles(obstacles)
+        self._kernel = _kernel.DiscWorld(self.radius, self.obstacles)
+
+
+class RectangleWorld(_World):
+    """A rectangle among axis-aligned rectangles; a state is its centre and angle (x, y, θ).
+
+    Parameters
+    ----------
+    width, height : float
+        Of the rectangle along x and y at angle zero, above 0. The angle is counter-clockwise.
+    obstacles : array of shape (m, 4)
+        Rectangles as ``x_min, y_min, x_max, y_max``.
+
+    Raises
+    ------
+    InvalidValueError
+        If a value is not finite or out of bounds.
+    """
+
+    _DIMENSION = 3
+    _SPACE_DIMENSION = 2
+
+    def __init__(self, width: float, height: float, obstacles: npt.ArrayLike) -> None:
+        self.width = _check_length("width", width)
+        self.height = _check_length("height", height)
+        self.obstacles = self._check_obstacles(obstacles)
+        self._kernel = _kernel.RectangleWorld(self.width, self.height, self.obstacles)
+
+
+class BoxWorld(_World):
+    """A box among axis-aligned boxes; a state is (x, y, z, yaw, pitch, roll) of its centre.
+
+    The box is turned by Rz(yaw) Ry(pitch) Rx(roll).
+
+    Parameters
+    ----------
+    size : tuple of float
+        Of the box along x, y and z at angles zero, above 0.
+    obstacles : array of shape (m, 6)
+        Boxes as ``x_min, y_min, z_min, x_max, y_max, z_max``.
+
+    Raises
+    ------
+    InvalidValueError
+        If a value is not finite or out of bounds.
+    """
+
+    _DIMENSION = 6
+    _SPACE_DIMENSION = 3
+
+    def __init__(self, size: tuple[float, float, float], obstacles: npt.ArrayLike) -> None:
+        x, y, z = (_check_length(f"size[{i}]", length) for i, length in enumerate(size))
+        self.size = (x, y, z)
+        self.obstacles = self._check_obstacles(obstacles)
+        self._kernel = _kernel.BoxWorld(x, y, z, self.obstacles)
+
+
+def _check_length(name: str, value: float) -> float:
+    if not 0.0 < value <= FAR:  # false for NaN too
+        raise InvalidValueError(f"{name}: {value}, must be above 0 and at most {FAR:g}")
+    return float(value)
+
+
+def _broadcast(states: FloatArray, actions: FloatArray) -> tuple[FloatArray, FloatArray]:
+    try:
+        shape = np.broadcast_shapes(states.shape, actions.shape)
+    except ValueError as error:
+        raise InvalidValueError(
+            f"actions: shape {actions.shape}, does not broadcast against states {states.shape}"
+        ) from error
+    return (
+        np.ascontiguousarray(np.broadcast_to(states, shape)),
+        np.ascontiguousarray(np.broadcast_to(actions, shape)),
+    )
+
+
+def _raise_not_finite(name: str, values: FloatArray) -> NoReturn:
+    index = np.unravel_index(int(np.argmin(np.isfinite(values))), values.shape)
+    position = ", ".join(str(int(i)) for i in index)
+    raise InvalidValueError(f"{name}[{position}]: {values[index]}, must be finite")
+
+
+def _explain_move(
+    states: FloatArray, actions: FloatArray, standard_deviation: FloatArray, tolerance: float
+) -> NoReturn:
+    """Raise the error for what the kernel refused."""
+    for name, values in (
+        ("states", states),
+        ("actions", actions),
+        ("standard_deviation", standard_deviation),
+    ):
+        if not np.isfinite(values).all():
+            _raise_not_finite(name, values)
+    if standard_deviation.shape != states.shape[-1:]:
+        raise InvalidValueError(
+            f"standard_deviation: shape {standard_deviation.shape}, must be {states.shape[-1:]}"
+        )
+    if (standard_deviation < 0.0).any():
+        raise InvalidValueError(
+            f"standard_deviation: {standard_deviation.tolist()}, must not be negative"
+        )
+    raise InvalidValueError(f"tolerance: {tolerance}, must be above 0 and below 1")

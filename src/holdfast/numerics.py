@@ -1,0 +1,73 @@
+"""Functions of arrays with the same bits on every machine.
+
+NumPy's ``exp``, ``sin`` or ``sum`` may differ in the last bit between processors, because they choose
+their code by processor. What a decision or a digest depends on goes through these instead; they
+are the kernel's, and use only operations that IEEE 754 defines exactly, in a fixed order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import numpy.typing as npt
+
+from holdfast import _kernel
+
+__all__ = ["arcsin", "cos", "exp", "log", "sin", "sum", "weighted_mean"]
+
+FloatArray = npt.NDArray[np.float64]
+
+
+def _elementwise(
+    function: Callable[[FloatArray], FloatArray], values: npt.ArrayLike
+) -> FloatArray:
+    array = np.asarray(values, dtype=np.float64, order="C")
+    return function(array.reshape(-1)).reshape(array.shape)
+
+
+def exp(values: npt.ArrayLike) -> FloatArray:
+    """Return e**values, elementwise; 0 below -707.7, infinite above 709.78."""
+    return _elementwise(_kernel.exp, values)
+
+
+def log(values: npt.ArrayLike) -> FloatArray:
+    """Return the natural logarithm, elementwise; -inf at 0, NaN below."""
+    return _elementwise(_kernel.log, values)
+
+
+def sin(values: npt.ArrayLike) -> FloatArray:
+    """Return the sine of angles in radians, elementwise; NaN above 2**30 in size."""
+    return _elementwise(_kernel.sin, values)
+
+
+def cos(values: npt.ArrayLike) -> FloatArray:
+    """Return the cosine of angles in radians, elementwise; NaN above 2**30 in size."""
+    return _elementwise(_kernel.cos, values)
+
+
+def arcsin(value: float) -> float:
+    """Return the angle in [-pi/2, pi/2] whose sine is ``value``; NaN outside [-1, 1]."""
+    return _kernel.arcsin(float(value))
+
+
+def sum(values: npt.ArrayLike) -> float:
+    """Return the sum of all values, added in one fixed order."""
+    return _kernel.sum(np.ascontiguousarray(values, dtype=np.float64).reshape(-1))
+
+
+def weighted_mean(rows: FloatArray, weights: FloatArray) -> FloatArray:
+    """Return the mean of rows under weights that sum to 1.
+
+    Parameters
+    ----------
+    rows : array of shape (n, d)
+    weights : array of shape (n,)
+
+    Returns
+    -------
+    array of shape (d,)
+    """
+    return _kernel.weighted_sums(
+        np.ascontiguousarray(weights, dtype=np.float64), np.ascontiguousarray(rows, np.float64)
+    )

@@ -1,0 +1,398 @@
+"""Planning as a deterministic state machine: a state, and pure functions of it.
+
+:class:`PlanningState` is everything that the next decision depends on besides the problem and the
+settings. Nothing here reads a clock, a socket or a generator with a state; every random number is
+named by (seed, trial, step, purpose). So whoever holds the state, a cloud service, the robot itself, a
+process started after a crash, makes the same next decision, and a checkpoint is simply the state, encoded.
+
+One step of the loop::
+
+    if needs_sensing(settings, state):
+        sensing_action, info = choose_sensing_action(problem, settings, state)
+        observation = environment.perform_sensing(sensing_action)
+        state, info = observe(problem, settings, state, sensing_action, observation)
+    task_action, info = choose_task_action(problem, settings, state)
+    environment.perform(task_action)
+    state = advance(problem, settings, state, task_action)
+"""
+
+from __future__ import annotations
+
+import hashlib
+import struct
+from typing import Annotated, NamedTuple
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from holdfast import sensing
+from holdfast.belief import Belief, estimate, resample, update
+from holdfast.errors import CheckpointError, InvalidValueError, ProblemError
+from holdfast.problems.problem import Problem
+from holdfast.randomness import Purpose, stream
+from holdfast.sensing import SensingInfo
+from holdfast.settings import MAX_PARTICLES, PlanningSettings
+
+__all__ = [
+    "ObservationInfo",
+    "PlanningState",
+    "SensingInfo",
+    "TaskInfo",
+    "advance",
+    "choose_sensing_action",
+    "choose_task_action",
+    "decode_checkpoint",
+    "digest",
+    "encode_checkpoint",
+    "initial_state",
+    "needs_sensing",
+    "observe",
+]
+
+FloatArray = npt.NDArray[np.float64]
+
+CHECKPOINT_VERSION = 1
+
+
+class PlanningState(NamedTuple):
+    """Everything that the next decision depends on, besides the problem and the settings.
+
+    Attributes
+    ----------
+    seed, trial, step : int
+        Name the random streams; ``step`` counts task actions.
+    stage : int
+        Stage of the task (which hole or via point is next).
+    sensed : bool
+        Whether this step's observation is already part of the belief.
+    belief : Belief
+    """
+
+    seed: int
+    trial: int
+    step: int
+    stage: int
+    sensed: bool
+    belief: Belief
+
+
+class ObservationInfo(NamedTuple):
+    """What folding in an observation found.
+
+    Attributes
+    ----------
+    effective_sample_size : float
+        After the update and before resampling; from 1 to the number of particles.
+    explained : bool
+        False if no particle explains the observation: the belief is valid but not to be trusted.
+    resampled : bool
+    """
+
+    effective_sample_size: float
+    explained: bool
+    resampled: bool
+
+
+class TaskInfo(NamedTuple):
+    """Why a task action was chosen.
+
+    Attributes
+    ----------
+    estimate : array of shape (state_size,)
+        The mean of the belief.
+    commanded : array of shape (action_size,)
+        What the policy said; the action itself is what the limits leave of it.
+    stage : int
+        The stage that the action belongs to.
+    """
+
+    estimate: FloatArray
+    commanded: FloatArray
+    stage: int
+
+
+def initial_state(
+    problem: Problem, settings: PlanningSettings, seed: int, trial: int
+) -> PlanningState:
+    """Return the state before the first step of a trial.
+
+    Parameters
+    ----------
+    problem : Problem
+    settings : PlanningSettings
+    seed : int
+        From 0 to 2**63 - 1.
+    trial : int
+        From 0 to 2**32 - 1.
+
+    Raises
+    ------
+    InvalidValueError
+        If seed, trial or the number of particles is out of bounds.
+    ProblemError
+        If the problem's initial states have the wrong shape or are not finite.
+    """
+    count = settings.particle_filter.num_particles
+    if not 1 <= count <= MAX_PARTICLES:
+        raise InvalidValueError(
+            f"particle_filter.num_particles {count}: allowed are 1 to {MAX_PARTICLES}"
+        )
+    states = problem.initial_states(stream(seed, trial, 0, Purpose.INITIAL_BELIEF), count)
+    _check_states(problem, "initial_states", states, (count, problem.state_size))
+    return PlanningState(seed, trial, 0, 0, False, Belief.uniform(states))
+
+
+def needs_sensing(settings: PlanningSettings, state: PlanningState) -> bool:
+    """Tell whether the next decision is a sensing action (else it is a task action)."""
+    return not state.sensed and state.step % (settings.sensing_interval + 1) == 0
+
+
+def choose_sensing_action(
+    problem: Problem, settings: PlanningSettings, state: PlanningState
+) -> tuple[int, SensingInfo]:
+    """Choose the next sensing action.
+
+    Returns
+    -------
+    index : int
+        Index into ``problem.sensing_actions``.
+    info : SensingInfo
+        The expected entropies behind the choice.
+
+    Raises
+    ------
+    InvalidValueError, ProblemError
+        As :func:`holdfast.sensing.choose_sensing_action`.
+    """
+    return sensing.choose_sensing_action(
+        problem,
+        settings,
+        state.belief,
+        state.stage,
+        stream(state.seed, state.trial, state.step, Purpose.HYPOTHESES),
+        stream(state.seed, state.trial, state.step, Purpose.SELECTION),
+    )
+
+
+def observe(
+    problem: Problem,
+    settings: PlanningSettings,
+    state: PlanningState,
+    sensing_action: int,
+    observation: npt.ArrayLike,
+) -> tuple[PlanningState, ObservationInfo]:
+    """Fold an observation into the belief.
+
+    Parameters
+    ----------
+    problem : Problem
+    settings : PlanningSettings
+    state : PlanningState
+    sensing_action : int
+        What was sensed.
+    observation : array of shape (observation_size,)
+        What it showed.
+
+    Returns
+    -------
+    state : PlanningState
+        With ``sensed`` set.
+    info : ObservationInfo
+
+    Raises
+    ------
+    InvalidValueError
+        If the sensing action does not exist, or the observation is not finite or of the wrong size. The
+        state that was passed in is still good.
+    """
+    if not 0 <= sensing_action < len(problem.sensing_actions):
+        raise InvalidValueError(
+            f"sensing action {sensing_action}: {problem.name} has 0 to "
+            f"{len(problem.sensing_actions) - 1}"
+        )
+    belief, found = update(problem, state.belief, sensing_action, observation)
+    count = belief.weights.shape[0]
+    threshold = settings.particle_filter.resampling_threshold * count
+    # Rounding may leave the size of equal weights a little above their number.
+    resampled = threshold == count or found.effective_sample_size <= threshold
+    if resampled:
+        belief = resample(
+            belief, stream(state.seed, state.trial, state.step, Purpose.RESAMPLING)
+        )
+    after = state._replace(sensed=True, belief=belief)
+    return after, ObservationInfo(found.effective_sample_size, found.explained, resampled)
+
+
+def choose_task_action(
+    problem: Problem, settings: PlanningSettings, state: PlanningState
+) -> tuple[FloatArray, TaskInfo]:
+    """Choose the next task action: the policy's for the mean of the belief, within its limits.
+
+    Returns
+    -------
+    action : array of shape (action_size,)
+        The executed action.
+    info : TaskInfo
+
+    Raises
+    ------
+    ProblemError
+        If the policy's action is not finite.
+    """
+    del settings  # the choice of the estimate will be one; callers should not have to change then
+    mean = estimate(state.belief)
+    stage = int(problem.next_stage(mean, state.stage))
+    commanded = problem.policy(mean, stage)
+    action = problem.execute(commanded)
+    if not np.isfinite(action).all():
+        raise ProblemError(f"policy of {problem.name} gives {action} in state {mean}")
+    return action, TaskInfo(mean, commanded, stage)
+
+
+def advance(
+    problem: Problem, settings: PlanningSettings, state: PlanningState, task_action: FloatArray
+) -> PlanningState:
+    """Predict the belief by a performed task action and go to the next step.
+
+    Parameters
+    ----------
+    problem : Problem
+    settings : PlanningSettings
+    state : PlanningState
+    task_action : array of shape (action_size,)
+        The executed action.
+
+    Raises
+    ------
+    InvalidValueError
+        If the action is not finite or of the wrong size.
+    ProblemError
+        If the problem moves a particle to a state that is not finite.
+    """
+    del settings
+    action = np.asarray(task_action, dtype=np.float64)
+    if action.shape != (problem.action_size,) or not np.isfinite(action).all():
+        raise InvalidValueError(
+            f"task action {action}: {problem.name} needs {problem.action_size} finite coordinates"
+        )
+    belief = state.belief
+    stage = int(problem.next_stage(estimate(belief), state.stage))
+    motion = stream(state.seed, state.trial, state.step, Purpose.PREDICTION)
+    states = problem.move(belief.states, action, motion)
+    _check_states(problem, "move", states, belief.states.shape)
+    return PlanningState(
+        state.seed, state.trial, state.step + 1, stage, False, Belief(states, belief.weights)
+    )
+
+
+def _check_states(
+    problem: Problem, function: str, states: FloatArray, shape: tuple[int, ...]
+) -> None:
+    if states.shape != shape or states.dtype != np.float64:
+        raise ProblemError(
+            f"{function} of {problem.name} returned {states.dtype} of shape {states.shape}: need "
+            f"float64 of shape {shape}"
+        )
+    if not np.isfinite(states).all():
+        bad = int(np.argmin(np.isfinite(states).all(axis=1)))
+        raise ProblemError(f"{function} of {problem.name} put particle {bad} at {states[bad]}")
+
+
+def digest(state: PlanningState) -> bytes:
+    """Return 32 bytes that are equal exactly when two states are equal, bit for bit.
+
+    BLAKE2b over all fields; the belief's arrays as little-endian float64 in C order.
+    """
+    states, weights = state.belief
+    header = struct.pack(
+        "<QQQQ?QQ",
+        state.seed,
+        state.trial,
+        state.step,
+        state.stage,
+        state.sensed,
+        states.shape[0],
+        states.shape[1],
+    )
+    hashed = hashlib.blake2b(header, digest_size=32, person=b"holdfast-state")
+    hashed.update(np.ascontiguousarray(states, dtype="<f8").data)
+    hashed.update(np.ascontiguousarray(weights, dtype="<f8").data)
+    return hashed.digest()
+
+
+Word = Annotated[int, msgspec.Meta(ge=0, le=2**32 - 1)]
+
+
+class _Checkpoint(msgspec.Struct, forbid_unknown_fields=True, array_like=True):
+    version: int
+    seed: Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
+    trial: Word
+    step: Word
+    stage: Word
+    sensed: bool
+    num_particles: Annotated[int, msgspec.Meta(ge=1, le=MAX_PARTICLES)]
+    state_size: Annotated[int, msgspec.Meta(ge=1, le=4096)]
+    states: bytes
+    weights: bytes
+
+
+_checkpoint_encoder = msgspec.msgpack.Encoder()
+_checkpoint_decoder = msgspec.msgpack.Decoder(_Checkpoint)
+
+
+def encode_checkpoint(state: PlanningState) -> bytes:
+    """Encode a state: MessagePack, the arrays as little-endian float64."""
+    states, weights = state.belief
+    return _checkpoint_encoder.encode(
+        _Checkpoint(
+            CHECKPOINT_VERSION,
+            state.seed,
+            state.trial,
+            state.step,
+            state.stage,
+            state.sensed,
+            states.shape[0],
+            states.shape[1],
+            np.ascontiguousarray(states, dtype="<f8").tobytes(),
+            np.ascontiguousarray(weights, dtype="<f8").tobytes(),
+        )
+    )
+
+
+def decode_checkpoint(data: bytes) -> PlanningState:
+    """Decode a state and check it.
+
+    Raises
+    ------
+    CheckpointError
+        If the bytes are no checkpoint, of another version, or describe no valid belief.
+    """
+    try:
+        content = _checkpoint_decoder.decode(data)
+    except (msgspec.DecodeError, msgspec.ValidationError) as error:
+        raise CheckpointError(f"{len(data)} bytes are no checkpoint: {error}") from error
+    if content.version != CHECKPOINT_VERSION:
+        raise CheckpointError(
+            f"checkpoint version {content.version}: this holdfast reads {CHECKPOINT_VERSION}"
+        )
+    count, size = content.num_particles, content.state_size
+    if len(content.states) != 8 * count * size or len(content.weights) != 8 * count:
+        raise CheckpointError(
+            f"checkpoint of {count} particles of {size} coordinates has {len(content.states)} and "
+            f"{len(content.weights)} bytes: need {8 * count * size} and {8 * count}"
+        )
+    states = np.frombuffer(content.states, dtype="<f8").astype(np.float64).reshape(count, size)
+    weights = np.frombuffer(content.weights, dtype="<f8").astype(np.float64)
+    if not np.isfinite(states).all():
+        raise CheckpointError("checkpoint has a state that is not finite")
+    if not (weights >= 0.0).all() or not abs(float(weights.sum()) - 1.0) < 1e-6:
+        raise CheckpointError(f"checkpoint has weights that are negative or sum to {weights.sum()}")
+    return PlanningState(
+        content.seed,
+        content.trial,
+        content.step,
+        content.stage,
+        content.sensed,
+        Belief(states, weights),
+    )

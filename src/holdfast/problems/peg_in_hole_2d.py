@@ -1,0 +1,190 @@
+"""A peg, a hole in the ground, and a robot that does not see where the peg is.
+
+The planner brings the peg over the hole, then upright, then lowers it; what it must know changes
+on the way, and that is what makes the choice of a sensing action worth a thought. Far from the hole
+only x matters to the next action; above it, the angle; when the peg goes in, the height.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar, Literal, Self
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from holdfast.geometry import FAR, RectangleWorld
+from holdfast.problems._fields import (
+    Coordinate,
+    Length,
+    PositiveVariance,
+    Step,
+    Tolerance,
+    Variance,
+    checked,
+)
+from holdfast.problems.problem import FloatArray, IntArray, Scene
+from holdfast.problems.rigid_body import PegProblem, upright_limit
+
+__all__ = ["PegInHole2D", "PegInHole2DModel", "PegInHole2DPlanner"]
+
+
+class PegInHole2DModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The section ``model``.
+
+    Attributes
+    ----------
+    state_size : int
+        3; accepted because the thesis's files have it, without effect.
+    peg_width, peg_height : float
+        Of the peg, in metres.
+    hole_tolerance : float
+        Gap between peg and hole on either side and below, and half the goal's size.
+    init_mean, init_cov : tuple of float
+        Mean and variances of the initial belief over (x, y, θ).
+    motion_cov : tuple of float
+        Variances of the motion noise.
+    sensing_cov : float
+        Variance of an observation.
+    collision_tol : float
+        Fraction of an action to which contact is located.
+    """
+
+    state_size: Literal[3] = 3
+    peg_width: Length = 1.0
+    peg_height: Length = 2.0
+    hole_tolerance: Length = 0.1
+    init_mean: tuple[Coordinate, Coordinate, Coordinate] = (4.0, 2.0, 0.0)
+    init_cov: tuple[Variance, Variance, Variance] = (2.0, 1.0, 1.57)
+    motion_cov: tuple[Variance, Variance, Variance] = (0.01, 0.01, 0.01)
+    sensing_cov: PositiveVariance = 0.001
+    collision_tol: Tolerance = 0.001
+
+
+class PegInHole2DPlanner(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The section ``state_space_planner``.
+
+    Attributes
+    ----------
+    translation_step_size : float
+        Largest size of an action's x and of its y component, each on its own.
+    rotation_step_size : float
+        Largest size of its angular component.
+    """
+
+    translation_step_size: Step = 0.1
+    rotation_step_size: Step = 0.1
+
+
+class PegInHole2D(PegProblem):
+    """Put a peg into a hole in the ground, in the plane.
+
+    The state is (x, y, θ) of the peg's centre. The ground is at y = 0; the hole is as wide as the
+    peg plus the tolerance on either side, and its floor is the tolerance below half the peg's
+    height. The goal is reached when the peg is half-way in: x and y are below the tolerance in
+    size. The policy turns the peg once its centre is within half its width of the hole's axis.
+
+    Parameters
+    ----------
+    model : PegInHole2DModel
+    state_space_planner : PegInHole2DPlanner
+
+    Raises
+    ------
+    InvalidValueError
+        If a setting is out of bounds.
+    """
+
+    Model: ClassVar[type[PegInHole2DModel]] = PegInHole2DModel
+    StateSpacePlanner: ClassVar[type[PegInHole2DPlanner]] = PegInHole2DPlanner
+
+    name = "peg_in_hole_2d"
+    state_size = 3
+    action_size = 3
+    sensing_actions: Sequence[str] = ("x", "y", "θ")
+    state_labels: Sequence[str] = ("x (m)", "y (m)", "θ (rad)")
+
+    def __init__(
+        self,
+        model: PegInHole2DModel | None = None,
+        state_space_planner: PegInHole2DPlanner | None = None,
+    ) -> None:
+        model = checked("model", model or PegInHole2DModel())
+        planner = checked("state_space_planner", state_space_planner or PegInHole2DPlanner())
+        half_hole = 0.5 * model.peg_width + model.hole_tolerance
+        floor = -0.5 * model.peg_height - model.hole_tolerance
+        super().__init__(
+            RectangleWorld(
+                model.peg_width,
+                model.peg_height,
+                [
+                    (-FAR, -FAR, -half_hole, 0.0),
+                    (half_hole, -FAR, FAR, 0.0),
+                    (-half_hole, -FAR, half_hole, floor),
+                ],
+            ),
+            init_mean=model.init_mean,
+            init_cov=model.init_cov,
+            motion_cov=model.motion_cov,
+            collision_tol=model.collision_tol,
+            sensing_cov=model.sensing_cov,
+            step_limits=(
+                planner.translation_step_size,
+                planner.translation_step_size,
+                planner.rotation_step_size,
+            ),
+        )
+        self.model = model
+        self.state_space_planner = planner
+        self._half_width = 0.5 * model.peg_width
+        self._tolerance = model.hole_tolerance
+        self._upright_limit = upright_limit(model.hole_tolerance, 0.5 * model.peg_height)
+
+    @classmethod
+    def from_settings(
+        cls, model: Mapping[str, Any], state_space_planner: Mapping[str, Any]
+    ) -> Self:
+        """Build the problem from plain data; ``msgspec.ValidationError`` if it does not fit."""
+        return cls(
+            msgspec.convert(model, PegInHole2DModel),
+            msgspec.convert(state_space_planner, PegInHole2DPlanner),
+        )
+
+    def policy(self, states: FloatArray, stage: int | IntArray) -> FloatArray:
+        """Go to x = 0; near it also turn upright; once upright also go down to y = 0."""
+        del stage
+        x, y, angle = states[..., 0], states[..., 1], states[..., 2]
+        near = np.abs(x) < self._half_width
+        upright = near & (np.abs(angle) < self._upright_limit)
+        actions = np.empty(states.shape)
+        actions[..., 0] = -x
+        actions[..., 1] = np.where(upright, -y, 0.0)
+        actions[..., 2] = np.where(near, -angle, 0.0)
+        return actions
+
+    def is_goal(self, states: FloatArray) -> npt.NDArray[np.bool_]:
+        """Tell where the peg is half-way in the hole."""
+        tolerance = self._tolerance
+        return np.asarray(
+            (np.abs(states[..., 0]) < tolerance) & (np.abs(states[..., 1]) < tolerance)
+        )
+
+    def scene(self) -> Scene:
+        """Return the ground with the hole, and the peg."""
+        half_width, half_height = 0.5 * self.model.peg_width, 0.5 * self.model.peg_height
+        reach = 2.0 * self.model.peg_height
+        x, y = self.model.init_mean[:2]
+        return Scene(
+            axes=(0, 1),
+            limits=(min(0.0, x) - reach, -reach, max(0.0, x) + reach, max(0.0, y) + reach),
+            obstacles=self.world.obstacles,
+            body=[
+                (-half_width, -half_height),
+                (half_width, -half_height),
+                (half_width, half_height),
+                (-half_width, half_height),
+            ],
+            angle=2,
+            goal=(0.0, 0.0),
+        )

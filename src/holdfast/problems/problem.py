@@ -1,0 +1,208 @@
+"""What a problem is: a plain object of NumPy functions.
+
+A problem says how the world moves, what a sensing action would show, what the task planner does in
+a known state, and when the task is done. Everything else (the belief, the entropies, the choice)
+is holdfast's. Write a class with the members of :class:`Problem`; subclassing is not needed, but
+:class:`ProblemBase` gives sensible defaults for the optional ones.
+
+Arrays of states have any leading batch shape and the state's coordinates last: ``(state_size,)`` is
+one state, ``(num_particles, state_size)`` a belief, ``(trials, num_particles, state_size)`` many.
+A function is called with any of these and returns the same leading shape.
+
+To have the same decisions, bit for bit, on every machine, a problem uses only operations that IEEE
+754 defines exactly (``+ - * /``, ``np.sqrt``, comparisons, ``np.where``) and takes ``exp``, ``sin``,
+sums and the like from :mod:`holdfast.numerics`. One that does not still works: then only the
+checkpoint, not a recomputation, carries a state from one machine to another.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Protocol, Self, runtime_checkable
+
+import numpy as np
+import numpy.typing as npt
+
+from holdfast.errors import ProblemError
+from holdfast.randomness import Stream
+
+__all__ = ["FloatArray", "IntArray", "Problem", "ProblemBase", "Scene"]
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+
+
+class Scene:
+    """What of a problem can be drawn: the plane of two coordinates, its obstacles and the body.
+
+    Parameters
+    ----------
+    axes : tuple of int
+        Which two coordinates of the state are drawn, horizontal first.
+    obstacles : array of shape (m, 4)
+        Rectangles as ``x_min, y_min, x_max, y_max`` in that plane.
+    limits : tuple of float
+        The part of the plane to show, ``x_min, y_min, x_max, y_max``.
+    body : array of shape (p, 2), or float, or None
+        Outline of the robot's body about its centre at angle zero, or the radius of a disc.
+    angle : int or None
+        Index of the coordinate by which the body is turned, counter-clockwise, in radians.
+    goal : array of shape (2,) or None
+        Centre of the goal.
+    points : array of shape (q, 2) or None
+        Places of interest (via points, lamps).
+    """
+
+    def __init__(
+        self,
+        axes: tuple[int, int],
+        limits: tuple[float, float, float, float],
+        obstacles: npt.ArrayLike = (),
+        body: npt.ArrayLike | float | None = None,
+        angle: int | None = None,
+        goal: npt.ArrayLike | None = None,
+        points: npt.ArrayLike | None = None,
+    ) -> None:
+        self.axes = axes
+        self.limits = limits
+        self.obstacles = np.asarray(obstacles, dtype=np.float64).reshape(-1, 4)
+        self.body = body
+        self.angle = angle
+        self.goal = None if goal is None else np.asarray(goal, dtype=np.float64)
+        self.points = None if points is None else np.asarray(points, dtype=np.float64)
+
+
+@runtime_checkable
+class Problem(Protocol):
+    """The contract between a problem and everything else.
+
+    Attributes
+    ----------
+    name : str
+        The registered name; it is what crosses the wire.
+    state_size, action_size : int
+        Numbers of coordinates of a state and of a task action.
+    sensing_actions : sequence of str
+        A label for each sensing action; a sensing action is an index into it.
+    num_stages : int
+        Stages of the task (holes to pass, via points to reach); 1 where there are none.
+    resolution : float
+        Distance below which two task actions do not differ in practice (of the order of the motion
+        noise's standard deviation), in the actions' unit.
+    motion_variance : array of shape (action_size,)
+        Variance of the noise on an executed action, for the Gaussian-mixture entropy.
+    """
+
+    name: str
+    state_size: int
+    action_size: int
+    sensing_actions: Sequence[str]
+    num_stages: int
+    resolution: float
+    motion_variance: FloatArray
+    state_labels: Sequence[str]
+
+    def initial_states(self, stream: Stream, count: int) -> FloatArray:
+        """Draw ``count`` states of the initial belief, shape ``(count, state_size)``."""
+        ...
+
+    def move(self, states: FloatArray, actions: FloatArray, stream: Stream) -> FloatArray:
+        """Draw the states after executed ``actions``, which broadcast against ``states``."""
+        ...
+
+    def observation_mean(self, states: FloatArray, sensing_action: int) -> FloatArray:
+        """Return the expected observation, shape ``(..., observation_size)``."""
+        ...
+
+    def observation_variance(self, states: FloatArray, sensing_action: int) -> FloatArray:
+        """Return the variance of each coordinate of the observation.
+
+        Shape ``(observation_size,)`` where it is the same for all states, else
+        ``(..., observation_size)``.
+        """
+        ...
+
+    def policy(self, states: FloatArray, stage: int | IntArray) -> FloatArray:
+        """Return the commanded task actions, shape ``(..., action_size)``.
+
+        ``stage`` is one integer or an array that broadcasts against the leading shape.
+        """
+        ...
+
+    def next_stage(self, estimates: FloatArray, stage: int | IntArray) -> int | IntArray:
+        """Return the stage that follows from the state estimate, of the shape of ``stage``."""
+        ...
+
+    def execute(self, actions: FloatArray) -> FloatArray:
+        """Limit commanded actions to what one step can do."""
+        ...
+
+    def reward(self, states: FloatArray, actions: FloatArray) -> FloatArray:
+        """Return the reward of executed ``actions`` that led to ``states``, of the leading shape."""
+        ...
+
+    def is_goal(self, states: FloatArray) -> npt.NDArray[np.bool_]:
+        """Tell which states end the task with success, of the leading shape."""
+        ...
+
+    def scene(self) -> Scene | None:
+        """Return what can be drawn, or None."""
+        ...
+
+
+class ProblemBase:
+    """Defaults for the optional members of :class:`Problem`.
+
+    A subclass sets ``name``, ``state_size``, ``action_size``, ``sensing_actions``, ``resolution`` and
+    ``motion_variance`` and writes ``initial_states``, ``move``, ``observation_mean``,
+    ``observation_variance``, ``policy`` and ``is_goal``.
+    """
+
+    name: str = ""
+    state_size: int = 0
+    action_size: int = 0
+    sensing_actions: Sequence[str] = ()
+    num_stages: int = 1
+    resolution: float = 0.1
+    motion_variance: FloatArray = np.array([0.01])
+    state_labels: Sequence[str] = ()
+
+    @classmethod
+    def from_settings(
+        cls, model: Mapping[str, Any], state_space_planner: Mapping[str, Any]
+    ) -> Self:
+        """Build the problem from the sections ``model`` and ``state_space_planner``.
+
+        The default passes the keys of both to the constructor as keyword arguments.
+
+        Raises
+        ------
+        ProblemError
+            If a key is in both sections or the constructor does not take it.
+        """
+        both = sorted(set(model) & set(state_space_planner))
+        if both:
+            raise ProblemError(
+                f"{', '.join(both)}: given in both model and state_space_planner; keep one"
+            )
+        try:
+            return cls(**model, **state_space_planner)
+        except TypeError as error:
+            raise ProblemError(f"{cls.__name__} cannot be built from its settings: {error}") from error
+
+    def next_stage(self, estimates: FloatArray, stage: int | IntArray) -> int | IntArray:
+        """Stay in the stage: the task has one."""
+        del estimates
+        return stage
+
+    def execute(self, actions: FloatArray) -> FloatArray:
+        """Do as commanded: actions have no limits."""
+        return actions
+
+    def reward(self, states: FloatArray, actions: FloatArray) -> FloatArray:
+        """Return zero: the task is judged by success alone."""
+        return np.zeros(np.broadcast_shapes(states.shape[:-1], actions.shape[:-1]))
+
+    def scene(self) -> Scene | None:
+        """Return None: nothing to draw."""
+        return None

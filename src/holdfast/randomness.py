@@ -1,0 +1,138 @@
+"""Random numbers by name, not by position.
+
+A generator with a state breaks as soon as two machines have drawn a different number of times. Here a
+draw is a function of where it belongs: (seed, trial, step, purpose) name a stream, and the same
+stream always gives the same numbers. A step that is computed again, elsewhere, after a crash, draws
+what it drew before.
+
+The generator is Philox 4x32-10 (Salmon et al., SC 2011): the seed is its key; trial, step and
+purpose are words of its counter, so that no two streams of one seed share a block.
+"""
+
+from __future__ import annotations
+
+import enum
+from typing import TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from holdfast import _kernel
+from holdfast.errors import InvalidValueError
+
+__all__ = ["Purpose", "Stream", "stream"]
+
+Words: TypeAlias = tuple[int, int, int, int, int]
+
+_WORD = 2**32
+
+
+class Purpose(enum.IntEnum):
+    """What a stream is for. The numbers are part of the format: they never change."""
+
+    INITIAL_BELIEF = 1
+    PREDICTION = 2
+    RESAMPLING = 3
+    HYPOTHESES = 4
+    SELECTION = 5
+    WORLD_INITIAL_STATE = 16
+    WORLD_MOTION = 17
+    WORLD_OBSERVATION = 18
+
+
+class Stream:
+    """An immutable name of an endless sequence of random numbers.
+
+    Asking twice gives the same numbers twice; different numbers come from different streams, for
+    instance from :meth:`substream`.
+
+    Parameters
+    ----------
+    words : tuple of int
+        Two key words and three counter words of 32 bits each.
+    """
+
+    __slots__ = ("words",)
+
+    words: Words
+
+    def __init__(self, words: Words) -> None:
+        self.words = words
+
+    def normal(self, shape: int | tuple[int, ...] = ()) -> npt.NDArray[np.float64]:
+        """Return standard normal deviates of the given shape.
+
+        Parameters
+        ----------
+        shape : int or tuple of int
+            The shape of the result; ``()`` gives an array of no dimension.
+
+        Returns
+        -------
+        array of float64
+            The first numbers of the stream, in C order.
+        """
+        return _kernel.normals(self.words, _size(shape)).reshape(shape)
+
+    def uniform(self, shape: int | tuple[int, ...] = ()) -> npt.NDArray[np.float64]:
+        """Return deviates that are uniform on [0, 1), of the given shape; as :meth:`normal`."""
+        return _kernel.uniforms(self.words, _size(shape)).reshape(shape)
+
+    def substream(self, index: int) -> Stream:
+        """Return an independent stream.
+
+        Parameters
+        ----------
+        index : int
+            Which one, from 0 to 2**32 - 1.
+
+        Raises
+        ------
+        InvalidValueError
+            If the index is out of range.
+        """
+        if not 0 <= index < _WORD:
+            raise InvalidValueError(f"substream index {index}: allowed are 0 to {_WORD - 1}")
+        return Stream(_kernel.substream(self.words, index))
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Stream) and self.words == other.words
+
+    def __hash__(self) -> int:
+        return hash(self.words)
+
+    def __repr__(self) -> str:
+        return f"Stream({self.words})"
+
+
+def stream(seed: int, trial: int, step: int, purpose: Purpose) -> Stream:
+    """Return the stream of one purpose at one step of one trial.
+
+    Parameters
+    ----------
+    seed : int
+        From 0 to 2**63 - 1.
+    trial, step : int
+        From 0 to 2**32 - 1.
+    purpose : Purpose
+        What the numbers are for.
+
+    Raises
+    ------
+    InvalidValueError
+        If a number is out of range.
+    """
+    if not 0 <= seed < 2**63:
+        raise InvalidValueError(f"seed {seed}: allowed are 0 to {2**63 - 1}")
+    if not (0 <= trial < _WORD and 0 <= step < _WORD):
+        raise InvalidValueError(f"trial {trial}, step {step}: allowed are 0 to {_WORD - 1}")
+    return Stream((seed % _WORD, seed >> 32, int(purpose), step, trial))
+
+
+def _size(shape: int | tuple[int, ...]) -> int:
+    if isinstance(shape, int):
+        return shape
+    size = 1
+    for extent in shape:
+        size *= extent
+    return size

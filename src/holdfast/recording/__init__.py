@@ -1,0 +1,1 @@
+"""What a run leaves behind: a journal, tables, a summary, the configuration and a figure."""

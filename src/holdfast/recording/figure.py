@@ -1,0 +1,538 @@
+"""One trial in one picture: where the robot was, what it believed, and what it chose to sense.
+
+On the left is the workspace, with the way that was gone, the way that was believed, and the
+belief's particles at some of the sensing steps. On the right each coordinate of the state runs over
+the steps, above a strip that shows what was sensed when, and how much the alternatives differed in
+entropy.
+Every sensing action has a colour and a marker of its own, so that a print in grey reads as well.
+
+This module imports matplotlib; import it only where a figure is wanted.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from pathlib import Path
+from textwrap import fill
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+import numpy.typing as npt
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.colors import to_rgba
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from matplotlib.ticker import MaxNLocator
+
+from holdfast.configuration import Configuration
+from holdfast.problems.problem import FloatArray, Problem, Scene
+from holdfast.recording.files import write_atomically
+from holdfast.recording.recorder import SensingRecord, TrialRecord
+
+__all__ = ["trial_figure"]
+
+_TRUE = "#111111"
+_BELIEF = "#2F6DB3"
+_OBSTACLE = "#C9CDD2"
+_OBSTACLE_EDGE = "#8A9099"
+_BODY = "#4A4F57"
+_GOAL = "#1E8A4C"
+
+# Ordered so that neighbours differ in lightness, too.
+_ACTION_COLORS = ("#1D3C78", "#E8A317", "#B5342B", "#54B5A6", "#7D3C98", "#9AA05A")
+_ACTION_MARKERS = ("o", "s", "^", "D", "v", "P")
+
+_NUM_BODIES = 9
+_NUM_CLOUDS = 4
+_DISC_CORNERS = 48
+_NARROWEST, _WIDEST = 1.0, 1.35
+_MAX_MARKS = 120
+"""With more sensing steps than this, marks on the paths would hide them; the strip has them all."""
+
+_LABEL_WIDTH = 14
+_DOTS_PER_INCH = 150
+
+# Typed loosely: matplotlib's releases differ in how they type these keys.
+_STYLE: Any = {
+    "font.family": "sans-serif",
+    "font.size": 9.0,
+    "axes.titlesize": 10.0,
+    "axes.labelsize": 9.0,
+    "axes.linewidth": 0.7,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.axisbelow": True,
+    "grid.color": "#E6E8EB",
+    "grid.linewidth": 0.6,
+    "xtick.major.width": 0.7,
+    "ytick.major.width": 0.7,
+    "legend.frameon": False,
+    "legend.fontsize": 8.5,
+    "mathtext.default": "regular",
+}
+
+
+def trial_figure(configuration: Configuration, record: TrialRecord, path: Path) -> None:
+    """Draw a trial and write the picture as PNG.
+
+    Parameters
+    ----------
+    configuration : Configuration
+        Of the run that the trial is one of.
+    record : TrialRecord
+        What happened in it.
+    path : Path
+        Where to write the picture.
+
+    Raises
+    ------
+    OutputError
+        If it cannot be written.
+    """
+    problem = configuration.problem
+    scene = problem.scene()
+    num_panels = problem.state_size + 2
+    height = max(6.2, 1.12 * num_panels + 1.6)
+    with mpl.rc_context(_STYLE):
+        figure = Figure(figsize=(13.0 if scene else 8.0, height), layout="constrained")
+        FigureCanvasAgg(figure)
+        figure.suptitle(_title(configuration, record), x=0.012, ha="left", fontsize=12.0)
+        if scene:
+            grid = figure.add_gridspec(1, 2, width_ratios=(1.08, 1.0))
+            left, right = (figure.add_subfigure(grid[0, column]) for column in range(2))
+            _draw_workspace(left.subplots(), problem, scene, record)
+        else:
+            right = figure.add_subfigure(figure.add_gridspec(1, 1)[0, 0])
+        panels = right.subplots(
+            num_panels, 1, sharex=True, height_ratios=[1.0] * problem.state_size + [0.75, 1.0]
+        )
+        _draw_coordinates(panels[: problem.state_size], problem, record)
+        _draw_choices(panels[-2], problem, record)
+        _draw_entropies(panels[-1], problem, record)
+        for panel in panels:
+            panel.grid(visible=True)
+            panel.margins(x=0.01)
+        right.align_ylabels(list(panels))
+        panels[-1].set_xlabel("step")
+        panels[-1].xaxis.set_major_locator(MaxNLocator(integer=True))
+        picture = io.BytesIO()
+        figure.savefig(picture, format="png", dpi=_DOTS_PER_INCH)
+    write_atomically(path, picture.getvalue())
+
+
+def _title(configuration: Configuration, record: TrialRecord) -> str:
+    text = f"{configuration.problem_name}, seed {configuration.simulator.seed}"
+    result = record.result
+    if result is not None:
+        outcome = "goal reached" if result.success else "goal not reached"
+        text += (
+            f", trial {result.trial}: {outcome} in {result.steps:,} steps, "
+            f"{result.sensing_decisions:,} sensing actions, reward {result.reward:.4g}"
+        )
+        shown = len(record.actions)
+        if shown < result.steps:
+            text += f" (the first {shown:,} steps)"
+    return text
+
+
+def _labels(problem: Problem) -> Sequence[str]:
+    labels = problem.state_labels
+    if len(labels) == problem.state_size:
+        return labels
+    return [f"state[{index}]" for index in range(problem.state_size)]
+
+
+def _look(sensing_action: int) -> tuple[str, str]:
+    return (
+        _ACTION_COLORS[sensing_action % len(_ACTION_COLORS)],
+        _ACTION_MARKERS[(sensing_action + sensing_action // 6) % len(_ACTION_MARKERS)],
+    )
+
+
+def _marker_size(record: TrialRecord) -> float:
+    """Return the area of a marker: smaller where there are many."""
+    return float(np.clip(1800.0 / max(len(record.sensing), 1), 7.0, 26.0))
+
+
+# ---------------------------------------------------------------------------------------------
+# The workspace
+# ---------------------------------------------------------------------------------------------
+
+
+def _draw_workspace(panel: Axes, problem: Problem, scene: Scene, record: TrialRecord) -> None:
+    axes = list(scene.axes)
+    panel.set_aspect("equal", anchor="N")
+    labels = _labels(problem)
+    panel.set_xlabel(labels[axes[0]])
+    panel.set_ylabel(labels[axes[1]])
+    for spine in panel.spines.values():
+        spine.set_visible(True)
+
+    _draw_obstacles(panel, scene)
+    _draw_clouds(panel, record.sensing, axes)
+    estimates = _stacked(record.estimates, problem.state_size)
+    truth = _stacked(record.true_states, problem.state_size)
+    way = truth if len(truth) else estimates
+    outlines = _outlines(scene, way)
+    x_min, y_min, x_max, y_max = _shown_part(scene, [estimates[:, axes], truth[:, axes], *outlines])
+    panel.set_xlim(x_min, x_max)
+    panel.set_ylim(y_min, y_max)
+    _draw_bodies(panel, outlines)
+    if len(estimates):
+        panel.plot(*estimates[:, axes].T, color=_BELIEF, linewidth=1.3, linestyle=(0, (4, 1.5)))
+    if len(truth):
+        panel.plot(*truth[:, axes].T, color=_TRUE, linewidth=1.3)
+    for sensing in record.sensing if len(record.sensing) <= _MAX_MARKS else ():
+        color, marker = _look(sensing.sensing_action)
+        panel.scatter(
+            way[sensing.step, axes[0]],
+            way[sensing.step, axes[1]],
+            s=_marker_size(record),
+            color=color,
+            marker=marker,
+            edgecolor="white",
+            linewidth=0.4,
+            zorder=4,
+        )
+    if scene.points is not None:
+        panel.scatter(
+            scene.points[:, 0],
+            scene.points[:, 1],
+            s=42,
+            marker="o",
+            facecolor="white",
+            edgecolor=_GOAL,
+            zorder=3,
+        )
+    if len(way):
+        panel.scatter(
+            way[0, axes[0]],
+            way[0, axes[1]],
+            s=70,
+            marker="o",
+            facecolor="white",
+            edgecolor=_TRUE,
+            zorder=5,
+        )
+    if scene.goal is not None:
+        panel.scatter(
+            scene.goal[0],
+            scene.goal[1],
+            s=150,
+            marker="*",
+            color=_GOAL,
+            edgecolor="white",
+            zorder=5,
+        )
+    _draw_workspace_legend(panel, problem, scene, record)
+
+
+def _shown_part(scene: Scene, points: Sequence[FloatArray]) -> FloatArray:
+    """Return the part of the plane where something happened, with a margin, within the limits."""
+    limits = np.array(scene.limits)
+    low, high = limits[:2], limits[2:]
+    marks = [] if scene.goal is None else [scene.goal.reshape(1, 2)]
+    happened = np.concatenate([*points, *marks])
+    if not len(happened):
+        return limits
+    margin = 0.12 * (happened.max(axis=0) - happened.min(axis=0)).max()
+    lower = np.clip(happened.min(axis=0) - margin, low, high)
+    upper = np.clip(happened.max(axis=0) + margin, low, high)
+    # A flat part is made higher and a narrow one wider, to fill the space that there is.
+    width, height = upper - lower
+    for axis, missing in ((1, width / _WIDEST - height), (0, height * _NARROWEST - width)):
+        if missing > 0.0:
+            lower[axis] = max(lower[axis] - 0.5 * missing, low[axis])
+            upper[axis] = min(upper[axis] + 0.5 * missing, high[axis])
+    return np.concatenate([lower, upper]) if np.all(upper > lower) else limits
+
+
+def _draw_obstacles(panel: Axes, scene: Scene) -> None:
+    # Cut to a little more than what is shown: some obstacles reach to the end of the world.
+    x_min, y_min, x_max, y_max = scene.limits
+    reach = 0.05 * max(x_max - x_min, y_max - y_min)
+    low = np.array([x_min - reach, y_min - reach])
+    high = np.array([x_max + reach, y_max + reach])
+    lower = np.clip(scene.obstacles[:, :2], low, high)
+    upper = np.clip(scene.obstacles[:, 2:], low, high)
+    rectangles = [
+        [(left, bottom), (right, bottom), (right, top), (left, top)]
+        for (left, bottom), (right, top) in zip(lower, upper, strict=True)
+        if right > left and top > bottom
+    ]
+    # The faces are drawn over the edges, so that touching rectangles look like one.
+    for width, face in ((1.4, "none"), (0.0, _OBSTACLE)):
+        panel.add_collection(
+            PolyCollection(
+                rectangles, facecolor=face, edgecolor=_OBSTACLE_EDGE, linewidth=width, zorder=1
+            ),
+            autolim=False,
+        )
+
+
+def _draw_clouds(panel: Axes, sensing: Sequence[SensingRecord], axes: list[int]) -> None:
+    """Draw the particles of a few beliefs, the older the paler."""
+    if not sensing:
+        return
+    chosen = np.unique(np.linspace(0, len(sensing) - 1, _NUM_CLOUDS).round().astype(int))
+    clouds: list[FloatArray] = [sensing[0].before, *(sensing[index].after for index in chosen)]
+    for cloud, opacity in zip(clouds, np.linspace(0.3, 0.8, len(clouds)), strict=True):
+        panel.scatter(
+            cloud[:, axes[0]],
+            cloud[:, axes[1]],
+            s=9,
+            color=_BELIEF,
+            alpha=float(opacity),
+            linewidth=0,
+            zorder=2,
+        )
+
+
+def _outlines(scene: Scene, way: FloatArray) -> list[FloatArray]:
+    """Return the body's outlines at places spread evenly along the way, first and last included."""
+    if scene.body is None or not len(way):
+        return []
+    body = np.asarray(scene.body, dtype=np.float64)
+    if body.ndim == 0:
+        turn = np.linspace(0.0, 2.0 * np.pi, _DISC_CORNERS, endpoint=False)
+        body = body * np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    places = way[:, list(scene.axes)]
+    distance = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(places, axis=0).T))])
+    wanted = np.linspace(0.0, distance[-1], _NUM_BODIES)
+    indices = np.unique(np.append(np.searchsorted(distance, wanted[:-1]), len(way) - 1))
+    return [_outline(body, scene, way[index]) for index in indices]
+
+
+def _draw_bodies(panel: Axes, outlines: Sequence[FloatArray]) -> None:
+    """Draw the outlines, the earlier the paler, and the last one in bold."""
+    opacities = np.linspace(0.3, 1.0, len(outlines))
+    panel.add_collection(
+        LineCollection(
+            [np.vstack([outline, outline[:1]]) for outline in outlines],
+            colors=[to_rgba(_BODY, float(opacity)) for opacity in opacities],
+            linewidths=[0.8] * (len(outlines) - 1) + [1.6],
+            zorder=2.5,
+        ),
+        autolim=False,
+    )
+
+
+def _outline(body: FloatArray, scene: Scene, state: FloatArray) -> FloatArray:
+    angle = 0.0 if scene.angle is None else float(state[scene.angle])
+    cosine, sine = np.cos(angle), np.sin(angle)
+    turned = np.stack(
+        [cosine * body[:, 0] - sine * body[:, 1], sine * body[:, 0] + cosine * body[:, 1]], axis=1
+    )
+    return np.asarray(turned + state[list(scene.axes)], dtype=np.float64)
+
+
+def _draw_workspace_legend(
+    panel: Axes, problem: Problem, scene: Scene, record: TrialRecord
+) -> None:
+    handles: list[Line2D | Patch] = []
+    if record.true_states:
+        handles.append(Line2D([], [], color=_TRUE, label="true path"))
+    handles += [
+        Line2D([], [], color=_BELIEF, linestyle=(0, (4, 1.5)), label="estimated path"),
+        _dot(_BELIEF, "o", "particles, older ones paler", size=3.5),
+        Line2D(
+            [], [], marker="o", linestyle="", markerfacecolor="white", color=_TRUE, label="start"
+        ),
+    ]
+    if scene.goal is not None:
+        handles.append(_dot(_GOAL, "*", "goal", size=11.0))
+    if scene.points is not None:
+        handles.append(
+            Line2D(
+                [],
+                [],
+                marker="o",
+                linestyle="",
+                markerfacecolor="white",
+                color=_GOAL,
+                label="via point",
+            )
+        )
+    if scene.body is not None:
+        handles.append(Line2D([], [], color=_BODY, linewidth=0.9, label="body"))
+    handles.append(Patch(facecolor=_OBSTACLE, edgecolor=_OBSTACLE_EDGE, label="obstacle"))
+    handles += _action_handles(problem, record)
+    panel.legend(
+        handles=handles,
+        loc="upper center",
+        bbox_to_anchor=(0.5, 0.0),
+        borderaxespad=4.2,
+        ncols=4 if max(map(len, problem.sensing_actions), default=0) <= _LABEL_WIDTH else 3,
+        columnspacing=1.6,
+        handletextpad=0.6,
+    )
+
+
+def _action_handles(problem: Problem, record: TrialRecord) -> list[Line2D]:
+    used = sorted({sensing.sensing_action for sensing in record.sensing})
+    return [
+        _dot(*_look(action), fill(f"sensed {problem.sensing_actions[action]}", 30), size=5.5)
+        for action in used
+    ]
+
+
+def _dot(color: str, marker: str, label: str, *, size: float) -> Line2D:
+    return Line2D(
+        [],
+        [],
+        color=color,
+        marker=marker,
+        linestyle="",
+        markersize=size,
+        markeredgewidth=0.0,
+        label=label,
+    )
+
+
+# ---------------------------------------------------------------------------------------------
+# Over the steps
+# ---------------------------------------------------------------------------------------------
+
+
+def _stacked(rows: Sequence[FloatArray], width: int) -> FloatArray:
+    return np.array(rows, dtype=np.float64).reshape(len(rows), width)
+
+
+def _draw_coordinates(
+    panels: npt.NDArray[np.object_], problem: Problem, record: TrialRecord
+) -> None:
+    estimates = _stacked(record.estimates, problem.state_size)
+    deviations = _stacked(record.standard_deviations, problem.state_size)
+    truth = _stacked(record.true_states, problem.state_size)
+    steps = np.arange(len(estimates))
+    for index, (panel, label) in enumerate(zip(panels, _labels(problem), strict=True)):
+        mean, two = estimates[:, index], 2.0 * deviations[:, index]
+        panel.fill_between(steps, mean - two, mean + two, color=_BELIEF, alpha=0.22, linewidth=0)
+        panel.plot(steps, mean, color=_BELIEF, linewidth=1.1, linestyle=(0, (4, 1.5)))
+        if len(truth):
+            panel.plot(np.arange(len(truth)), truth[:, index], color=_TRUE, linewidth=1.1)
+        if len(record.sensing) <= _MAX_MARKS:
+            _scatter_sensing(
+                panel, record, [estimates[sensing.step, index] for sensing in record.sensing]
+            )
+        panel.set_ylabel(label)
+        panel.yaxis.set_major_locator(MaxNLocator(nbins=4))
+    handles: list[Line2D | Patch] = []
+    if len(truth):
+        handles.append(Line2D([], [], color=_TRUE, label="true"))
+    handles += [
+        Line2D([], [], color=_BELIEF, linestyle=(0, (4, 1.5)), label="estimate"),
+        Patch(facecolor=_BELIEF, alpha=0.22, label="± 2 standard deviations"),
+    ]
+    if not all(sensing.explained for sensing in record.sensing):
+        handles.append(
+            Line2D(
+                [],
+                [],
+                marker="o",
+                linestyle="",
+                markerfacecolor="none",
+                markersize=8.0,
+                color=_TRUE,
+                label="explained by no particle",
+            )
+        )
+    panels[0].legend(
+        handles=handles,
+        loc="lower center",
+        bbox_to_anchor=(0.5, 1.0),
+        ncols=len(handles),
+        columnspacing=1.2,
+        handletextpad=0.5,
+    )
+
+
+def _scatter_sensing(panel: Axes, record: TrialRecord, heights: Sequence[float]) -> None:
+    """Mark the sensing steps, one call for each sensing action."""
+    heights_array = np.asarray(heights, dtype=np.float64)
+    actions = np.array([sensing.sensing_action for sensing in record.sensing], dtype=int)
+    steps = np.array([sensing.step for sensing in record.sensing], dtype=int)
+    for action in np.unique(actions):
+        color, marker = _look(int(action))
+        chosen = actions == action
+        panel.scatter(
+            steps[chosen],
+            heights_array[chosen],
+            s=_marker_size(record),
+            color=color,
+            marker=marker,
+            edgecolor="white",
+            linewidth=0.4,
+            zorder=4,
+        )
+
+
+def _draw_choices(panel: Axes, problem: Problem, record: TrialRecord) -> None:
+    """Draw a row for each sensing action, with a mark where it was chosen."""
+    count = len(problem.sensing_actions)
+    _scatter_sensing(panel, record, [float(sensing.sensing_action) for sensing in record.sensing])
+    unexplained = [sensing for sensing in record.sensing if not sensing.explained]
+    if unexplained:
+        panel.scatter(
+            [sensing.step for sensing in unexplained],
+            [float(sensing.sensing_action) for sensing in unexplained],
+            s=3.0 * _marker_size(record),
+            facecolor="none",
+            edgecolor=_TRUE,
+            linewidth=0.8,
+        )
+    labels = [fill(str(label), _LABEL_WIDTH) for label in problem.sensing_actions]
+    size = 9.0 if max(map(len, labels), default=0) <= _LABEL_WIDTH else 7.0
+    panel.set_yticks(range(count), labels, fontsize=size)
+    panel.set_ylim(count - 0.4, -0.6)
+    panel.set_ylabel("sensed")
+
+
+def _draw_entropies(panel: Axes, problem: Problem, record: TrialRecord) -> None:
+    """Draw every sensing action's entropy at each sensing step; the lowest was chosen."""
+    panel.set_ylabel("entropy (nats)")
+    panel.yaxis.set_major_locator(MaxNLocator(nbins=4))
+    known = [sensing for sensing in record.sensing if sensing.entropies is not None]
+    if not known:
+        panel.text(
+            0.5, 0.5, "no entropies: the selector looks at no belief", ha="center", va="center",
+            transform=panel.transAxes, color=_BODY,
+        )  # fmt: skip
+        panel.set_yticks([])
+        return
+    steps = np.array([sensing.step for sensing in known])
+    entropies = np.array([sensing.entropies for sensing in known])
+    chosen = np.array([sensing.sensing_action for sensing in known])
+    panel.vlines(
+        steps, entropies.min(axis=1), entropies.max(axis=1), color="#B4B9C0", linewidth=0.8
+    )
+    size = _marker_size(record)
+    for action in range(len(problem.sensing_actions)):
+        color, marker = _look(action)
+        won = chosen == action
+        # The alternatives are hollow, so that the choice stands out.
+        panel.scatter(
+            steps[~won],
+            entropies[~won, action],
+            s=0.6 * size,
+            facecolor="white",
+            edgecolor=color,
+            marker=marker,
+            linewidth=0.7,
+            zorder=3,
+        )
+        panel.scatter(
+            steps[won],
+            entropies[won, action],
+            s=size,
+            color=color,
+            marker=marker,
+            edgecolor="white",
+            linewidth=0.4,
+            zorder=4,
+        )

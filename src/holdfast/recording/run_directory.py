@@ -1,0 +1,269 @@
+"""The directory of a run: what is in it, and whether it may be written to.
+
+A run's directory is claimed before its first trial, so that a wrong path costs no computing. The
+journal is the truth; ``trials.csv`` and ``summary.json`` are made from it, and are made again when
+a run is resumed.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from holdfast import __version__
+from holdfast.configuration import Configuration
+from holdfast.recording.files import OutputError, write_atomically
+from holdfast.recording.journal import Journal
+from holdfast.recording.tables import RunSummary, SummaryBuilder, csv_lines
+from holdfast.runtime.trial import TrialResult
+
+__all__ = ["RunDirectory", "claim_default_directory", "latest_default_directory", "output_names"]
+
+CONFIGURATION_NAME = "config.yaml"
+FIGURE_NAME = "trial.png"
+JOURNAL_NAME = "journal.sqlite"
+SUMMARY_NAME = "summary.json"
+TRIALS_NAME = "trials.csv"
+
+_MAX_SUFFIX = 10_000
+
+
+class RunDirectory:
+    """An open directory of a run.
+
+    Use :meth:`create` or :meth:`resume`, and close it or use it in a ``with`` statement.
+
+    Parameters
+    ----------
+    path : Path
+        The directory.
+    configuration : Configuration
+        What the run is.
+    journal : Journal
+        Its open journal.
+    """
+
+    def __init__(self, path: Path, configuration: Configuration, journal: Journal) -> None:
+        self.path = path
+        self.configuration = configuration
+        self.journal = journal
+        self.earlier_wall_time_s = float(journal.meta().get("wall_time_s", "0"))
+
+    @classmethod
+    def create(cls, path: Path, configuration: Configuration) -> Self:
+        """Claim a directory for a new run; it is made if it is not there.
+
+        Raises
+        ------
+        OutputError
+            If it holds a run already, or cannot be written.
+        """
+        try:
+            path.mkdir(parents=True, exist_ok=True)
+            taken = [name for name in output_names() if (path / name).exists()]
+        except FileExistsError as error:
+            raise OutputError(f"{path}: is a file, not a directory") from error
+        except OSError as error:
+            raise OutputError(f"{path}: cannot be made: {error.strerror}") from error
+        if taken:
+            raise OutputError(
+                f"{path}: holds {', '.join(taken)} already; go on with that run (--resume) or "
+                "choose another directory (--out)"
+            )
+        text = configuration.to_yaml()
+        # First, because it is an ordinary file: it shows whether the directory can be written.
+        write_atomically(path / CONFIGURATION_NAME, text)
+        journal = Journal.create(
+            path / JOURNAL_NAME,
+            {
+                "configuration": text,
+                "configuration_hash": _hash(text),
+                "holdfast_version": __version__,
+            },
+        )
+        return cls(path, configuration, journal)
+
+    @classmethod
+    def resume(cls, path: Path, configuration: Configuration) -> Self:
+        """Open the directory of a run that shall go on.
+
+        Raises
+        ------
+        OutputError
+            If it holds no run, one with another configuration, or one that is in use.
+        """
+        if not path.is_dir():
+            raise OutputError(f"{path}: there is no such directory, so no run to resume")
+        if not (path / JOURNAL_NAME).is_file():
+            raise OutputError(f"{path}: holds no {JOURNAL_NAME}, so no run to resume")
+        journal = Journal.open(path / JOURNAL_NAME)
+        try:
+            _require_same(path, journal.meta(), configuration.to_yaml())
+            return cls(path, configuration, journal)
+        except BaseException:
+            journal.close()
+            raise
+
+    def add(self, result: TrialResult) -> None:
+        """Keep a finished trial."""
+        self.journal.add(result)
+
+    def write_tables(self, wall_time_s: float) -> RunSummary:
+        """Write ``trials.csv`` and ``summary.json`` from the journal.
+
+        Parameters
+        ----------
+        wall_time_s : float
+            Time that this part of the run took; what earlier parts took is added.
+
+        Returns
+        -------
+        RunSummary
+            The content of ``summary.json``.
+        """
+        total_s = self.earlier_wall_time_s + wall_time_s
+        self.journal.set_meta("wall_time_s", repr(total_s))
+        builder = SummaryBuilder()
+
+        def added() -> Iterator[TrialResult]:
+            for result in self.journal.results():
+                builder.add(result)
+                yield result
+
+        write_atomically(self.path / TRIALS_NAME, csv_lines(added()))
+        summary = builder.build(
+            problem=self.configuration.problem_name,
+            seed=self.configuration.simulator.seed,
+            version=__version__,
+            trials=self.configuration.simulator.num_trials,
+            wall_time_s=total_s,
+        )
+        write_atomically(self.path / SUMMARY_NAME, summary.to_json())
+        return summary
+
+    def close(self) -> None:
+        """Close the journal and leave the directory to others."""
+        self.journal.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+
+def output_names() -> tuple[str, ...]:
+    """Return the names of the files that a run leaves in its directory."""
+    return (TRIALS_NAME, SUMMARY_NAME, CONFIGURATION_NAME, FIGURE_NAME, JOURNAL_NAME)
+
+
+def claim_default_directory(configuration: Configuration, parent: Path) -> Path:
+    """Make and return a new directory named after the configuration and the seed.
+
+    Parameters
+    ----------
+    configuration : Configuration
+    parent : Path
+        Where to make it; it is made too.
+
+    Returns
+    -------
+    Path
+        ``<parent>/<stem of the configuration>-seed<seed>``, with ``-2``, ``-3``, ... if taken.
+
+    Raises
+    ------
+    OutputError
+        If it cannot be made.
+    """
+    for path in _default_directories(configuration, parent):
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            # Making it is also the test whether it is free, so two runs never share one.
+            path.mkdir()
+        except FileExistsError:
+            if not path.parent.is_dir():
+                raise OutputError(f"{path.parent}: is a file, not a directory") from None
+        except OSError as error:
+            raise OutputError(f"{path}: cannot be made: {error.strerror}") from error
+        else:
+            return path
+    raise OutputError(f"{parent}: more than {_MAX_SUFFIX} runs of one name; give --out")
+
+
+def latest_default_directory(configuration: Configuration, parent: Path) -> Path:
+    """Return the last of the directories that :func:`claim_default_directory` has made.
+
+    Raises
+    ------
+    OutputError
+        If there is none.
+    """
+    latest: Path | None = None
+    for path in _default_directories(configuration, parent):
+        if not path.exists():
+            break
+        latest = path
+    if latest is None:
+        first = next(_default_directories(configuration, parent))
+        raise OutputError(f"{first}: there is no such directory, so no run to resume; give --out")
+    return latest
+
+
+def _default_directories(configuration: Configuration, parent: Path) -> Iterator[Path]:
+    name = f"{configuration.path.stem}-seed{configuration.simulator.seed}"
+    yield parent / name
+    for number in range(2, _MAX_SUFFIX):
+        yield parent / f"{name}-{number}"
+
+
+def _hash(text: str) -> str:
+    return hashlib.blake2b(text.encode(), digest_size=32).hexdigest()
+
+
+def _require_same(path: Path, meta: Mapping[str, str], text: str) -> None:
+    if meta.get("configuration_hash") == _hash(text):
+        return
+    key, there, here = _first_difference(meta.get("configuration", ""), text)
+    raise OutputError(
+        f"{path}: that run has another configuration: {key} is {there} there and {here} here; "
+        "use the same one, or another directory (--out)"
+    )
+
+
+def _first_difference(there: str, here: str) -> tuple[str, str, str]:
+    """Return the key and both values of the first difference of two resolved configurations."""
+    import yaml
+
+    # Both were written by us, so the same plain loader reads both in the same way.
+    found = _difference_in(yaml.safe_load(there), yaml.safe_load(here), "")
+    return found or ("its text", "written one way", "in another")
+
+
+def _difference_in(there: Any, here: Any, key: str) -> tuple[str, str, str] | None:
+    if isinstance(there, Mapping) and isinstance(here, Mapping):
+        for name in [*here, *(name for name in there if name not in here)]:
+            inner = f"{key}.{name}" if key else str(name)
+            found = _difference_in(there.get(name), here.get(name), inner)
+            if found:
+                return found
+        return None
+    if isinstance(there, list) and isinstance(here, list) and len(there) == len(here):
+        for index, (old, new) in enumerate(zip(there, here, strict=True)):
+            found = _difference_in(old, new, f"{key}[{index}]")
+            if found:
+                return found
+        return None
+    return None if there == here else (key or "the whole", _shown(there), _shown(here))
+
+
+def _shown(value: Any) -> str:
+    return "not given" if value is None else repr(value)

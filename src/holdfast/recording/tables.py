@@ -1,0 +1,220 @@
+"""What a run comes to: one row for each trial, and one page about all of them.
+
+The tables are made from results in the order of their trials, one at a time, so that a run of
+millions of trials needs no more memory than its sensing times take.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from array import array
+from collections.abc import Iterable, Iterator
+
+import msgspec
+import numpy as np
+
+from holdfast.runtime.trial import TrialResult
+
+__all__ = [
+    "CSV_COLUMNS",
+    "RunSummary",
+    "SummaryBuilder",
+    "csv_lines",
+    "csv_row",
+    "wilson_interval",
+]
+
+CSV_COLUMNS = (
+    "trial",
+    "seed",
+    "success",
+    "steps",
+    "reward",
+    "sensing_decisions",
+    "mean_sensing_ms",
+    "recoveries",
+    "unexplained_observations",
+    "digest",
+)
+"""Columns of ``trials.csv``."""
+
+_NORMAL_QUANTILE_975 = 1.959963984540054
+
+
+class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
+    """The content of ``summary.json``.
+
+    Attributes
+    ----------
+    problem : str
+        Name of the problem.
+    seed : int
+        Seed of the run.
+    holdfast_version : str
+        Version that made the run (or its last part, if it was resumed).
+    trials : int
+        Trials that the configuration asks for.
+    finished : int
+        Trials that are finished; all other figures are about these.
+    successes : int
+        Trials that reached the goal.
+    success_rate : float or None
+        Successes over finished trials.
+    success_rate_interval_95 : tuple of float, or None
+        Wilson's interval for it.
+    mean_reward : float or None
+        Mean of the rewards of all finished trials.
+    mean_reward_of_successes : float or None
+        The same of the successful ones alone, as earlier work reports it.
+    mean_steps : float or None
+        Mean number of steps.
+    sensing_decisions : int
+        Sensing actions chosen in all trials.
+    unexplained_observations : int
+        Observations that no particle explained.
+    recoveries : int
+        Times that another service took over.
+    sensing_ms_median, sensing_ms_p99 : float or None
+        Wall time of choosing a sensing action, over all of them.
+    wall_time_s : float
+        Time that the run took, over all its parts.
+    digest : str
+        BLAKE2b-256 over the digests of the trials in order: equal if, and only if, all decisions
+        of two runs are.
+    """
+
+    problem: str
+    seed: int
+    holdfast_version: str
+    trials: int
+    finished: int
+    successes: int
+    success_rate: float | None
+    success_rate_interval_95: tuple[float, float] | None
+    mean_reward: float | None
+    mean_reward_of_successes: float | None
+    mean_steps: float | None
+    sensing_decisions: int
+    unexplained_observations: int
+    recoveries: int
+    sensing_ms_median: float | None
+    sensing_ms_p99: float | None
+    wall_time_s: float
+    digest: str
+
+    def to_json(self) -> str:
+        """Return the summary as indented JSON."""
+        return msgspec.json.format(msgspec.json.encode(self), indent=2).decode() + "\n"
+
+
+def csv_row(result: TrialResult) -> list[str]:
+    """Return one row of ``trials.csv``; reading a number back gives the same number."""
+    return [
+        str(int(value)) if isinstance(value, bool) else str(value)
+        for value in (getattr(result, column) for column in CSV_COLUMNS)
+    ]
+
+
+def csv_lines(results: Iterable[TrialResult]) -> Iterator[str]:
+    """Yield the lines of ``trials.csv``, the head first; no value needs quotes."""
+    yield ",".join(CSV_COLUMNS) + "\n"
+    for result in results:
+        yield ",".join(csv_row(result)) + "\n"
+
+
+def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
+    """Return the 95 % interval for a rate, by Wilson's score.
+
+    Unlike the usual plus-minus interval it is right near 0 and 1 and never leaves them.
+
+    Parameters
+    ----------
+    successes, trials : int
+        Counts; ``trials`` is at least 1.
+
+    Returns
+    -------
+    tuple of float
+        Lower and upper end.
+    """
+    z_squared = _NORMAL_QUANTILE_975**2
+    rate = successes / trials
+    centre = rate + z_squared / (2 * trials)
+    spread = float(
+        _NORMAL_QUANTILE_975
+        * np.sqrt(rate * (1 - rate) / trials + z_squared / (4 * trials * trials))
+    )
+    scale = 1 + z_squared / trials
+    low = 0.0 if successes == 0 else (centre - spread) / scale
+    high = 1.0 if successes == trials else (centre + spread) / scale
+    return low, high
+
+
+class SummaryBuilder:
+    """Adds up results, in the order of their trials, to a summary."""
+
+    def __init__(self) -> None:
+        self._finished = 0
+        self._successes = 0
+        self._reward = 0.0
+        self._reward_of_successes = 0.0
+        self._steps = 0
+        self._unexplained = 0
+        self._recoveries = 0
+        self._sensing_ms = array("f")
+        self._digest = hashlib.blake2b(digest_size=32)
+
+    def add(self, result: TrialResult) -> None:
+        """Add the next result."""
+        self._finished += 1
+        self._reward += result.reward
+        if result.success:
+            self._successes += 1
+            self._reward_of_successes += result.reward
+        self._steps += result.steps
+        self._unexplained += result.unexplained_observations
+        self._recoveries += result.recoveries
+        self._sensing_ms.extend(result.sensing_ms)
+        self._digest.update(bytes.fromhex(result.digest))
+
+    def build(
+        self, *, problem: str, seed: int, version: str, trials: int, wall_time_s: float
+    ) -> RunSummary:
+        """Return the summary of what was added.
+
+        Parameters
+        ----------
+        problem : str
+        seed : int
+        version : str
+        trials : int
+            Trials that the configuration asks for.
+        wall_time_s : float
+        """
+        count = self._finished
+        median = p99 = None
+        if self._sensing_ms:
+            quantiles = np.quantile(np.frombuffer(self._sensing_ms, dtype=np.float32), [0.5, 0.99])
+            median, p99 = (round(float(quantile), 4) for quantile in quantiles)
+        return RunSummary(
+            problem=problem,
+            seed=seed,
+            holdfast_version=version,
+            trials=trials,
+            finished=count,
+            successes=self._successes,
+            success_rate=self._successes / count if count else None,
+            success_rate_interval_95=wilson_interval(self._successes, count) if count else None,
+            mean_reward=self._reward / count if count else None,
+            mean_reward_of_successes=(
+                self._reward_of_successes / self._successes if self._successes else None
+            ),
+            mean_steps=self._steps / count if count else None,
+            sensing_decisions=len(self._sensing_ms),
+            unexplained_observations=self._unexplained,
+            recoveries=self._recoveries,
+            sensing_ms_median=median,
+            sensing_ms_p99=p99,
+            wall_time_s=round(wall_time_s, 3),
+            digest=self._digest.hexdigest(),
+        )

@@ -1,0 +1,360 @@
+"""Many trials, on one core or on several.
+
+A trial depends on nothing but the configuration and its number, so the order and the place in which
+trials are run change no result. The first trials are run in this process; worker processes are
+started only once the time that a trial takes shows that they would pay for their own start.
+
+The pool is made of pipes, not of ``concurrent.futures``, for two reasons: when a worker is killed
+we must say which trial it was running, and on Ctrl-C the workers must end at once. Each worker has
+a pipe of its own, is sent trial numbers, and answers with one message for each. It holds only a few
+numbers at a time, so ten million trials are never queued anywhere.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import os
+import signal
+import traceback
+from collections import deque
+from collections.abc import Callable, Collection, Iterator
+from itertools import chain
+from multiprocessing import resource_tracker
+from multiprocessing.connection import Connection, wait
+from multiprocessing.context import SpawnProcess
+from time import perf_counter
+from typing import Any
+
+import msgspec
+
+from holdfast.configuration import Configuration
+from holdfast.errors import HoldfastError, InvalidValueError
+from holdfast.problems.problem import Problem
+from holdfast.runtime.trial import (
+    NULL_OBSERVER,
+    NullObserver,
+    SensingStep,
+    TaskStep,
+    TrialObserver,
+    TrialResult,
+    run_trial,
+)
+from holdfast.settings import PlanningSettings
+
+__all__ = ["TrialCrashError", "TrialError", "WorkerDiedError", "available_cores", "run_trials"]
+
+MAX_JOBS = 1024
+"""Bound on the number of worker processes."""
+
+_WORKER_START_S = 1.0
+"""About what it costs to start workers; they must save more than this."""
+
+_LOOKAHEAD_S = 0.1
+"""A worker is sent trials for about this long, so that it never waits for the next number."""
+
+_MAX_LOOKAHEAD = 16
+
+
+class TrialError(HoldfastError):
+    """An error that holdfast raised on purpose, with the trial in which it happened."""
+
+
+class WorkerDiedError(HoldfastError):
+    """A worker process ended without having been asked to."""
+
+
+class TrialCrashError(RuntimeError):
+    """An unexpected error in a worker process; the message holds its traceback."""
+
+
+class _Finished(msgspec.Struct, tag="finished"):
+    result: TrialResult
+    elapsed_s: float
+
+
+class _Failed(msgspec.Struct, tag="failed"):
+    text: str
+    expected: bool
+
+
+_MESSAGE_DECODER = msgspec.msgpack.Decoder(_Finished | _Failed)
+
+
+class _TrialIsLongError(Exception):
+    """Not an error: the trial that runs in this process is worth starting workers for."""
+
+
+class _Watch(NullObserver):
+    """Gives a trial up once it has taken longer than workers need to start."""
+
+    def __init__(self) -> None:
+        self._deadline = perf_counter() + _WORKER_START_S
+
+    def sensed(self, step: SensingStep) -> None:
+        """Look at the clock."""
+        del step
+        self._check()
+
+    def acted(self, step: TaskStep) -> None:
+        """Look at the clock."""
+        del step
+        self._check()
+
+    def _check(self) -> None:
+        if perf_counter() > self._deadline:
+            raise _TrialIsLongError
+
+
+class _Worker:
+    """A worker process as its parent sees it."""
+
+    def __init__(self, process: SpawnProcess, connection: Connection) -> None:
+        self.process = process
+        self.connection = connection
+        self.outstanding: deque[int] = deque()
+
+    def send(self, trial: int) -> None:
+        self.outstanding.append(trial)
+        # A dead worker is found out when its pipe is read, where we know which trial it had.
+        with contextlib.suppress(BrokenPipeError, ConnectionResetError):
+            self.connection.send_bytes(trial.to_bytes(8, "little"))
+
+
+def available_cores() -> int:
+    """Return the number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def run_trials(
+    configuration: Configuration,
+    jobs: int,
+    finished: Collection[int],
+    on_result: Callable[[TrialResult], None],
+    observer: TrialObserver = NULL_OBSERVER,
+) -> None:
+    """Run the trials of a configuration that are not yet finished.
+
+    Parameters
+    ----------
+    configuration : Configuration
+        Says what a trial is and how many there are.
+    jobs : int
+        Largest number of processes; 1 runs all trials in this one. Changes time only.
+    finished : collection of int
+        Numbers of the trials to leave out.
+    on_result : callable
+        Called in this process with the result of each trial as soon as it is there, in any order.
+    observer : TrialObserver
+        Looks on at the trials that are run in this process because no worker could help: all of
+        them if ``jobs`` is 1, else the last one at most.
+
+    Raises
+    ------
+    TrialError
+        If holdfast refuses something in a trial, for example what a problem's function returned.
+    WorkerDiedError
+        If a worker process was killed; the message names the trial that it was running.
+    TrialCrashError
+        If anything else went wrong in a worker process. In this process that error is raised as
+        it is, with a note that names the trial.
+    KeyboardInterrupt
+        After the workers have been ended.
+    """
+    if not 1 <= jobs <= MAX_JOBS:
+        raise InvalidValueError(f"jobs is {jobs}; it must be from 1 to {MAX_JOBS}")
+    num_trials = configuration.simulator.num_trials
+    finished = finished if isinstance(finished, (set, frozenset, range)) else set(finished)
+    pending = (trial for trial in range(num_trials) if trial not in finished)
+    remaining = num_trials - sum(1 for trial in finished if 0 <= trial < num_trials)
+
+    serial = jobs == 1 or remaining <= 1
+    elapsed_s = 0.0
+    for count, trial in enumerate(pending, start=1):
+        started = perf_counter()
+        try:
+            result = _run_one(
+                configuration, configuration.planning, trial, observer if serial else _Watch()
+            )
+        except _TrialIsLongError:
+            # It decides the same when a worker runs it again; only the time so far is lost.
+            _run_in_workers(
+                configuration, jobs, chain((trial,), pending), remaining, _WORKER_START_S, on_result
+            )
+            return
+        elapsed_s += perf_counter() - started
+        remaining -= 1
+        on_result(result)
+        if not serial and remaining > 1:
+            saved_s = remaining * (elapsed_s / count) * (1.0 - 1.0 / min(jobs, remaining))
+            if saved_s > _WORKER_START_S:
+                _run_in_workers(
+                    configuration, jobs, pending, remaining, elapsed_s / count, on_result
+                )
+                return
+        elif remaining == 1:
+            # The last one: no worker could help.
+            serial = True
+
+
+def _run_one(
+    configuration: Configuration, planning: PlanningSettings, trial: int, observer: TrialObserver
+) -> TrialResult:
+    problem: Problem = configuration.problem
+    simulator = configuration.simulator
+    where = f"trial {trial} (seed {simulator.seed})"
+    try:
+        return run_trial(problem, planning, simulator, trial, observer=observer)
+    except _TrialIsLongError:
+        raise
+    except HoldfastError as error:
+        raise TrialError(f"{where}: {error}") from error
+    except Exception as error:
+        error.add_note(f"in {where}")
+        raise
+
+
+def _run_in_workers(
+    configuration: Configuration,
+    jobs: int,
+    pending: Iterator[int],
+    remaining: int,
+    mean_s: float,
+    on_result: Callable[[TrialResult], None],
+) -> None:
+    workers: list[_Worker] = []
+    try:
+        _start_workers(workers, configuration, min(jobs, remaining))
+        by_connection = {worker.connection: worker for worker in workers}
+        elapsed_s = 0.0
+        count = 0
+        _feed(workers, pending, mean_s)
+        while any(worker.outstanding for worker in workers):
+            for connection in wait(list(by_connection)):
+                assert isinstance(connection, Connection)
+                worker = by_connection[connection]
+                try:
+                    message = _MESSAGE_DECODER.decode(connection.recv_bytes())
+                except (EOFError, ConnectionResetError):
+                    raise _worker_died(worker) from None
+                if isinstance(message, _Failed):
+                    if message.expected:
+                        raise TrialError(message.text)
+                    raise TrialCrashError(f"in a worker process:\n{message.text}")
+                worker.outstanding.popleft()
+                elapsed_s += message.elapsed_s
+                count += 1
+                on_result(message.result)
+            if count:
+                mean_s = elapsed_s / count
+            _feed(workers, pending, mean_s)
+    finally:
+        # There is nothing to wait for: each result is sent whole or not wanted any more.
+        for worker in workers:
+            worker.process.terminate()
+        for worker in workers:
+            worker.process.join()
+            worker.connection.close()
+
+
+def _feed(workers: list[_Worker], pending: Iterator[int], mean_s: float) -> None:
+    """Send trials round by round, so that the last ones are spread over all workers."""
+    depth = max(1, min(_MAX_LOOKAHEAD, int(_LOOKAHEAD_S / max(mean_s, 1e-6))))
+    for level in range(depth):
+        for worker in workers:
+            if len(worker.outstanding) <= level:
+                trial = next(pending, None)
+                if trial is None:
+                    return
+                worker.send(trial)
+
+
+def _start_workers(workers: list[_Worker], configuration: Configuration, count: int) -> None:
+    """Append ``count`` started workers, one by one, so that the caller can always end them."""
+    context = multiprocessing.get_context("spawn")
+    threads = max(1, available_cores() // count)
+    limit = configuration.planning.active_sensing.num_cores
+    if limit:
+        threads = min(threads, limit)
+    plain = configuration.plain()
+    # Its start would undo the mask set below, so it must have been started before.
+    resource_tracker.ensure_running()
+    with _inherited_by_children(threads):
+        for number in range(count):
+            ours, theirs = context.Pipe()
+            process = context.Process(
+                target=_work,
+                args=(theirs, plain, threads),
+                name=f"holdfast-worker-{number}",
+                daemon=True,
+            )
+            process.start()
+            # Only the child must hold this end, else its death would not close the pipe.
+            theirs.close()
+            workers.append(_Worker(process, ours))
+
+
+@contextlib.contextmanager
+def _inherited_by_children(threads: int) -> Iterator[None]:
+    """Let children start with few threads and with SIGINT blocked.
+
+    Ctrl-C reaches every process of the terminal; the parent alone answers it. Blocking the signal
+    here, not in the child, covers the child's first moments too, and delays it for us only.
+    """
+    variables = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+    saved = {name: os.environ.get(name) for name in variables}
+    os.environ.update(dict.fromkeys(variables, str(threads)))
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        for name, value in saved.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+
+
+def _work(connection: Connection, plain: dict[str, Any], threads: int) -> None:
+    """Run trials by number until the parent closes the pipe or one of them fails."""
+    encode = msgspec.msgpack.Encoder().encode
+    configuration: Configuration | None = None
+    # The parent may end at any time; then nobody is left to tell.
+    with contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError):
+        while True:
+            trial = int.from_bytes(connection.recv_bytes(), "little")
+            started = perf_counter()
+            message: _Finished | _Failed
+            try:
+                if configuration is None:
+                    configuration = Configuration.from_plain(plain)
+                    planning = msgspec.structs.replace(
+                        configuration.planning,
+                        active_sensing=msgspec.structs.replace(
+                            configuration.planning.active_sensing, num_cores=threads
+                        ),
+                    )
+                result = _run_one(configuration, planning, trial, NULL_OBSERVER)
+                message = _Finished(result, perf_counter() - started)
+            except HoldfastError as error:
+                message = _Failed(str(error), True)
+            except Exception:  # noqa: BLE001 - whatever it is, the parent raises it again
+                message = _Failed(traceback.format_exc(), False)
+            connection.send_bytes(encode(message))
+            if isinstance(message, _Failed):
+                return
+
+
+def _worker_died(worker: _Worker) -> WorkerDiedError:
+    worker.process.join(timeout=10.0)
+    code = worker.process.exitcode
+    if code is not None and code < 0:
+        how = f"was killed by {signal.Signals(-code).name}"
+        advice = " (often the machine is out of memory: use fewer jobs or fewer particles)"
+    else:
+        how = f"ended with exit code {code}"
+        advice = ""
+    trial = worker.outstanding[0] if worker.outstanding else None
+    what = "before it had a trial to run" if trial is None else f"while it ran trial {trial}"
+    return WorkerDiedError(f"a worker process {how} {what}{advice}; finished trials are kept")

@@ -1,0 +1,334 @@
+"""Choosing what to sense.
+
+Look ahead by one observation: for each sensing action, imagine what it might show, update the belief
+by it, and ask how uncertain the robot would then be about what to **do**. The sensing action with the
+least expected entropy of the task actions wins (*action entropy*). Asking instead how uncertain it would
+be about where it *is* (*state entropy*) spends sensing on differences that change no action. Two
+choices that imagine nothing, *random* and *fixed*, are there to compare with.
+
+Source: Greigarn, Branicky and Çavuşoğlu, "Task-oriented active sensing via action entropy
+minimization", IEEE Access 7, 2019, algorithm 2.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from holdfast import _kernel, numerics
+from holdfast.belief import Belief
+from holdfast.entropy import GaussianMixture, KernelEstimator, NearestNeighbor, kernel_estimator
+from holdfast.errors import InvalidValueError, ProblemError
+from holdfast.problems.problem import Problem
+from holdfast.randomness import Stream
+from holdfast.settings import PlanningSettings
+
+__all__ = ["SensingInfo", "choose_sensing_action"]
+
+FloatArray = npt.NDArray[np.float64]
+
+# Substreams of the stream of hypotheses; 1 is the kernel's own, for the observation noise.
+_HORIZON_MOTION = 2
+_GENERAL_OBSERVATIONS = 3
+
+
+class SensingInfo(NamedTuple):
+    """Why a sensing action was chosen.
+
+    Attributes
+    ----------
+    entropies : array of shape (J,) or None
+        Expected (discounted, summed) entropy after each sensing action, in nats; None for ``random``
+        and ``fixed``.
+    samples : array of shape (J, M) or None
+        The entropies of the single hypothetical observations, whose means ``entropies`` are.
+    likelihoods, visits : int
+        Work done: likelihoods evaluated and distances between points looked at.
+    """
+
+    entropies: FloatArray | None
+    samples: FloatArray | None
+    likelihoods: int
+    visits: int
+
+
+def choose_sensing_action(
+    problem: Problem,
+    settings: PlanningSettings,
+    belief: Belief,
+    stage: int,
+    hypotheses: Stream,
+    selection: Stream,
+) -> tuple[int, SensingInfo]:
+    """Choose a sensing action for a belief.
+
+    Parameters
+    ----------
+    problem : Problem
+    settings : PlanningSettings
+    belief : Belief
+    stage : int
+        Stage of the task.
+    hypotheses : Stream
+        Random numbers of the hypothetical observations.
+    selection : Stream
+        Random number of the method ``random``.
+
+    Returns
+    -------
+    index : int
+        Index into ``problem.sensing_actions``. The lowest one of equally good ones.
+    info : SensingInfo
+
+    Raises
+    ------
+    InvalidValueError
+        If a setting does not fit the problem or the belief.
+    ProblemError
+        If a function of the problem returns something out of its contract.
+    """
+    selector = settings.selector
+    count = len(problem.sensing_actions)
+    if selector.method == "fixed":
+        if selector.sensing_action >= count:
+            raise InvalidValueError(
+                f"selector.sensing_action {selector.sensing_action}: {problem.name} has sensing actions "
+                f"0 to {count - 1}"
+            )
+        return selector.sensing_action, SensingInfo(None, None, 0, 0)
+    if selector.method == "random":
+        return int(float(selection.uniform()) * count), SensingInfo(None, None, 0, 0)
+
+    points_of = _points_of(problem, settings)
+    points = points_of(belief.states, stage)
+    estimator = _estimator(problem, settings, belief, points)
+    threads = settings.active_sensing.num_cores
+    if hasattr(problem, "log_likelihood"):
+        log_weights = _general_log_weights(problem, settings, belief, hypotheses)
+        samples, likelihoods, visits = _entropies(points, log_weights, False, estimator, threads)
+        samples = samples.reshape(count, -1)
+        entropies = _row_means(samples)
+    else:
+        sizes, predicted, variance = _predictions(problem, belief)
+        entropies, samples, likelihoods, visits = _kernel.hypothetical_entropies(
+            belief.weights,
+            sizes,
+            predicted,
+            variance,
+            settings.active_sensing.num_observation_samples,
+            hypotheses.words,
+            points if estimator.scale is None else points * estimator.scale,
+            estimator.mixture,
+            estimator.neighbors,
+            estimator.resolution,
+            estimator.exponent,
+            estimator.offset,
+            threads,
+        )
+    if settings.active_sensing.horizon > 1:
+        later = _later_entropies(problem, settings, belief, stage, hypotheses, estimator, points_of)
+        samples = samples + later
+        entropies = _row_means(samples)
+    index = int(entropies.argmin())
+    # argmin finds a NaN, if there is one.
+    if entropies[index] != entropies[index]:
+        raise ProblemError(
+            f"the entropy after sensing action {index} of {problem.name} is not a number: a hypothetical "
+            "observation had no likelihood under any particle"
+        )
+    return index, SensingInfo(entropies, samples, likelihoods, visits)
+
+
+def _points_of(
+    problem: Problem, settings: PlanningSettings
+) -> Callable[[FloatArray, int], FloatArray]:
+    """Return the map from states to the points whose entropy counts."""
+    if settings.selector.method == "state_entropy":
+        return lambda states, _: states
+    if settings.selector.actions == "executed":
+        return lambda states, stage: problem.execute(problem.policy(states, stage))
+    return problem.policy
+
+
+def _estimator(
+    problem: Problem, settings: PlanningSettings, belief: Belief, points: FloatArray
+) -> KernelEstimator:
+    if points.ndim != 2 or points.shape[0] != belief.states.shape[0]:
+        raise ProblemError(
+            f"policy of {problem.name} returned shape {points.shape} for states of shape "
+            f"{belief.states.shape}: need ({belief.states.shape[0]}, {problem.action_size})"
+        )
+    if not np.isfinite(points).all():
+        bad = int(np.argmin(np.isfinite(points).all(axis=1)))
+        raise ProblemError(
+            f"policy of {problem.name} returned {points[bad]} in state {belief.states[bad]}: every "
+            "coordinate must be finite"
+        )
+    dimension = points.shape[1]
+    selector = settings.selector
+    if selector.estimator == "nearest_neighbor":
+        neighbors = settings.active_sensing.num_nearest_neighbors
+        if neighbors >= points.shape[0]:
+            raise InvalidValueError(
+                f"active_sensing.num_nearest_neighbors {neighbors}: must be below the number of "
+                f"particles, {points.shape[0]}"
+            )
+        resolution = problem.resolution if selector.resolution is None else selector.resolution
+        return kernel_estimator(NearestNeighbor(neighbors, resolution), dimension)
+    upper = selector.estimator == "gaussian_mixture_upper"
+    if selector.resolution is not None:
+        variance = np.full(dimension, selector.resolution * selector.resolution)
+    else:
+        variance = np.asarray(problem.motion_variance, dtype=np.float64)
+        if variance.shape != (dimension,):
+            raise InvalidValueError(
+                f"selector.estimator {selector.estimator}: {problem.name} has a motion variance of "
+                f"{variance.shape[0]} coordinates for points of {dimension}; give selector.resolution"
+            )
+    return kernel_estimator(GaussianMixture(variance, upper), dimension)
+
+
+def _predictions(problem: Problem, belief: Belief) -> tuple[list[int], FloatArray, FloatArray]:
+    """Return the sizes of the observations, their means and their variances, row by coordinate.
+
+    The variances have one column where no sensing action's variance depends on the state.
+    """
+    states = belief.states
+    count = states.shape[0]
+    means = []
+    variances = []
+    for action in range(len(problem.sensing_actions)):
+        means.append(problem.observation_mean(states, action))
+        variances.append(problem.observation_variance(states, action))
+    sizes = [mean.shape[-1] for mean in means]
+    predicted = np.empty((sum(sizes), count))
+    varying = any(variance.ndim > 1 for variance in variances)
+    variance = np.empty((predicted.shape[0], count if varying else 1))
+    row = 0
+    for size, mean, own_variance in zip(sizes, means, variances, strict=True):
+        predicted[row : row + size] = mean.T
+        variance[row : row + size] = (
+            own_variance.T if own_variance.ndim > 1 else own_variance.reshape(-1, 1)
+        )
+        row += size
+    if not np.isfinite(predicted).all():
+        raise ProblemError(f"observation_mean of {problem.name} is not finite for a particle")
+    # A comparison with NaN is false.
+    if not ((variance > 0.0) & (variance < np.inf)).all():
+        raise ProblemError(
+            f"observation_variance of {problem.name} has the entry {variance.min()}: every entry must be "
+            "positive and finite"
+        )
+    return sizes, predicted, variance
+
+
+def _general_log_weights(
+    problem: Problem, settings: PlanningSettings, belief: Belief, hypotheses: Stream
+) -> FloatArray:
+    """Return the log weights of all hypothetical posteriors, shape (J * M, N).
+
+    For problems that give ``log_likelihood`` and ``sample_observation`` instead of a Gaussian.
+    """
+    samples = settings.active_sensing.num_observation_samples
+    particles = _stratified(belief.weights, samples, hypotheses)
+    log_prior = numerics.log(belief.weights)
+    rows = []
+    for action in range(len(problem.sensing_actions)):
+        for i, particle in enumerate(particles):
+            observation = problem.sample_observation(  # type: ignore[attr-defined]
+                belief.states[particle], action, hypotheses.substream(_GENERAL_OBSERVATIONS).substream(i)
+            )
+            rows.append(
+                log_prior
+                + problem.log_likelihood(belief.states, action, observation)  # type: ignore[attr-defined]
+            )
+    return np.ascontiguousarray(rows, dtype=np.float64)
+
+
+def _stratified(weights: FloatArray, samples: int, stream: Stream) -> list[int]:
+    """Draw one particle from each ``samples``-th of the cumulated weight."""
+    positions = (np.arange(samples) + stream.uniform(samples)) / samples
+    # np.cumsum adds one by one, in order, unlike np.sum.
+    found = np.searchsorted(np.cumsum(weights), positions, side="right")
+    last = int(np.flatnonzero(weights)[-1])
+    return [min(int(index), last) for index in found]
+
+
+def _entropies(
+    points: FloatArray,
+    weights: FloatArray,
+    normalized: bool,
+    estimator: KernelEstimator,
+    threads: int,
+) -> tuple[FloatArray, int, int]:
+    result, likelihoods, visits = _kernel.entropies(
+        np.ascontiguousarray(points if estimator.scale is None else points * estimator.scale),
+        weights,
+        normalized,
+        estimator.mixture,
+        estimator.neighbors,
+        estimator.resolution,
+        estimator.exponent,
+        estimator.offset,
+        threads,
+    )
+    return result, likelihoods, visits
+
+
+def _later_entropies(
+    problem: Problem,
+    settings: PlanningSettings,
+    belief: Belief,
+    stage: int,
+    hypotheses: Stream,
+    estimator: KernelEstimator,
+    points_of: Callable[[FloatArray, int], FloatArray],
+) -> FloatArray:
+    """Return the discounted entropies of the steps after the first, shape (J, M).
+
+    Each hypothetical belief takes the action of its own estimate and is moved by it. The motion noise is
+    the same for every sensing action, as the observation noise is.
+    """
+    sensing = settings.active_sensing
+    samples = sensing.num_observation_samples
+    actions = len(problem.sensing_actions)
+    if hasattr(problem, "log_likelihood"):
+        log_weights = _general_log_weights(problem, settings, belief, hypotheses)
+        rows = [_kernel.normalize(row, -745.0)[0] for row in log_weights]
+        weights = np.array(rows).reshape(actions, samples, -1)
+    else:
+        sizes, predicted, variance = _predictions(problem, belief)
+        weights = _kernel.hypothetical_weights(
+            belief.weights, sizes, predicted, variance, samples, hypotheses.words
+        )
+    motion = hypotheses.substream(_HORIZON_MOTION)
+    later = np.zeros((actions, samples))
+    for j in range(actions):
+        for i in range(samples):
+            states = belief.states
+            own_weights = np.ascontiguousarray(weights[j, i])
+            own_stage: int = stage
+            factor = 1.0
+            for step in range(1, sensing.horizon):
+                mean = _kernel.weighted_sums(own_weights, states)
+                own_stage = int(problem.next_stage(mean, own_stage))
+                action = problem.execute(problem.policy(mean, own_stage))
+                states = problem.move(states, action, motion.substream(i).substream(step))
+                factor *= sensing.discount
+                row, _, _ = _entropies(
+                    points_of(states, own_stage), own_weights.reshape(1, -1), True, estimator, 1
+                )
+                later[j, i] += factor * row[0]
+    return later
+
+
+def _row_means(rows: FloatArray) -> FloatArray:
+    """Return the mean of each row, added from left to right."""
+    total = np.zeros(rows.shape[0])
+    for column in range(rows.shape[1]):
+        total += rows[:, column]
+    mean: FloatArray = total / rows.shape[1]
+    return mean

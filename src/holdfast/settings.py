@@ -1,0 +1,140 @@
+"""What a user may choose about planning, as validated, immutable data.
+
+Each class is one section of the configuration file and has the key names of the thesis's YAML, so
+that its files load unchanged; the fields that the thesis does not have come after its own and have
+defaults. Bounds stand beside the fields, once: the loader reports a breach of them with file, key
+and value, and the constructor helper :func:`holdfast.configuration.load` is the only way in for
+outside data.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import msgspec
+
+__all__ = [
+    "ActiveSensingSettings",
+    "ParticleFilterSettings",
+    "PlanningSettings",
+    "SelectorSettings",
+    "SimulatorSettings",
+]
+
+MAX_PARTICLES = 10_000_000
+"""Bound on ``num_particles``: states of six coordinates then fill 480 MB."""
+
+Count = Annotated[int, msgspec.Meta(ge=1)]
+NonNegativeCount = Annotated[int, msgspec.Meta(ge=0)]
+Positive = Annotated[float, msgspec.Meta(gt=0.0)]
+Seed = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
+
+
+class ParticleFilterSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The section ``particle_filter``.
+
+    Attributes
+    ----------
+    num_particles : int
+        Number of particles, at least 1.
+    resampling_threshold : float
+        Resample after an observation when the effective sample size is at most this fraction of
+        the number of particles. 1 (the default) resamples after every observation.
+    """
+
+    num_particles: Annotated[int, msgspec.Meta(ge=1, le=MAX_PARTICLES)] = 100
+    resampling_threshold: Annotated[float, msgspec.Meta(ge=0.0, le=1.0)] = 1.0
+
+
+class ActiveSensingSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The section ``active_sensing``: Algorithm 2 and its entropy estimate.
+
+    Attributes
+    ----------
+    horizon : int
+        Number H of entropies added up: now, and after each of H - 1 predicted steps.
+    discount : float
+        Weight of the entropy h steps ahead is ``discount**h``.
+    num_observation_samples : int
+        Number M of hypothetical observations of each sensing action.
+    num_nearest_neighbors : int
+        The k of the nearest-neighbour estimate; below ``num_particles``.
+    num_cores : int
+        Threads of the kernel; 0 means all cores. Changes time only, never a result.
+    """
+
+    horizon: Annotated[int, msgspec.Meta(ge=1, le=1000)] = 1
+    discount: Annotated[float, msgspec.Meta(ge=0.0, le=1.0)] = 1.0
+    num_observation_samples: Annotated[int, msgspec.Meta(ge=1, le=1_000_000)] = 10
+    num_nearest_neighbors: Count = 5
+    num_cores: NonNegativeCount = 0
+
+
+class SelectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The section ``selector``: how the sensing action is chosen.
+
+    Attributes
+    ----------
+    method : {"action_entropy", "state_entropy", "random", "fixed"}
+        What is minimised; ``random`` and ``fixed`` look at no belief.
+    sensing_action : int
+        Index of the sensing action that ``fixed`` chooses.
+    estimator : {"nearest_neighbor", "gaussian_mixture_upper", "gaussian_mixture_lower"}
+        The entropy estimate.
+    actions : {"commanded", "executed"}
+        Whether ``action_entropy`` looks at what the policy says or at what the limits leave of it.
+    resolution : float or None
+        Distance below which two actions (or states) do not differ in practice, in their unit.
+        None takes the problem's own, which follows its motion noise.
+    """
+
+    method: Literal["action_entropy", "state_entropy", "random", "fixed"] = "action_entropy"
+    sensing_action: NonNegativeCount = 0
+    estimator: Literal["nearest_neighbor", "gaussian_mixture_upper", "gaussian_mixture_lower"] = (
+        "nearest_neighbor"
+    )
+    actions: Literal["commanded", "executed"] = "commanded"
+    resolution: Positive | None = None
+
+
+class SimulatorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The section ``simulator``: trials, their length and how often the robot senses.
+
+    Attributes
+    ----------
+    num_trials : int
+        Number of trials.
+    max_steps : int
+        Steps after which a trial has failed.
+    sensing_intervals : int
+        Steps between two sensing steps: the robot senses at every step t with
+        ``t % (sensing_intervals + 1) == 0``. (The thesis's spelling of the key.)
+    verbosity : int
+        Accepted because the thesis's files have it; the log level decides here.
+    seed : int
+        Seed of every random stream.
+    """
+
+    num_trials: Annotated[int, msgspec.Meta(ge=1, le=10_000_000)] = 10
+    max_steps: Annotated[int, msgspec.Meta(ge=1, le=10_000_000)] = 500
+    sensing_intervals: NonNegativeCount = 8
+    verbosity: NonNegativeCount = 0
+    seed: Seed = 0
+
+
+class PlanningSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """All that a decision depends on besides the problem and the state.
+
+    Attributes
+    ----------
+    particle_filter : ParticleFilterSettings
+    active_sensing : ActiveSensingSettings
+    selector : SelectorSettings
+    sensing_interval : int
+        Steps between two sensing steps.
+    """
+
+    particle_filter: ParticleFilterSettings = msgspec.field(default_factory=ParticleFilterSettings)
+    active_sensing: ActiveSensingSettings = msgspec.field(default_factory=ActiveSensingSettings)
+    selector: SelectorSettings = msgspec.field(default_factory=SelectorSettings)
+    sensing_interval: NonNegativeCount = 8

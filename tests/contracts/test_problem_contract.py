@@ -1,0 +1,245 @@
+"""What every registered problem promises, checked for each of them.
+
+A problem of your own can be put through the same checks: register it, and it is.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from holdfast.problems import registry
+from holdfast.problems.problem import FloatArray, IntArray, Problem
+from holdfast.randomness import Purpose, stream
+
+SEED = 11
+LEADING_SHAPES = [(), (1,), (13,), (3, 5), (2, 3, 4), (0,)]
+INITIAL = stream(SEED, 0, 0, Purpose.INITIAL_BELIEF)
+MOTION = stream(SEED, 0, 0, Purpose.PREDICTION)
+
+
+@pytest.fixture(scope="module", params=registry.names())
+def problem(request: pytest.FixtureRequest) -> Problem:
+    built = registry.problem_class(request.param).from_settings({}, {})
+    assert isinstance(built, Problem)
+    return built
+
+
+def some_states(problem: Problem, leading: tuple[int, ...]) -> FloatArray:
+    """Return states from all along the way: started, then moved by the policy for a while."""
+    count = int(np.prod(leading, dtype=int))
+    states = problem.initial_states(INITIAL, count)
+    for step in range(30):
+        actions = problem.execute(problem.policy(states, 0))
+        states = problem.move(states, actions, MOTION.substream(step))
+    return states.reshape(*leading, problem.state_size)
+
+
+def some_stages(problem: Problem, leading: tuple[int, ...]) -> IntArray:
+    count = int(np.prod(leading, dtype=int))
+    return (np.arange(count, dtype=np.int64) % problem.num_stages).reshape(leading)
+
+
+def test_attributes(problem: Problem) -> None:
+    assert problem.name in registry.names()
+    assert type(problem) is registry.problem_class(problem.name)
+    assert problem.state_size >= 1
+    assert problem.action_size >= 1
+    assert problem.num_stages >= 1
+    assert len(problem.sensing_actions) >= 1
+    assert all(isinstance(label, str) and label for label in problem.sensing_actions)
+    assert len(set(problem.sensing_actions)) == len(problem.sensing_actions)
+    assert len(problem.state_labels) == problem.state_size
+    assert 0.0 < problem.resolution < np.inf
+    assert problem.motion_variance.shape == (problem.action_size,)
+    assert (problem.motion_variance >= 0.0).all()
+
+
+def test_initial_states(problem: Problem) -> None:
+    states = problem.initial_states(INITIAL, 50)
+    assert states.shape == (50, problem.state_size)
+    assert states.dtype == np.float64
+    assert np.isfinite(states).all()
+    assert len(np.unique(states, axis=0)) == 50
+    assert problem.initial_states(INITIAL, 50).tobytes() == states.tobytes()
+    assert problem.initial_states(INITIAL, 20).tobytes() == states[:20].tobytes()
+    assert problem.initial_states(INITIAL.substream(1), 50).tobytes() != states.tobytes()
+
+
+@pytest.mark.parametrize("leading", LEADING_SHAPES)
+def test_shapes_and_kinds(problem: Problem, leading: tuple[int, ...]) -> None:
+    states = some_states(problem, leading)
+    stages = some_stages(problem, leading)
+    actions = problem.policy(states, stages)
+    executed = problem.execute(actions)
+    moved = problem.move(states, executed, MOTION)
+    for array, size in (
+        (actions, problem.action_size),
+        (executed, problem.action_size),
+        (moved, problem.state_size),
+    ):
+        assert array.shape == (*leading, size)
+        assert array.dtype == np.float64
+        assert np.isfinite(array).all()
+    reward = np.asarray(problem.reward(moved, executed))
+    assert reward.shape == leading
+    assert reward.dtype == np.float64
+    goal = np.asarray(problem.is_goal(states))
+    assert goal.shape == leading
+    assert goal.dtype == np.bool_
+    following = np.asarray(problem.next_stage(states, stages))
+    assert following.shape == leading
+    assert np.issubdtype(following.dtype, np.integer)
+
+
+@pytest.mark.parametrize("leading", LEADING_SHAPES)
+def test_observations(problem: Problem, leading: tuple[int, ...]) -> None:
+    states = some_states(problem, leading)
+    for sensing_action in range(len(problem.sensing_actions)):
+        mean = problem.observation_mean(states, sensing_action)
+        variance = problem.observation_variance(states, sensing_action)
+        assert mean.shape[:-1] == leading
+        assert mean.shape[-1] >= 1
+        assert variance.shape in {mean.shape, mean.shape[-1:]}
+        assert np.isfinite(mean).all()
+        assert (variance > 0.0).all()
+        assert np.isfinite(variance).all()
+
+
+def test_a_batch_is_its_elements(problem: Problem) -> None:
+    states = some_states(problem, (40,))
+    stages = some_stages(problem, (40,))
+    actions = problem.policy(states, stages)
+    executed = problem.execute(actions)
+    rewards = problem.reward(states, executed)
+    goals = problem.is_goal(states)
+    following = np.asarray(problem.next_stage(states, stages))
+    for n, state in enumerate(states):
+        stage = int(stages[n])
+        assert problem.policy(state, stage).tobytes() == actions[n].tobytes()
+        assert problem.execute(actions[n]).tobytes() == executed[n].tobytes()
+        assert problem.reward(state, executed[n]) == rewards[n]
+        assert problem.is_goal(state) == goals[n]
+        assert problem.next_stage(state, stage) == following[n]
+        for sensing_action in range(len(problem.sensing_actions)):
+            assert (
+                problem.observation_mean(state, sensing_action).tobytes()
+                == problem.observation_mean(states, sensing_action)[n].tobytes()
+            )
+
+
+def test_one_stage_for_a_belief_each(problem: Problem) -> None:
+    states = some_states(problem, (4, 6))
+    stages = some_stages(problem, (4,))
+    together = problem.policy(states, stages[:, np.newaxis])
+    for trial in range(4):
+        alone = problem.policy(states[trial], int(stages[trial]))
+        assert alone.tobytes() == together[trial].tobytes()
+
+
+def test_motion_is_a_function_of_state_action_and_stream(problem: Problem) -> None:
+    states = some_states(problem, (64,))
+    actions = problem.execute(problem.policy(states, 0))
+    moved = problem.move(states, actions, MOTION)
+    assert problem.move(states, actions, MOTION).tobytes() == moved.tobytes()
+    assert problem.move(states, actions, MOTION.substream(7)).tobytes() != moved.tobytes()
+    # The first particles move as they would without the others.
+    assert problem.move(states[:9], actions[:9], MOTION).tobytes() == moved[:9].tobytes()
+    # One action for all is that action for each.
+    shared = problem.move(states, actions[0], MOTION)
+    repeated = problem.move(states, np.tile(actions[0], (64, 1)), MOTION)
+    assert shared.tobytes() == repeated.tobytes()
+
+
+def test_the_noise_has_the_stated_variance(problem: Problem) -> None:
+    # Of particles that start in one place, many are free to move: their spread is the noise's.
+    count = 4000
+    start = problem.initial_states(INITIAL, 1)
+    spread = problem.move(
+        np.repeat(start, count, axis=0), np.zeros(problem.action_size), MOTION
+    ).var(axis=0)
+    # Walls can only cut the noise off. Five standard errors above is one false alarm in 10^6.
+    assert (spread <= problem.motion_variance * (1.0 + 5.0 * np.sqrt(2.0 / count))).all()
+    assert (spread >= 0.1 * problem.motion_variance).all()
+
+
+def test_limits_are_limits(problem: Problem) -> None:
+    commanded = INITIAL.normal((200, problem.action_size))
+    executed = problem.execute(commanded)
+    np.testing.assert_allclose(problem.execute(executed), executed, rtol=1e-15)
+    larger = np.abs(problem.execute(1e6 * commanded))
+    assert (np.abs(executed) <= larger.max(axis=0) * (1.0 + 1e-15)).all()
+    assert (executed * commanded >= 0.0).all()
+
+
+def test_stages_advance_one_by_one_to_the_last(problem: Problem) -> None:
+    states = some_states(problem, (200,))
+    for stage in range(problem.num_stages):
+        stages = np.full(200, stage, dtype=np.int64)
+        following = np.asarray(problem.next_stage(states, stages))
+        assert (following >= stage).all()
+        assert (following <= min(stage + 1, problem.num_stages - 1)).all()
+    single = problem.next_stage(states[0], 0)
+    assert isinstance(single, int)
+
+
+def test_nothing_changes_its_arguments(problem: Problem) -> None:
+    states = some_states(problem, (20,))
+    stages = some_stages(problem, (20,))
+    actions = problem.execute(problem.policy(states, stages))
+    for array in (states, stages, actions):
+        array.setflags(write=False)
+    problem.policy(states, stages)
+    problem.execute(actions)
+    problem.next_stage(states, stages)
+    problem.reward(states, actions)
+    problem.is_goal(states)
+    moved = problem.move(states, actions, MOTION)
+    assert not np.shares_memory(moved, states)
+
+
+def test_the_task_can_be_done(problem: Problem) -> None:
+    """With the state known, the policy reaches the goal in most trials."""
+    trials = 20
+    states = problem.initial_states(INITIAL, trials)
+    stages: int | IntArray = np.zeros(trials, dtype=np.int64)
+    done = np.zeros(trials, dtype=bool)
+    assert not problem.is_goal(states).any()
+    for step in range(1500):
+        stages = problem.next_stage(states, stages)
+        actions = problem.execute(problem.policy(states, stages))
+        states = problem.move(states, actions, MOTION.substream(step))
+        done |= problem.is_goal(states)
+        if done.all():
+            break
+    assert done.mean() >= 0.9
+
+
+def test_scene(problem: Problem) -> None:
+    scene = problem.scene()
+    if scene is None:
+        return
+    assert len(set(scene.axes)) == 2
+    assert all(0 <= axis < problem.state_size for axis in scene.axes)
+    x_min, y_min, x_max, y_max = scene.limits
+    assert x_min < x_max
+    assert y_min < y_max
+    assert (scene.obstacles[:, :2] < scene.obstacles[:, 2:]).all()
+    assert scene.angle is None or 0 <= scene.angle < problem.state_size
+
+
+def test_the_defaults_can_be_written_out_and_read_in(problem: Problem) -> None:
+    built = registry.problem_class(problem.name)
+    if not hasattr(problem, "model"):
+        pytest.skip("takes plain keyword arguments")
+    import msgspec
+
+    again = built.from_settings(
+        msgspec.to_builtins(problem.model),
+        msgspec.to_builtins(problem.state_space_planner),  # type: ignore[attr-defined]
+    )
+    states = some_states(problem, (10,))
+    assert again.policy(states, 0).tobytes() == problem.policy(states, 0).tobytes()
+    assert again.initial_states(INITIAL, 10).tobytes() == (
+        problem.initial_states(INITIAL, 10).tobytes()
+    )

@@ -1,0 +1,65 @@
+"""The entropy estimates, written for reading: one point, one neighbour at a time.
+
+Shares no code with the kernel; SciPy's digamma, NumPy's sorting.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+from scipy.special import digamma
+
+FloatArray = npt.NDArray[np.float64]
+
+
+def nearest_neighbor_entropy(
+    points: FloatArray, weights: FloatArray, neighbors: int, resolution: float
+) -> float:
+    kept = weights >= 1e-6 * weights.max()
+    points, weights = points[kept], weights[kept] / weights[kept].sum()
+    count, dimension = points.shape
+    log_ball = 0.5 * dimension * math.log(math.pi) - math.lgamma(0.5 * dimension + 1.0)
+    if count == 1:
+        return log_ball + dimension * math.log(resolution)
+    k = min(neighbors, count - 1)
+    total = 0.0
+    for n in range(count):
+        others = np.delete(np.arange(count), n)
+        # Squares compared with squares, as a radius that is a square root would move ties apart.
+        squared = np.zeros(count - 1)
+        for coordinate in range(dimension):
+            squared += (points[others, coordinate] - points[n, coordinate]) ** 2
+        kth = np.sort(squared)[k - 1]
+        # Distances that differ by rounding alone are equal.
+        tolerance = 1.0 + 2.0**-40
+        resolved = kth > resolution * resolution * tolerance
+        radius_squared = (kth if resolved else resolution * resolution) * tolerance
+        within = squared <= radius_squared
+        q = k if resolved else int(within.sum())
+        mass = weights[others][within].sum() / weights[others].sum()
+        total += weights[n] * (
+            -math.log(mass)
+            + log_ball
+            + 0.5 * dimension * math.log(radius_squared)
+            + math.log(q)
+            - digamma(q)
+        )
+    return float(total)
+
+
+def gaussian_mixture_entropy(
+    points: FloatArray, weights: FloatArray, variance: FloatArray, upper: bool
+) -> float:
+    kept = weights >= 1e-6 * weights.max()
+    points, weights = points[kept], weights[kept] / weights[kept].sum()
+    dimension = points.shape[1]
+    c = 0.5 if upper else 0.125
+    squared = (((points[:, None, :] - points[None, :, :]) ** 2) / variance).sum(axis=2)
+    mixture = -(weights * np.log((weights * np.exp(-c * squared)).sum(axis=1))).sum()
+    return float(
+        0.5 * dimension * math.log(2.0 * math.pi * math.e)
+        + 0.5 * np.log(variance).sum()
+        + mixture
+    )

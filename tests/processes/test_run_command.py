@@ -1,0 +1,302 @@
+"""``holdfast run`` as a person runs it: the real command, real processes, real signals."""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+COMMAND = [sys.executable, "-c", "from holdfast.cli import main; main()"]
+
+PEG = """
+problem: peg_in_hole_2d
+particle_filter: {num_particles: 40}
+active_sensing: {num_observation_samples: 3, num_cores: 1}
+simulator: {num_trials: 6, max_steps: 80, seed: 3}
+"""
+
+# Notes the process and the time of each trial's start, and makes it last a quarter of a second.
+SLOW = """
+import os
+import time
+from pathlib import Path
+
+from holdfast.problems.peg_in_hole_2d import PegInHole2D
+
+
+class Slow(PegInHole2D):
+    name = "slow"
+
+    def initial_states(self, stream, count):
+        if count == 1:
+            marks = Path(__file__).with_name("marks")
+            marks.mkdir(exist_ok=True)
+            (marks / f"{time.time_ns()}-{os.getpid()}").touch()
+            time.sleep(0.25)
+        return super().initial_states(stream, count)
+"""
+
+SLOW_CONFIGURATION = """
+problem: slow_problem:Slow
+particle_filter: {num_particles: 20}
+active_sensing: {num_observation_samples: 2, num_cores: 1}
+simulator: {num_trials: 16, max_steps: 10, seed: 3}
+"""
+
+
+def holdfast(directory: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [*COMMAND, *arguments],
+        cwd=directory,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+
+
+def decided(directory: Path) -> list[tuple[str, ...]]:
+    """The table of trials, without the times."""
+    with (directory / "trials.csv").open() as file:
+        return [
+            tuple(value for key, value in row.items() if key != "mean_sensing_ms")
+            for row in csv.DictReader(file)
+        ]
+
+
+def summary(directory: Path) -> dict[str, object]:
+    content = json.loads((directory / "summary.json").read_text())
+    assert isinstance(content, dict)
+    return content
+
+
+@pytest.fixture
+def workplace(tmp_path: Path) -> Path:
+    (tmp_path / "peg.yaml").write_text(PEG)
+    (tmp_path / "slow.yaml").write_text(SLOW_CONFIGURATION)
+    (tmp_path / "slow_problem.py").write_text(SLOW)
+    return tmp_path
+
+
+def wait_until(condition: Callable[[], bool], what: str) -> None:
+    """Wait for something that other processes do; generous, because machines can be busy."""
+    deadline = time.monotonic() + 60.0
+    while not condition():
+        assert time.monotonic() < deadline, f"waited in vain for {what}"
+        time.sleep(0.02)
+
+
+class SlowRun:
+    """A run of the slow problem that is going on."""
+
+    def __init__(self, workplace: Path) -> None:
+        self._marks = workplace / "marks"
+        self.process = subprocess.Popen(
+            [*COMMAND, "run", "slow.yaml", "--jobs", "2", "--out", "out"],
+            cwd=workplace,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            # A process group of its own, which gets the signals that a terminal would send.
+            start_new_session=True,
+        )
+
+    def workers(self) -> list[int]:
+        """Processes that have started a trial, without the parent, in the order of their starts."""
+        names = sorted(path.name for path in self._marks.glob("*"))
+        pids = dict.fromkeys(int(name.split("-")[1]) for name in names)
+        return [pid for pid in pids if pid != self.process.pid]
+
+    def wait_for_workers(self) -> None:
+        wait_until(lambda: len(self.workers()) == 2, "two workers")
+
+    def end(self) -> str:
+        _, errors = self.process.communicate(timeout=60)
+        return errors
+
+
+@pytest.fixture
+def slow_run(workplace: Path) -> Iterator[SlowRun]:
+    run = SlowRun(workplace)
+    with run.process:
+        try:
+            yield run
+        finally:
+            # The group is the run's own, and empty if all went well.
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(run.process.pid, signal.SIGKILL)
+
+
+def is_alive(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+class TestOutput:
+    def test_files_and_what_is_said(self, workplace: Path) -> None:
+        done = holdfast(workplace, "run", "peg.yaml", "--out", "out")
+        assert done.returncode == 0, done.stderr
+        names = {path.name for path in (workplace / "out").iterdir()}
+        assert names == {
+            "trials.csv",
+            "summary.json",
+            "config.yaml",
+            "journal.sqlite",
+            "trial.png",
+        }
+        assert all(name in done.stdout for name in names)
+        assert "success" in done.stdout
+        assert done.stderr.splitlines() == ["peg_in_hole_2d, 6 trials, seed 3; results in out"]
+        assert [row[0] for row in decided(workplace / "out")] == ["0", "1", "2", "3", "4", "5"]
+        assert summary(workplace / "out")["finished"] == 6
+
+    def test_the_resolved_configuration_runs_again_to_the_same(self, workplace: Path) -> None:
+        holdfast(workplace, "run", "peg.yaml", "--out", "first", "--seed", "8", "--trials", "3")
+        again = holdfast(workplace, "run", "first/config.yaml", "--out", "second", "--jobs", "1")
+        assert again.returncode == 0, again.stderr
+        assert decided(workplace / "second") == decided(workplace / "first")
+        assert summary(workplace / "second")["digest"] == summary(workplace / "first")["digest"]
+        assert summary(workplace / "second")["seed"] == 8
+
+    def test_quiet_says_nothing(self, workplace: Path) -> None:
+        done = holdfast(workplace, "run", "peg.yaml", "--out", "out", "--quiet")
+        assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+    def test_without_out_directories_are_numbered(self, workplace: Path) -> None:
+        for name in ("peg-seed3", "peg-seed3-2"):
+            assert holdfast(workplace, "run", "peg.yaml", "--trials", "1").returncode == 0
+            assert (workplace / "runs" / name / "trials.csv").is_file()
+
+    def test_without_matplotlib_there_is_no_figure_but_all_else(self, workplace: Path) -> None:
+        (workplace / "absent").mkdir()
+        (workplace / "absent" / "matplotlib.py").write_text(
+            "raise ModuleNotFoundError(\"No module named 'matplotlib'\", name='matplotlib')\n"
+        )
+        done = subprocess.run(
+            [*COMMAND, "run", "peg.yaml", "--out", "out"],
+            cwd=workplace,
+            env=os.environ | {"PYTHONPATH": str(workplace / "absent")},
+            capture_output=True,
+            text=True,
+            timeout=120,
+            check=False,
+        )
+        assert done.returncode == 0, done.stderr
+        assert "pip install 'holdfast[figures]'" in done.stderr
+        assert not (workplace / "out" / "trial.png").exists()
+        assert (workplace / "out" / "summary.json").exists()
+
+    def test_version(self, workplace: Path) -> None:
+        done = holdfast(workplace, "--version")
+        assert done.returncode == 0
+        assert done.stdout.startswith("holdfast ")
+
+
+class TestInterruption:
+    def test_ctrl_c_ends_promptly_and_resume_ends_as_if_nothing_was(
+        self, workplace: Path, slow_run: SlowRun
+    ) -> None:
+        slow_run.wait_for_workers()
+        # The whole group, as Ctrl-C at a terminal does it: the workers get it as well.
+        os.killpg(slow_run.process.pid, signal.SIGINT)
+        errors = slow_run.end()
+        assert slow_run.process.returncode == 130
+        assert "Traceback" not in errors
+        assert "Interrupted." in errors
+        assert "holdfast run slow.yaml --jobs 2 --out out --resume" in errors
+        wait_until(
+            lambda: not any(is_alive(pid) for pid in slow_run.workers()), "the end of the workers"
+        )
+        kept = decided(workplace / "out")
+        assert 0 < len(kept) < 16
+        assert summary(workplace / "out")["finished"] == len(kept)
+
+        resumed = holdfast(workplace, "run", "slow.yaml", "--out", "out", "--resume")
+        assert resumed.returncode == 0, resumed.stderr
+        assert f"{len(kept)} finished before" in resumed.stderr
+        whole = holdfast(workplace, "run", "slow.yaml", "--out", "whole", "--jobs", "1")
+        assert whole.returncode == 0, whole.stderr
+        assert decided(workplace / "out") == decided(workplace / "whole")
+        assert len(decided(workplace / "out")) == 16
+
+    def test_a_killed_worker_is_reported_with_its_trial(
+        self, workplace: Path, slow_run: SlowRun
+    ) -> None:
+        slow_run.wait_for_workers()
+        os.kill(slow_run.workers()[0], signal.SIGKILL)
+        errors = slow_run.end()
+        assert slow_run.process.returncode == 2
+        assert "Traceback" not in errors
+        assert "a worker process was killed by SIGKILL while it ran trial " in errors
+        kept = len(decided(workplace / "out"))
+        assert 0 < kept < 16
+        resumed = holdfast(workplace, "run", "slow.yaml", "--out", "out", "--resume")
+        assert resumed.returncode == 0, resumed.stderr
+        assert summary(workplace / "out")["finished"] == 16
+
+    def test_a_killed_parent_leaves_a_run_that_can_go_on(
+        self, workplace: Path, slow_run: SlowRun
+    ) -> None:
+        slow_run.wait_for_workers()
+        os.kill(slow_run.process.pid, signal.SIGKILL)
+        slow_run.process.wait(timeout=60)
+        wait_until(
+            lambda: not any(is_alive(pid) for pid in slow_run.workers()), "the end of the workers"
+        )
+        resumed = holdfast(workplace, "run", "slow.yaml", "--out", "out", "--resume")
+        assert resumed.returncode == 0, resumed.stderr
+        assert "finished before" in resumed.stderr
+        assert summary(workplace / "out")["finished"] == 16
+
+
+class TestErrors:
+    @staticmethod
+    def fails(workplace: Path, *arguments: str) -> str:
+        done = holdfast(workplace, *arguments)
+        assert done.returncode == 2
+        assert done.stdout == ""
+        assert done.stderr.startswith("holdfast: error: ")
+        assert "Traceback" not in done.stderr
+        return done.stderr
+
+    def test_a_missing_configuration(self, workplace: Path) -> None:
+        assert "missing.yaml" in self.fails(workplace, "run", "missing.yaml")
+        assert not (workplace / "runs").exists()
+
+    def test_a_directory_that_cannot_be_made(self, workplace: Path) -> None:
+        assert "is a file" in self.fails(workplace, "run", "peg.yaml", "--out", "peg.yaml")
+
+    def test_a_directory_that_holds_a_run(self, workplace: Path) -> None:
+        assert holdfast(workplace, "run", "peg.yaml", "--out", "out").returncode == 0
+        before = (workplace / "out" / "summary.json").read_bytes()
+        assert "--resume" in self.fails(workplace, "run", "peg.yaml", "--out", "out")
+        error = self.fails(workplace, "run", "peg.yaml", "--out", "out", "--seed", "4", "--resume")
+        assert "simulator.seed is 3 there and 4 here" in error
+        assert (workplace / "out" / "summary.json").read_bytes() == before
+
+    def test_nothing_to_resume(self, workplace: Path) -> None:
+        assert "no run to resume" in self.fails(workplace, "run", "peg.yaml", "--resume")
+
+    def test_a_defect_keeps_its_traceback_and_names_the_trial(self, workplace: Path) -> None:
+        (workplace / "broken.py").write_text(
+            "from holdfast.problems.peg_in_hole_2d import PegInHole2D\n"
+            "class Broken(PegInHole2D):\n"
+            "    def policy(self, states, stage):\n"
+            "        raise ZeroDivisionError\n"
+        )
+        done = holdfast(workplace, "run", "peg.yaml", "--problem", "broken:Broken", "--out", "out")
+        assert done.returncode == 1
+        assert "Traceback" in done.stderr
+        assert "in trial 0 (seed 3)" in done.stderr

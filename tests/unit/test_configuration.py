@@ -1,0 +1,549 @@
+"""The configuration file: what loads, to what, and what every mistake in it is answered with."""
+
+from __future__ import annotations
+
+import pickle
+import re
+import sys
+import textwrap
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from holdfast.configuration import Configuration, load
+from holdfast.errors import ConfigurationError, UnknownProblemError
+from holdfast.problems import registry
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+
+# The thesis's file for peg-in-hole, key by key, without anything of ours.
+THESIS = """\
+model:
+  state_size: 3
+  peg_width: 1
+  peg_height: 2
+  hole_tolerance: 0.1
+  init_mean: [4, 2, 0]
+  init_cov: [2, 1, 1.57]
+  motion_cov: [0.01, 0.01, 0.01]
+  sensing_cov: 0.001
+  collision_tol: 0.001
+particle_filter:
+  num_particles: 100
+state_space_planner:
+  translation_step_size: 0.1
+  rotation_step_size: 0.1
+active_sensing:
+  horizon: 1
+  discount: 1.0
+  num_observation_samples: 10
+  num_nearest_neighbors: 5
+  num_cores: 8
+simulator:
+  num_trials: 10
+  max_steps: 700
+  sensing_intervals: 8
+  verbosity: 0
+"""
+
+# A user's problem beside the configuration: once with keyword arguments, once with structs.
+LAMPS = """\
+from typing import Annotated
+
+import msgspec
+import numpy as np
+
+from holdfast.problems.problem import ProblemBase
+
+
+class Lamp(msgspec.Struct, forbid_unknown_fields=True):
+    center: tuple[float, float]
+    height: Annotated[float, msgspec.Meta(gt=0.0)] = 1.0
+
+
+class Model(msgspec.Struct, forbid_unknown_fields=True):
+    colour: str = "red"
+    lamps: Annotated[list[Lamp], msgspec.Meta(min_length=1)] = msgspec.field(
+        default_factory=lambda: [Lamp((0.0, 0.0))]
+    )
+    weights: dict[str, float] = {}
+
+
+class Planner(msgspec.Struct, forbid_unknown_fields=True):
+    gain: Annotated[float, msgspec.Meta(ge=0.0, le=10.0)] = 1.0
+
+
+class Keywords(ProblemBase):
+    name = "lamps"
+    state_size = action_size = 1
+    sensing_actions = ("left", "right")
+
+    def __init__(self, gain=1.0, brightness=(1, 2), colour="red", lamps=None):
+        if gain < 0.0:
+            raise ValueError(f"gain is {gain}; it must not be negative")
+        self.gain = gain
+        self.colour = colour
+
+    def initial_states(self, stream, count): return np.zeros((count, 1))
+    def move(self, states, actions, stream): return states + actions
+    def observation_mean(self, states, sensing_action): return states
+    def observation_variance(self, states, sensing_action): return np.ones(1)
+    def policy(self, states, stage): return -self.gain * states
+    def is_goal(self, states): return np.abs(states[..., 0]) < 0.1
+
+
+class Structs(Keywords):
+    Model = Model
+    StateSpacePlanner = Planner
+
+    @classmethod
+    def from_settings(cls, model, state_space_planner):
+        return cls(
+            gain=msgspec.convert(state_space_planner, Planner).gain,
+            colour=msgspec.convert(model, Model).colour,
+        )
+
+
+class Unfinished(ProblemBase):
+    state_size = 1
+"""
+
+Write = Callable[[str], Path]
+
+
+@pytest.fixture
+def write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Write:
+    # A problem beside the file puts its directory on the import path; take it off again.
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    monkeypatch.delitem(sys.modules, "lamps", raising=False)
+
+    def write_file(text: str) -> Path:
+        (tmp_path / "lamps.py").write_text(LAMPS)
+        path = tmp_path / "run.yaml"
+        path.write_text(textwrap.dedent(text), encoding="utf-8")
+        return path
+
+    return write_file
+
+
+def complaint(path: Path, **arguments: Any) -> str:
+    """Load a file that cannot be used and return the message, which is one or two lines."""
+    with pytest.raises(ConfigurationError) as caught:
+        load(path, **arguments)
+    message = str(caught.value)
+    assert message.count("\n") <= 1, message
+    return message
+
+
+class TestWhatLoads:
+    def test_the_thesis_file_as_it_stands(self, write: Write) -> None:
+        configuration = load(write(THESIS))
+        assert configuration.problem_name == "peg_in_hole_2d"
+        assert configuration.problem.name == "peg_in_hole_2d"
+        assert configuration.planning.particle_filter.num_particles == 100
+        assert configuration.planning.active_sensing.num_nearest_neighbors == 5
+        assert configuration.planning.active_sensing.num_cores == 8
+        assert configuration.planning.sensing_interval == 8
+        assert configuration.simulator.max_steps == 700
+        assert configuration.model["init_cov"] == pytest.approx([2, 1, 1.57])
+
+    def test_the_thesis_example_has_exactly_the_thesis_keys_and_values(self) -> None:
+        example = yaml.safe_load((EXAMPLES / "thesis.yaml").read_text(encoding="utf-8"))
+        assert example.pop("problem") == "peg_in_hole_2d"
+        assert example == yaml.safe_load(THESIS)
+
+    @pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.yaml")), ids=lambda path: path.stem)
+    def test_an_example_loads_and_is_told_by_its_keys(self, path: Path, write: Write) -> None:
+        named = load(path)
+        text = path.read_text(encoding="utf-8")
+        inferred = load(write(re.sub(r"(?m)^problem: .*$", "", text)))
+        assert inferred == named
+
+    @pytest.mark.parametrize("name", registry.names())
+    def test_nothing_but_the_name(self, name: str, write: Write) -> None:
+        configuration = load(write(f"problem: {name}"))
+        assert configuration.problem.name == name
+        assert configuration.planning.particle_filter.num_particles == 100
+
+    def test_the_argument_rules_over_the_file(self, write: Write) -> None:
+        path = write("problem: peg_in_hole_2d\nsimulator: {num_trials: 3, seed: 4}")
+        assert load(path).simulator.num_trials == 3
+        configuration = load(path, problem="capsule_robot", num_trials=5, seed=6)
+        assert configuration.problem_name == "capsule_robot"
+        assert (configuration.simulator.num_trials, configuration.simulator.seed) == (5, 6)
+
+    def test_an_empty_section_has_its_defaults(self, write: Write) -> None:
+        empty = load(write("problem: peg_in_hole_2d\nmodel:\nsimulator: ~\nselector: {}"))
+        assert empty == load(write("problem: peg_in_hole_2d"))
+
+    @pytest.mark.parametrize("text", ["1e-3", "1E-3", ".001", "0.001", "1.0e-03", "+1e-3"])
+    def test_every_spelling_of_a_number(self, text: str, write: Write) -> None:
+        configuration = load(write(f"problem: peg_in_hole_2d\nmodel: {{sensing_cov: {text}}}"))
+        assert configuration.model["sensing_cov"] == 1e-3
+
+    def test_a_byte_order_mark_and_anchors(self, write: Write) -> None:
+        path = write(
+            "\ufeffproblem: peg_in_hole_2d\nmodel: {init_cov: &c [1, 1, 1], motion_cov: *c}"
+        )
+        assert load(path).model["motion_cov"] == load(path).model["init_cov"]
+
+    @pytest.mark.parametrize("kind", ["Keywords", "Structs"])
+    def test_a_problem_beside_the_file(self, kind: str, write: Write) -> None:
+        configuration = load(
+            write(
+                f"problem: lamps:{kind}\nmodel: {{colour: 'no'}}\nstate_space_planner: {{gain: 2}}"
+            )
+        )
+        assert configuration.problem_name == f"lamps:{kind}"
+        assert (configuration.problem.colour, configuration.problem.gain) == ("no", 2)  # type: ignore[attr-defined]
+
+
+class TestResolved:
+    @pytest.mark.parametrize(
+        "text",
+        [
+            THESIS,
+            "problem: capsule_robot\nselector: {method: fixed, sensing_action: 1, resolution: 1e-7}"
+            "\nsimulator: {sensing_intervals: 0}",
+            "problem: multitier_peg_in_hole_2d\nsimulator: {seed: 9223372036854775807}",
+            "problem: lamps:Keywords\nmodel: {colour: '1e-3', lamps: [1, null, {a: 'yes'}]}",
+            "problem: lamps:Structs\nmodel: {lamps: [{center: [0.1, 1e22]}], weights: {'1': 2}}",
+        ],
+        ids=["thesis", "capsule", "multitier", "keywords", "structs"],
+    )
+    def test_it_loads_to_the_same(self, text: str, write: Write) -> None:
+        configuration = load(write(text))
+        again = load(write(configuration.to_yaml()))
+        assert again == configuration
+        assert again.to_yaml() == configuration.to_yaml()
+
+    def test_every_default_is_written(self, write: Write) -> None:
+        resolved = yaml.safe_load(load(write("problem: peg_in_hole_2d")).to_yaml())
+        assert resolved["problem"] == "peg_in_hole_2d"
+        assert resolved["model"]["peg_height"] == 2
+        assert resolved["state_space_planner"] == {
+            "translation_step_size": 0.1,
+            "rotation_step_size": 0.1,
+        }
+        assert resolved["selector"]["method"] == "action_entropy"
+        assert resolved["selector"]["resolution"] is None
+        assert resolved["simulator"]["seed"] == 0
+
+    def test_defaults_of_keyword_arguments_are_written_where_yaml_holds_them(
+        self, write: Write
+    ) -> None:
+        resolved = load(write("problem: lamps:Keywords\nstate_space_planner: {gain: 2}")).to_yaml()
+        assert yaml.safe_load(resolved)["model"] == {"colour": "red", "lamps": None}
+
+    @pytest.mark.parametrize("text", [THESIS, "problem: lamps:Keywords"], ids=["thesis", "lamps"])
+    def test_another_process_rebuilds_it(self, text: str, write: Write) -> None:
+        configuration = load(write(text), seed=7)
+        plain = pickle.loads(pickle.dumps(configuration.plain()))
+        again = Configuration.from_plain(plain)
+        assert again == configuration
+        assert again.path.samefile(configuration.path)
+        assert type(again.problem) is type(configuration.problem)
+
+    def test_other_plain_data_is_refused(self) -> None:
+        with pytest.raises(ConfigurationError, match="path and configuration"):
+            Configuration.from_plain({"problem": "peg_in_hole_2d"})
+
+
+class TestFiles:
+    def test_missing(self, tmp_path: Path) -> None:
+        assert "absent.yaml: there is no such file" in complaint(tmp_path / "absent.yaml")
+
+    def test_directory(self, tmp_path: Path) -> None:
+        assert f"{tmp_path}: is a directory" in complaint(tmp_path)
+
+    def test_below_a_file(self, write: Write) -> None:
+        assert "cannot be read: Not a directory" in complaint(write(THESIS) / "run.yaml")
+
+    def test_a_name_that_no_file_can_have(self) -> None:
+        assert "cannot be read" in complaint(Path("a\0b"))
+
+    def test_not_utf8(self, tmp_path: Path) -> None:
+        path = tmp_path / "run.yaml"
+        path.write_bytes(b"problem: peg_in_hole_2d\n# caf\xe9\n")
+        assert "run.yaml, line 2: not UTF-8 text (byte 0xe9" in complaint(path)
+
+    def test_too_large(self, tmp_path: Path) -> None:
+        path = tmp_path / "run.yaml"
+        path.write_bytes(b"#" * (1024 * 1024 + 1))
+        assert "run.yaml: over 1048576 bytes" in complaint(path)
+
+    @pytest.mark.parametrize("text", ["", "# nothing\n", "---\n"])
+    def test_empty(self, text: str, write: Write) -> None:
+        assert "run.yaml: is empty; a configuration has the sections model," in complaint(
+            write(text)
+        )
+
+    @pytest.mark.parametrize(
+        ("text", "expected"),
+        [
+            ("- model\n", "is a list at the top, where a mapping"),
+            ("peg_in_hole_2d\n", 'is "peg_in_hole_2d" at the top'),
+            ("3\n", "is 3 at the top"),
+        ],
+    )
+    def test_not_a_mapping(self, text: str, expected: str, write: Write) -> None:
+        assert expected in complaint(write(text))
+
+
+class TestYaml:
+    @pytest.mark.parametrize(
+        ("text", "expected"),
+        [
+            ("model:\n\tpeg_width: 1\n", "run.yaml, line 2, column 1: not YAML: found character"),
+            ("model: {peg_width: 1\n", "run.yaml, line 2, column 1: not YAML: expected"),
+            ("a: 1\n---\nb: 2\n", "line 2, column 1: not YAML: but found another document"),
+            ("model: *x\n", "line 1, column 8: not YAML: found undefined alias 'x'"),
+            ("model:\n  a: '\x01'\n", "line 2: not YAML: the character U+0001 is not allowed"),
+        ],
+    )
+    def test_not_yaml(self, text: str, expected: str, write: Write) -> None:
+        assert expected in complaint(write(text))
+
+    @pytest.mark.parametrize(
+        ("text", "expected"),
+        [
+            (
+                "simulator:\n  seed: 1\n  max_steps: 5\n  seed: 2\n",
+                "line 4, column 3: the key simulator.seed stands twice, on lines 2 and 4",
+            ),
+            ("simulator: {seed: 1, seed: 1}", "simulator.seed stands twice, on line 1"),
+            ("model: {a: 1}\nmodel: {b: 1}", "the key model stands twice, on lines 1 and 2"),
+        ],
+    )
+    def test_a_key_that_stands_twice(self, text: str, expected: str, write: Write) -> None:
+        assert expected in complaint(write(text))
+
+    @pytest.mark.parametrize("text", [".nan", ".inf", "-.inf", "1e999"])
+    def test_not_finite(self, text: str, write: Write) -> None:
+        message = complaint(write(f"model:\n  init_mean: [4, {text}, 0]\n"))
+        assert f"line 2, column 18: model.init_mean[1]: {text} is not a finite number" in message
+
+    @pytest.mark.parametrize("text", ["no", "On", "YES", "010", "1:30", "1_000"])
+    def test_what_yaml_readers_read_differently(self, text: str, write: Write) -> None:
+        message = complaint(write(f"simulator:\n  num_trials: {text}\n"))
+        assert f"line 2, column 15: simulator.num_trials: {text} means different things" in message
+
+    @pytest.mark.parametrize("text", ["9223372036854775808", "-9223372036854775809", "9" * 5000])
+    def test_a_number_over_64_bits(self, text: str, write: Write) -> None:
+        assert "does not fit into 64 bits" in complaint(write(f"simulator: {{seed: {text}}}"))
+
+    @pytest.mark.parametrize(
+        "value", ["!!python/object/apply:os.system [x]", "!!set {x}", "!mine x", "!!int x"]
+    )
+    def test_tags(self, value: str, write: Write) -> None:
+        assert "the tag" in complaint(write(f"model: {{peg_width: {value}}}"))
+
+    @pytest.mark.parametrize("key", ["1", "null", "true", "0.5", "[a, b]"])
+    def test_a_key_that_is_not_text(self, key: str, write: Write) -> None:
+        assert "stands as a key, which only text may" in complaint(write(f"model: {{{key}: 1}}"))
+
+    @pytest.mark.parametrize(
+        ("text", "expected"),
+        [
+            ("[" * 100_000, "more than 32 levels"),
+            ("model: &a [*a]", "more than 32 levels"),
+            ("model: [" + "1," * 100_001 + "]", "more than 100000 keys and values"),
+            (
+                "a0: &a0 [0,0,0,0,0,0,0,0,0,0]\n"
+                + "".join(f"a{i}: &a{i} [{','.join([f'*a{i - 1}'] * 10)}]\n" for i in range(1, 8)),
+                "more than 100000 values, counting what aliases repeat",
+            ),
+        ],
+        ids=["deep", "endless", "long", "exploding"],
+    )
+    def test_documents_made_to_exhaust_memory(self, text: str, expected: str, write: Write) -> None:
+        assert expected in complaint(write(text))
+
+
+class TestKeysAndValues:
+    @pytest.mark.parametrize(
+        ("text", "expected"),
+        [
+            (
+                "particle_filter:\n  num_particles: 0",
+                "run.yaml, line 3: particle_filter.num_particles is 0;"
+                " expected a whole number >= 1 and <= 10000000",
+            ),
+            ("particle_filter: {num_particles: ten}", 'is "ten"; expected a whole number'),
+            ("particle_filter: {num_particles: 2.5}", "is 2.5; expected a whole number"),
+            ("particle_filter: {num_particles: true}", "is true; expected a whole number"),
+            ("particle_filter: {num_particles: }", "is null; expected a whole number"),
+            ("particle_filter: {num_particles: [1]}", "is [1] (a list of 1); expected a whole"),
+            ("active_sensing: {discount: 1.5}", "discount is 1.5; expected a number >= 0 and <= 1"),
+            ("selector: {resolution: 0}", "is 0; expected a number > 0 or null"),
+            (
+                "selector: {method: action-entropy}",
+                'selector.method is "action-entropy"; expected one of action_entropy, fixed,'
+                " random, state_entropy; did you mean action_entropy?",
+            ),
+            ("model: {init_mean: [1, 2]}", "is [1, 2] (a list of 2); expected a list of 3"),
+            ("model: {init_mean: [1, 2, x]}", 'model.init_mean[2] is "x"; expected a number'),
+            ("model: {peg_width: -1}", "model.peg_width is -1; expected a number > 0"),
+            ("state_space_planner: {rotation_step_size: 0}", "rotation_step_size is 0; expected"),
+            ("simulator: {seed: -1}", "simulator.seed is -1; expected a whole number >= 0"),
+            ("simulator: 3", "line 2: simulator is 3; expected a mapping of keys"),
+            ("simulator: [seed]", 'simulator is ["seed"]; expected a mapping of keys'),
+            ("simulator: ''", 'simulator is ""; expected a mapping of keys'),
+            (f"simulator: {{seed: {'x' * 500}}}", f'is "{"x" * 56}...; expected a whole number'),
+        ],
+    )
+    def test_a_value_that_is_not_allowed(self, text: str, expected: str, write: Write) -> None:
+        assert expected in complaint(write(f"problem: peg_in_hole_2d\n{text}"))
+
+    @pytest.mark.parametrize(
+        ("text", "expected"),
+        [
+            (
+                "\nparticle_filter:\n  num_particle: 10",
+                "line 4: particle_filter.num_particle is not a known key; did you mean"
+                " num_particles?\nallowed: num_particles, resampling_threshold",
+            ),
+            (
+                "model: {peg_wdth: 1}",
+                "model.peg_wdth is not a known key; did you mean peg_width?\nallowed: state_size,",
+            ),
+            (
+                "particle_filter: {horizon: 2}",
+                "particle_filter.horizon is a key of active_sensing, not of particle_filter",
+            ),
+            (
+                "model: {rotation_step_size: 2}",
+                "model.rotation_step_size is a key of state_space_planner, not of model",
+            ),
+            (
+                "particle_filters: {num_particles: 10}",
+                "particle_filters is not a known section; did you mean particle_filter?\n"
+                "allowed: problem, model, particle_filter, state_space_planner, active_sensing,",
+            ),
+            ("num_particles: 10", "line 2: num_particles is not a known section"),
+            ("simulator: {'\\e[2J': 1}", "is not a known key"),
+        ],
+    )
+    def test_a_key_that_is_not_known(self, text: str, expected: str, write: Write) -> None:
+        assert expected in complaint(write(f"problem: peg_in_hole_2d\n{text}"))
+
+    def test_no_control_character_reaches_the_terminal(self, write: Write) -> None:
+        message = complaint(write('problem: peg_in_hole_2d\nsimulator: {"\\e[2J": "\\e[2J"}'))
+        assert "\x1b" not in message
+        message = complaint(write('problem: peg_in_hole_2d\nsimulator: {seed: "\\e[2J"}'))
+        assert "\x1b" not in message
+
+    def test_within_the_lists_of_a_problem(self, write: Write) -> None:
+        holes = "problem: multitier_peg_in_hole_2d\nmodel:\n  holes:\n    - {}\n    - {}\n".format
+        good = "center: [0, 0], tol: 0.1, depth: 1"
+        message = complaint(write(holes(f"{{{good}}}", f"{{{good}, width: 1}}")))
+        assert "line 5: model.holes[1].width is not a known key" in message
+        assert "allowed: center, tol, depth" in message
+        message = complaint(write(holes(f"{{{good}}}", "{center: [0], tol: 0.1, depth: 1}")))
+        assert "model.holes[1].center is [0] (a list of 1); expected a list of 2" in message
+        message = complaint(write(holes("{tol: 0.1, depth: 1}", f"{{{good}}}")))
+        assert "line 4: model.holes[0].center is missing; it has no default" in message
+
+    def test_what_is_given_as_an_argument(self, write: Write) -> None:
+        message = complaint(write("problem: peg_in_hole_2d\nsimulator: {seed: 3}"), seed=-1)
+        assert re.match(
+            r"simulator\.seed, given instead of what .*run\.yaml says, is -1; ", message
+        )
+        assert "num_trials, given instead" in complaint(write(THESIS), num_trials=0)
+
+
+class TestTwoKeys:
+    def test_neighbours_need_as_many_other_particles(self, write: Write) -> None:
+        text = "problem: peg_in_hole_2d\nparticle_filter: {num_particles: %d}\n"
+        message = complaint(write(text % 5 + "active_sensing:\n  num_nearest_neighbors: 5"))
+        assert "line 4: active_sensing.num_nearest_neighbors is 5;" in message
+        assert "below particle_filter.num_particles, which is 5" in message
+        assert "is 5;" in complaint(write(text % 4))  # The default breaks it as well.
+        assert load(write(text % 6)).planning.particle_filter.num_particles == 6
+
+    @pytest.mark.parametrize(
+        "selector", ["{estimator: gaussian_mixture_upper}", "{method: random}", "{method: fixed}"]
+    )
+    def test_where_neighbours_are_not_counted_one_particle_is_enough(
+        self, selector: str, write: Write
+    ) -> None:
+        text = "problem: peg_in_hole_2d\nparticle_filter: {num_particles: 1}\nselector: "
+        assert load(write(text + selector)).planning.particle_filter.num_particles == 1
+
+    def test_a_fixed_sensing_action_exists(self, write: Write) -> None:
+        text = "problem: peg_in_hole_2d\nselector: {method: %s, sensing_action: %d}"
+        message = complaint(write(text % ("fixed", 3)))
+        assert "line 2: selector.sensing_action is 3; peg_in_hole_2d has the" in message
+        assert "sensing actions 0 to 2 (x, y, θ)" in message
+        assert load(write(text % ("fixed", 2))).planning.selector.sensing_action == 2
+        assert load(write(text % ("action_entropy", 3))).planning.selector.sensing_action == 3
+
+
+class TestProblems:
+    def test_none_named_and_none_told(self, write: Write) -> None:
+        message = complaint(write("model: {colour: red}"))
+        assert "names no problem, and the keys of its model do not tell it" in message
+        for name in registry.names():
+            assert name in message
+
+    def test_several_told(self, write: Write) -> None:
+        message = complaint(write("model: {peg_width: 1, robot_radius: 0.1}"))
+        assert "belong to capsule_robot and peg_in_hole_2d" in message
+
+    def test_unknown(self, write: Write) -> None:
+        with pytest.raises(UnknownProblemError) as caught:
+            load(write("\nproblem: peg_in_hole_2\n"))
+        message = str(caught.value)
+        assert "run.yaml, line 2: problem" in message
+        assert "peg_in_hole_2d" in message
+
+    def test_unknown_as_an_argument(self, write: Write) -> None:
+        with pytest.raises(UnknownProblemError, match="capsule_robot"):
+            load(write(THESIS), problem="capsule")
+
+    @pytest.mark.parametrize("name", ["lamps:Absent", "absent_module:Lamps", "lamps:"])
+    def test_not_importable(self, name: str, write: Write) -> None:
+        with pytest.raises(UnknownProblemError):
+            load(write(f"problem: '{name}'"))
+
+    @pytest.mark.parametrize("name", ["3", "[a]", "{a: b}"])
+    def test_not_a_name(self, name: str, write: Write) -> None:
+        message = complaint(write(f"problem: {name}"))
+        assert "line 1: problem is" in message
+        assert "or module:Class" in message
+
+    @pytest.mark.parametrize(
+        ("text", "expected"),
+        [
+            (
+                "lamps:Keywords\nmodel:\n  color: red",
+                "line 3: model.color is not a known key; did you mean colour?\n"
+                "allowed: gain, brightness, colour, lamps",
+            ),
+            (
+                "lamps:Keywords\nmodel: {gain: 1}\nstate_space_planner: {gain: 1}",
+                "gain: given in both model and state_space_planner",
+            ),
+            (
+                "lamps:Keywords\nstate_space_planner:\n  gain: -1",
+                "line 3: gain is -1; it must not be negative",
+            ),
+            ("lamps:Structs\nstate_space_planner: {gain: 11}", "gain is 11; expected a number"),
+            ("lamps:Structs\nmodel: {lamps: []}", "model.lamps is [] (a list of 0); expected"),
+            (
+                "lamps:Structs\nmodel: {lamps: [{center: [0, 0], height: 0}]}",
+                "lamps[0].height is 0",
+            ),
+            ("lamps:Structs\nmodel: {weights: {a: b}}", "model.weights holds something that is"),
+            ("lamps:Unfinished", "lamps:Unfinished is no problem: it lacks initial_states, move,"),
+        ],
+    )
+    def test_a_user_s_problem(self, text: str, expected: str, write: Write) -> None:
+        assert expected in complaint(write(f"problem: {text}"))
+
+    def test_what_a_problem_itself_refuses(self, write: Write) -> None:
+        message = complaint(write("problem: capsule_robot\nmodel:\n  num_walls: 5"))
+        assert "run.yaml, line 3: model.num_walls" in message

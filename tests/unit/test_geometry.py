@@ -1,0 +1,423 @@
+"""Worlds: collision in cases that can be checked by hand, motion against a readable reference."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from holdfast.errors import InvalidValueError
+from holdfast.geometry import FAR, MAX_NOISE_ATTEMPTS, BoxWorld, DiscWorld, RectangleWorld
+from holdfast.problems.problem import FloatArray
+from holdfast.randomness import Purpose, Stream, stream
+
+World = DiscWorld | RectangleWorld | BoxWorld
+
+STREAM = stream(20, 1, 2, Purpose.PREDICTION)
+GROUND = [(-FAR, -FAR, FAR, 0.0)]
+SLOT = [
+    (-FAR, -FAR, -0.6, 0.0),
+    (0.6, -FAR, FAR, 0.0),
+    (-0.6, -FAR, 0.6, -1.1),
+]
+SLOT_3D = [
+    (-FAR, -FAR, -FAR, -0.6, FAR, 0.0),
+    (0.6, -FAR, -FAR, FAR, FAR, 0.0),
+    (-0.6, -FAR, -FAR, 0.6, -0.6, 0.0),
+    (-0.6, 0.6, -FAR, 0.6, FAR, 0.0),
+    (-0.6, -0.6, -FAR, 0.6, 0.6, -1.1),
+]
+
+
+def collides(world: World, *state: float) -> bool:
+    return bool(world.collides(np.array(state)))
+
+
+class TestDisc:
+    world = DiscWorld(0.5, [(0.0, 0.0, 2.0, 1.0)])
+
+    def test_beside_an_edge(self) -> None:
+        assert collides(self.world, 1.0, 1.49)
+        assert not collides(self.world, 1.0, 1.51)
+
+    def test_at_a_corner_the_distance_counts_not_the_bounding_box(self) -> None:
+        assert not collides(self.world, 2.4, 1.4)  # at distance 0.566
+        assert collides(self.world, 2.3, 1.3)  # at distance 0.424
+
+    def test_centre_inside(self) -> None:
+        assert collides(self.world, 1.0, 0.5)
+
+    def test_touching_is_free(self) -> None:
+        assert not collides(self.world, 1.0, 1.5)
+        assert not collides(self.world, -0.5, 0.5)
+
+
+class TestRectangle:
+    world = RectangleWorld(1.0, 2.0, GROUND)
+
+    def test_touching_is_free(self) -> None:
+        assert not collides(self.world, 123.0, 1.0, 0.0)
+
+    def test_overlapping_by_little_collides(self) -> None:
+        assert collides(self.world, 123.0, 1.0 - 1e-9, 0.0)
+
+    @pytest.mark.parametrize("angle", [0.3, -0.3, 1.2, 2.5, -4.0, 100.0])
+    def test_turned_it_reaches_down_by_the_lowest_corner(self, angle: float) -> None:
+        reach = 0.5 * abs(np.sin(angle)) + 1.0 * abs(np.cos(angle))
+        assert collides(self.world, 0.0, reach - 1e-9, angle)
+        assert not collides(self.world, 0.0, reach + 1e-9, angle)
+
+    def test_a_corner_that_only_the_turned_axes_separate(self) -> None:
+        # A diamond of half diagonal 0.707 beside the corner (1, 1) of a square: the intervals on x
+        # and y overlap, those along the diagonal do not.
+        world = RectangleWorld(1.0, 1.0, [(0.0, 0.0, 1.0, 1.0)])
+        along = 1.0 + 0.5 * np.sqrt(0.5)
+        assert not collides(world, along + 1e-9, along + 1e-9, 0.25 * np.pi)
+        assert collides(world, along - 1e-9, along - 1e-9, 0.25 * np.pi)
+
+    def test_one_inside_the_other(self) -> None:
+        assert collides(RectangleWorld(1.0, 2.0, [(-9.0, -9.0, 9.0, 9.0)]), 0.0, 0.0, 0.4)
+        assert collides(RectangleWorld(9.0, 9.0, [(-0.1, -0.1, 0.1, 0.1)]), 0.0, 0.0, 0.4)
+
+    def test_slot(self) -> None:
+        world = RectangleWorld(1.0, 2.0, SLOT)
+        assert not collides(world, 0.0, 0.0, 0.0)
+        assert not collides(world, 0.05, -0.05, 0.02)
+        assert collides(world, 0.11, 0.0, 0.0)
+        assert collides(world, 0.0, -0.11, 0.0)
+        assert collides(world, 0.0, 0.0, 0.25)
+
+
+class TestBox:
+    def test_touching_is_free(self) -> None:
+        world = BoxWorld((1.0, 2.0, 3.0), [(-9.0, -9.0, -9.0, 9.0, 9.0, 0.0)])
+        assert not collides(world, 0.0, 0.0, 1.5, 0.0, 0.0, 0.0)
+        assert collides(world, 0.0, 0.0, 1.5 - 1e-9, 0.0, 0.0, 0.0)
+
+    def test_parallel_edges_separate_nothing(self) -> None:
+        # Without care, the cross product of parallel edges is a zero axis that "separates" all.
+        world = BoxWorld((1.0, 1.0, 1.0), [(-1.0, -1.0, -1.0, 1.0, 1.0, 1.0)])
+        for angles in np.eye(3) * 0.7:
+            assert collides(world, 0.3, 0.2, 0.1, *angles)
+
+    def test_two_edges_that_only_their_cross_product_separates(self) -> None:
+        # A cube on its edge along y above the edge, along x, of another: none of the six face
+        # directions separates them, the cross product of the two edges does.
+        world = BoxWorld((1.0, 1.0, 1.0), [(-5.0, -0.5, -5.0, 5.0, 0.5, 0.0)])
+        reach = np.sqrt(0.5)
+        assert collides(world, 0.0, 0.0, reach - 1e-9, 0.0, 0.25 * np.pi, 0.0)
+        assert not collides(world, 0.0, 0.0, reach + 1e-9, 0.0, 0.25 * np.pi, 0.0)
+
+    @pytest.mark.parametrize(
+        ("angles", "reach"),
+        [
+            ((0.5 * np.pi, 0.0, 0.0), (1.0, 0.5, 1.5)),  # yaw turns x to y
+            ((0.0, 0.5 * np.pi, 0.0), (1.5, 1.0, 0.5)),  # pitch turns z to x
+            ((0.0, 0.0, 0.5 * np.pi), (0.5, 1.5, 1.0)),  # roll turns y to z
+            # Roll first, then pitch: lengths (1, 2, 3) become (1, 3, 2), then (2, 3, 1).
+            ((0.0, 0.5 * np.pi, 0.5 * np.pi), (1.0, 1.5, 0.5)),
+        ],
+    )
+    def test_order_and_axes_of_the_angles(
+        self, angles: tuple[float, float, float], reach: tuple[float, float, float]
+    ) -> None:
+        for axis in range(3):
+            wall = np.full(6, 50.0)
+            wall[:3] = -50.0
+            wall[axis] = 0.0
+            world = BoxWorld((1.0, 2.0, 3.0), [wall])
+            position = np.zeros(3)
+            position[axis] = -reach[axis]
+            inward = np.zeros(3)
+            inward[axis] = 1e-9
+            assert collides(world, *(position + inward), *angles)
+            assert not collides(world, *(position - inward), *angles)
+
+    def test_yaw_against_the_plane_geometry(self) -> None:
+        flat = RectangleWorld(1.0, 2.0, [(0.0, 0.0, 1.0, 1.0), (-3.0, -2.0, -1.0, -1.0)])
+        tall = BoxWorld(
+            (1.0, 2.0, 1.0),
+            [(0.0, 0.0, -1.0, 1.0, 1.0, 1.0), (-3.0, -2.0, -1.0, -1.0, -1.0, 1.0)],
+        )
+        poses = STREAM.normal((2000, 3)) * np.array([2.0, 2.0, 3.0])
+        poses_3d = np.zeros((2000, 6))
+        poses_3d[:, [0, 1, 3]] = poses
+        expected = flat.collides(poses)
+        assert 0.1 < expected.mean() < 0.9
+        np.testing.assert_array_equal(tall.collides(poses_3d), expected)
+
+
+def reference_move(
+    world: World,
+    states: FloatArray,
+    actions: FloatArray,
+    deviation: FloatArray,
+    tolerance: float,
+    source: Stream,
+) -> FloatArray:
+    """Say in the plainest way what ``move`` does."""
+    result = np.empty_like(states)
+    noise: list[FloatArray] = []
+    for n, (state, action) in enumerate(zip(states, actions, strict=True)):
+        stopped = state + action
+        if world.collides(stopped):
+            low, high = 0.0, 1.0
+            while high - low > tolerance:
+                middle = (low + high) / 2
+                if world.collides(state + middle * action):
+                    high = middle
+                else:
+                    low = middle
+            stopped = state + low * action
+        result[n] = stopped
+        for attempt in range(MAX_NOISE_ATTEMPTS):
+            if attempt == len(noise):
+                noise.append(source.substream(attempt).normal(states.shape))
+            candidate = stopped + deviation * noise[attempt][n]
+            if not world.collides(candidate):
+                result[n] = candidate
+                break
+    return result
+
+
+WORLDS: dict[str, tuple[World, FloatArray, FloatArray, FloatArray]] = {
+    "disc": (
+        DiscWorld(0.1, [(-FAR, -FAR, FAR, 0.0), (0.0, 0.0, 0.1, 5.0)]),
+        np.array([-0.15, 0.15]),
+        np.array([0.05, 0.05]),
+        np.array([0.1, -0.1]),
+    ),
+    "rectangle": (
+        RectangleWorld(1.0, 2.0, SLOT),
+        np.array([0.0, 0.0, 0.0]),
+        np.array([0.1, 0.1, 0.1]),
+        np.array([0.05, -0.1, 0.05]),
+    ),
+    "box": (
+        BoxWorld((1.0, 1.0, 2.0), SLOT_3D),
+        np.zeros(6),
+        np.full(6, 0.05),
+        np.array([0.05, 0.0, -0.1, 0.05, 0.0, 0.02]),
+    ),
+}
+
+
+@pytest.fixture(params=WORLDS)
+def case(request: pytest.FixtureRequest) -> tuple[World, FloatArray, FloatArray, FloatArray]:
+    return WORLDS[request.param]
+
+
+class TestMove:
+    def test_equals_the_reference_bit_for_bit(
+        self, case: tuple[World, FloatArray, FloatArray, FloatArray]
+    ) -> None:
+        world, mean, deviation, action = case
+        states, unplaced = world.draw_free(mean, deviation, 60, STREAM.substream(9))
+        assert unplaced == 0
+        actions = action * (1.0 + STREAM.substream(8).normal(states.shape))
+        assert 5 < world.collides(states + actions).sum() < 60  # some stop, some do not
+        moved = world.move(states, actions, deviation, 1e-3, STREAM)
+        expected = reference_move(world, states, actions, deviation, 1e-3, STREAM)
+        assert moved.tobytes() == expected.tobytes()
+
+    def test_stays_free(self, case: tuple[World, FloatArray, FloatArray, FloatArray]) -> None:
+        world, mean, deviation, action = case
+        states, _ = world.draw_free(mean, deviation, 500, STREAM)
+        for step in range(5):
+            states = world.move(states, action, deviation, 1e-3, STREAM.substream(step))
+        assert not world.collides(states).any()
+
+    def test_a_particle_does_not_depend_on_the_others_or_on_threads(
+        self, case: tuple[World, FloatArray, FloatArray, FloatArray]
+    ) -> None:
+        world, mean, deviation, action = case
+        count = 5000  # above the kernel's threshold for threads
+        states, _ = world.draw_free(mean, deviation, count, STREAM)
+        few, _ = world.draw_free(mean, deviation, 300, STREAM)
+        assert states[:300].tobytes() == few.tobytes()
+        moved = world.move(states, action, deviation, 1e-3, STREAM)
+        fewer = world.move(states[:300], action, deviation, 1e-3, STREAM)
+        assert moved[:300].tobytes() == fewer.tobytes()
+
+    def test_stops_at_contact_within_the_tolerance(self) -> None:
+        world = DiscWorld(0.1, GROUND)
+        moved = world.move(np.array([0.0, 0.5]), np.array([1.0, -1.0]), np.zeros(2), 1e-3, STREAM)
+        assert 0.1 <= moved[1] <= 0.1 + 1e-3
+        assert moved[0] == pytest.approx(0.5 - moved[1])
+
+    def test_free_action_without_noise_is_added_exactly(self) -> None:
+        world = RectangleWorld(1.0, 2.0, GROUND)
+        state, action = np.array([0.3, 5.1, 0.7]), np.array([0.1, -0.1, 0.1])
+        moved = world.move(state, action, np.zeros(3), 1e-3, STREAM)
+        np.testing.assert_array_equal(moved, state + action)
+
+    def test_a_tiny_tolerance_ends(self) -> None:
+        world = DiscWorld(0.1, GROUND)
+        moved = world.move(np.array([0.0, 0.5]), np.array([0.0, -1.0]), np.zeros(2), 1e-300, STREAM)
+        assert moved[1] == pytest.approx(0.1, abs=1e-15)
+
+    def test_noise_far_from_obstacles_is_gaussian(self) -> None:
+        world = DiscWorld(0.1, GROUND)
+        deviation = np.array([0.2, 0.5])
+        count = 20_000
+        noise = world.move(
+            np.tile([0.0, 100.0], (count, 1)), np.zeros(2), deviation, 1e-3, STREAM
+        ) - np.array([0.0, 100.0])
+        # Five standard errors: a false alarm in less than one of 10^6 choices of the seed.
+        assert (np.abs(noise.mean(axis=0)) < 5 * deviation / np.sqrt(count)).all()
+        ratio = noise.std(axis=0) / deviation
+        assert (np.abs(ratio - 1.0) < 5 / np.sqrt(2 * count)).all()
+
+    def test_noise_at_a_wall_is_the_gaussian_cut_off(self) -> None:
+        world = DiscWorld(0.1, GROUND)
+        count = 20_000
+        states = np.tile([0.0, 0.1], (count, 1))  # touching the ground
+        height = world.move(states, np.zeros(2), np.array([0.05, 0.05]), 1e-3, STREAM)[:, 1] - 0.1
+        mean = 0.05 * np.sqrt(2 / np.pi)
+        standard_error = 0.05 * np.sqrt((1 - 2 / np.pi) / count)
+        assert (height >= 0.0).all()
+        assert abs(height.mean() - mean) < 5 * standard_error
+
+    def test_where_no_noise_fits_there_is_none(self) -> None:
+        cage = [
+            (-FAR, -FAR, -0.1, FAR),
+            (0.1, -FAR, FAR, FAR),
+            (-FAR, -FAR, FAR, -0.1),
+            (-FAR, 0.1, FAR, FAR),
+        ]
+        world = DiscWorld(0.099, cage)
+        moved = world.move(np.zeros(2), np.array([0.0005, 0.0]), np.full(2, 4.0), 1e-3, STREAM)
+        np.testing.assert_array_equal(moved, [0.0005, 0.0])
+
+    def test_a_start_in_collision_without_a_way_out_stays(self) -> None:
+        world = DiscWorld(0.1, GROUND)
+        state = np.array([0.0, -50.0])
+        moved = world.move(state, np.array([0.1, 0.1]), np.full(2, 0.1), 1e-3, STREAM)
+        np.testing.assert_array_equal(moved, state)
+
+    def test_inputs_are_not_changed(self) -> None:
+        world = DiscWorld(0.1, GROUND)
+        states, actions = np.full((4, 2), 1.0), np.full((4, 2), 0.1)
+        world.move(states, actions, np.full(2, 0.1), 1e-3, STREAM)
+        assert (states == 1.0).all()
+        assert (actions == 0.1).all()
+
+    @pytest.mark.parametrize(
+        ("states", "actions", "result"),
+        [
+            ((2,), (2,), (2,)),
+            ((7, 2), (2,), (7, 2)),
+            ((7, 2), (1, 2), (7, 2)),
+            ((3, 7, 2), (3, 7, 2), (3, 7, 2)),
+            ((3, 7, 2), (3, 1, 2), (3, 7, 2)),
+            ((2,), (5, 2), (5, 2)),
+            ((0, 2), (2,), (0, 2)),
+        ],
+    )
+    def test_shapes_broadcast(
+        self, states: tuple[int, ...], actions: tuple[int, ...], result: tuple[int, ...]
+    ) -> None:
+        world = DiscWorld(0.1, GROUND)
+        state_values = 10.0 + STREAM.normal(states)
+        action_values = STREAM.substream(1).normal(actions)
+        moved = world.move(state_values, action_values, np.zeros(2), 1e-3, STREAM)
+        np.testing.assert_array_equal(moved, state_values + action_values)
+        assert moved.shape == result
+
+    def test_arrays_in_any_memory_order(self) -> None:
+        world = RectangleWorld(1.0, 2.0, SLOT)
+        states = np.array([0.0, 3.0, 0.0]) + 0.1 * STREAM.normal((50, 3))
+        action, deviation = np.full(3, -0.1), np.full(3, 0.1)
+        expected = world.move(states, action, deviation, 1e-3, STREAM)
+        strided = np.asfortranarray(states)
+        moved = world.move(strided, action, deviation, 1e-3, STREAM)
+        assert moved.tobytes() == expected.tobytes()
+
+
+class TestDrawFree:
+    def test_takes_the_first_free_draw(self) -> None:
+        world = RectangleWorld(1.0, 2.0, GROUND)
+        mean, deviation = np.array([0.0, 1.2, 0.0]), np.array([1.0, 1.0, 1.0])
+        states, unplaced = world.draw_free(mean, deviation, 40, STREAM)
+        assert unplaced == 0
+        draws = np.array(
+            [mean + deviation * STREAM.substream(a).normal((40, 3)) for a in range(30)]
+        )
+        free = ~world.collides(draws)
+        assert free.any(axis=0).all()
+        assert not free[0].all()
+        np.testing.assert_array_equal(states, draws[free.argmax(axis=0), np.arange(40)])
+
+    def test_counts_what_it_cannot_place(self) -> None:
+        world = DiscWorld(0.1, GROUND)
+        states, unplaced = world.draw_free(np.array([0.0, -9.0]), np.full(2, 0.1), 17, STREAM)
+        assert unplaced == 17
+        np.testing.assert_array_equal(states, np.tile([0.0, -9.0], (17, 1)))
+
+    def test_none(self) -> None:
+        states, unplaced = DiscWorld(0.1, GROUND).draw_free(np.ones(2), np.ones(2), 0, STREAM)
+        assert states.shape == (0, 2)
+        assert unplaced == 0
+
+
+class TestRefusals:
+    world = DiscWorld(0.1, GROUND)
+
+    @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+    def test_values_that_are_not_finite(self, bad: float) -> None:
+        good, wrong = np.ones((3, 2)), np.ones((3, 2))
+        wrong[1, 0] = bad
+        deviation = np.ones(2)
+        with pytest.raises(InvalidValueError, match=r"states\[1, 0\]"):
+            self.world.collides(wrong)
+        with pytest.raises(InvalidValueError, match=r"states\[1, 0\]"):
+            self.world.move(wrong, good, deviation, 1e-3, STREAM)
+        with pytest.raises(InvalidValueError, match=r"actions\[1, 0\]"):
+            self.world.move(good, wrong, deviation, 1e-3, STREAM)
+        with pytest.raises(InvalidValueError, match=r"standard_deviation\[1\]"):
+            self.world.move(good, good, np.array([1.0, bad]), 1e-3, STREAM)
+        with pytest.raises(InvalidValueError, match=r"mean\[0\]"):
+            self.world.draw_free(np.array([bad, 1.0]), deviation, 3, STREAM)
+
+    @pytest.mark.parametrize("tolerance", [0.0, -1.0, 1.0, np.nan])
+    def test_tolerance(self, tolerance: float) -> None:
+        with pytest.raises(InvalidValueError, match="tolerance"):
+            self.world.move(np.ones(2), np.ones(2), np.ones(2), tolerance, STREAM)
+
+    def test_negative_deviation(self) -> None:
+        with pytest.raises(InvalidValueError, match="must not be negative"):
+            self.world.move(np.ones(2), np.ones(2), np.array([1.0, -1.0]), 1e-3, STREAM)
+        with pytest.raises(InvalidValueError, match="must not be negative"):
+            self.world.draw_free(np.ones(2), np.array([1.0, -1.0]), 3, STREAM)
+
+    def test_shapes(self) -> None:
+        with pytest.raises(InvalidValueError, match=r"shape \(3, 4\)"):
+            self.world.collides(np.ones((3, 4)))
+        with pytest.raises(InvalidValueError, match=r"shape \(3,\)"):
+            self.world.move(np.ones((3, 2)), np.ones(3), np.ones(2), 1e-3, STREAM)
+        with pytest.raises(InvalidValueError, match="does not broadcast"):
+            self.world.move(np.ones((3, 2)), np.ones((4, 2)), np.ones(2), 1e-3, STREAM)
+        with pytest.raises(InvalidValueError, match="standard_deviation"):
+            self.world.move(np.ones((3, 2)), np.ones(2), np.ones(3), 1e-3, STREAM)
+        with pytest.raises(InvalidValueError, match="mean"):
+            self.world.draw_free(np.ones(3), np.ones(2), 3, STREAM)
+        with pytest.raises(InvalidValueError, match="count: -1"):
+            self.world.draw_free(np.ones(2), np.ones(2), -1, STREAM)
+
+    @pytest.mark.parametrize("size", [0.0, -1.0, np.nan, np.inf])
+    def test_sizes(self, size: float) -> None:
+        with pytest.raises(InvalidValueError, match="radius"):
+            DiscWorld(size, GROUND)
+        with pytest.raises(InvalidValueError, match="height"):
+            RectangleWorld(1.0, size, GROUND)
+        with pytest.raises(InvalidValueError, match=r"size\[2\]"):
+            BoxWorld((1.0, 1.0, size), SLOT_3D)
+
+    @pytest.mark.parametrize(
+        "obstacles", [[(0, 0, 1)], [(0, 0, 0, 1)], [(0, 2, 1, 1)], [(0, 0, np.inf, 1)]]
+    )
+    def test_obstacles(self, obstacles: list[tuple[float, ...]]) -> None:
+        with pytest.raises(InvalidValueError, match="obstacles"):
+            DiscWorld(1.0, obstacles)
+
+    def test_no_obstacles(self) -> None:
+        assert not DiscWorld(1.0, []).collides(np.zeros((5, 2))).any()

@@ -1,0 +1,374 @@
+"""Journal, tables, the run's directory, the recorder and the figure."""
+
+from __future__ import annotations
+
+import csv
+import json
+import sqlite3
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+import scipy.stats
+
+from holdfast.configuration import Configuration, load
+from holdfast.recording.figure import trial_figure
+from holdfast.recording.files import OutputError, write_atomically
+from holdfast.recording.journal import Journal
+from holdfast.recording.recorder import MAX_PARTICLES_KEPT, Recorder
+from holdfast.recording.run_directory import (
+    RunDirectory,
+    claim_default_directory,
+    latest_default_directory,
+    output_names,
+)
+from holdfast.recording.tables import (
+    CSV_COLUMNS,
+    SummaryBuilder,
+    csv_lines,
+    wilson_interval,
+)
+from holdfast.runtime.trial import Decisions, TrialResult, run_trial
+
+
+def result_of(
+    trial: int, *, success: bool = True, reward: float = -1.0, sensing_ms: tuple[float, ...] = ()
+) -> TrialResult:
+    decisions = Decisions(1, trial.to_bytes(8, "little"))
+    return TrialResult(
+        trial=trial,
+        seed=5,
+        success=success,
+        steps=10 + trial,
+        reward=reward,
+        sensing_decisions=len(sensing_ms),
+        mean_sensing_ms=0.1 + 0.2,
+        recoveries=0,
+        unexplained_observations=1,
+        digest=decisions.digest(),
+        sensing_ms=sensing_ms,
+        decisions=decisions,
+    )
+
+
+def configuration_of(
+    tmp_path: Path, *, seed: int = 5, tolerance: float = 0.1, num_particles: int = 30
+) -> Configuration:
+    path = tmp_path / "peg.yaml"
+    path.write_text(
+        "problem: peg_in_hole_2d\n"
+        f"model: {{hole_tolerance: {tolerance}}}\n"
+        f"particle_filter: {{num_particles: {num_particles}}}\n"
+        "active_sensing: {num_observation_samples: 2, num_cores: 1}\n"
+        f"simulator: {{num_trials: 3, max_steps: 30, seed: {seed}}}\n"
+    )
+    return load(path)
+
+
+def without_decisions(result: TrialResult) -> TrialResult:
+    return msgspec.structs.replace(result, decisions=None)
+
+
+class TestAtomicFiles:
+    def test_text_bytes_and_lines(self, tmp_path: Path) -> None:
+        path = tmp_path / "file"
+        for content, expected in (
+            ("θ", "θ"),
+            (b"bytes", "bytes"),
+            (iter(["a\n", "b\n"]), "a\nb\n"),
+        ):
+            write_atomically(path, content)
+            assert path.read_text(encoding="utf-8") == expected
+        assert [entry.name for entry in tmp_path.iterdir()] == ["file"]
+
+    def test_a_failure_leaves_the_old_file_and_nothing_else(self, tmp_path: Path) -> None:
+        path = tmp_path / "file"
+        write_atomically(path, "old")
+
+        def lines() -> list[str]:
+            raise ZeroDivisionError
+
+        with pytest.raises(ZeroDivisionError):
+            write_atomically(path, (line for _ in range(1) for line in lines()))
+        assert path.read_text() == "old"
+        assert [entry.name for entry in tmp_path.iterdir()] == ["file"]
+
+    def test_a_missing_directory_is_named(self, tmp_path: Path) -> None:
+        with pytest.raises(OutputError, match="missing/file: cannot be written: No such file"):
+            write_atomically(tmp_path / "missing" / "file", "text")
+
+
+class TestJournal:
+    def test_what_was_added_comes_back_in_order(self, tmp_path: Path) -> None:
+        path = tmp_path / "journal.sqlite"
+        results = [result_of(2, success=False), result_of(0), result_of(1, sensing_ms=(0.5, 1.5))]
+        with Journal.create(path, {"key": "value"}) as journal:
+            for result in results:
+                journal.add(result)
+        with Journal.open(path) as journal:
+            assert journal.meta()["key"] == "value"
+            assert journal.finished() == {0, 1, 2}
+            assert journal.tally() == (3, 2)
+            expected = sorted(map(without_decisions, results), key=lambda result: result.trial)
+            assert list(journal.results()) == expected
+            for result in results:
+                assert journal.decisions(result.trial) == result.decisions
+
+    def test_closing_leaves_one_file(self, tmp_path: Path) -> None:
+        with Journal.create(tmp_path / "journal.sqlite", {}) as journal:
+            journal.add(result_of(0))
+        assert [entry.name for entry in tmp_path.iterdir()] == ["journal.sqlite"]
+
+    def test_a_trial_is_kept_once(self, tmp_path: Path) -> None:
+        with Journal.create(tmp_path / "journal.sqlite", {}) as journal:
+            journal.add(result_of(0, reward=-1.0))
+            with pytest.raises(OutputError, match="UNIQUE"):
+                journal.add(result_of(0, reward=-2.0))
+            assert [result.reward for result in journal.results()] == [-1.0]
+
+    def test_it_belongs_to_one_process_at_a_time(self, tmp_path: Path) -> None:
+        path = tmp_path / "journal.sqlite"
+        with (
+            Journal.create(path, {}),
+            pytest.raises(OutputError, match="another process is using this run"),
+        ):
+            Journal.open(path)
+        Journal.open(path).close()
+
+    def test_a_trial_that_is_not_there_is_named(self, tmp_path: Path) -> None:
+        with (
+            Journal.create(tmp_path / "journal.sqlite", {}) as journal,
+            pytest.raises(OutputError, match="trial 7 is not in the journal"),
+        ):
+            journal.decisions(7)
+
+    def test_other_files_are_refused(self, tmp_path: Path) -> None:
+        path = tmp_path / "journal.sqlite"
+        with pytest.raises(OutputError, match="there is no journal"):
+            Journal.open(path)
+        path.write_bytes(b"no database at all, but long enough to be looked at" * 20)
+        with pytest.raises(OutputError, match="not a usable journal"):
+            Journal.open(path)
+        path.unlink()
+        sqlite3.connect(path).close()
+        path.touch()
+        with pytest.raises(OutputError, match="no such table: meta"):
+            Journal.open(path)
+
+    def test_another_version_is_refused(self, tmp_path: Path) -> None:
+        path = tmp_path / "journal.sqlite"
+        with Journal.create(path, {}) as journal:
+            journal.set_meta("schema_version", "999")
+        with pytest.raises(OutputError, match="schema version 999; this holdfast reads version 1"):
+            Journal.open(path)
+
+
+class TestTables:
+    @pytest.mark.parametrize("trials", [1, 2, 10, 1000])
+    def test_wilson_interval_is_that_of_scipy(self, trials: int) -> None:
+        for successes in {0, 1, trials // 3, trials - 1, trials}:
+            expected = scipy.stats.binomtest(successes, trials).proportion_ci(method="wilson")
+            low, high = wilson_interval(successes, trials)
+            assert low == pytest.approx(expected.low, abs=1e-12)
+            assert high == pytest.approx(expected.high, abs=1e-12)
+
+    def test_csv_numbers_read_back_exactly(self) -> None:
+        results = [result_of(0, reward=-0.1 - 0.2), result_of(1, success=False, reward=1e-300)]
+        rows = list(csv.DictReader("".join(csv_lines(results)).splitlines()))
+        assert tuple(rows[0]) == CSV_COLUMNS
+        assert CSV_COLUMNS[:8] == (
+            "trial",
+            "seed",
+            "success",
+            "steps",
+            "reward",
+            "sensing_decisions",
+            "mean_sensing_ms",
+            "recoveries",
+        )
+        for row, result in zip(rows, results, strict=True):
+            assert float(row["reward"]) == result.reward
+            assert float(row["mean_sensing_ms"]) == result.mean_sensing_ms
+            assert int(row["success"]) == result.success
+            assert row["digest"] == result.digest
+
+    def test_summary(self) -> None:
+        builder = SummaryBuilder()
+        builder.add(result_of(0, reward=-1.0, sensing_ms=(1.0, 2.0)))
+        builder.add(result_of(1, reward=-3.0, sensing_ms=(3.0,)))
+        builder.add(result_of(2, reward=-8.0, success=False))
+        summary = builder.build(problem="p", seed=5, version="1", trials=4, wall_time_s=2.0)
+        assert (summary.trials, summary.finished, summary.successes) == (4, 3, 2)
+        assert summary.success_rate == pytest.approx(2 / 3)
+        assert summary.mean_reward == pytest.approx(-4.0)
+        assert summary.mean_reward_of_successes == pytest.approx(-2.0)
+        assert summary.mean_steps == pytest.approx(11.0)
+        assert summary.sensing_ms_median == pytest.approx(2.0)
+        assert summary.sensing_ms_p99 == pytest.approx(2.98)
+        assert summary.unexplained_observations == 3
+        assert json.loads(summary.to_json())["digest"] == summary.digest
+
+    def test_the_digest_depends_on_every_trial_and_their_order(self) -> None:
+        def digest(*order: int) -> str:
+            builder = SummaryBuilder()
+            for trial in order:
+                builder.add(result_of(trial))
+            return builder.build(problem="p", seed=5, version="1", trials=3, wall_time_s=0.0).digest
+
+        assert len({digest(0, 1, 2), digest(0, 2, 1), digest(0, 1), digest()}) == 4
+
+    def test_without_trials_there_are_no_means(self) -> None:
+        summary = SummaryBuilder().build(
+            problem="p", seed=5, version="1", trials=3, wall_time_s=0.0
+        )
+        assert summary.finished == 0
+        assert summary.success_rate is None
+        assert summary.mean_reward is None
+        assert summary.sensing_ms_median is None
+
+
+class TestRunDirectory:
+    def test_tables_are_made_from_the_journal(self, tmp_path: Path) -> None:
+        configuration = configuration_of(tmp_path)
+        with RunDirectory.create(tmp_path / "out", configuration) as directory:
+            for trial in (2, 0, 1):
+                directory.add(result_of(trial))
+            summary = directory.write_tables(wall_time_s=1.5)
+        rows = list(csv.DictReader((tmp_path / "out" / "trials.csv").read_text().splitlines()))
+        assert [row["trial"] for row in rows] == ["0", "1", "2"]
+        assert summary.finished == 3
+        assert load(tmp_path / "out" / "config.yaml") == configuration
+
+    def test_wall_time_adds_up_over_resumed_parts(self, tmp_path: Path) -> None:
+        configuration = configuration_of(tmp_path)
+        with RunDirectory.create(tmp_path / "out", configuration) as directory:
+            directory.add(result_of(0))
+            directory.write_tables(wall_time_s=1.5)
+        with RunDirectory.resume(tmp_path / "out", configuration) as directory:
+            assert directory.journal.finished() == {0}
+            assert directory.write_tables(wall_time_s=2.0).wall_time_s == 3.5
+
+    @pytest.mark.parametrize("name", output_names())
+    def test_no_file_of_a_run_is_overwritten(self, tmp_path: Path, name: str) -> None:
+        (tmp_path / "out").mkdir()
+        (tmp_path / "out" / name).write_text("mine")
+        with pytest.raises(OutputError, match=rf"holds {name} already.*--resume"):
+            RunDirectory.create(tmp_path / "out", configuration_of(tmp_path))
+        assert (tmp_path / "out" / name).read_text() == "mine"
+
+    def test_a_place_that_cannot_be_a_directory_is_refused(self, tmp_path: Path) -> None:
+        (tmp_path / "file").touch()
+        with pytest.raises(OutputError, match="is a file, not a directory"):
+            RunDirectory.create(tmp_path / "file", configuration_of(tmp_path))
+        with pytest.raises(OutputError, match="cannot be made: Not a directory"):
+            RunDirectory.create(tmp_path / "file" / "below", configuration_of(tmp_path))
+
+    def test_resuming_needs_a_run(self, tmp_path: Path) -> None:
+        with pytest.raises(OutputError, match="no such directory, so no run to resume"):
+            RunDirectory.resume(tmp_path / "missing", configuration_of(tmp_path))
+        (tmp_path / "empty").mkdir()
+        with pytest.raises(OutputError, match=r"holds no journal\.sqlite, so no run to resume"):
+            RunDirectory.resume(tmp_path / "empty", configuration_of(tmp_path))
+
+    def test_resuming_with_another_configuration_names_the_key(self, tmp_path: Path) -> None:
+        RunDirectory.create(tmp_path / "out", configuration_of(tmp_path)).close()
+        with pytest.raises(OutputError, match=r"simulator\.seed is 5 there and 6 here"):
+            RunDirectory.resume(tmp_path / "out", configuration_of(tmp_path, seed=6))
+        with pytest.raises(OutputError, match=r"model\.hole_tolerance is 0\.1 there and 0\.2 here"):
+            RunDirectory.resume(tmp_path / "out", configuration_of(tmp_path, tolerance=0.2))
+
+    def test_default_directories_are_numbered(self, tmp_path: Path) -> None:
+        configuration = configuration_of(tmp_path)
+        runs = tmp_path / "runs"
+        with pytest.raises(OutputError, match="no run to resume"):
+            latest_default_directory(configuration, runs)
+        made = [claim_default_directory(configuration, runs) for _ in range(3)]
+        assert [path.name for path in made] == ["peg-seed5", "peg-seed5-2", "peg-seed5-3"]
+        assert latest_default_directory(configuration, runs) == made[-1]
+
+
+class TestRecorder:
+    @staticmethod
+    def record(configuration: Configuration, trial: int = 1) -> Recorder:
+        recorder = Recorder(trial)
+        run_trial(
+            configuration.problem,
+            configuration.planning,
+            configuration.simulator,
+            trial,
+            observer=recorder,
+        )
+        return recorder
+
+    def test_it_keeps_every_step(self, tmp_path: Path) -> None:
+        record = self.record(configuration_of(tmp_path)).record
+        assert record.result is not None
+        steps = record.result.steps
+        assert len(record.actions) == len(record.rewards) == steps
+        # One more than steps: the states before the first and after each.
+        assert len(record.true_states) == len(record.estimates) == steps + 1
+        assert len(record.standard_deviations) == steps + 1
+        assert sum(record.rewards) == pytest.approx(record.result.reward)
+        assert [sensing.step for sensing in record.sensing] == list(range(0, steps, 9))
+
+    def test_the_choice_has_the_least_entropy(self, tmp_path: Path) -> None:
+        for sensing in self.record(configuration_of(tmp_path)).record.sensing:
+            assert sensing.entropies is not None
+            assert sensing.sensing_action == int(np.argmin(sensing.entropies))
+
+    def test_it_keeps_copies(self, tmp_path: Path) -> None:
+        record = self.record(configuration_of(tmp_path)).record
+        states = np.array(record.true_states)
+        assert len(np.unique(states, axis=0)) == len(states)
+
+    def test_it_looks_away_from_other_trials(self, tmp_path: Path) -> None:
+        configuration = configuration_of(tmp_path)
+        recorder = Recorder(trial=0)
+        run_trial(
+            configuration.problem,
+            configuration.planning,
+            configuration.simulator,
+            1,
+            observer=recorder,
+        )
+        assert recorder.record.result is None
+        assert not recorder.record.actions
+
+    def test_particles_are_thinned_out(self, tmp_path: Path) -> None:
+        configuration = configuration_of(tmp_path, num_particles=2 * MAX_PARTICLES_KEPT + 1)
+        before = self.record(configuration).record.sensing[0].before
+        assert MAX_PARTICLES_KEPT // 2 < len(before) <= MAX_PARTICLES_KEPT
+
+
+class TestFigure:
+    @pytest.mark.parametrize("method", ["action_entropy", "random"])
+    @pytest.mark.parametrize("problem", ["peg_in_hole_2d", "capsule_robot", "peg_in_hole_3d"])
+    def test_every_kind_of_problem_is_drawn(
+        self, tmp_path: Path, problem: str, method: str
+    ) -> None:
+        path = tmp_path / "run.yaml"
+        path.write_text(
+            f"problem: {problem}\n"
+            f"selector: {{method: {method}}}\n"
+            "simulator: {num_trials: 1, max_steps: 12}\n"
+        )
+        configuration = load(path)
+        recorder = TestRecorder.record(configuration, trial=0)
+        trial_figure(configuration, recorder.record, tmp_path / "trial.png")
+        assert (tmp_path / "trial.png").read_bytes().startswith(b"\x89PNG\r\n")
+
+    def test_a_problem_without_a_scene_is_drawn(self, tmp_path: Path) -> None:
+        (tmp_path / "sceneless.py").write_text(
+            "from holdfast.problems.peg_in_hole_2d import PegInHole2D\n"
+            "class Sceneless(PegInHole2D):\n"
+            "    state_labels = ()\n"
+            "    def scene(self):\n"
+            "        return None\n"
+        )
+        path = tmp_path / "run.yaml"
+        path.write_text("problem: sceneless:Sceneless\nsimulator: {num_trials: 1, max_steps: 12}\n")
+        configuration = load(path)
+        recorder = TestRecorder.record(configuration, trial=0)
+        trial_figure(configuration, recorder.record, tmp_path / "trial.png")
+        assert (tmp_path / "trial.png").read_bytes().startswith(b"\x89PNG\r\n")
