@@ -19,6 +19,8 @@
 
 namespace holdfast {
 
+inline namespace HOLDFAST_ISA {
+
 namespace detail {
 
 // Adding 1.5 * 2^52 rounds a double of moderate size to the nearest integer, and leaves that
@@ -54,8 +56,14 @@ HOLDFAST_INLINE T from_bits(Integer<T> x) {
 }
 
 template <class T>
-HOLDFAST_INLINE T constant(double x) {
-    return T{} + x;
+HOLDFAST_INLINE T constant(double x);
+template <>
+HOLDFAST_INLINE double constant<double>(double x) {
+    return x;
+}
+template <>
+HOLDFAST_INLINE Lanes constant<Lanes>(double x) {
+    return splat(x);
 }
 
 /// c[0] + x c[1] + x^2 c[2] + ..., innermost first.
@@ -98,11 +106,11 @@ HOLDFAST_INLINE T exp_of(T x) {
     const T n = shifted - detail::rounding_shift;
     const T r = (x - n * log_2_high) - n * log_2_low;
     // 2^(n-1) and then times 2, because 2^n itself overflows at the upper end of the range.
-    const auto exponent = detail::bits(shifted) - detail::rounding_shift_bits + 1022;
-    const T value = detail::horner(r, inverse_factorials) * detail::from_bits<T>(exponent << 52) * 2.0;
+    const auto exponent = detail::bits(shifted) - detail::rounding_shift_bits + std::int64_t{1022};
+    const T value = detail::horner(r, inverse_factorials) * detail::from_bits<T>(shift_left(exponent, 52)) * 2.0;
     const T infinite = detail::constant<T>(std::numeric_limits<double>::infinity());
     const T bounded = select(x > 709.782712893384, infinite, value);
-    return select(x < -707.7, T{}, bounded);
+    return select(x < -707.7, detail::constant<T>(0.0), bounded);
 }
 
 /// The natural logarithm; -infinity at 0 and NaN below.
@@ -119,10 +127,13 @@ HOLDFAST_INLINE T log_of(T x) {
     const auto subnormal = x < smallest_normal;
     const T scaled = select(subnormal, x * two_to_54, x);
     const auto pattern = detail::bits(scaled);
-    const auto exponent = (pattern - bits_of_root_half) >> 52;
-    const T m = detail::from_bits<T>(pattern - (exponent << 52));  // in [sqrt 1/2, sqrt 2)
+    // Biased by 1023 so that the shifted pattern is positive.
+    const auto exponent =
+        shift_right(pattern - (bits_of_root_half - (std::int64_t{1023} << 52)), 52) - std::int64_t{1023};
+    const T m = detail::from_bits<T>(pattern - shift_left(exponent, 52));  // in [sqrt 1/2, sqrt 2)
     const T e = detail::from_bits<T>(exponent + detail::rounding_shift_bits) -
-                detail::rounding_shift - select(subnormal, detail::constant<T>(54.0), T{});
+                detail::rounding_shift -
+                select(subnormal, detail::constant<T>(54.0), detail::constant<T>(0.0));
     const T f = m - 1.0;
     const T s = f / (f + 2.0);
     const T s2 = s * s;
@@ -168,9 +179,10 @@ HOLDFAST_INLINE detail::SineCosine<T> sine_cosine_of(T x) {
     const T sine = r + r * (r2 * detail::horner(r2, sine_series));
     const T cosine = detail::horner(r2, cosine_series);
     const auto quadrant = detail::bits(shifted);  // its two low bits are those of n
-    const auto swap = (quadrant & 1) != 0;
-    const auto negate_sine = (quadrant & 2) != 0;
-    const auto negate_cosine = ((quadrant + 1) & 2) != 0;
+    const auto swap = (quadrant & std::int64_t{1}) != std::int64_t{0};
+    const auto negate_sine = (quadrant & std::int64_t{2}) != std::int64_t{0};
+    const auto negate_cosine =
+        ((quadrant + std::int64_t{1}) & std::int64_t{2}) != std::int64_t{0};
     const T s = select(swap, cosine, sine);
     const T c = select(swap, sine, cosine);
     const T nan = detail::constant<T>(std::numeric_limits<double>::quiet_NaN());
@@ -211,4 +223,5 @@ inline double arcsin(double x) {
     return angle;
 }
 
+}  // namespace HOLDFAST_ISA
 }  // namespace holdfast

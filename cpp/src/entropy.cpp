@@ -121,6 +121,15 @@ public:
                 mask[member] = row[member] != 0.0 ? 1 : 0;
             }
         }
+        block_weights_.resize(slots / lane_count * columns);
+        block_counts_.resize(slots / lane_count * columns);
+        for (std::size_t slot = 0; slot < tree.count; ++slot) {
+            for (std::size_t column = 0; column < columns; ++column) {
+                const std::size_t block = slot / lane_count * columns + column;
+                block_weights_[block] += weights_[slot * columns + column];
+                block_counts_[block] += significant_[slot * columns + column];
+            }
+        }
         node_weights_.resize(tree.nodes.size() * columns);
         node_counts_.resize(tree.nodes.size() * columns);
         for (std::size_t at = tree.nodes.size(); at-- > 0;) {
@@ -128,11 +137,12 @@ public:
             double* mass = &node_weights_[at * columns];
             std::uint32_t* number = &node_counts_[at * columns];
             if (node.left == 0) {
-                for (std::size_t slot = node.first_leaf * leaf_size;
-                     slot < (node.first_leaf + 1) * leaf_size; ++slot) {
+                constexpr std::size_t blocks = leaf_size / lane_count;
+                for (std::size_t block = node.first_leaf * blocks;
+                     block < (node.first_leaf + 1) * blocks; ++block) {
                     for (std::size_t column = 0; column < columns; ++column) {
-                        mass[column] += weights_[slot * columns + column];
-                        number[column] += significant_[slot * columns + column];
+                        mass[column] += block_weights_[block * columns + column];
+                        number[column] += block_counts_[block * columns + column];
                     }
                 }
             } else {
@@ -148,8 +158,11 @@ public:
         for (std::size_t member = 0; member < members_; ++member) {
             neighbors_[member] = neighbors_among(task, survivors[member]);
         }
-        view_ = {tree.view(),         members_,             vectors,             weights_.data(),
-                 significant_.data(), node_weights_.data(), node_counts_.data(), neighbors_.data()};
+        view_ = {tree.view(),           members_,
+                 vectors,               weights_.data(),
+                 significant_.data(),   block_weights_.data(),
+                 block_counts_.data(),  node_weights_.data(),
+                 node_counts_.data(),   neighbors_.data()};
     }
 
     /// One task per leaf; partial sums are added in the order of the leaves.
@@ -188,8 +201,8 @@ private:
     const Task& task_;
     const PointTree& tree_;
     std::size_t members_;
-    std::vector<double> weights_, node_weights_;
-    std::vector<std::uint32_t> significant_, node_counts_, neighbors_;
+    std::vector<double> weights_, block_weights_, node_weights_;
+    std::vector<std::uint32_t> significant_, block_counts_, node_counts_, neighbors_;
     PosteriorGroup view_{};
 };
 

@@ -36,6 +36,8 @@ struct PosteriorGroup {
     std::size_t vectors;               // Lanes in a row, 1 to 4
     const double* weights;             // [slots][vectors * 8], each column sums to 1
     const std::uint32_t* significant;  // [slots][vectors * 8], 1 where the weight is not zero
+    const double* block_weights;       // [slots / 8][vectors * 8], sums of eight slots
+    const std::uint32_t* block_counts;
     const double* node_weights;        // [nodes][vectors * 8], sums below each node
     const std::uint32_t* node_counts;  // [nodes][vectors * 8]
     const std::uint32_t* neighbors;    // [vectors * 8] the k of each column, 0 in unused columns

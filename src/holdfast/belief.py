@@ -3,10 +3,11 @@
 A belief about the state is a set of states ("particles") with weights that sum to 1. Moving the
 robot moves every particle (*predict*); an observation multiplies each weight by how well that
 particle explains it (*update*); and when few particles carry most of the weight, the set is drawn
-anew from itself (*resample*). The functions are pure: they return a new belief and keep the old one.
+anew from itself (*resample*). The functions are pure: they return a new belief and keep the old
+one.
 
-Weights are multiplied as logarithms, so an observation that every particle finds most unlikely still
-ranks them instead of turning every weight into zero.
+Weights are multiplied as logarithms, so an observation that every particle finds most unlikely
+still ranks them instead of turning every weight into zero.
 """
 
 from __future__ import annotations
@@ -104,7 +105,9 @@ class Belief(NamedTuple):
             raise InvalidValueError(f"weights of shape {array.shape}: need ({count},)")
         if not np.isfinite(array).all() or (array < 0.0).any():
             bad = int(np.argmin(np.isfinite(array) & (array >= 0.0)))
-            raise InvalidValueError(f"weight of particle {bad} is {array[bad]}: must be >= 0, finite")
+            raise InvalidValueError(
+                f"weight of particle {bad} is {array[bad]}: must be >= 0, finite"
+            )
         total = numerics.sum(array)
         if not 0.0 < total < np.inf:
             raise InvalidValueError(f"sum of the weights is {total}: must be positive and finite")
@@ -197,8 +200,8 @@ def update(
         )
         if np.isnan(log_likelihood).any() or (log_likelihood == np.inf).any():
             raise ProblemError(
-                f"log_likelihood of observation {observed} under sensing action {sensing_action} is "
-                "NaN or plus infinity for a particle"
+                f"log_likelihood of observation {observed} under sensing action {sensing_action} "
+                "is NaN or plus infinity for a particle"
             )
         explained = bool((log_likelihood > -np.inf).any())
     weights, survivors = _kernel.normalize(numerics.log(belief.weights) + log_likelihood, -745.0)

@@ -1,10 +1,10 @@
 """How uncertain are weighted points? Differential entropy, estimated.
 
 Two estimates. *Nearest neighbour*: where the k-th neighbour is far, the density is low. Below a
-resolution distances are not looked at, so that equal points (a policy that says "do not move" to half
-of the particles) give a finite answer. *Gaussian mixture*: every point stands for a Gaussian of
-the motion noise, because that is what a robot that is told to do it will do; pairwise distances then
-bound the entropy of the mixture.
+resolution distances are not looked at, so that equal points (a policy that says "do not move" to
+half of the particles) give a finite answer. *Gaussian mixture*: every point stands for a Gaussian
+of the motion noise, because that is what a robot that is told to do it will do; pairwise distances
+then bound the entropy of the mixture.
 
 Entropies are in nats. Those of continuous quantities may be negative.
 """
@@ -29,16 +29,16 @@ MAX_DIMENSION = 64
 class NearestNeighbor(NamedTuple):
     """The weighted nearest-neighbour estimate with a resolution.
 
-    With r_n the distance from point n to its k-th nearest other point, or the resolution if that is
-    larger; q_n the number of others within r_n (k where the k-th distance set it); m_n their weight over
-    ``1 - w_n``; and c_d the volume of the unit ball::
+    With r_n the distance from point n to its k-th nearest other point, or the resolution if that
+    is larger; q_n the number of others within r_n (k where the k-th distance set it); m_n their
+    weight over ``1 - w_n``; and c_d the volume of the unit ball::
 
         entropy = sum_n w_n (-log m_n + log c_d + d log r_n + log q_n - psi(q_n))
 
     Points of less than a millionth of the largest weight are left out, because a neighbour of
-    weight 1e-200 says nothing about the density; with k or fewer others left, k is their number; and a
-    single point has the entropy of the ball of the resolution. On uniform weights and a small
-    resolution it is the estimate of Kozachenko and Leonenko (1987) in the form of Kraskov,
+    weight 1e-200 says nothing about the density; with k or fewer others left, k is their number;
+    and a single point has the entropy of the ball of the resolution. On uniform weights and a
+    small resolution it is the estimate of Kozachenko and Leonenko (1987) in the form of Kraskov,
     Stögbauer and Grassberger (2004), with ``log N`` in the place of ``psi(N)``.
 
     Attributes
@@ -58,7 +58,8 @@ class GaussianMixture(NamedTuple):
 
     With S the noise's covariance (diagonal)::
 
-        d/2 log(2 pi e) + 1/2 log |S| - sum_i w_i log sum_j w_j exp(-c (u_i - u_j)' S^-1 (u_i - u_j))
+        d/2 log(2 pi e) + 1/2 log |S| - sum_i w_i log sum_j w_j exp(-c (u_i - u_j)' S^-1 (u_i -
+        u_j))
 
     Attributes
     ----------
@@ -69,8 +70,8 @@ class GaussianMixture(NamedTuple):
 
     Notes
     -----
-    Kolchinsky and Tracey (2017), "Estimating mixture entropy with pairwise distances", Entropy 19(7),
-    eqs. 10 and 11 with the Kullback-Leibler and the Bhattacharyya distance.
+    Kolchinsky and Tracey (2017), "Estimating mixture entropy with pairwise distances", Entropy
+    19(7), eqs. 10 and 11 with the Kullback-Leibler and the Bhattacharyya distance.
     """
 
     variance: FloatArray
@@ -99,7 +100,9 @@ def kernel_estimator(
         If a parameter is out of bounds.
     """
     if not 1 <= dimension <= MAX_DIMENSION:
-        raise InvalidValueError(f"points of {dimension} coordinates: allowed are 1 to {MAX_DIMENSION}")
+        raise InvalidValueError(
+            f"points of {dimension} coordinates: allowed are 1 to {MAX_DIMENSION}"
+        )
     if isinstance(estimator, NearestNeighbor):
         if estimator.neighbors < 1:
             raise InvalidValueError(f"neighbors {estimator.neighbors}: must be at least 1")

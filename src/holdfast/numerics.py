@@ -1,8 +1,8 @@
 """Functions of arrays with the same bits on every machine.
 
-NumPy's ``exp``, ``sin`` or ``sum`` may differ in the last bit between processors, because they choose
-their code by processor. What a decision or a digest depends on goes through these instead; they
-are the kernel's, and use only operations that IEEE 754 defines exactly, in a fixed order.
+NumPy's ``exp``, ``sin`` or ``sum`` may differ in the last bit between processors, because they
+choose their code by processor. What a decision or a digest depends on goes through these instead;
+they are the kernel's, and use only operations that IEEE 754 defines exactly, in a fixed order.
 """
 
 from __future__ import annotations
@@ -19,9 +19,7 @@ __all__ = ["arcsin", "cos", "exp", "log", "sin", "sum", "weighted_mean"]
 FloatArray = npt.NDArray[np.float64]
 
 
-def _elementwise(
-    function: Callable[[FloatArray], FloatArray], values: npt.ArrayLike
-) -> FloatArray:
+def _elementwise(function: Callable[[FloatArray], FloatArray], values: npt.ArrayLike) -> FloatArray:
     array = np.asarray(values, dtype=np.float64, order="C")
     return function(array.reshape(-1)).reshape(array.shape)
 
@@ -51,7 +49,7 @@ def arcsin(value: float) -> float:
     return _kernel.arcsin(float(value))
 
 
-def sum(values: npt.ArrayLike) -> float:
+def sum(values: npt.ArrayLike) -> float:  # noqa: A001 - always used as numerics.sum
     """Return the sum of all values, added in one fixed order."""
     return _kernel.sum(np.ascontiguousarray(values, dtype=np.float64).reshape(-1))
 

@@ -2,8 +2,9 @@
 
 :class:`PlanningState` is everything that the next decision depends on besides the problem and the
 settings. Nothing here reads a clock, a socket or a generator with a state; every random number is
-named by (seed, trial, step, purpose). So whoever holds the state, a cloud service, the robot itself, a
-process started after a crash, makes the same next decision, and a checkpoint is simply the state, encoded.
+named by (seed, trial, step, purpose). So whoever holds the state, a cloud service, the robot
+itself, a process started after a crash, makes the same next decision, and a checkpoint is simply
+the state, encoded.
 
 One step of the loop::
 
@@ -203,8 +204,8 @@ def observe(
     Raises
     ------
     InvalidValueError
-        If the sensing action does not exist, or the observation is not finite or of the wrong size. The
-        state that was passed in is still good.
+        If the sensing action does not exist, or the observation is not finite or of the wrong
+        size. The state that was passed in is still good.
     """
     if not 0 <= sensing_action < len(problem.sensing_actions):
         raise InvalidValueError(
@@ -217,9 +218,7 @@ def observe(
     # Rounding may leave the size of equal weights a little above their number.
     resampled = threshold == count or found.effective_sample_size <= threshold
     if resampled:
-        belief = resample(
-            belief, stream(state.seed, state.trial, state.step, Purpose.RESAMPLING)
-        )
+        belief = resample(belief, stream(state.seed, state.trial, state.step, Purpose.RESAMPLING))
     after = state._replace(sensed=True, belief=belief)
     return after, ObservationInfo(found.effective_sample_size, found.explained, resampled)
 

@@ -1,9 +1,9 @@
 """Random numbers by name, not by position.
 
-A generator with a state breaks as soon as two machines have drawn a different number of times. Here a
-draw is a function of where it belongs: (seed, trial, step, purpose) name a stream, and the same
-stream always gives the same numbers. A step that is computed again, elsewhere, after a crash, draws
-what it drew before.
+A generator with a state breaks as soon as two machines have drawn a different number of times.
+Here a draw is a function of where it belongs: (seed, trial, step, purpose) name a stream, and the
+same stream always gives the same numbers. A step that is computed again, elsewhere, after a crash,
+draws what it drew before.
 
 The generator is Philox 4x32-10 (Salmon et al., SC 2011): the seed is its key; trial, step and
 purpose are words of its counter, so that no two streams of one seed share a block.

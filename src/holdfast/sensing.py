@@ -1,10 +1,11 @@
 """Choosing what to sense.
 
-Look ahead by one observation: for each sensing action, imagine what it might show, update the belief
-by it, and ask how uncertain the robot would then be about what to **do**. The sensing action with the
-least expected entropy of the task actions wins (*action entropy*). Asking instead how uncertain it would
-be about where it *is* (*state entropy*) spends sensing on differences that change no action. Two
-choices that imagine nothing, *random* and *fixed*, are there to compare with.
+Look ahead by one observation: for each sensing action, imagine what it might show, update the
+belief by it, and ask how uncertain the robot would then be about what to **do**. The sensing
+action with the least expected entropy of the task actions wins (*action entropy*). Asking instead
+how uncertain it would be about where it *is* (*state entropy*) spends sensing on differences that
+change no action. Two choices that imagine nothing, *random* and *fixed*, are there to compare
+with.
 
 Source: Greigarn, Branicky and Çavuşoğlu, "Task-oriented active sensing via action entropy
 minimization", IEEE Access 7, 2019, algorithm 2.
@@ -41,8 +42,8 @@ class SensingInfo(NamedTuple):
     Attributes
     ----------
     entropies : array of shape (J,) or None
-        Expected (discounted, summed) entropy after each sensing action, in nats; None for ``random``
-        and ``fixed``.
+        Expected (discounted, summed) entropy after each sensing action, in nats; None for
+        ``random`` and ``fixed``.
     samples : array of shape (J, M) or None
         The entropies of the single hypothetical observations, whose means ``entropies`` are.
     likelihoods, visits : int
@@ -95,8 +96,8 @@ def choose_sensing_action(
     if selector.method == "fixed":
         if selector.sensing_action >= count:
             raise InvalidValueError(
-                f"selector.sensing_action {selector.sensing_action}: {problem.name} has sensing actions "
-                f"0 to {count - 1}"
+                f"selector.sensing_action {selector.sensing_action}: {problem.name} has sensing "
+                f"actions 0 to {count - 1}"
             )
         return selector.sensing_action, SensingInfo(None, None, 0, 0)
     if selector.method == "random":
@@ -136,8 +137,8 @@ def choose_sensing_action(
     # argmin finds a NaN, if there is one.
     if entropies[index] != entropies[index]:
         raise ProblemError(
-            f"the entropy after sensing action {index} of {problem.name} is not a number: a hypothetical "
-            "observation had no likelihood under any particle"
+            f"the entropy after sensing action {index} of {problem.name} is not a number: a "
+            "hypothetical observation had no likelihood under any particle"
         )
     return index, SensingInfo(entropies, samples, likelihoods, visits)
 
@@ -186,7 +187,7 @@ def _estimator(
         if variance.shape != (dimension,):
             raise InvalidValueError(
                 f"selector.estimator {selector.estimator}: {problem.name} has a motion variance of "
-                f"{variance.shape[0]} coordinates for points of {dimension}; give selector.resolution"
+                f"{variance.shape[0]} coordinates, the points {dimension}: set selector.resolution"
             )
     return kernel_estimator(GaussianMixture(variance, upper), dimension)
 
@@ -219,8 +220,8 @@ def _predictions(problem: Problem, belief: Belief) -> tuple[list[int], FloatArra
     # A comparison with NaN is false.
     if not ((variance > 0.0) & (variance < np.inf)).all():
         raise ProblemError(
-            f"observation_variance of {problem.name} has the entry {variance.min()}: every entry must be "
-            "positive and finite"
+            f"observation_variance of {problem.name} has the entry {variance.min()}: every entry "
+            "must be positive and finite"
         )
     return sizes, predicted, variance
 
@@ -239,11 +240,12 @@ def _general_log_weights(
     for action in range(len(problem.sensing_actions)):
         for i, particle in enumerate(particles):
             observation = problem.sample_observation(  # type: ignore[attr-defined]
-                belief.states[particle], action, hypotheses.substream(_GENERAL_OBSERVATIONS).substream(i)
+                belief.states[particle],
+                action,
+                hypotheses.substream(_GENERAL_OBSERVATIONS).substream(i),
             )
             rows.append(
-                log_prior
-                + problem.log_likelihood(belief.states, action, observation)  # type: ignore[attr-defined]
+                log_prior + problem.log_likelihood(belief.states, action, observation)  # type: ignore[attr-defined]
             )
     return np.ascontiguousarray(rows, dtype=np.float64)
 
@@ -289,8 +291,8 @@ def _later_entropies(
 ) -> FloatArray:
     """Return the discounted entropies of the steps after the first, shape (J, M).
 
-    Each hypothetical belief takes the action of its own estimate and is moved by it. The motion noise is
-    the same for every sensing action, as the observation noise is.
+    Each hypothetical belief takes the action of its own estimate and is moved by it. The motion
+    noise is the same for every sensing action, as the observation noise is.
     """
     sensing = settings.active_sensing
     samples = sensing.num_observation_samples

@@ -59,7 +59,5 @@ def gaussian_mixture_entropy(
     squared = (((points[:, None, :] - points[None, :, :]) ** 2) / variance).sum(axis=2)
     mixture = -(weights * np.log((weights * np.exp(-c * squared)).sum(axis=1))).sum()
     return float(
-        0.5 * dimension * math.log(2.0 * math.pi * math.e)
-        + 0.5 * np.log(variance).sum()
-        + mixture
+        0.5 * dimension * math.log(2.0 * math.pi * math.e) + 0.5 * np.log(variance).sum() + mixture
     )

@@ -208,10 +208,11 @@ class TestPegInHole3D:
 
     def test_policy(self) -> None:
         assert action(self.problem, 2.0, -1.0, 3.0, 0.01, 0, 0) == [-2.0, 1.0, 0, 0, 0, 0]
-        tilted = action(self.problem, 0.05, 0.05, 3.0, 0.1, -0.05, 0.02)
-        assert tilted == [0.0, 0.0, 0.0, -0.1, 0.05, -0.02]
-        upright = action(self.problem, 0.05, 0.05, 3.0, 0.05, -0.05, 0.02)
-        assert upright == [0.0, 0.0, -3.0, -0.05, 0.05, -0.02]
+        assert action(self.problem, 0.4, 0.4, 3.0, 0.01, 0, 0) == [-0.4, -0.4, 0, 0, 0, 0]
+        tilted = action(self.problem, 0.3, 0.3, 3.0, 0.1, -0.05, 0.02)
+        assert tilted == [-0.3, -0.3, 0.0, -0.1, 0.05, -0.02]
+        upright = action(self.problem, 0.3, 0.3, 3.0, 0.05, -0.05, 0.02)
+        assert upright == [-0.3, -0.3, -3.0, -0.05, 0.05, -0.02]
 
     def test_the_hole_fits_the_peg_with_the_tolerance(self) -> None:
         free = np.zeros((4, 6))

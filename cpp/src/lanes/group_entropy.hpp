@@ -250,6 +250,11 @@ static void sum_balls(const PosteriorGroup& group, const QueryLeaf& query, doubl
                 unsigned bits = bits_of(leaf_distances(tree, query.points[i], node.first_leaf, block) <=
                                         radius_squared);
                 const std::size_t base = node.first_leaf * leaf_size + block * lane_count;
+                if (bits == 0xff) {
+                    row.add(group.block_weights + base / lane_count * columns,
+                            group.block_counts + base / lane_count * columns);
+                    continue;
+                }
                 while (bits != 0) {
                     const std::size_t slot = base + static_cast<std::size_t>(__builtin_ctz(bits));
                     bits &= bits - 1;

@@ -1,8 +1,11 @@
 // Eight doubles at a time, without naming an instruction set.
 //
-// The compiler lowers a 64-byte vector to one AVX-512 register, two AVX registers or four SSE/NEON
-// registers. Every operation on it is element by element and IEEE-exact, and sums over elements are
-// written out in a fixed order, so the bits are the same whatever the width of the machine.
+// A value is one AVX-512 register, two AVX registers or four SSE or NEON registers, by what the file is
+// compiled for; the code above it is the same. Every operation is element by element and IEEE-exact, and
+// sums over elements are written out in a fixed order, so the bits are the same whatever the width.
+//
+// (One vector type of 64 bytes for all machines would be shorter; but compilers lower its comparisons
+// and selections to scalar code where the registers are narrower.)
 
 #pragma once
 
@@ -14,17 +17,113 @@
 #include <immintrin.h>
 #endif
 
+// The inner loops define this as the namespace of their instruction set. The types below depend on the
+// set, so they live in that namespace: no two compilations may share a name for different things.
+#ifndef HOLDFAST_ISA
+#define HOLDFAST_ISA isa_of_this_file
+#endif
+
+#define HOLDFAST_INLINE inline __attribute__((always_inline))
+
 namespace holdfast {
 
 inline constexpr std::size_t lane_count = 8;
 
-using Lanes = double __attribute__((vector_size(64)));
-using IntLanes = std::int64_t __attribute__((vector_size(64)));
+inline namespace HOLDFAST_ISA {
+
+#if defined(__AVX512DQ__)
+inline constexpr std::size_t register_bytes = 64;
+#elif defined(__AVX__)
+inline constexpr std::size_t register_bytes = 32;
+#else
+inline constexpr std::size_t register_bytes = 16;
+#endif
+inline constexpr std::size_t registers = 64 / register_bytes;
+
+using DoubleRegister = double __attribute__((vector_size(register_bytes)));
+using IntRegister = std::int64_t __attribute__((vector_size(register_bytes)));
+using UnsignedRegister = std::uint64_t __attribute__((vector_size(register_bytes)));
 using CountLanes = std::uint32_t __attribute__((vector_size(32)));
 
-#define HOLDFAST_INLINE inline __attribute__((always_inline))
+/// Eight 64-bit integers, or eight truth values (all bits or none).
+struct IntLanes {
+    IntRegister part[registers];
+};
 
-HOLDFAST_INLINE Lanes splat(double value) { return Lanes{} + value; }
+/// Eight doubles.
+struct Lanes {
+    DoubleRegister part[registers];
+
+    HOLDFAST_INLINE double& operator[](std::size_t i) { return reinterpret_cast<double*>(part)[i]; }
+    HOLDFAST_INLINE double operator[](std::size_t i) const {
+        return reinterpret_cast<const double*>(part)[i];
+    }
+};
+
+HOLDFAST_INLINE Lanes splat(double value) {
+    Lanes result;
+    for (std::size_t r = 0; r < registers; ++r) result.part[r] = DoubleRegister{} + value;
+    return result;
+}
+
+HOLDFAST_INLINE IntLanes splat_int(std::int64_t value) {
+    IntLanes result;
+    for (std::size_t r = 0; r < registers; ++r) result.part[r] = IntRegister{} + value;
+    return result;
+}
+
+#define HOLDFAST_LANES_OPERATOR(Result, Type, Scalar, fill, op)                          \
+    HOLDFAST_INLINE Result operator op(const Type& a, const Type& b) {                   \
+        Result result;                                                                   \
+        for (std::size_t r = 0; r < registers; ++r) result.part[r] = a.part[r] op b.part[r]; \
+        return result;                                                                   \
+    }                                                                                    \
+    HOLDFAST_INLINE Result operator op(const Type& a, Scalar b) { return a op fill(b); } \
+    HOLDFAST_INLINE Result operator op(Scalar a, const Type& b) { return fill(a) op b; }
+HOLDFAST_LANES_OPERATOR(Lanes, Lanes, double, splat, +)
+HOLDFAST_LANES_OPERATOR(Lanes, Lanes, double, splat, -)
+HOLDFAST_LANES_OPERATOR(Lanes, Lanes, double, splat, *)
+HOLDFAST_LANES_OPERATOR(Lanes, Lanes, double, splat, /)
+HOLDFAST_LANES_OPERATOR(IntLanes, Lanes, double, splat, <)
+HOLDFAST_LANES_OPERATOR(IntLanes, Lanes, double, splat, <=)
+HOLDFAST_LANES_OPERATOR(IntLanes, Lanes, double, splat, >)
+HOLDFAST_LANES_OPERATOR(IntLanes, Lanes, double, splat, >=)
+HOLDFAST_LANES_OPERATOR(IntLanes, Lanes, double, splat, ==)
+HOLDFAST_LANES_OPERATOR(IntLanes, IntLanes, std::int64_t, splat_int, +)
+HOLDFAST_LANES_OPERATOR(IntLanes, IntLanes, std::int64_t, splat_int, -)
+HOLDFAST_LANES_OPERATOR(IntLanes, IntLanes, std::int64_t, splat_int, &)
+HOLDFAST_LANES_OPERATOR(IntLanes, IntLanes, std::int64_t, splat_int, |)
+HOLDFAST_LANES_OPERATOR(IntLanes, IntLanes, std::int64_t, splat_int, !=)
+#undef HOLDFAST_LANES_OPERATOR
+
+HOLDFAST_INLINE Lanes operator-(const Lanes& a) {
+    Lanes result;
+    for (std::size_t r = 0; r < registers; ++r) result.part[r] = -a.part[r];
+    return result;
+}
+HOLDFAST_INLINE Lanes& operator+=(Lanes& a, const Lanes& b) { return a = a + b; }
+HOLDFAST_INLINE Lanes& operator-=(Lanes& a, const Lanes& b) { return a = a - b; }
+HOLDFAST_INLINE IntLanes& operator|=(IntLanes& a, const IntLanes& b) { return a = a | b; }
+
+HOLDFAST_INLINE IntLanes shift_left(const IntLanes& a, int by) {
+    IntLanes result;
+    for (std::size_t r = 0; r < registers; ++r) result.part[r] = a.part[r] << by;
+    return result;
+}
+HOLDFAST_INLINE std::int64_t shift_left(std::int64_t a, int by) { return a << by; }
+
+/// Shift of the bit pattern: zeros come in from the left.
+HOLDFAST_INLINE IntLanes shift_right(const IntLanes& a, int by) {
+    IntLanes result;
+    for (std::size_t r = 0; r < registers; ++r) {
+        result.part[r] =
+            reinterpret_cast<IntRegister>(reinterpret_cast<UnsignedRegister>(a.part[r]) >> by);
+    }
+    return result;
+}
+HOLDFAST_INLINE std::int64_t shift_right(std::int64_t a, int by) {
+    return static_cast<std::int64_t>(static_cast<std::uint64_t>(a) >> by);
+}
 
 HOLDFAST_INLINE Lanes load(const double* from) {
     Lanes lanes;
@@ -32,7 +131,7 @@ HOLDFAST_INLINE Lanes load(const double* from) {
     return lanes;
 }
 
-HOLDFAST_INLINE void store(double* to, Lanes lanes) { std::memcpy(to, &lanes, sizeof lanes); }
+HOLDFAST_INLINE void store(double* to, const Lanes& lanes) { std::memcpy(to, &lanes, sizeof lanes); }
 
 /// Loads `count` < 8 doubles and fills up with `filler`.
 HOLDFAST_INLINE Lanes load_partial(const double* from, std::size_t count, double filler) {
@@ -41,54 +140,60 @@ HOLDFAST_INLINE Lanes load_partial(const double* from, std::size_t count, double
     return lanes;
 }
 
-HOLDFAST_INLINE void store_partial(double* to, Lanes lanes, std::size_t count) {
+HOLDFAST_INLINE void store_partial(double* to, const Lanes& lanes, std::size_t count) {
     for (std::size_t i = 0; i < count; ++i) to[i] = lanes[i];
 }
 
-HOLDFAST_INLINE Lanes select(IntLanes mask, Lanes yes, Lanes no) { return mask ? yes : no; }
+HOLDFAST_INLINE Lanes select(const IntLanes& mask, const Lanes& yes, const Lanes& no) {
+    Lanes result;
+    for (std::size_t r = 0; r < registers; ++r) {
+        result.part[r] = mask.part[r] ? yes.part[r] : no.part[r];
+    }
+    return result;
+}
 HOLDFAST_INLINE double select(bool mask, double yes, double no) { return mask ? yes : no; }
 
 HOLDFAST_INLINE double square_root(double x) { return __builtin_sqrt(x); }
-HOLDFAST_INLINE Lanes square_root(Lanes x) {
-    double values[lane_count];
-    store(values, x);
-    for (std::size_t i = 0; i < lane_count; ++i) values[i] = __builtin_sqrt(values[i]);
-    return load(values);
+HOLDFAST_INLINE Lanes square_root(const Lanes& x) {
+    Lanes result;
+    for (std::size_t i = 0; i < lane_count; ++i) result[i] = __builtin_sqrt(x[i]);
+    return result;
 }
 
 /// Adds the eight elements in one fixed order: pairs at distance 4, then 2, then 1.
-HOLDFAST_INLINE double sum_of(Lanes x) {
+HOLDFAST_INLINE double sum_of(const Lanes& x) {
     const double a0 = x[0] + x[4], a1 = x[1] + x[5], a2 = x[2] + x[6], a3 = x[3] + x[7];
     return (a0 + a2) + (a1 + a3);
 }
 
-HOLDFAST_INLINE double maximum_of(Lanes x) {
+HOLDFAST_INLINE double maximum_of(const Lanes& x) {
     double largest = x[0];
     for (std::size_t i = 1; i < lane_count; ++i) largest = x[i] > largest ? x[i] : largest;
     return largest;
 }
 
-/// One bit for each element of a comparison's result.
-HOLDFAST_INLINE unsigned bits_of(IntLanes mask) {
+/// One bit for each truth value.
+HOLDFAST_INLINE unsigned bits_of(const IntLanes& mask) {
 #if defined(__AVX512DQ__)
-    return _mm512_movepi64_mask(reinterpret_cast<__m512i>(mask));
+    return _mm512_movepi64_mask(reinterpret_cast<__m512i>(mask.part[0]));
 #elif defined(__AVX__)
-    __m256d halves[2];
-    std::memcpy(halves, &mask, sizeof halves);
-    return static_cast<unsigned>(_mm256_movemask_pd(halves[0])) |
-           (static_cast<unsigned>(_mm256_movemask_pd(halves[1])) << 4);
+    return static_cast<unsigned>(_mm256_movemask_pd(reinterpret_cast<__m256d>(mask.part[0]))) |
+           static_cast<unsigned>(_mm256_movemask_pd(reinterpret_cast<__m256d>(mask.part[1]))) << 4;
 #elif defined(__SSE2__)
-    __m128d quarters[4];
-    std::memcpy(quarters, &mask, sizeof quarters);
-    return static_cast<unsigned>(_mm_movemask_pd(quarters[0])) |
-           (static_cast<unsigned>(_mm_movemask_pd(quarters[1])) << 2) |
-           (static_cast<unsigned>(_mm_movemask_pd(quarters[2])) << 4) |
-           (static_cast<unsigned>(_mm_movemask_pd(quarters[3])) << 6);
+    unsigned bits = 0;
+    for (std::size_t r = 0; r < registers; ++r) {
+        bits |= static_cast<unsigned>(_mm_movemask_pd(reinterpret_cast<__m128d>(mask.part[r])))
+                << (2 * r);
+    }
+    return bits;
 #else
     unsigned bits = 0;
-    for (std::size_t i = 0; i < lane_count; ++i) bits |= (mask[i] != 0 ? 1u : 0u) << i;
+    for (std::size_t i = 0; i < lane_count; ++i) {
+        bits |= (reinterpret_cast<const std::int64_t*>(mask.part)[i] != 0 ? 1u : 0u) << i;
+    }
     return bits;
 #endif
 }
 
+}  // namespace HOLDFAST_ISA
 }  // namespace holdfast

@@ -10,9 +10,9 @@ one state, ``(num_particles, state_size)`` a belief, ``(trials, num_particles, s
 A function is called with any of these and returns the same leading shape.
 
 To have the same decisions, bit for bit, on every machine, a problem uses only operations that IEEE
-754 defines exactly (``+ - * /``, ``np.sqrt``, comparisons, ``np.where``) and takes ``exp``, ``sin``,
-sums and the like from :mod:`holdfast.numerics`. One that does not still works: then only the
-checkpoint, not a recomputation, carries a state from one machine to another.
+754 defines exactly (``+ - * /``, ``np.sqrt``, comparisons, ``np.where``) and takes ``exp``,
+``sin``, sums and the like from :mod:`holdfast.numerics`. One that does not still works: then only
+the checkpoint, not a recomputation, carries a state from one machine to another.
 """
 
 from __future__ import annotations
@@ -138,7 +138,7 @@ class Problem(Protocol):
         ...
 
     def reward(self, states: FloatArray, actions: FloatArray) -> FloatArray:
-        """Return the reward of executed ``actions`` that led to ``states``, of the leading shape."""
+        """Return the reward of executed ``actions`` that led to ``states``, leading shape."""
         ...
 
     def is_goal(self, states: FloatArray) -> npt.NDArray[np.bool_]:
@@ -153,8 +153,8 @@ class Problem(Protocol):
 class ProblemBase:
     """Defaults for the optional members of :class:`Problem`.
 
-    A subclass sets ``name``, ``state_size``, ``action_size``, ``sensing_actions``, ``resolution`` and
-    ``motion_variance`` and writes ``initial_states``, ``move``, ``observation_mean``,
+    A subclass sets ``name``, ``state_size``, ``action_size``, ``sensing_actions``, ``resolution``
+    and ``motion_variance`` and writes ``initial_states``, ``move``, ``observation_mean``,
     ``observation_variance``, ``policy`` and ``is_goal``.
     """
 
@@ -188,7 +188,9 @@ class ProblemBase:
         try:
             return cls(**model, **state_space_planner)
         except TypeError as error:
-            raise ProblemError(f"{cls.__name__} cannot be built from its settings: {error}") from error
+            raise ProblemError(
+                f"{cls.__name__} cannot be built from its settings: {error}"
+            ) from error
 
     def next_stage(self, estimates: FloatArray, stage: int | IntArray) -> int | IntArray:
         """Stay in the stage: the task has one."""

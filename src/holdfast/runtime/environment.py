@@ -1,7 +1,7 @@
 """What the robot's loop acts on: a world that can be sensed and moved.
 
-The loop knows three methods. The simulated world is made from the problem and draws from streams of its
-own; a real robot is another object with the same three methods.
+The loop knows three methods. The simulated world is made from the problem and draws from streams
+of its own; a real robot is another object with the same three methods.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ class Environment(Protocol):
 class SimulatedEnvironment:
     """A world made from a problem, with random streams of its own.
 
-    What happens is a function of (seed, trial) and of the task actions performed so far: sensing draws
-    from a stream of its own and so does not change how the world moves.
+    What happens is a function of (seed, trial) and of the task actions performed so far: sensing
+    draws from a stream of its own and so does not change how the world moves.
 
     Parameters
     ----------

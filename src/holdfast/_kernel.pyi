@@ -1,0 +1,84 @@
+"""The compiled kernel. Private: go through the typed functions that wrap it."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+_Floats = npt.NDArray[np.float64]
+_Words = tuple[int, int, int, int, int]
+
+def simd() -> str: ...
+def exp(values: _Floats) -> _Floats: ...
+def log(values: _Floats) -> _Floats: ...
+def sin(values: _Floats) -> _Floats: ...
+def cos(values: _Floats) -> _Floats: ...
+def arcsin(value: float) -> float: ...
+def sum(values: _Floats) -> float: ...  # noqa: A001
+def weighted_sums(weights: _Floats, rows: _Floats) -> _Floats: ...
+def normalize(log_weights: _Floats, log_negligible: float) -> tuple[_Floats, int]: ...
+def philox(words: _Words, block: int) -> tuple[int, int, int, int, int]: ...
+def substream(words: _Words, index: int) -> _Words: ...
+def normals(words: _Words, count: int) -> _Floats: ...
+def uniforms(words: _Words, count: int) -> _Floats: ...
+def systematic_resample(weights: _Floats, offset: float) -> npt.NDArray[np.int64]: ...
+def entropies(
+    points: _Floats,
+    weights: _Floats,
+    normalized: bool,
+    mixture: bool,
+    neighbors: int,
+    resolution: float,
+    exponent: float,
+    offset: float,
+    threads: int,
+) -> tuple[_Floats, int, int]: ...
+def hypothetical_entropies(
+    weights: _Floats,
+    sizes: Sequence[int],
+    predicted: _Floats,
+    variance: _Floats,
+    samples: int,
+    stream: _Words,
+    points: _Floats,
+    mixture: bool,
+    neighbors: int,
+    resolution: float,
+    exponent: float,
+    offset: float,
+    threads: int,
+) -> tuple[_Floats, _Floats, int, int]: ...
+def hypothetical_weights(
+    weights: _Floats,
+    sizes: Sequence[int],
+    predicted: _Floats,
+    variance: _Floats,
+    samples: int,
+    stream: _Words,
+) -> _Floats: ...
+def measure_exp(count: int, repetitions: int) -> float: ...
+def measure_visit(count: int, dimension: int, repetitions: int) -> float: ...
+
+class _World:
+    def collides(self, states: _Floats, result: npt.NDArray[np.bool_]) -> bool: ...
+    def move(
+        self,
+        states: _Floats,
+        actions: _Floats,
+        standard_deviation: _Floats,
+        tolerance: float,
+        stream: _Words,
+        next_states: _Floats,
+    ) -> bool: ...
+    def draw_free(
+        self, mean: _Floats, standard_deviation: _Floats, stream: _Words, states: _Floats
+    ) -> int: ...
+
+class DiscWorld(_World):
+    def __init__(self, radius: float, obstacles: _Floats) -> None: ...
+
+class RectangleWorld(_World):
+    def __init__(self, width: float, height: float, obstacles: _Floats) -> None: ...
+
+class BoxWorld(_World):
+    def __init__(self, size_x: float, size_y: float, size_z: float, obstacles: _Floats) -> None: ...
