@@ -60,7 +60,7 @@ $(BIN)/python:
 	    sys.exit(not (pathlib.Path(sysconfig.get_path("include")) / "Python.h").exists())' || { \
 	    echo "make: $(PYTHON) has no headers; on Debian: apt-get install python3-dev" >&2; exit 1; }
 	@command -v "$${CXX:-c++}" >/dev/null || { \
-	    echo "make: no C++ compiler; install gcc or clang (with OpenMP), or set CXX" >&2; exit 1; }
+	    echo "make: no C++ compiler; install gcc or clang, or set CXX" >&2; exit 1; }
 	$(PYTHON) -m venv $(VENV)
 
 $(INSTALLED_FIGURES): pyproject.toml $(NATIVE_SOURCES) | $(BIN)/python

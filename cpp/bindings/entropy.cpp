@@ -28,17 +28,11 @@ EntropySettings make_settings(bool mixture, std::uint32_t neighbors, double reso
 }
 
 HypothesisInput make_input(const Input<1>& weights, const std::vector<std::uint32_t>& sizes,
-                           const Input<2>& predicted, const Input<2>& variance,
-                           std::size_t samples, const StreamWords& stream) {
-    return {weights.shape(0),
-            weights.data(),
-            sizes.size(),
-            sizes.data(),
-            predicted.data(),
-            variance.data(),
-            variance.shape(1) != 1,
-            samples,
-            to_stream(stream)};
+                           const Input<2>& predicted, const Input<2>& variance, std::size_t samples,
+                           const StreamWords& stream) {
+    return {weights.shape(0),       weights.data(),   sizes.size(),
+            sizes.data(),           predicted.data(), variance.data(),
+            variance.shape(1) != 1, samples,          to_stream(stream)};
 }
 
 double seconds_since(std::chrono::steady_clock::time_point start) {
@@ -48,39 +42,37 @@ double seconds_since(std::chrono::steady_clock::time_point start) {
 }  // namespace
 
 void holdfast::bind_entropy(nb::module_& module) {
-    module.def(
-        "entropies",
-        [](const Input<2>& points, const Input<2>& log_weights, bool normalized, bool mixture,
-           std::uint32_t neighbors, double resolution, double exponent, double offset, int threads) {
-            const std::size_t posteriors = log_weights.shape(0), count = points.shape(0);
-            double* out;
-            auto result = make_array<double>({posteriors}, out);
-            EntropyCounts counts;
-            {
-                nb::gil_scoped_release release;
-                const double log_negligible = holdfast::log(negligible_weight);
-                const VectorKernels& kernels = vector_kernels();
-                const double* rows = log_weights.data();
-                const auto source = [&](std::size_t index, double* weights) {
-                    if (normalized) {
-                        kernels.log(rows + index * count, weights, count);
-                        return kernels.normalize(weights, count, log_negligible, weights);
-                    }
-                    return kernels.normalize(rows + index * count, count, log_negligible, weights);
-                };
-                entropies(points.data(), count, points.shape(1), posteriors, source,
-                          make_settings(mixture, neighbors, resolution, exponent, offset, threads), out,
-                          counts);
-            }
-            return nb::make_tuple(result, counts.likelihoods, counts.visits);
-        });
+    module.def("entropies", [](const Input<2>& points, const Input<2>& log_weights, bool normalized,
+                               bool mixture, std::uint32_t neighbors, double resolution,
+                               double exponent, double offset, int threads) {
+        const std::size_t posteriors = log_weights.shape(0), count = points.shape(0);
+        double* out;
+        auto result = make_array<double>({posteriors}, out);
+        EntropyCounts counts;
+        {
+            nb::gil_scoped_release release;
+            const VectorKernels& kernels = vector_kernels();
+            const double* rows = log_weights.data();
+            const auto source = [&](std::size_t index, double* weights) {
+                if (normalized) {
+                    kernels.log(rows + index * count, weights, count);
+                    return kernels.normalize(weights, count, true, weights);
+                }
+                return kernels.normalize(rows + index * count, count, true, weights);
+            };
+            entropies(points.data(), count, points.shape(1), posteriors, source,
+                      make_settings(mixture, neighbors, resolution, exponent, offset, threads), out,
+                      counts);
+        }
+        return nb::make_tuple(result, counts.likelihoods, counts.visits);
+    });
 
     module.def(
         "hypothetical_entropies",
-        [](const Input<1>& weights, const std::vector<std::uint32_t>& sizes, const Input<2>& predicted,
-           const Input<2>& variance, std::size_t samples, const StreamWords& stream,
-           const Input<2>& points, bool mixture, std::uint32_t neighbors, double resolution,
-           double exponent, double offset, int threads) {
+        [](const Input<1>& weights, const std::vector<std::uint32_t>& sizes,
+           const Input<2>& predicted, const Input<2>& variance, std::size_t samples,
+           const StreamWords& stream, const Input<2>& points, bool mixture, std::uint32_t neighbors,
+           double resolution, double exponent, double offset, int threads) {
             double* out;
             auto result = make_array<double>({sizes.size(), samples}, out);
             double* mean;
@@ -102,17 +94,16 @@ void holdfast::bind_entropy(nb::module_& module) {
             return nb::make_tuple(means, result, counts.likelihoods, counts.visits);
         });
 
-    module.def("hypothetical_weights",
-               [](const Input<1>& weights, const std::vector<std::uint32_t>& sizes,
-                  const Input<2>& predicted, const Input<2>& variance, std::size_t samples,
-                  const StreamWords& stream) {
-                   double* out;
-                   auto result = make_array<double>({sizes.size(), samples, weights.shape(0)}, out);
-                   nb::gil_scoped_release release;
-                   hypothetical_weights(
-                       make_input(weights, sizes, predicted, variance, samples, stream), out);
-                   return result;
-               });
+    module.def("hypothetical_weights", [](const Input<1>& weights,
+                                          const std::vector<std::uint32_t>& sizes,
+                                          const Input<2>& predicted, const Input<2>& variance,
+                                          std::size_t samples, const StreamWords& stream) {
+        double* out;
+        auto result = make_array<double>({sizes.size(), samples, weights.shape(0)}, out);
+        nb::gil_scoped_release release;
+        hypothetical_weights(make_input(weights, sizes, predicted, variance, samples, stream), out);
+        return result;
+    });
 
     // For benchmarks: seconds that one vectorised exp, and one visit of a neighbour, take here.
     module.def("measure_exp", [](std::size_t count, int repetitions) {
@@ -136,9 +127,9 @@ void holdfast::bind_entropy(nb::module_& module) {
         std::uint64_t visits = 0;
         const auto start = std::chrono::steady_clock::now();
         for (int i = 0; i < repetitions; ++i) {
-            vector_kernels().compact_nearest({stride, stride, dimension, coordinates.data(),
-                                              weights.data(), scratch.data()},
-                                             1, {1.0, 0.0, bias.data()}, &visits);
+            vector_kernels().compact_nearest(
+                {stride, stride, dimension, coordinates.data(), weights.data(), scratch.data()}, 1,
+                {1.0, 0.0, bias.data()}, &visits);
         }
         return seconds_since(start) / static_cast<double>(visits);
     });

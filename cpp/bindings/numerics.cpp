@@ -13,7 +13,7 @@ namespace {
 
 using Elementwise = void (*)(const double*, double*, std::size_t);
 
-template <Elementwise VectorKernels::*function>
+template <Elementwise VectorKernels::* function>
 Output<double> elementwise(const Input<1>& in) {
     double* out;
     auto result = make_array<double>({in.shape(0)}, out);
@@ -34,14 +34,15 @@ void holdfast::bind_numerics(nb::module_& module) {
     module.def("weighted_sums", [](const Input<1>& weights, const Input<2>& rows) {
         double* out;
         auto result = make_array<double>({rows.shape(1)}, out);
-        vector_kernels().weighted_sums(weights.data(), rows.data(), rows.shape(0), rows.shape(1), out);
+        vector_kernels().weighted_sums(weights.data(), rows.data(), rows.shape(0), rows.shape(1),
+                                       out);
         return result;
     });
-    module.def("normalize", [](const Input<1>& log_weights, double log_negligible) {
+    module.def("normalize", [](const Input<1>& log_weights) {
         double* out;
         auto result = make_array<double>({log_weights.shape(0)}, out);
         const std::size_t survivors =
-            vector_kernels().normalize(log_weights.data(), log_weights.shape(0), log_negligible, out);
+            vector_kernels().normalize(log_weights.data(), log_weights.shape(0), false, out);
         return nb::make_tuple(result, survivors);
     });
     module.def("philox", [](const StreamWords& words, std::uint32_t block) {

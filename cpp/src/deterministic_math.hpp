@@ -11,7 +11,6 @@
 
 #pragma once
 
-#include <bit>
 #include <cstdint>
 #include <limits>
 
@@ -41,18 +40,16 @@ struct IntegerOf<Lanes> {
 template <class T>
 using Integer = typename IntegerOf<T>::type;
 
-template <class T>
-HOLDFAST_INLINE Integer<T> bits(T x) {
-    Integer<T> result;
-    std::memcpy(&result, &x, sizeof x);
-    return result;
+HOLDFAST_INLINE std::int64_t bits(double x) {
+    return __builtin_bit_cast(std::int64_t, x);
+}
+HOLDFAST_INLINE IntLanes bits(const Lanes& x) {
+    return __builtin_bit_cast(IntLanes, x);
 }
 
 template <class T>
 HOLDFAST_INLINE T from_bits(Integer<T> x) {
-    T result;
-    std::memcpy(&result, &x, sizeof x);
-    return result;
+    return __builtin_bit_cast(T, x);
 }
 
 template <class T>
@@ -107,7 +104,8 @@ HOLDFAST_INLINE T exp_of(T x) {
     const T r = (x - n * log_2_high) - n * log_2_low;
     // 2^(n-1) and then times 2, because 2^n itself overflows at the upper end of the range.
     const auto exponent = detail::bits(shifted) - detail::rounding_shift_bits + std::int64_t{1022};
-    const T value = detail::horner(r, inverse_factorials) * detail::from_bits<T>(shift_left(exponent, 52)) * 2.0;
+    const T value = detail::horner(r, inverse_factorials) *
+                    detail::from_bits<T>(shift_left(exponent, 52)) * 2.0;
     const T infinite = detail::constant<T>(std::numeric_limits<double>::infinity());
     const T bounded = select(x > 709.782712893384, infinite, value);
     return select(x < -707.7, detail::constant<T>(0.0), bounded);
@@ -129,7 +127,8 @@ HOLDFAST_INLINE T log_of(T x) {
     const auto pattern = detail::bits(scaled);
     // Biased by 1023 so that the shifted pattern is positive.
     const auto exponent =
-        shift_right(pattern - (bits_of_root_half - (std::int64_t{1023} << 52)), 52) - std::int64_t{1023};
+        shift_right(pattern - (bits_of_root_half - (std::int64_t{1023} << 52)), 52) -
+        std::int64_t{1023};
     const T m = detail::from_bits<T>(pattern - shift_left(exponent, 52));  // in [sqrt 1/2, sqrt 2)
     const T e = detail::from_bits<T>(exponent + detail::rounding_shift_bits) -
                 detail::rounding_shift -
@@ -138,7 +137,8 @@ HOLDFAST_INLINE T log_of(T x) {
     const T s = f / (f + 2.0);
     const T s2 = s * s;
     const T twice = s + s;
-    const T value = e * log_2_high + (twice + (twice * (s2 * detail::horner(s2, series)) + e * log_2_low));
+    const T value =
+        e * log_2_high + (twice + (twice * (s2 * detail::horner(s2, series)) + e * log_2_low));
     const T infinite = detail::constant<T>(std::numeric_limits<double>::infinity());
     const T nan = detail::constant<T>(std::numeric_limits<double>::quiet_NaN());
     T result = select(x < infinite, value, x);  // keeps +infinity and NaN
@@ -154,14 +154,9 @@ HOLDFAST_INLINE detail::SineCosine<T> sine_cosine_of(T x) {
     constexpr double half_pi_1 = 1.57079632673412561417e+00;
     constexpr double half_pi_2 = 6.07710050630396597660e-11;
     constexpr double half_pi_3 = 2.02226624879595063154e-21;
-    constexpr double sine_series[] = {-1.0 / 6,
-                                      1.0 / 120,
-                                      -1.0 / 5040,
-                                      1.0 / 362880,
-                                      -1.0 / 39916800,
-                                      1.0 / 6227020800,
-                                      -1.0 / 1307674368000,
-                                      1.0 / 355687428096000};
+    constexpr double sine_series[] = {
+        -1.0 / 6,        1.0 / 120,        -1.0 / 5040,          1.0 / 362880,
+        -1.0 / 39916800, 1.0 / 6227020800, -1.0 / 1307674368000, 1.0 / 355687428096000};
     constexpr double cosine_series[] = {1.0,
                                         -1.0 / 2,
                                         1.0 / 24,
@@ -181,8 +176,7 @@ HOLDFAST_INLINE detail::SineCosine<T> sine_cosine_of(T x) {
     const auto quadrant = detail::bits(shifted);  // its two low bits are those of n
     const auto swap = (quadrant & std::int64_t{1}) != std::int64_t{0};
     const auto negate_sine = (quadrant & std::int64_t{2}) != std::int64_t{0};
-    const auto negate_cosine =
-        ((quadrant + std::int64_t{1}) & std::int64_t{2}) != std::int64_t{0};
+    const auto negate_cosine = ((quadrant + std::int64_t{1}) & std::int64_t{2}) != std::int64_t{0};
     const T s = select(swap, cosine, sine);
     const T c = select(swap, sine, cosine);
     const T nan = detail::constant<T>(std::numeric_limits<double>::quiet_NaN());
@@ -192,10 +186,18 @@ HOLDFAST_INLINE detail::SineCosine<T> sine_cosine_of(T x) {
             select(sensible, select(negate_cosine, -c, c), nan)};
 }
 
-inline double exp(double x) { return exp_of(x); }
-inline double log(double x) { return log_of(x); }
-inline double sin(double x) { return sine_cosine_of(x).sine; }
-inline double cos(double x) { return sine_cosine_of(x).cosine; }
+inline double exp(double x) {
+    return exp_of(x);
+}
+inline double log(double x) {
+    return log_of(x);
+}
+inline double sin(double x) {
+    return sine_cosine_of(x).sine;
+}
+inline double cos(double x) {
+    return sine_cosine_of(x).cosine;
+}
 inline void sincos(double x, double& sine, double& cosine) {
     const auto both = sine_cosine_of(x);
     sine = both.sine;

@@ -1,14 +1,13 @@
 #include "entropy.hpp"
 
 #include <algorithm>
-#include <exception>
 #include <limits>
 #include <memory>
 #include <vector>
 
 #include "deterministic_math.hpp"
 #include "point_tree.hpp"
-#include "threads.hpp"
+#include "thread_pool.hpp"
 #include "vector_kernels.hpp"
 
 namespace holdfast {
@@ -17,16 +16,23 @@ namespace {
 
 constexpr double infinity = std::numeric_limits<double>::infinity();
 
-// The ways to an entropy and when which is taken. All give the same values up to rounding, and
-// the choice depends on counts alone, so the bits do not depend on threads or machines.
+// The ways to an entropy and when which is taken. All give the same values up to rounding, and the
+// choice depends on counts alone, so the bits do not depend on threads or machines.
 //  - pair by pair: a posterior of few points, quadratic in them;
-//  - grouped: posteriors that keep a good part of the points share one tree over all of them;
-//  - own tree: many points, but few of all.
-constexpr std::size_t always_compact = 16;
-constexpr std::size_t compact_limit = 64;
-constexpr std::size_t always_group = 1024;
-constexpr double pair_cost = 2.0;          // ns
-constexpr double grouped_point_cost = 600; // ns, for all posteriors of a group together
+//  - own tree: one posterior, a tree over its points;
+//  - grouped: posteriors that keep a good part of the points share one tree over all of them.
+// The costs are nanoseconds, measured in three dimensions; they need to be right within a factor of
+// two.
+constexpr std::size_t compact_limit = 24;
+constexpr double grouped_share =
+    0.12;  // below it the lists of near points hold too few of a posterior
+constexpr double grouped_cost_of_a_point = 1000.0;
+
+double cost_alone(std::size_t survivors) {
+    const auto size = static_cast<double>(survivors);
+    if (survivors <= compact_limit) return size * (60.0 + 5.0 * size);
+    return size * std::min(110.0 + 0.7 * size, 450.0);
+}
 
 /// [q] = log q - psi(q), psi(q) = -gamma + 1 + 1/2 + ... + 1/(q - 1). Grows and is kept per thread.
 const double* bias_corrections(std::size_t largest) {
@@ -92,18 +98,18 @@ double compact_entropy(const Task& task, const double* weights, std::size_t surv
         for (std::size_t c = 0; c < task.dimension; ++c) coordinates[c * stride + at] = infinity;
         compact_weights[at] = 0.0;
     }
-    const CompactPosterior posterior{survivors,       stride,          task.dimension, coordinates,
-                                     compact_weights, compact_weights + stride};
+    const CompactPosterior posterior{survivors,   stride,          task.dimension,
+                                     coordinates, compact_weights, compact_weights + stride};
     if (task.settings->estimator == Estimator::gaussian_mixture) {
         return task.kernels->compact_mixture(posterior, task.settings->exponent, &visits);
     }
-    return task.kernels->compact_nearest(posterior, neighbors_among(task, survivors), task.constants,
-                                         &visits);
+    return task.kernels->compact_nearest(posterior, neighbors_among(task, survivors),
+                                         task.constants, &visits);
 }
 
 /// Posteriors side by side over one tree; owns what PosteriorGroup points to.
 class Group {
-public:
+  public:
     Group(const Task& task, const PointTree& tree, const std::vector<const double*>& weights,
           const std::vector<std::size_t>& survivors)
         : task_(task), tree_(tree), members_(weights.size()) {
@@ -158,36 +164,36 @@ public:
         for (std::size_t member = 0; member < members_; ++member) {
             neighbors_[member] = neighbors_among(task, survivors[member]);
         }
-        view_ = {tree.view(),           members_,
-                 vectors,               weights_.data(),
-                 significant_.data(),   block_weights_.data(),
-                 block_counts_.data(),  node_weights_.data(),
-                 node_counts_.data(),   neighbors_.data()};
+        view_ = {tree.view(),
+                 members_,
+                 vectors,
+                 weights_.data(),
+                 significant_.data(),
+                 block_weights_.data(),
+                 block_counts_.data(),
+                 node_weights_.data(),
+                 node_counts_.data(),
+                 neighbors_.data()};
     }
 
     /// One task per leaf; partial sums are added in the order of the leaves.
     void run(int threads, double* out, std::uint64_t& visits) const {
         const std::size_t columns = view_.vectors * lane_count;
-        const auto leaves = static_cast<std::ptrdiff_t>(tree_.leaves);
         std::vector<double> partial(tree_.leaves * columns);
-        std::uint64_t visited = 0;
-#pragma omp parallel for schedule(dynamic, 4) num_threads(threads) reduction(+ : visited) \
-    if (threads > 1)
-        for (std::ptrdiff_t leaf = 0; leaf < leaves; ++leaf) {
-            const auto at = static_cast<std::size_t>(leaf);
-            double* terms = &partial[at * columns];
-            std::uint64_t mine = 0;
+        std::vector<std::uint64_t> visited(tree_.leaves);
+        parallel_for(tree_.leaves, threads, [&](std::size_t leaf) {
+            double* terms = &partial[leaf * columns];
             if (task_.settings->estimator == Estimator::gaussian_mixture) {
-                task_.kernels->group_mixture(view_, at, task_.settings->exponent, terms, &mine);
-            } else {
-                thread_local std::vector<double> scratch;
-                scratch.resize(task_.settings->neighbors);
-                task_.kernels->group_nearest(view_, at, task_.constants, scratch.data(), terms,
-                                             &mine);
+                task_.kernels->group_mixture(view_, leaf, task_.settings->exponent, terms,
+                                             &visited[leaf]);
+                return;
             }
-            visited += mine;
-        }
-        visits += visited;
+            thread_local std::vector<double> scratch;
+            scratch.resize(task_.settings->neighbors);
+            task_.kernels->group_nearest(view_, leaf, task_.constants, scratch.data(), terms,
+                                         &visited[leaf]);
+        });
+        for (const std::uint64_t v : visited) visits += v;
         for (std::size_t member = 0; member < members_; ++member) {
             double sum = 0.0;
             for (std::size_t leaf = 0; leaf < tree_.leaves; ++leaf) {
@@ -197,7 +203,7 @@ public:
         }
     }
 
-private:
+  private:
     const Task& task_;
     const PointTree& tree_;
     std::size_t members_;
@@ -228,23 +234,6 @@ double own_tree_entropy(const Task& task, const double* weights, std::size_t sur
     return entropy;
 }
 
-/// Runs `body(i)` for i < tasks on several threads and passes on the first exception.
-template <class Body>
-void parallel_for(std::size_t tasks, int threads, const Body& body) {
-    std::exception_ptr failure;
-    const auto last = static_cast<std::ptrdiff_t>(tasks);
-#pragma omp parallel for schedule(dynamic) num_threads(threads) if (threads > 1)
-    for (std::ptrdiff_t i = 0; i < last; ++i) {
-        try {
-            body(static_cast<std::size_t>(i));
-        } catch (...) {
-#pragma omp critical(holdfast_parallel_for)
-            if (!failure) failure = std::current_exception();
-        }
-    }
-    if (failure) std::rethrow_exception(failure);
-}
-
 }  // namespace
 
 void entropies(const double* points, std::size_t count, std::size_t dimension,
@@ -259,7 +248,8 @@ void entropies(const double* points, std::size_t count, std::size_t dimension,
                      mixture ? nullptr : bias_corrections(count)},
                     &vector_kernels()};
     // Posteriors are taken in batches so that their weights fit in 64 MB whatever their number.
-    const std::size_t batch = std::max<std::size_t>(max_group_lanes, (std::size_t{8} << 20) / count);
+    const std::size_t batch =
+        std::max<std::size_t>(max_group_lanes, (std::size_t{8} << 20) / count);
     std::vector<double> weights(std::min(batch, posteriors) * count);
     std::vector<std::size_t> survivors(std::min(batch, posteriors));
     std::unique_ptr<PointTree> tree;
@@ -273,39 +263,42 @@ void entropies(const double* points, std::size_t count, std::size_t dimension,
                      [&](std::size_t i) { survivors[i] = source(first + i, &weights[i * count]); });
         counts.likelihoods += number * count;
 
-        double middling = 0.0;  // what the posteriors of middling size would cost pair by pair
-        for (const std::size_t s : survivors) {
-            const auto size = static_cast<double>(s);
-            if (s > always_compact && s <= compact_limit) middling += pair_cost * size * size;
+        const double shared_from = grouped_share * static_cast<double>(count);
+        double candidates_alone = 0.0;
+        std::size_t candidates = 0;
+        for (std::size_t i = 0; i < number; ++i) {
+            const std::size_t s = survivors[i];
+            if (s <= compact_limit || static_cast<double>(s) < shared_from) continue;
+            candidates_alone += cost_alone(s);
+            ++candidates;
         }
-        const std::size_t limit = count <= always_group &&
-                                          middling > grouped_point_cost * static_cast<double>(count)
-                                      ? always_compact
-                                      : compact_limit;
+        const std::size_t groups = (candidates + max_group_lanes - 1) / max_group_lanes;
+        const bool group_them =
+            candidates_alone >
+            static_cast<double>(groups) * static_cast<double>(count) * grouped_cost_of_a_point;
         std::vector<std::size_t> alone, grouped;
-        double pairs = 0.0;
+        double work_alone = 0.0;
         for (std::size_t i = 0; i < number; ++i) {
             const std::size_t s = survivors[i];
             if (s <= 1) {
-                out[first + i] =
-                    s == 0 ? std::numeric_limits<double>::quiet_NaN()
-                           : entropy_of_one(task) + settings.offset;
-            } else if (s > limit && (count <= always_group || 4 * s >= count)) {
+                out[first + i] = s == 0 ? std::numeric_limits<double>::quiet_NaN()
+                                        : entropy_of_one(task) + settings.offset;
+            } else if (group_them && s > compact_limit && static_cast<double>(s) >= shared_from) {
                 grouped.push_back(i);
             } else {
                 alone.push_back(i);
-                const auto size = static_cast<double>(s);
-                pairs += s <= compact_limit ? pair_cost * size * size : 300.0 * size;
+                work_alone += cost_alone(s);
             }
         }
-        parallel_for(alone.size(), threads_for(pairs, alone.size(), settings.threads),
+        parallel_for(alone.size(), threads_for(work_alone, alone.size(), settings.threads),
                      [&](std::size_t task_index) {
                          const std::size_t i = alone[task_index];
                          const double* w = &weights[i * count];
-                         out[first + i] = settings.offset +
-                                          (survivors[i] <= compact_limit
-                                               ? compact_entropy(task, w, survivors[i], visits[i])
-                                               : own_tree_entropy(task, w, survivors[i], visits[i]));
+                         out[first + i] =
+                             settings.offset +
+                             (survivors[i] <= compact_limit
+                                  ? compact_entropy(task, w, survivors[i], visits[i])
+                                  : own_tree_entropy(task, w, survivors[i], visits[i]));
                      });
         for (const std::uint64_t v : visits) counts.visits += v;
 
@@ -320,7 +313,7 @@ void entropies(const double* points, std::size_t count, std::size_t dimension,
             }
             const Group group(task, *tree, members, sizes);
             double results[max_group_lanes];
-            const double work = grouped_point_cost * static_cast<double>(count);
+            const double work = grouped_cost_of_a_point * static_cast<double>(count);
             group.run(threads_for(work, tree->leaves, settings.threads), results, counts.visits);
             for (std::size_t g = begin; g < end; ++g) {
                 out[first + grouped[g]] = settings.offset + results[g - begin];

@@ -1,15 +1,17 @@
 // Differential entropy of weighted points, for many weightings of the same points at once.
 //
-// Nearest neighbour with a resolution: r_n is the distance to the k-th other point of non-zero weight, or
-// the resolution if that is larger; q_n others lie within it, with the share m_n of the others' weight;
+// Nearest neighbour with a resolution: r_n is the distance to the k-th other point of non-zero
+// weight, or the resolution if that is larger; q_n others lie within it, with the share m_n of the
+// others' weight;
 //     entropy = sum_n w_n (-log m_n + log c_d + d log r_n + log q_n - psi(q_n)),
 // c_d the volume of the unit ball. On uniform weights and a small resolution it is the estimator of
-// Kozachenko and Leonenko (1987) in the form of Kraskov, Stoegbauer and Grassberger (2004, eq. 20), with
-// log N - psi(N) neglected; with ties it stays finite.
+// Kozachenko and Leonenko (1987) in the form of Kraskov, Stoegbauer and Grassberger (2004, eq. 20),
+// with log(N - 1) where they have psi(N); with ties it stays finite.
 //
-// Gaussian mixture: every point is the mean of a Gaussian of covariance S; Kolchinsky and Tracey (2017)
-// bound the mixture's entropy by
-//     d/2 log(2 pi e) + 1/2 log |S| - sum_i w_i log sum_j w_j exp(-c (u_i - u_j)' S^-1 (u_i - u_j)),
+// Gaussian mixture: every point is the mean of a Gaussian of covariance S; Kolchinsky and Tracey
+// (2017) bound the mixture's entropy by
+//     d/2 log(2 pi e) + 1/2 log |S| - sum_i w_i log sum_j w_j exp(-c (u_i - u_j)' S^-1 (u_i -
+//     u_j)),
 // c = 1/2 from above, 1/8 from below. The caller scales the points by S^-1/2.
 
 #pragma once
@@ -37,10 +39,8 @@ struct EntropyCounts {
     std::uint64_t visits = 0;
 };
 
-/// Weights below this fraction of the largest count as zero.
-inline constexpr double negligible_weight = 1e-6;
-
-/// Fills `weights[count]` with posterior `index`, normalised; returns the number of non-zero ones.
+/// Fills `weights[count]` with posterior `index`, normalised and without negligible weights
+/// (lanes/posterior.hpp); returns the number of non-zero ones.
 /// Called from several threads at once.
 using PosteriorSource = std::function<std::size_t(std::size_t index, double* weights)>;
 

@@ -2,9 +2,11 @@
 
 #include <algorithm>
 #include <array>
+#include <atomic>
 
 #include "geometry_2d.hpp"
 #include "geometry_3d.hpp"
+#include "thread_pool.hpp"
 
 namespace holdfast {
 namespace {
@@ -67,6 +69,10 @@ std::size_t add_noise(const World& world, std::size_t first, std::size_t count,
     return num_pending;
 }
 
+int threads_for_particles(std::size_t count) {
+    return count >= parallel_threshold ? thread_limit(0) : 1;
+}
+
 bool all_zero(const double* values, std::size_t count) {
     return std::all_of(values, values + count, [](double value) { return value == 0.0; });
 }
@@ -81,8 +87,7 @@ void move(const World& world, std::size_t count, const double* states, const dou
     const bool noisy = !all_zero(standard_deviation, d);
     const std::size_t num_blocks = (count + block_size - 1) / block_size;
 
-#pragma omp parallel for schedule(static) if (count >= parallel_threshold)
-    for (std::size_t block = 0; block < num_blocks; ++block) {
+    parallel_for(num_blocks, threads_for_particles(count), [&](std::size_t block) {
         const std::size_t first = block * block_size;
         const std::size_t size = std::min(block_size, count - first);
         for (std::size_t n = first; n < first + size; ++n) {
@@ -90,7 +95,7 @@ void move(const World& world, std::size_t count, const double* states, const dou
                             next + n * d);
         }
         if (noisy) add_noise(world, first, size, standard_deviation, stream, next + first * d);
-    }
+    });
 }
 
 template <class World>
@@ -98,16 +103,15 @@ std::size_t draw_free(const World& world, std::size_t count, const double* mean,
                       const double* standard_deviation, const Stream& stream, double* states) {
     constexpr std::size_t d = World::dimension;
     const std::size_t num_blocks = (count + block_size - 1) / block_size;
-    std::size_t unplaced = 0;
+    std::atomic<std::size_t> unplaced = 0;
 
-#pragma omp parallel for schedule(static) reduction(+ : unplaced) if (count >= parallel_threshold)
-    for (std::size_t block = 0; block < num_blocks; ++block) {
+    parallel_for(num_blocks, threads_for_particles(count), [&](std::size_t block) {
         const std::size_t first = block * block_size;
         const std::size_t size = std::min(block_size, count - first);
         for (std::size_t n = first; n < first + size; ++n)
             std::copy(mean, mean + d, states + n * d);
         unplaced += add_noise(world, first, size, standard_deviation, stream, states + first * d);
-    }
+    });
     return unplaced;
 }
 

@@ -1,7 +1,7 @@
 // Random numbers by name: Philox 4x32-10, a counter-based generator.
 //
-// A draw is a function of (stream, index) and of nothing else: there is no state that could fall out
-// of step. The 64-bit key and three of the four counter words name the stream; the fourth word
+// A draw is a function of (stream, index) and of nothing else: there is no state that could fall
+// out of step. The 64-bit key and three of the four counter words name the stream; the fourth word
 // counts blocks of two doubles within it.
 //
 // Source: Salmon, Moraes, Dror and Shaw, "Parallel random numbers: as easy as 1, 2, 3", SC 2011.
@@ -34,8 +34,10 @@ HOLDFAST_INLINE PhiloxBlock philox(const Stream& stream, std::uint32_t block) {
     for (int round = 0; round < 10; ++round) {
         const std::uint64_t p0 = std::uint64_t{0xD2511F53u} * c0;
         const std::uint64_t p1 = std::uint64_t{0xCD9E8D57u} * c2;
-        const auto high0 = static_cast<std::uint32_t>(p0 >> 32), low0 = static_cast<std::uint32_t>(p0);
-        const auto high1 = static_cast<std::uint32_t>(p1 >> 32), low1 = static_cast<std::uint32_t>(p1);
+        const auto high0 = static_cast<std::uint32_t>(p0 >> 32),
+                   low0 = static_cast<std::uint32_t>(p0);
+        const auto high1 = static_cast<std::uint32_t>(p1 >> 32),
+                   low1 = static_cast<std::uint32_t>(p1);
         c0 = high1 ^ c1 ^ k0;
         c1 = low1;
         c2 = high0 ^ c3 ^ k1;
@@ -84,8 +86,9 @@ void uniforms(const Stream& stream, std::uint64_t first, std::size_t count, doub
 
 /// An independent stream named by `index` below this one.
 ///
-/// Its key is a Philox output of this stream's key at a counter that no draw ever uses (the marker),
-/// so draws of parent and child never share a block; two children share a key with probability 2^-64.
+/// Its key is a Philox output of this stream's key at a counter that no draw ever uses (the
+/// marker), so draws of parent and child never share a block; two children share a key with
+/// probability 2^-64.
 HOLDFAST_INLINE Stream substream(const Stream& stream, std::uint32_t index) {
     const Stream deriving{stream.key0, stream.key1, stream.c1 | derivation_marker, stream.c2,
                           stream.c3};

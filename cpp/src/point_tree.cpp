@@ -31,8 +31,8 @@ std::uint32_t PointTree::build(const double* points, std::uint32_t first_leaf,
                                std::uint32_t last_leaf) {
     const auto node = static_cast<std::uint32_t>(nodes.size());
     const auto begin = order.begin() + static_cast<std::ptrdiff_t>(first_leaf * leaf_size);
-    const auto end =
-        order.begin() + static_cast<std::ptrdiff_t>(std::min<std::size_t>(last_leaf * leaf_size, count));
+    const auto end = order.begin() + static_cast<std::ptrdiff_t>(
+                                         std::min<std::size_t>(last_leaf * leaf_size, count));
     nodes.push_back({first_leaf, last_leaf, 0, 0});
     low.resize(low.size() + dimension, std::numeric_limits<double>::infinity());
     high.resize(high.size() + dimension, -std::numeric_limits<double>::infinity());

@@ -1,9 +1,10 @@
 // A k-d tree over points, laid out for scanning eight points at a time.
 //
-// Built once for a set of points and shared by every posterior over them: posteriors differ in their
-// weights, not in where their points are. Leaves hold 16 consecutive slots; the tree says which leaves
-// are wholly inside a ball, wholly outside, or worth looking into (Moore, "Efficient memory-based
-// learning for robot control", 1991, and the multiresolution sums of Gray and Moore, NIPS 2000).
+// Built once for a set of points and shared by every posterior over them: posteriors differ in
+// their weights, not in where their points are. Leaves hold 16 consecutive slots; the tree says
+// which leaves are wholly inside a ball, wholly outside, or worth looking into (Moore, "Efficient
+// memory-based learning for robot control", 1991, and the multiresolution sums of Gray and Moore,
+// NIPS 2000).
 
 #pragma once
 
@@ -36,12 +37,12 @@ struct TreeView {
 };
 
 class PointTree {
-public:
+  public:
     /// @param points row-major, `count` rows of `dimension` finite coordinates; count >= 1
     PointTree(const double* points, std::size_t count, std::size_t dimension);
 
     TreeView view() const {
-        return {count,         dimension,  leaves,     coordinates.data(),
+        return {count,        dimension,  leaves,     coordinates.data(),
                 nodes.data(), low.data(), high.data()};
     }
 
@@ -56,7 +57,7 @@ public:
     /// low[node * dimension + c] <= coordinate c of every point of the node <= high[...].
     std::vector<double> low, high;
 
-private:
+  private:
     std::uint32_t build(const double* points, std::uint32_t first_leaf, std::uint32_t last_leaf);
 };
 

@@ -9,8 +9,7 @@ void systematic_resample(const double* weights, std::size_t count, double offset
     double cumulated = 0.0;
     std::size_t n = 0, last_with_weight = 0;
     for (std::size_t j = 0; j < count; ++j) {
-        const double tooth =
-            (static_cast<double>(j) + offset) / static_cast<double>(count) * total;
+        const double tooth = (static_cast<double>(j) + offset) / static_cast<double>(count) * total;
         while (n < count && cumulated + weights[n] <= tooth) {
             if (weights[n] > 0.0) last_with_weight = n;
             cumulated += weights[n++];

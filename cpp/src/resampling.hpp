@@ -1,8 +1,9 @@
-// Systematic resampling: N evenly spaced teeth, with one random offset, through the cumulated weights.
+// Systematic resampling: N evenly spaced teeth, with one random offset, through the cumulated
+// weights.
 //
 // Source: Carpenter, Clifford and Fearnhead (1999); Thrun, Burgard and Fox, Probabilistic Robotics,
-// table 4.4. Mind the division: the teeth are at (j + u) / N as real numbers. With an integer division all
-// teeth fall on one particle, which is what the first implementation of this work did.
+// table 4.4. Mind the division: the teeth are at (j + u) / N as real numbers. With an integer
+// division all teeth fall on one particle, which is what the first implementation of this work did.
 
 #pragma once
 

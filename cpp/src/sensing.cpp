@@ -11,9 +11,8 @@ namespace {
 
 /// The hypothetical observations and all that their posteriors share.
 class Hypotheses {
-public:
-    explicit Hypotheses(const HypothesisInput& input)
-        : input_(input), log_weights_(input.count), log_negligible_(log(negligible_weight)) {
+  public:
+    explicit Hypotheses(const HypothesisInput& input) : input_(input), log_weights_(input.count) {
         const VectorKernels& kernels = vector_kernels();
         kernels.log(input.weights, log_weights_.data(), input.count);
         std::size_t total = 0, largest = 0;
@@ -34,7 +33,8 @@ public:
             for (std::size_t j = 0; j < input.sensing_actions; ++j) {
                 for (std::size_t c = first_coordinate_[j]; c < first_coordinate_[j + 1]; ++c) {
                     for (std::size_t n = 0; n < input.count; ++n) {
-                        log_normalizer_[j * input.count + n] += 0.5 * log_variance[c * input.count + n];
+                        log_normalizer_[j * input.count + n] +=
+                            0.5 * log_variance[c * input.count + n];
                     }
                 }
             }
@@ -51,7 +51,8 @@ public:
                 if (input.weights[n] > 0.0) last_with_weight = n;
                 cumulated += input.weights[n++];
             }
-            // Rounding can leave the total a little below `at`; then the last particle with weight is meant.
+            // Rounding can leave the total a little below `at`; then the last particle with weight
+            // is meant.
             particle[i] = n < input.count ? n : last_with_weight;
         }
         const Stream noise_stream = substream(input.stream, 1);
@@ -83,15 +84,13 @@ public:
             {input_.count, log_weights_.data(), input_.observation_size[j],
              input_.predicted + row * input_.count, inverse_variance_.data() + variance_row,
              input_.varying_variance ? log_normalizer_.data() + j * input_.count : nullptr,
-             observations_.data() + row * input_.samples + i * input_.observation_size[j],
-             log_negligible_},
+             observations_.data() + row * input_.samples + i * input_.observation_size[j]},
             weights);
     }
 
-private:
+  private:
     const HypothesisInput& input_;
     std::vector<double> log_weights_;
-    double log_negligible_;
     std::vector<std::size_t> first_coordinate_;
     std::vector<double> inverse_variance_, log_normalizer_, observations_;
 };
@@ -102,9 +101,10 @@ void hypothetical_entropies(const HypothesisInput& input, const double* points,
                             std::size_t dimension, const EntropySettings& settings, double* out,
                             EntropyCounts& counts) {
     const Hypotheses hypotheses(input);
-    entropies(points, input.count, dimension, input.sensing_actions * input.samples,
-              [&](std::size_t index, double* weights) { return hypotheses(index, weights); },
-              settings, out, counts);
+    entropies(
+        points, input.count, dimension, input.sensing_actions * input.samples,
+        [&](std::size_t index, double* weights) { return hypotheses(index, weights); }, settings,
+        out, counts);
 }
 
 void hypothetical_weights(const HypothesisInput& input, double* out) {

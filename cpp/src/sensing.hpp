@@ -1,14 +1,14 @@
 // Algorithm 2: the expected entropy of the task actions after each sensing action.
 //
-// For every sensing action j and for i = 1..M: draw a particle from the belief, draw an observation z of
-// it under j, reweight all particles by p(z | v_j, x), and take the entropy of the policy's actions under
-// these weights. Sensing does not move the state, so the actions (`points`) are computed once by the
-// caller; and the M draws use the same random numbers for every j, so that differences between
-// sensing actions have less variance than the entropies themselves. The M particles are drawn by stratified
-// sampling: one from each M-th of the cumulated weight.
+// For every sensing action j and for i = 1..M: draw a particle from the belief, draw an observation
+// z of it under j, reweight all particles by p(z | v_j, x), and take the entropy of the policy's
+// actions under these weights. Sensing does not move the state, so the actions (`points`) are
+// computed once by the caller; and the M draws use the same random numbers for every j, so that
+// differences between sensing actions have less variance than the entropies themselves. The M
+// particles are drawn by stratified sampling: one from each M-th of the cumulated weight.
 //
 // Source: Greigarn, Branicky and Cavusoglu, "Task-oriented active sensing via action entropy
-// minimization", IEEE Access 2019, algorithm 2.
+// minimization", IEEE Access, 2019.
 
 #pragma once
 
@@ -34,7 +34,8 @@ struct HypothesisInput {
 
 inline constexpr std::size_t max_observation_size = 1024;
 
-/// Entropies of the J x M hypothetical posteriors, row by row; NaN where an observation explains nothing.
+/// Entropies of the J x M hypothetical posteriors, row by row; NaN where an observation explains
+/// nothing.
 void hypothetical_entropies(const HypothesisInput& input, const double* points,
                             std::size_t dimension, const EntropySettings& settings, double* out,
                             EntropyCounts& counts);

@@ -1,8 +1,8 @@
 // The inner loops, compiled once for each instruction set and chosen at start-up.
 //
 // The files in lanes/ are compiled several times, each time in a namespace of its own and with
-// another -m flag; this table holds the entry points of one such compilation. All of them give the same
-// bits (tests/unit/test_kernel.py), only the speed differs.
+// another -m flag; this table holds the entry points of one such compilation. All of them give the
+// same bits (tests/unit/test_kernel.py), only the speed differs.
 
 #pragma once
 
@@ -26,10 +26,10 @@ struct PosteriorInput {
     const double* inverse_variance;  // [observation_size], or [observation_size][count]
     const double* log_normalizer;    // null, or [count]: sum over coordinates of log(variance) / 2
     const double* observation;       // [observation_size]
-    double log_negligible;           // weights below e^this of the largest count as zero
 };
 
-/// Posteriors over the points of one tree, side by side: row = slot of the tree, column = posterior.
+/// Posteriors over the points of one tree, side by side: row = slot of the tree, column =
+/// posterior.
 struct PosteriorGroup {
     TreeView tree;
     std::size_t members;               // posteriors; the other columns of a row are zero
@@ -70,10 +70,11 @@ struct VectorKernels {
     double (*sum)(const double* in, std::size_t count);
     void (*weighted_sums)(const double* weights, const double* rows, std::size_t count,
                           std::size_t dimension, double* out);
-    /// Normalised posterior weights; returns how many are not zero, 0 if there is no posterior.
+    /// Normalised posterior weights without the negligible ones; returns how many are not zero, 0
+    /// if there is no posterior.
     std::size_t (*posterior)(const PosteriorInput&, double* weights);
-    /// Normalises weights e^log_weights likewise.
-    std::size_t (*normalize)(const double* log_weights, std::size_t count, double log_negligible,
+    /// Normalises weights e^log_weights; those that underflow next to the largest are zero.
+    std::size_t (*normalize)(const double* log_weights, std::size_t count, bool drop_negligible,
                              double* weights);
     double (*compact_nearest)(const CompactPosterior&, std::uint32_t neighbors,
                               const NearestNeighborConstants&, std::uint64_t* visits);

@@ -204,7 +204,7 @@ def update(
                 "is NaN or plus infinity for a particle"
             )
         explained = bool((log_likelihood > -np.inf).any())
-    weights, survivors = _kernel.normalize(numerics.log(belief.weights) + log_likelihood, -745.0)
+    weights, survivors = _kernel.normalize(numerics.log(belief.weights) + log_likelihood)
     if survivors == 0:
         return belief, UpdateInfo(effective_sample_size(belief), explained=False)
     after = Belief(belief.states, weights)

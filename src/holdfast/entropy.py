@@ -35,11 +35,14 @@ class NearestNeighbor(NamedTuple):
 
         entropy = sum_n w_n (-log m_n + log c_d + d log r_n + log q_n - psi(q_n))
 
-    Points of less than a millionth of the largest weight are left out, because a neighbour of
-    weight 1e-200 says nothing about the density; with k or fewer others left, k is their number;
+    Points of negligible weight are left out, because a neighbour of weight 1e-200 says nothing
+    about the density: those below the largest of 1e-2, 1e-3, ..., 1e-6 times the greatest weight
+    that loses at most 0.5 % of the sum, or below 1e-6 times it if none does. With k or fewer
+    others left, k is their number;
     and a single point has the entropy of the ball of the resolution. On uniform weights and a
     small resolution it is the estimate of Kozachenko and Leonenko (1987) in the form of Kraskov,
-    Stögbauer and Grassberger (2004), with ``log N`` in the place of ``psi(N)``.
+    Stögbauer and Grassberger (2004), with ``log(N - 1)`` in the place of
+    ``psi(N)``.
 
     Attributes
     ----------
@@ -58,8 +61,8 @@ class GaussianMixture(NamedTuple):
 
     With S the noise's covariance (diagonal)::
 
-        d/2 log(2 pi e) + 1/2 log |S| - sum_i w_i log sum_j w_j exp(-c (u_i - u_j)' S^-1 (u_i -
-        u_j))
+        d/2 log(2 pi e) + 1/2 log |S| - sum_i w_i log sum_j w_j exp(-c D(u_i, u_j)),
+        D(u, v) = (u - v)' S^-1 (u - v)
 
     Attributes
     ----------
@@ -172,8 +175,14 @@ def entropy(
     rows = rows.reshape(1, -1) if rows.ndim == 1 else rows
     if rows.ndim != 2 or rows.shape[1] != count:
         raise InvalidValueError(f"weights of shape {rows.shape}: need ({count},) or (b, {count})")
-    if not np.isfinite(rows).all() or (rows < 0.0).any() or not (rows > 0.0).any(axis=1).all():
-        raise InvalidValueError("weights must be finite, >= 0 and not all zero")
+    if not np.isfinite(rows).all() or (rows < 0.0).any():
+        row, bad = np.argwhere(~(np.isfinite(rows) & (rows >= 0.0)))[0]
+        raise InvalidValueError(
+            f"weight of point {bad} is {rows[row, bad]}: must be >= 0 and finite"
+        )
+    if not (rows > 0.0).any(axis=1).all():
+        bad = int(np.argmin((rows > 0.0).any(axis=1)))
+        raise InvalidValueError(f"weights[{bad}] are all zero: one must be positive")
     if kernel.scale is not None:
         array = array * kernel.scale
     result, _, _ = _kernel.entropies(

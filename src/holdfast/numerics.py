@@ -13,10 +13,16 @@ import numpy as np
 import numpy.typing as npt
 
 from holdfast import _kernel
+from holdfast.errors import ConfigurationError
 
 __all__ = ["arcsin", "cos", "exp", "log", "sin", "sum", "weighted_mean"]
 
 FloatArray = npt.NDArray[np.float64]
+
+try:
+    _kernel.simd()
+except RuntimeError as error:  # HOLDFAST_SIMD names an instruction set that is not there
+    raise ConfigurationError(str(error)) from error
 
 
 def _elementwise(function: Callable[[FloatArray], FloatArray], values: npt.ArrayLike) -> FloatArray:

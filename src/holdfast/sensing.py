@@ -8,7 +8,7 @@ change no action. Two choices that imagine nothing, *random* and *fixed*, are th
 with.
 
 Source: Greigarn, Branicky and Çavuşoğlu, "Task-oriented active sensing via action entropy
-minimization", IEEE Access 7, 2019, algorithm 2.
+minimization", IEEE Access, 2019; Algorithm 2 of the thesis that the configuration files come from.
 """
 
 from __future__ import annotations
@@ -299,7 +299,7 @@ def _later_entropies(
     actions = len(problem.sensing_actions)
     if hasattr(problem, "log_likelihood"):
         log_weights = _general_log_weights(problem, settings, belief, hypotheses)
-        rows = [_kernel.normalize(row, -745.0)[0] for row in log_weights]
+        rows = [_kernel.normalize(row)[0] for row in log_weights]
         weights = np.array(rows).reshape(actions, samples, -1)
     else:
         sizes, predicted, variance = _predictions(problem, belief)

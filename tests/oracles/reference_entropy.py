@@ -14,15 +14,45 @@ from scipy.special import digamma
 FloatArray = npt.NDArray[np.float64]
 
 
+def without_negligible(weights: FloatArray) -> npt.NDArray[np.bool_]:
+    """The points that count: see holdfast.entropy.NearestNeighbor."""
+    largest, total = weights.max(), weights.sum()
+    for threshold in (1e-2, 1e-3, 1e-4, 1e-5):
+        if weights[weights < threshold * largest].sum() <= 0.005 * total:
+            break
+    else:
+        threshold = 1e-6
+    kept: npt.NDArray[np.bool_] = (weights >= threshold * largest) & (weights > 0.0)
+    return kept
+
+
+def significant(weights: FloatArray) -> npt.NDArray[np.bool_]:
+    """Tell which points count: all but those that weigh nothing next to the others.
+
+    Of the thresholds 1e-2, 1e-3, ..., 1e-6, relative to the greatest weight, the largest below
+    which lies at most 0.5 % of the sum; 1e-6 if there is none.
+    """
+    relative: FloatArray = weights / weights.max()
+    for threshold in (1e-2, 1e-3, 1e-4, 1e-5):
+        if relative[relative < threshold].sum() <= 0.005 * relative.sum():
+            return np.greater_equal(relative, threshold)
+    return np.greater_equal(relative, 1e-6)
+
+
+def log_unit_ball(dimension: int) -> float:
+    """Return the logarithm of the volume of the unit ball."""
+    return float(0.5 * dimension * math.log(math.pi) - math.lgamma(0.5 * dimension + 1.0))
+
+
 def nearest_neighbor_entropy(
     points: FloatArray, weights: FloatArray, neighbors: int, resolution: float
 ) -> float:
-    kept = weights >= 1e-6 * weights.max()
+    kept = without_negligible(weights)
     points, weights = points[kept], weights[kept] / weights[kept].sum()
     count, dimension = points.shape
-    log_ball = 0.5 * dimension * math.log(math.pi) - math.lgamma(0.5 * dimension + 1.0)
+    log_ball = log_unit_ball(dimension)
     if count == 1:
-        return log_ball + dimension * math.log(resolution)
+        return float(log_ball + dimension * math.log(resolution))
     k = min(neighbors, count - 1)
     total = 0.0
     for n in range(count):
@@ -31,7 +61,7 @@ def nearest_neighbor_entropy(
         squared = np.zeros(count - 1)
         for coordinate in range(dimension):
             squared += (points[others, coordinate] - points[n, coordinate]) ** 2
-        kth = np.sort(squared)[k - 1]
+        kth = np.partition(squared, k - 1)[k - 1]
         # Distances that differ by rounding alone are equal.
         tolerance = 1.0 + 2.0**-40
         resolved = kth > resolution * resolution * tolerance
@@ -52,7 +82,7 @@ def nearest_neighbor_entropy(
 def gaussian_mixture_entropy(
     points: FloatArray, weights: FloatArray, variance: FloatArray, upper: bool
 ) -> float:
-    kept = weights >= 1e-6 * weights.max()
+    kept = without_negligible(weights)
     points, weights = points[kept], weights[kept] / weights[kept].sum()
     dimension = points.shape[1]
     c = 0.5 if upper else 0.125

@@ -22,8 +22,9 @@ HOLDFAST_INLINE void insert_smallest(double* smallest, std::uint32_t& kept, std:
 inline constexpr double tie_tolerance = 1.0 + 0x1p-40;
 
 /// The term of one point: w (-log(m / (1 - w)) + log c_d + d log r + log q - psi(q)).
-HOLDFAST_INLINE double nearest_term(double weight, double mass, double log_radius, std::size_t dimension,
-                                    std::uint32_t within, const NearestNeighborConstants& constants) {
+HOLDFAST_INLINE double nearest_term(double weight, double mass, double log_radius,
+                                    std::size_t dimension, std::uint32_t within,
+                                    const NearestNeighborConstants& constants) {
     return weight * (constants.log_ball_volume + static_cast<double>(dimension) * log_radius -
                      log_of(mass / (1.0 - weight)) + constants.bias_correction[within]);
 }

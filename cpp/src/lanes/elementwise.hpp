@@ -10,7 +10,8 @@ template <class Function>
 HOLDFAST_INLINE void map(const double* in, double* out, std::size_t count, Function function) {
     std::size_t i = 0;
     for (; i + lane_count <= count; i += lane_count) store(out + i, function(load(in + i)));
-    if (i < count) store_partial(out + i, function(load_partial(in + i, count - i, 1.0)), count - i);
+    if (i < count)
+        store_partial(out + i, function(load_partial(in + i, count - i, 1.0)), count - i);
 }
 
 static void exp_array(const double* in, double* out, std::size_t count) {
@@ -64,10 +65,12 @@ static void normals_array(const Stream& stream, std::uint64_t first, std::size_t
         // Eight blocks of two deviates at a time; the first and last block may be used in part.
         const std::uint64_t first_block = index >> 1;
         const std::uint64_t blocks = (end + 1) / 2 - first_block;
-        const std::size_t used = blocks < lane_count ? static_cast<std::size_t>(blocks) : lane_count;
+        const std::size_t used =
+            blocks < lane_count ? static_cast<std::size_t>(blocks) : lane_count;
         Lanes radius_uniform{}, angle_uniform{};
         for (std::size_t lane = 0; lane < used; ++lane) {
-            const PhiloxBlock block = philox(stream, static_cast<std::uint32_t>(first_block + lane));
+            const PhiloxBlock block =
+                philox(stream, static_cast<std::uint32_t>(first_block + lane));
             radius_uniform[lane] = unit_interval(block.words[0], block.words[1]);
             angle_uniform[lane] = unit_interval(block.words[2], block.words[3]);
         }

@@ -1,17 +1,29 @@
-// The entropies of many posteriors over the same points at once (one compilation per instruction set).
+// The entropies of many posteriors over the same points at once (one compilation per instruction
+// set).
 //
 // The geometry (which points lie within a ball, what the kernel between two points is) does not
 // depend on the weights. So it is computed once per pair of points and applied to a row of up to 32
-// posteriors; and where a whole node of the tree lies within the ball, its row of sums is added at once.
+// posteriors; and where a whole node of the tree lies within the ball, its row of sums is added at
+// once.
 //
-// Bounds of boxes are computed with the same operations in the same order as distances of points. Rounding
-// is monotone, so a box that is found inside (outside) has only points that would be found inside (outside).
+// Bounds of boxes are computed with the same operations in the same order as distances of points.
+// Rounding is monotone, so a box that is found inside (outside) has only points that would be found
+// inside (outside).
 
 #pragma once
 
 #include "compact_entropy.hpp"
 
 namespace holdfast::HOLDFAST_ISA {
+
+template <std::size_t... i>
+struct Indices {};
+template <std::size_t count, std::size_t... i>
+struct IndicesBelow : IndicesBelow<count - 1, count - 1, i...> {};
+template <std::size_t... i>
+struct IndicesBelow<0, i...> {
+    using type = Indices<i...>;
+};
 
 inline constexpr std::size_t stack_size = 128;  // deeper than any balanced tree of 2^32 points
 
@@ -39,13 +51,15 @@ struct Row {
 };
 
 /// Least and greatest squared distance between the boxes of two nodes.
-HOLDFAST_INLINE void box_distances(const TreeView& tree, std::size_t a, std::size_t b, double& least,
-                                   double& greatest) {
+HOLDFAST_INLINE void box_distances(const TreeView& tree, std::size_t a, std::size_t b,
+                                   double& least, double& greatest) {
     least = 0.0;
     greatest = 0.0;
     for (std::size_t c = 0; c < tree.dimension; ++c) {
-        const double a_low = tree.low[a * tree.dimension + c], a_high = tree.high[a * tree.dimension + c];
-        const double b_low = tree.low[b * tree.dimension + c], b_high = tree.high[b * tree.dimension + c];
+        const double a_low = tree.low[a * tree.dimension + c],
+                     a_high = tree.high[a * tree.dimension + c];
+        const double b_low = tree.low[b * tree.dimension + c],
+                     b_high = tree.high[b * tree.dimension + c];
         const double gap_1 = b_low - a_high, gap_2 = a_low - b_high;
         double gap = gap_1 > gap_2 ? gap_1 : gap_2;
         if (gap < 0.0) gap = 0.0;
@@ -112,7 +126,8 @@ static double kth_distance(const PosteriorGroup& group, const double* point, std
                 far_least = l;
             }
             if (group.node_counts[far * columns + column] != 0) stack[depth++] = {far, far_least};
-            if (group.node_counts[near * columns + column] != 0) stack[depth++] = {near, near_least};
+            if (group.node_counts[near * columns + column] != 0)
+                stack[depth++] = {near, near_least};
             continue;
         }
         for (std::size_t block = 0; block < leaf_size / lane_count; ++block) {
@@ -175,7 +190,8 @@ static Within within_radius(const PosteriorGroup& group, const double* point, st
     return found;
 }
 
-/// One point under one posterior, by searching the tree: right for every point, and the slowest way.
+/// One point under one posterior, by searching the tree: right for every point, and the slowest
+/// way.
 static double searched_term(const PosteriorGroup& group, const double* point, std::size_t slot,
                             std::size_t column, const NearestNeighborConstants& constants,
                             double* scratch, std::uint64_t* visits) {
@@ -216,7 +232,8 @@ HOLDFAST_INLINE void open_leaf(const TreeView& tree, std::size_t leaf, QueryLeaf
     }
 }
 
-/// For each point of the leaf: weights and numbers of all points (itself too) within the resolution.
+/// For each point of the leaf: weights and numbers of all points (itself too) within the
+/// resolution.
 template <std::size_t vectors>
 static void sum_balls(const PosteriorGroup& group, const QueryLeaf& query, double radius_squared,
                       Row<vectors>* rows, std::uint64_t* visits) {
@@ -247,8 +264,8 @@ static void sum_balls(const PosteriorGroup& group, const QueryLeaf& query, doubl
         for (std::size_t i = 0; i < query.used; ++i) {
             Row<vectors> row = rows[i];
             for (std::size_t block = 0; block < leaf_size / lane_count; ++block) {
-                unsigned bits = bits_of(leaf_distances(tree, query.points[i], node.first_leaf, block) <=
-                                        radius_squared);
+                unsigned bits = bits_of(leaf_distances(tree, query.points[i], node.first_leaf,
+                                                       block) <= radius_squared);
                 const std::size_t base = node.first_leaf * leaf_size + block * lane_count;
                 if (bits == 0xff) {
                     row.add(group.block_weights + base / lane_count * columns,
@@ -267,12 +284,12 @@ static void sum_balls(const PosteriorGroup& group, const QueryLeaf& query, doubl
     for (std::size_t i = 0; i < query.used; ++i) rows[i].add(shared);
 }
 
-/// The nearest points of sixteen query points, sorted: row = rank, element = query point.
+/// The nearest points of sixteen query points, sorted: keys[v][rank] has those of eight of them.
 ///
-/// A key is a squared distance whose ten low bits are replaced by the number of the candidate, so that
-/// numbers travel with distances through the sorting. The order of two points may therefore be wrong
-/// where their squared distances differ by less than 2e-13 of their size; radii and sums are computed
-/// from the distances themselves.
+/// A key is a squared distance whose ten low bits are replaced by the number of the candidate, so
+/// that numbers travel with distances through the sorting. The order of two points may therefore be
+/// wrong where their squared distances differ by less than 2e-13 of their size; radii and sums are
+/// computed from the distances themselves.
 inline constexpr std::int64_t number_bits = 1023;
 inline constexpr std::size_t max_candidate_leaves = (number_bits + 1) / leaf_size;
 inline constexpr std::size_t query_vectors = leaf_size / lane_count;
@@ -280,69 +297,102 @@ inline constexpr double far_away = 1e300;
 
 template <std::size_t length>
 struct NearestLists {
-    Lanes keys[length][query_vectors];
+    Lanes keys[query_vectors][length];
     std::uint32_t leaves[max_candidate_leaves];  // number / leaf_size -> leaf
     double complete_below;                       // no point nearer than this was left out
 };
 
-HOLDFAST_INLINE void compare_exchange(Lanes* low, Lanes* high) {
-    for (std::size_t v = 0; v < query_vectors; ++v) {
-        const Lanes a = low[v], b = high[v];
-        low[v] = select(a < b, a, b);
-        high[v] = select(a < b, b, a);
-    }
-}
+/// Comparisons of a sorting network, as constants, so that the rows it sorts can stay in registers.
+struct Comparison {
+    std::uint8_t low, high;
+};
 
-/// The comparisons of Batcher's odd-even merge sort (1968) for `length` rows, a power of two.
 template <std::size_t length>
-struct SortingNetwork {
-    std::uint8_t low[length * 10], high[length * 10];
-    std::size_t size = 0;
+struct Network {
+    Comparison comparisons[length * 10];
+    std::size_t size;
+};
 
-    constexpr SortingNetwork() : low{}, high{} {
-        for (std::size_t p = 1; p < length; p += p) {
-            for (std::size_t k = p; k >= 1; k /= 2) {
-                for (std::size_t j = k % p; j + k < length; j += 2 * k) {
-                    for (std::size_t i = j; i < j + k && i + k < length; ++i) {
-                        if (i / (2 * p) != (i + k) / (2 * p)) continue;
-                        low[size] = static_cast<std::uint8_t>(i);
-                        high[size++] = static_cast<std::uint8_t>(i + k);
-                    }
+/// Batcher's odd-even merge sort (1968); `length` is a power of two.
+template <std::size_t length>
+constexpr Network<length> sorting_network() {
+    Network<length> network{};
+    for (std::size_t p = 1; p < length; p += p) {
+        for (std::size_t k = p; k >= 1; k /= 2) {
+            for (std::size_t j = k % p; j + k < length; j += 2 * k) {
+                for (std::size_t i = j; i < j + k && i + k < length; ++i) {
+                    if (i / (2 * p) != (i + k) / (2 * p)) continue;
+                    network.comparisons[network.size++] = {static_cast<std::uint8_t>(i),
+                                                           static_cast<std::uint8_t>(i + k)};
                 }
             }
         }
     }
-};
-
-/// Sorts the rows: the same comparisons for every element, so sixteen lists are sorted as one.
-template <std::size_t length>
-HOLDFAST_INLINE void sort_rows(Lanes (*keys)[query_vectors]) {
-    static constexpr SortingNetwork<length> network;
-    for (std::size_t i = 0; i < network.size; ++i) {
-        compare_exchange(keys[network.low[i]], keys[network.high[i]]);
-    }
+    return network;
 }
 
-/// Keeps in `best` the least of both sorted lists, sorted: the last stages of a bitonic sorter.
+/// The last stages of a bitonic sorter: sorts what first rises and then falls.
 template <std::size_t length>
-HOLDFAST_INLINE void merge_rows(Lanes (*best)[query_vectors], Lanes (*block)[query_vectors]) {
-    for (std::size_t i = 0; i < length; ++i) {
-        for (std::size_t v = 0; v < query_vectors; ++v) {
-            const Lanes a = best[i][v], b = block[length - 1 - i][v];
-            best[i][v] = select(a < b, a, b);
-        }
-    }
+constexpr Network<length> merging_network() {
+    Network<length> network{};
     for (std::size_t k = length / 2; k >= 1; k /= 2) {
         for (std::size_t j = 0; j < length; j += 2 * k) {
-            for (std::size_t i = 0; i < k; ++i) compare_exchange(best[i + j], best[i + j + k]);
+            for (std::size_t i = j; i < j + k; ++i) {
+                network.comparisons[network.size++] = {static_cast<std::uint8_t>(i),
+                                                       static_cast<std::uint8_t>(i + k)};
+            }
+        }
+    }
+    return network;
+}
+
+template <std::size_t length>
+inline constexpr Network<length> sorting = sorting_network<length>();
+template <std::size_t length>
+inline constexpr Network<length> merging = merging_network<length>();
+
+template <std::size_t length, const Network<length>& network, std::size_t... i>
+HOLDFAST_INLINE void apply_written_out(Lanes* rows, Indices<i...>) {
+    (order(rows[network.comparisons[i].low], rows[network.comparisons[i].high]), ...);
+}
+
+/// Applies a network to rows of eight lists each. Thirty-two rows fit into the registers of
+/// AVX-512, so there the comparisons are written out; more rows go through memory in a loop.
+template <std::size_t length, const Network<length>& network>
+HOLDFAST_INLINE void apply(Lanes* rows) {
+    if constexpr (length <= 32) {
+        apply_written_out<length, network>(rows, typename IndicesBelow<network.size>::type{});
+    } else {
+        for (std::size_t i = 0; i < network.size; ++i) {
+            order(rows[network.comparisons[i].low], rows[network.comparisons[i].high]);
         }
     }
 }
 
-/// The largest key of a row: no query point looks further.
-HOLDFAST_INLINE double furthest(const Lanes* row) {
-    Lanes largest = row[0];
-    for (std::size_t v = 1; v < query_vectors; ++v) largest = select(row[v] > largest, row[v], largest);
+/// Sorts `block` and keeps in the sorted `best` the least of both, sorted: for eight lists at once.
+template <std::size_t length>
+static void merge_block(Lanes* best, Lanes* block) {
+    Lanes rows[length];
+    for (std::size_t i = 0; i < length; ++i) rows[i] = block[i];
+    apply<length, sorting<length>>(rows);
+    for (std::size_t i = 0; i < length; ++i) block[i] = rows[i];
+    for (std::size_t i = 0; i < length; ++i) {
+        rows[i] = best[i];
+        Lanes other = block[length - 1 - i];
+        order(rows[i], other);
+    }
+    apply<length, merging<length>>(rows);
+    for (std::size_t i = 0; i < length; ++i) best[i] = rows[i];
+}
+
+/// The largest of the last keys: no query point looks further.
+template <std::size_t length>
+HOLDFAST_INLINE double furthest(const NearestLists<length>& lists) {
+    Lanes largest = lists.keys[0][length - 1];
+    for (std::size_t v = 1; v < query_vectors; ++v) {
+        const Lanes last = lists.keys[v][length - 1];
+        largest = select(last > largest, last, largest);
+    }
     return maximum_of(largest);
 }
 
@@ -354,19 +404,16 @@ static void find_nearest(const TreeView& tree, const QueryLeaf& query, NearestLi
         double least;
     } stack[stack_size];
     std::size_t depth = 0, leaves = 0, in_block = 0;
-    Lanes block[length][query_vectors];
-    for (std::size_t i = 0; i < length; ++i) {
-        for (std::size_t v = 0; v < query_vectors; ++v) {
-            lists.keys[i][v] = splat(far_away);
-            block[i][v] = splat(far_away);
-        }
+    Lanes block[query_vectors][length];
+    for (std::size_t v = 0; v < query_vectors; ++v) {
+        for (std::size_t i = 0; i < length; ++i) lists.keys[v][i] = splat(far_away);
     }
     lists.complete_below = __builtin_inf();
     double bound = far_away;
     // Lists of unused query slots would keep the bound up: they ask for nothing.
     for (std::size_t i = query.used; i < leaf_size; ++i) {
         for (std::size_t rank = 0; rank < length; ++rank) {
-            lists.keys[rank][i / lane_count][i % lane_count] = -1.0;
+            lists.keys[i / lane_count][rank][i % lane_count] = -1.0;
         }
     }
     stack[depth++] = {0, 0.0};
@@ -384,7 +431,8 @@ static void find_nearest(const TreeView& tree, const QueryLeaf& query, NearestLi
             box_distances(tree, query.node, node.right, right_least, unused);
             // The nearer one on top; the query's own side, where both touch it.
             const bool own_side_left = query.leaf < tree.nodes[node.left].last_leaf;
-            const bool left_first = left_least != right_least ? left_least < right_least : own_side_left;
+            const bool left_first =
+                left_least != right_least ? left_least < right_least : own_side_left;
             if (left_first) {
                 stack[depth++] = {node.right, right_least};
                 stack[depth++] = {node.left, left_least};
@@ -400,7 +448,8 @@ static void find_nearest(const TreeView& tree, const QueryLeaf& query, NearestLi
             for (std::size_t v = 0; v < query_vectors; ++v) {
                 Lanes distance{};
                 for (std::size_t c = 0; c < tree.dimension; ++c) {
-                    const double x = tree.coordinates[(leaf * tree.dimension + c) * leaf_size + other];
+                    const double x =
+                        tree.coordinates[(leaf * tree.dimension + c) * leaf_size + other];
                     const Lanes difference =
                         load(tree.coordinates + (query.leaf * tree.dimension + c) * leaf_size +
                              v * lane_count) -
@@ -409,26 +458,25 @@ static void find_nearest(const TreeView& tree, const QueryLeaf& query, NearestLi
                 }
                 // Unused slots are at infinity from others and, as NaN, from each other.
                 distance = select(distance < far_away, distance, splat(far_away));
-                block[in_block][v] = detail::from_bits<Lanes>((detail::bits(distance) & ~number_bits) |
-                                                              number);
+                block[v][in_block] =
+                    detail::from_bits<Lanes>((detail::bits(distance) & ~number_bits) | number);
             }
             ++in_block;
         }
         *visits += query.used * leaf_size;
         lists.leaves[leaves++] = leaf;
         if (in_block == length) {
-            sort_rows<length>(block);
-            merge_rows<length>(lists.keys, block);
-            bound = furthest(lists.keys[length - 1]);
+            for (std::size_t v = 0; v < query_vectors; ++v)
+                merge_block<length>(lists.keys[v], block[v]);
+            bound = furthest(lists);
             in_block = 0;
         }
     }
     if (in_block > 0) {
-        for (; in_block < length; ++in_block) {
-            for (std::size_t v = 0; v < query_vectors; ++v) block[in_block][v] = splat(far_away);
+        for (std::size_t v = 0; v < query_vectors; ++v) {
+            for (std::size_t i = in_block; i < length; ++i) block[v][i] = splat(far_away);
+            merge_block<length>(lists.keys[v], block[v]);
         }
-        sort_rows<length>(block);
-        merge_rows<length>(lists.keys, block);
     }
 }
 
@@ -445,10 +493,11 @@ static void walk_outwards(const PosteriorGroup& group, const QueryLeaf& query, s
     const double* own_weights = group.weights + slot * columns;
     Lanes mass[vectors] = {}, within[vectors] = {}, radius[vectors];
     for (std::size_t v = 0; v < vectors; ++v) {
-        radius[v] = select(load(own_weights + v * lane_count) > 0.0, splat(__builtin_inf()), splat(-1.0));
+        radius[v] =
+            select(load(own_weights + v * lane_count) > 0.0, splat(__builtin_inf()), splat(-1.0));
     }
     for (std::size_t rank = 0; rank < length; ++rank) {
-        const double key = lists.keys[rank][i / lane_count][i % lane_count];
+        const double key = lists.keys[i / lane_count][rank][i % lane_count];
         if (key >= limit) break;
         const auto number = static_cast<std::size_t>(detail::bits(key) & number_bits);
         const std::size_t leaf = lists.leaves[number / leaf_size], other = number % leaf_size;
@@ -456,8 +505,9 @@ static void walk_outwards(const PosteriorGroup& group, const QueryLeaf& query, s
         if (other_slot == slot) continue;
         double distance = 0.0;
         for (std::size_t c = 0; c < tree.dimension; ++c) {
-            const double difference = query.points[i][c] -
-                                      tree.coordinates[(leaf * tree.dimension + c) * leaf_size + other];
+            const double difference =
+                query.points[i][c] -
+                tree.coordinates[(leaf * tree.dimension + c) * leaf_size + other];
             distance += difference * difference;
         }
         const double reached_radius =
@@ -482,16 +532,17 @@ static void walk_outwards(const PosteriorGroup& group, const QueryLeaf& query, s
             if (!(weight[lane] > 0.0)) continue;
             const std::size_t column = v * lane_count + lane;
             if (!(radius[v][lane] < limit)) {
-                terms[v][lane] += searched_term(group, query.points[i], slot, column, constants, scratch,
-                                                visits);
+                terms[v][lane] +=
+                    searched_term(group, query.points[i], slot, column, constants, scratch, visits);
                 continue;
             }
             const std::uint32_t q = radius[v][lane] > resolution_squared
                                         ? group.neighbors[column]
                                         : static_cast<std::uint32_t>(within[v][lane]);
-            terms[v][lane] += weight[lane] * (constants.log_ball_volume +
-                                              static_cast<double>(tree.dimension) * log_radius[lane] -
-                                              log_mass[lane] + constants.bias_correction[q]);
+            terms[v][lane] +=
+                weight[lane] * (constants.log_ball_volume +
+                                static_cast<double>(tree.dimension) * log_radius[lane] -
+                                log_mass[lane] + constants.bias_correction[q]);
         }
     }
 }
@@ -502,8 +553,8 @@ static void ball_terms(const PosteriorGroup& group, const QueryLeaf& query, std:
                        const Row<vectors>& row, const NearestNeighborConstants& constants,
                        double* scratch, Lanes* terms, std::uint64_t* visits) {
     const std::size_t slot = query.first_slot + i;
-    const double log_ball = constants.log_ball_volume +
-                            static_cast<double>(group.tree.dimension) * log_of(constants.resolution);
+    const double log_ball = constants.log_ball_volume + static_cast<double>(group.tree.dimension) *
+                                                            log_of(constants.resolution);
     for (std::size_t v = 0; v < vectors; ++v) {
         const Lanes weight = load(group.weights + (slot * vectors + v) * lane_count);
         // The point itself is within every ball around it.
@@ -514,16 +565,16 @@ static void ball_terms(const PosteriorGroup& group, const QueryLeaf& query, std:
             const std::uint32_t count = row.within[v][lane] - 1;
             terms[v][lane] +=
                 count >= group.neighbors[column]
-                    ? weight[lane] *
-                          (log_ball - log_mass[lane] + constants.bias_correction[count])
-                    : searched_term(group, query.points[i], slot, column, constants, scratch, visits);
+                    ? weight[lane] * (log_ball - log_mass[lane] + constants.bias_correction[count])
+                    : searched_term(group, query.points[i], slot, column, constants, scratch,
+                                    visits);
         }
     }
 }
 
-/// Three ways to the same terms. Where the points are denser than the resolution, sums over balls; where
-/// they are not, sorted lists of the nearest points, made once for all posteriors; and for what neither
-/// settles (few of the near points have weight), a search for one posterior.
+/// Three ways to the same terms. Where the points are denser than the resolution, sums over balls;
+/// where they are not, sorted lists of the nearest points, made once for all posteriors; and for
+/// what neither settles (few of the near points have weight), a search for one posterior.
 template <std::size_t vectors, std::size_t length>
 static void group_nearest_rows(const PosteriorGroup& group, const QueryLeaf& query,
                                const NearestNeighborConstants& constants, double* scratch,
@@ -550,11 +601,12 @@ static void group_nearest_rows(const PosteriorGroup& group, const QueryLeaf& que
         if (!dense) {
             // Without its number, so that no point as far as the last one is taken for nearer.
             const double last = detail::from_bits<double>(
-                detail::bits(lists.keys[length - 1][i / lane_count][i % lane_count]) & ~number_bits);
+                detail::bits(lists.keys[i / lane_count][length - 1][i % lane_count]) &
+                ~number_bits);
             const double limit = last < lists.complete_below ? last : lists.complete_below;
             if (limit > resolution_squared) {
-                walk_outwards<vectors, length>(group, query, i, lists, wanted, limit, constants, scratch,
-                                               terms, visits);
+                walk_outwards<vectors, length>(group, query, i, lists, wanted, limit, constants,
+                                               scratch, terms, visits);
                 continue;
             }
         }
@@ -597,9 +649,8 @@ static void group_mixture_rows(const PosteriorGroup& group, std::size_t leaf, do
             for (std::size_t v = 0; v < vectors; ++v) total[v] = totals[i][v];
             for (std::size_t block = 0; block < leaf_size / lane_count; ++block) {
                 double kernel[lane_count];
-                store(kernel,
-                      exp_of(-exponent *
-                             leaf_distances(tree, query.points[i], node.first_leaf, block)));
+                store(kernel, exp_of(-exponent * leaf_distances(tree, query.points[i],
+                                                                node.first_leaf, block)));
                 const double* weights =
                     group.weights + (node.first_leaf * leaf_size + block * lane_count) * columns;
                 for (std::size_t lane = 0; lane < lane_count; ++lane) {
@@ -613,7 +664,8 @@ static void group_mixture_rows(const PosteriorGroup& group, std::size_t leaf, do
     }
     for (std::size_t i = 0; i < query.used; ++i) {
         for (std::size_t v = 0; v < vectors; ++v) {
-            const Lanes weight = load(group.weights + (query.first_slot + i) * columns + v * lane_count);
+            const Lanes weight =
+                load(group.weights + (query.first_slot + i) * columns + v * lane_count);
             const Lanes term = select(weight > 0.0, weight * log_of(totals[i][v]), Lanes{});
             store(out + v * lane_count, load(out + v * lane_count) - term);
         }
@@ -630,7 +682,11 @@ static void group_nearest_leaf(const PosteriorGroup& group, std::size_t leaf,
     for (std::size_t m = 0; m < group.members; ++m) {
         if (group.neighbors[m] > most) most = group.neighbors[m];
     }
-    if (most <= 8) {
+    // A list must reach k points of non-zero weight: all points have it where one posterior has a
+    // tree of its own, and perhaps one in four where posteriors with different points share one.
+    if (group.members == 1 && most <= 8) {
+        group_nearest_rows<vectors, 16>(group, query, constants, scratch, out, visits);
+    } else if (most <= 8) {
         group_nearest_rows<vectors, 32>(group, query, constants, scratch, out, visits);
     } else {
         group_nearest_rows<vectors, 64>(group, query, constants, scratch, out, visits);
@@ -641,20 +697,28 @@ static void group_nearest(const PosteriorGroup& group, std::size_t leaf,
                           const NearestNeighborConstants& constants, double* scratch, double* out,
                           std::uint64_t* visits) {
     switch (group.vectors) {
-        case 1: return group_nearest_leaf<1>(group, leaf, constants, scratch, out, visits);
-        case 2: return group_nearest_leaf<2>(group, leaf, constants, scratch, out, visits);
-        case 3: return group_nearest_leaf<3>(group, leaf, constants, scratch, out, visits);
-        default: return group_nearest_leaf<4>(group, leaf, constants, scratch, out, visits);
+        case 1:
+            return group_nearest_leaf<1>(group, leaf, constants, scratch, out, visits);
+        case 2:
+            return group_nearest_leaf<2>(group, leaf, constants, scratch, out, visits);
+        case 3:
+            return group_nearest_leaf<3>(group, leaf, constants, scratch, out, visits);
+        default:
+            return group_nearest_leaf<4>(group, leaf, constants, scratch, out, visits);
     }
 }
 
-static void group_mixture(const PosteriorGroup& group, std::size_t leaf, double exponent, double* out,
-                          std::uint64_t* visits) {
+static void group_mixture(const PosteriorGroup& group, std::size_t leaf, double exponent,
+                          double* out, std::uint64_t* visits) {
     switch (group.vectors) {
-        case 1: return group_mixture_rows<1>(group, leaf, exponent, out, visits);
-        case 2: return group_mixture_rows<2>(group, leaf, exponent, out, visits);
-        case 3: return group_mixture_rows<3>(group, leaf, exponent, out, visits);
-        default: return group_mixture_rows<4>(group, leaf, exponent, out, visits);
+        case 1:
+            return group_mixture_rows<1>(group, leaf, exponent, out, visits);
+        case 2:
+            return group_mixture_rows<2>(group, leaf, exponent, out, visits);
+        case 3:
+            return group_mixture_rows<3>(group, leaf, exponent, out, visits);
+        default:
+            return group_mixture_rows<4>(group, leaf, exponent, out, visits);
     }
 }
 

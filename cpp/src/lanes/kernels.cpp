@@ -10,14 +10,13 @@
 #include "group_entropy.hpp"
 #include "posterior.hpp"
 
-
 namespace holdfast::HOLDFAST_ISA {
 
 extern const VectorKernels table;
 const VectorKernels table = {
-    HOLDFAST_ISA_NAME, exp_array,      log_array,       sin_array,       cos_array,
-    normals_array,     sum_array,      weighted_sums,   posterior,       normalize,
-    compact_nearest,   compact_mixture, group_nearest,  group_mixture,
+    HOLDFAST_ISA_NAME, exp_array,       log_array,     sin_array,     cos_array,
+    normals_array,     sum_array,       weighted_sums, posterior,     normalize,
+    compact_nearest,   compact_mixture, group_nearest, group_mixture,
 };
 
 }  // namespace holdfast::HOLDFAST_ISA

@@ -1,11 +1,12 @@
 // Eight doubles at a time, without naming an instruction set.
 //
-// A value is one AVX-512 register, two AVX registers or four SSE or NEON registers, by what the file is
-// compiled for; the code above it is the same. Every operation is element by element and IEEE-exact, and
-// sums over elements are written out in a fixed order, so the bits are the same whatever the width.
+// A value is one AVX-512 register, two AVX registers or four SSE or NEON registers, by what the
+// file is compiled for; the code above it is the same. Every operation is element by element and
+// IEEE-exact, and sums over elements are written out in a fixed order, so the bits are the same
+// whatever the width.
 //
-// (One vector type of 64 bytes for all machines would be shorter; but compilers lower its comparisons
-// and selections to scalar code where the registers are narrower.)
+// (One vector type of 64 bytes for all machines would be shorter; but compilers lower its
+// comparisons and selections to scalar code where the registers are narrower.)
 
 #pragma once
 
@@ -17,8 +18,9 @@
 #include <immintrin.h>
 #endif
 
-// The inner loops define this as the namespace of their instruction set. The types below depend on the
-// set, so they live in that namespace: no two compilations may share a name for different things.
+// The inner loops define this as the namespace of their instruction set. The types below depend on
+// the set, so they live in that namespace: no two compilations may share a name for different
+// things.
 #ifndef HOLDFAST_ISA
 #define HOLDFAST_ISA isa_of_this_file
 #endif
@@ -43,7 +45,32 @@ inline constexpr std::size_t registers = 64 / register_bytes;
 using DoubleRegister = double __attribute__((vector_size(register_bytes)));
 using IntRegister = std::int64_t __attribute__((vector_size(register_bytes)));
 using UnsignedRegister = std::uint64_t __attribute__((vector_size(register_bytes)));
+// May lie anywhere in an array of double.
+using LooseRegister =
+    double __attribute__((vector_size(register_bytes), aligned(alignof(double)), may_alias));
 using CountLanes = std::uint32_t __attribute__((vector_size(32)));
+
+// A loop over the registers, written out: compilers keep the parts of a structure in registers only
+// if they see constant indices early.
+#define HOLDFAST_EACH_REGISTER(statement) \
+    {                                     \
+        constexpr std::size_t r = 0;      \
+        statement;                        \
+    }                                     \
+    if constexpr (registers > 1) {        \
+        constexpr std::size_t r = 1;      \
+        statement;                        \
+    }                                     \
+    if constexpr (registers > 2) {        \
+        {                                 \
+            constexpr std::size_t r = 2;  \
+            statement;                    \
+        }                                 \
+        {                                 \
+            constexpr std::size_t r = 3;  \
+            statement;                    \
+        }                                 \
+    }
 
 /// Eight 64-bit integers, or eight truth values (all bits or none).
 struct IntLanes {
@@ -62,24 +89,28 @@ struct Lanes {
 
 HOLDFAST_INLINE Lanes splat(double value) {
     Lanes result;
-    for (std::size_t r = 0; r < registers; ++r) result.part[r] = DoubleRegister{} + value;
+    HOLDFAST_EACH_REGISTER(result.part[r] = DoubleRegister{} + value)
     return result;
 }
 
 HOLDFAST_INLINE IntLanes splat_int(std::int64_t value) {
     IntLanes result;
-    for (std::size_t r = 0; r < registers; ++r) result.part[r] = IntRegister{} + value;
+    HOLDFAST_EACH_REGISTER(result.part[r] = IntRegister{} + value)
     return result;
 }
 
-#define HOLDFAST_LANES_OPERATOR(Result, Type, Scalar, fill, op)                          \
-    HOLDFAST_INLINE Result operator op(const Type& a, const Type& b) {                   \
-        Result result;                                                                   \
-        for (std::size_t r = 0; r < registers; ++r) result.part[r] = a.part[r] op b.part[r]; \
-        return result;                                                                   \
-    }                                                                                    \
-    HOLDFAST_INLINE Result operator op(const Type& a, Scalar b) { return a op fill(b); } \
-    HOLDFAST_INLINE Result operator op(Scalar a, const Type& b) { return fill(a) op b; }
+#define HOLDFAST_LANES_OPERATOR(Result, Type, Scalar, fill, op)         \
+    HOLDFAST_INLINE Result operator op(const Type& a, const Type& b) {  \
+        Result result;                                                  \
+        HOLDFAST_EACH_REGISTER(result.part[r] = a.part[r] op b.part[r]) \
+        return result;                                                  \
+    }                                                                   \
+    HOLDFAST_INLINE Result operator op(const Type& a, Scalar b) {       \
+        return a op fill(b);                                            \
+    }                                                                   \
+    HOLDFAST_INLINE Result operator op(Scalar a, const Type& b) {       \
+        return fill(a) op b;                                            \
+    }
 HOLDFAST_LANES_OPERATOR(Lanes, Lanes, double, splat, +)
 HOLDFAST_LANES_OPERATOR(Lanes, Lanes, double, splat, -)
 HOLDFAST_LANES_OPERATOR(Lanes, Lanes, double, splat, *)
@@ -98,27 +129,33 @@ HOLDFAST_LANES_OPERATOR(IntLanes, IntLanes, std::int64_t, splat_int, !=)
 
 HOLDFAST_INLINE Lanes operator-(const Lanes& a) {
     Lanes result;
-    for (std::size_t r = 0; r < registers; ++r) result.part[r] = -a.part[r];
+    HOLDFAST_EACH_REGISTER(result.part[r] = -a.part[r])
     return result;
 }
-HOLDFAST_INLINE Lanes& operator+=(Lanes& a, const Lanes& b) { return a = a + b; }
-HOLDFAST_INLINE Lanes& operator-=(Lanes& a, const Lanes& b) { return a = a - b; }
-HOLDFAST_INLINE IntLanes& operator|=(IntLanes& a, const IntLanes& b) { return a = a | b; }
+HOLDFAST_INLINE Lanes& operator+=(Lanes& a, const Lanes& b) {
+    return a = a + b;
+}
+HOLDFAST_INLINE Lanes& operator-=(Lanes& a, const Lanes& b) {
+    return a = a - b;
+}
+HOLDFAST_INLINE IntLanes& operator|=(IntLanes& a, const IntLanes& b) {
+    return a = a | b;
+}
 
 HOLDFAST_INLINE IntLanes shift_left(const IntLanes& a, int by) {
     IntLanes result;
-    for (std::size_t r = 0; r < registers; ++r) result.part[r] = a.part[r] << by;
+    HOLDFAST_EACH_REGISTER(result.part[r] = a.part[r] << by)
     return result;
 }
-HOLDFAST_INLINE std::int64_t shift_left(std::int64_t a, int by) { return a << by; }
+HOLDFAST_INLINE std::int64_t shift_left(std::int64_t a, int by) {
+    return a << by;
+}
 
 /// Shift of the bit pattern: zeros come in from the left.
 HOLDFAST_INLINE IntLanes shift_right(const IntLanes& a, int by) {
     IntLanes result;
-    for (std::size_t r = 0; r < registers; ++r) {
-        result.part[r] =
-            reinterpret_cast<IntRegister>(reinterpret_cast<UnsignedRegister>(a.part[r]) >> by);
-    }
+    HOLDFAST_EACH_REGISTER(result.part[r] = reinterpret_cast<IntRegister>(
+                               reinterpret_cast<UnsignedRegister>(a.part[r]) >> by))
     return result;
 }
 HOLDFAST_INLINE std::int64_t shift_right(std::int64_t a, int by) {
@@ -126,12 +163,17 @@ HOLDFAST_INLINE std::int64_t shift_right(std::int64_t a, int by) {
 }
 
 HOLDFAST_INLINE Lanes load(const double* from) {
-    Lanes lanes;
-    std::memcpy(&lanes, from, sizeof lanes);
-    return lanes;
+    constexpr std::size_t width = lane_count / registers;
+    Lanes result;
+    HOLDFAST_EACH_REGISTER(result.part[r] =
+                               *reinterpret_cast<const LooseRegister*>(from + r * width))
+    return result;
 }
 
-HOLDFAST_INLINE void store(double* to, const Lanes& lanes) { std::memcpy(to, &lanes, sizeof lanes); }
+HOLDFAST_INLINE void store(double* to, const Lanes& lanes) {
+    constexpr std::size_t width = lane_count / registers;
+    HOLDFAST_EACH_REGISTER(*reinterpret_cast<LooseRegister*>(to + r * width) = lanes.part[r])
+}
 
 /// Loads `count` < 8 doubles and fills up with `filler`.
 HOLDFAST_INLINE Lanes load_partial(const double* from, std::size_t count, double filler) {
@@ -146,14 +188,35 @@ HOLDFAST_INLINE void store_partial(double* to, const Lanes& lanes, std::size_t c
 
 HOLDFAST_INLINE Lanes select(const IntLanes& mask, const Lanes& yes, const Lanes& no) {
     Lanes result;
-    for (std::size_t r = 0; r < registers; ++r) {
-        result.part[r] = mask.part[r] ? yes.part[r] : no.part[r];
-    }
+    HOLDFAST_EACH_REGISTER(result.part[r] = mask.part[r] ? yes.part[r] : no.part[r])
     return result;
 }
-HOLDFAST_INLINE double select(bool mask, double yes, double no) { return mask ? yes : no; }
+HOLDFAST_INLINE double select(bool mask, double yes, double no) {
+    return mask ? yes : no;
+}
 
-HOLDFAST_INLINE double square_root(double x) { return __builtin_sqrt(x); }
+/// The lesser and the greater of two, element by element, where neither is NaN.
+HOLDFAST_INLINE void order(Lanes& low, Lanes& high) {
+    const Lanes a = low, b = high;
+#if defined(__AVX512DQ__)
+    low.part[0] = _mm512_min_pd(a.part[0], b.part[0]);
+    high.part[0] = _mm512_max_pd(a.part[0], b.part[0]);
+#elif defined(__AVX__)
+    HOLDFAST_EACH_REGISTER(low.part[r] = _mm256_min_pd(a.part[r], b.part[r]))
+    HOLDFAST_EACH_REGISTER(high.part[r] = _mm256_max_pd(a.part[r], b.part[r]))
+#elif defined(__SSE2__)
+    HOLDFAST_EACH_REGISTER(low.part[r] = _mm_min_pd(a.part[r], b.part[r]))
+    HOLDFAST_EACH_REGISTER(high.part[r] = _mm_max_pd(a.part[r], b.part[r]))
+#else
+    const IntLanes less = a < b;
+    low = select(less, a, b);
+    high = select(less, b, a);
+#endif
+}
+
+HOLDFAST_INLINE double square_root(double x) {
+    return __builtin_sqrt(x);
+}
 HOLDFAST_INLINE Lanes square_root(const Lanes& x) {
     Lanes result;
     for (std::size_t i = 0; i < lane_count; ++i) result[i] = __builtin_sqrt(x[i]);
@@ -181,10 +244,9 @@ HOLDFAST_INLINE unsigned bits_of(const IntLanes& mask) {
            static_cast<unsigned>(_mm256_movemask_pd(reinterpret_cast<__m256d>(mask.part[1]))) << 4;
 #elif defined(__SSE2__)
     unsigned bits = 0;
-    for (std::size_t r = 0; r < registers; ++r) {
+    HOLDFAST_EACH_REGISTER(
         bits |= static_cast<unsigned>(_mm_movemask_pd(reinterpret_cast<__m128d>(mask.part[r])))
-                << (2 * r);
-    }
+                << (2 * r))
     return bits;
 #else
     unsigned bits = 0;
@@ -194,6 +256,8 @@ HOLDFAST_INLINE unsigned bits_of(const IntLanes& mask) {
     return bits;
 #endif
 }
+
+#undef HOLDFAST_EACH_REGISTER
 
 }  // namespace HOLDFAST_ISA
 }  // namespace holdfast

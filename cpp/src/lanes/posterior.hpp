@@ -1,8 +1,12 @@
 // The posterior after a hypothetical observation (one compilation per instruction set).
 //
-// Bayes: w_n' = w_n p(z | v, x_n) / sum, computed from logarithms so that nothing underflows as a whole.
-// Weights below `negligible` times the largest are set to zero: they are below any effect on the
-// entropy, and a particle of weight 1e-200 must not count as a neighbour.
+// Bayes: w_n' = w_n p(z | v, x_n) / sum, computed from logarithms so that nothing underflows as a
+// whole.
+//
+// Negligible weights become zero: those below the largest of 1e-2, 1e-3, ..., 1e-6 times the
+// greatest weight that leaves out at most 0.5 % of the sum (or below 1e-6 times it, if none does).
+// A particle of weight 1e-200 must not count as a neighbour, and one of 1e-5 is hardly better; but
+// where small weights together matter, they stay.
 
 #pragma once
 
@@ -12,34 +16,65 @@ namespace holdfast::HOLDFAST_ISA {
 
 /// In place: log weights (in `weights`) to normalised weights; returns the number of non-zero ones.
 static std::size_t normalize_in_place(double* weights, std::size_t count, double largest,
-                                      double log_negligible) {
-    // NaN compares false; -infinity everywhere means that no particle can have made the observation.
+                                      bool drop_negligible) {
+    // NaN compares false; -infinity everywhere means that no particle can have made the
+    // observation.
     if (!(largest > -1.7976931348623157e308 && largest < 1.7976931348623157e308)) return 0;
-    Lanes total{};
-    std::size_t survivors = 0;
+    constexpr std::size_t steps = 5;
+    constexpr double thresholds[steps] = {1e-2, 1e-3, 1e-4, 1e-5, 1e-6};
+    constexpr double may_be_lost = 0.005;
+    Lanes total{}, below[steps] = {};
     for (std::size_t i = 0; i < count; i += lane_count) {
         const std::size_t left = count - i < lane_count ? count - i : lane_count;
-        const Lanes relative =
-            (left == lane_count ? load(weights + i) : load_partial(weights + i, left, -1e300)) - largest;
-        const IntLanes kept = relative >= log_negligible;
-        const Lanes weight = select(kept, exp_of(relative), Lanes{});
-        survivors += static_cast<std::size_t>(__builtin_popcount(bits_of(kept)));
+        const Lanes weight =
+            exp_of((left == lane_count ? load(weights + i)
+                                       : load_partial(weights + i, left, -__builtin_inf())) -
+                   largest);
         total += weight;
+        if (drop_negligible) {
+            for (std::size_t step = 0; step < steps; ++step) {
+                below[step] += select(weight < thresholds[step], weight, Lanes{});
+            }
+        }
         if (left == lane_count) {
             store(weights + i, weight);
         } else {
             store_partial(weights + i, weight, left);
         }
     }
+    double threshold = 0.0;
+    if (drop_negligible) {
+        const double limit = may_be_lost * sum_of(total);
+        std::size_t step = 0;
+        while (step + 1 < steps && sum_of(below[step]) > limit) ++step;
+        threshold = thresholds[step];
+    }
+    std::size_t survivors = 0;
+    total = Lanes{};
+    for (std::size_t i = 0; i < count; i += lane_count) {
+        const std::size_t left = count - i < lane_count ? count - i : lane_count;
+        const Lanes weight =
+            left == lane_count ? load(weights + i) : load_partial(weights + i, left, 0.0);
+        const IntLanes kept = (weight >= threshold) & (weight > 0.0);
+        const Lanes result = select(kept, weight, Lanes{});
+        survivors += static_cast<std::size_t>(__builtin_popcount(bits_of(kept)));
+        total += result;
+        if (left == lane_count) {
+            store(weights + i, result);
+        } else {
+            store_partial(weights + i, result, left);
+        }
+    }
     const double inverse = 1.0 / sum_of(total);
     if (!(inverse > 0.0)) return 0;  // a NaN among the log weights
     std::size_t i = 0;
-    for (; i + lane_count <= count; i += lane_count) store(weights + i, load(weights + i) * inverse);
+    for (; i + lane_count <= count; i += lane_count)
+        store(weights + i, load(weights + i) * inverse);
     for (; i < count; ++i) weights[i] = weights[i] * inverse;
     return survivors;
 }
 
-static std::size_t normalize(const double* log_weights, std::size_t count, double log_negligible,
+static std::size_t normalize(const double* log_weights, std::size_t count, bool drop_negligible,
                              double* weights) {
     double largest = log_weights[0];
     for (std::size_t i = 0; i < count; ++i) {
@@ -48,7 +83,7 @@ static std::size_t normalize(const double* log_weights, std::size_t count, doubl
         if (largest != largest) return 0;
         weights[i] = log_weights[i];
     }
-    return normalize_in_place(weights, count, largest, log_negligible);
+    return normalize_in_place(weights, count, largest, drop_negligible);
 }
 
 /// log w_n - sum over c of (z_c - h_c(x_n))^2 / (2 R_c) + log R_c / 2, then normalised.
@@ -62,7 +97,8 @@ static std::size_t posterior(const PosteriorInput& in, double* weights) {
         };
         Lanes exponent{};
         for (std::size_t c = 0; c < in.observation_size; ++c) {
-            const Lanes difference = splat(in.observation[c]) - fetch(in.predicted + c * in.count, 0.0);
+            const Lanes difference =
+                splat(in.observation[c]) - fetch(in.predicted + c * in.count, 0.0);
             const Lanes inverse = varying ? fetch(in.inverse_variance + c * in.count, 1.0)
                                           : splat(in.inverse_variance[c]);
             exponent += difference * difference * inverse;
@@ -76,7 +112,7 @@ static std::size_t posterior(const PosteriorInput& in, double* weights) {
             store_partial(weights + i, log_weight, left);
         }
     }
-    return normalize_in_place(weights, in.count, maximum_of(largest), in.log_negligible);
+    return normalize_in_place(weights, in.count, maximum_of(largest), true);
 }
 
 }  // namespace holdfast::HOLDFAST_ISA

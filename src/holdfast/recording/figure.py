@@ -360,7 +360,8 @@ def _draw_workspace_legend(
         )
     if scene.body is not None:
         handles.append(Line2D([], [], color=_BODY, linewidth=0.9, label="body"))
-    handles.append(Patch(facecolor=_OBSTACLE, edgecolor=_OBSTACLE_EDGE, label="obstacle"))
+    if len(scene.obstacles):
+        handles.append(Patch(facecolor=_OBSTACLE, edgecolor=_OBSTACLE_EDGE, label="obstacle"))
     handles += _action_handles(problem, record)
     panel.legend(
         handles=handles,

@@ -1,0 +1,87 @@
+"""The beliefs that decisions are timed on.
+
+A decision's cost depends on the belief: a wide one leaves few particles to a hypothetical
+observation, a narrow one nearly all. So a trial is run and its belief at every sensing step is
+kept: from the initial one over spread ones to those with the peg in the hole.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from holdfast.belief import Belief
+from holdfast.planning import (
+    PlanningState,
+    advance,
+    choose_sensing_action,
+    choose_task_action,
+    initial_state,
+    needs_sensing,
+    observe,
+)
+from holdfast.problems.problem import Problem
+from holdfast.randomness import Purpose, stream
+from holdfast.runtime.environment import SimulatedEnvironment
+from holdfast.settings import ParticleFilterSettings, PlanningSettings
+
+__all__ = ["concentrated_state", "recorded_trial", "settings_for", "with_sensing"]
+
+SEED = 0
+MAX_STEPS = 500
+
+
+def settings_for(num_particles: int, threads: int, **sensing: Any) -> PlanningSettings:
+    """Return the published settings (M = 10, k = 5, H = 1, interval 8), changed as asked."""
+    settings = PlanningSettings(particle_filter=ParticleFilterSettings(num_particles=num_particles))
+    return with_sensing(settings, num_cores=threads, **sensing)
+
+
+def with_sensing(settings: PlanningSettings, **sensing: Any) -> PlanningSettings:
+    """Return settings with other values in the section ``active_sensing``."""
+    changed = msgspec.structs.replace(settings.active_sensing, **sensing)
+    return msgspec.structs.replace(settings, active_sensing=changed)
+
+
+def recorded_trial(
+    problem: Problem, settings: PlanningSettings, trial: int = 0
+) -> tuple[list[PlanningState], list[float]]:
+    """Run a trial; return its state before each sensing decision and what the decision took.
+
+    Parameters
+    ----------
+    problem : Problem
+    settings : PlanningSettings
+    trial : int
+
+    Returns
+    -------
+    states : list of PlanningState
+    seconds : list of float
+        Each decision made once, where it belongs, in between everything else that a trial does.
+    """
+    state = initial_state(problem, settings, SEED, trial)
+    environment = SimulatedEnvironment(problem, SEED, trial)
+    states, seconds = [], []
+    while not environment.is_done() and state.step < MAX_STEPS:
+        if needs_sensing(settings, state):
+            states.append(state)
+            start = time.perf_counter()
+            sensing_action, _ = choose_sensing_action(problem, settings, state)
+            seconds.append(time.perf_counter() - start)
+            observation = environment.perform_sensing(sensing_action)
+            state, _ = observe(problem, settings, state, sensing_action, observation)
+        task_action, _ = choose_task_action(problem, settings, state)
+        environment.perform(task_action)
+        state = advance(problem, settings, state, task_action)
+    return states, seconds
+
+
+def concentrated_state(num_particles: int, deviation: float) -> PlanningState:
+    """Return a Gaussian belief around (0, 1, 0): the peg above the hole, about to be lowered."""
+    draws = stream(SEED, 0, 0, Purpose.INITIAL_BELIEF)
+    states = np.array([0.0, 1.0, 0.0]) + deviation * draws.normal((num_particles, 3))
+    return PlanningState(SEED, 0, 0, 0, False, Belief.uniform(states))

@@ -1,0 +1,132 @@
+"""Tables and bars: what a measurement leaves, and how it reads on the terminal and in a file."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from rich.console import Console
+from rich.table import Table as RichTable
+
+__all__ = [
+    "Bar",
+    "Result",
+    "Table",
+    "markdown_of",
+    "milliseconds",
+    "paragraph",
+    "show",
+    "write_atomically",
+]
+
+
+class Bar(NamedTuple):
+    """A figure that was asked for.
+
+    Attributes
+    ----------
+    what : str
+    value, limit : float
+    unit : str
+    at_least : bool
+        Whether the value must reach the limit; else it must not be above it.
+    """
+
+    what: str
+    value: float
+    limit: float
+    unit: str
+    at_least: bool = False
+
+    @property
+    def met(self) -> bool:
+        """Whether the value is on the right side of the limit."""
+        return self.value >= self.limit if self.at_least else self.value <= self.limit
+
+    def cells(self) -> list[str]:
+        """Return the bar as a row of a table."""
+        bound = "at least" if self.at_least else "at most"
+        return [
+            self.what,
+            f"{self.value:.3g} {self.unit}".rstrip(),
+            f"{bound} {self.limit:g} {self.unit}".rstrip(),
+            "pass" if self.met else "**miss**",
+        ]
+
+
+class Table(NamedTuple):
+    """Rows of text under a header; the first column is text, the others are numbers."""
+
+    header: Sequence[str]
+    rows: Sequence[Sequence[str]]
+
+
+class Result(NamedTuple):
+    """What one measurement found: paragraphs and tables in order, and its bars."""
+
+    content: Sequence[str | Table]
+    bars: Sequence[Bar] = ()
+
+
+BARS_HEADER = ("what", "measured", "bar", "verdict")
+
+
+def milliseconds(seconds: float) -> str:
+    """Return a time in milliseconds with three significant digits."""
+    value = seconds * 1e3
+    return f"{value:.0f}" if value >= 1000.0 else f"{value:.3g}"
+
+
+def paragraph(text: str) -> str:
+    """Return a text with every run of white space made one space."""
+    return " ".join(text.split())
+
+
+def markdown_of(table: Table) -> str:
+    """Return a table in Markdown, its columns aligned for those who read the source."""
+    rows = [list(table.header), *[list(row) for row in table.rows]]
+    widths = [max(3, *(len(row[column]) for row in rows)) for column in range(len(table.header))]
+
+    def line(cells: Sequence[str]) -> str:
+        padded = [cells[0].ljust(widths[0])]
+        padded += [cell.rjust(width) for cell, width in zip(cells[1:], widths[1:], strict=True)]
+        return "| " + " | ".join(padded) + " |"
+
+    rule = "|" + "|".join(
+        "-" * (width + 2) if column == 0 else "-" * (width + 1) + ":"
+        for column, width in enumerate(widths)
+    )
+    return "\n".join([line(rows[0]), rule + "|", *[line(row) for row in rows[1:]]])
+
+
+def show(console: Console, content: Sequence[str | Table]) -> None:
+    """Print paragraphs and tables on the terminal."""
+    for part in content:
+        if isinstance(part, str):
+            console.print(part, markup=False, highlight=False)
+            continue
+        table = RichTable(show_edge=False, pad_edge=False)
+        for column, name in enumerate(part.header):
+            table.add_column(name, justify="left" if column == 0 else "right")
+        for row in part.rows:
+            table.add_row(*[cell.replace("**", "") for cell in row])
+        console.print(table)
+
+
+def write_atomically(path: Path, text: str) -> None:
+    """Write a file so that it is there as a whole or not at all."""
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=path.name, suffix=".part")
+    temporary = Path(name)
+    try:
+        with os.fdopen(handle, "w", encoding="utf-8") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.chmod(0o644)
+        temporary.replace(path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise

@@ -1,0 +1,175 @@
+"""Run the benchmarks: ``python benchmarks/run.py [--quick] [--only NAME...]``.
+
+A full run writes benchmarks/RESULTS.md; a quick or partial one prints only, unless ``--output``
+says where. A bar that is missed does not change the exit status: the machine may have a slow
+minute.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from rich.console import Console
+
+from benchmarks.cases import CASES
+from benchmarks.common import Case, Context
+from benchmarks.machine import describe, kernel_hash
+from benchmarks.measure import OtherLoad
+from benchmarks.report import (
+    BARS_HEADER,
+    Bar,
+    Result,
+    Table,
+    markdown_of,
+    show,
+    write_atomically,
+)
+from holdfast.runtime.trials import available_cores
+
+RESULTS = Path(__file__).with_name("RESULTS.md")
+
+# Cores that others may use before the report says so.
+LOUD = 0.15
+
+
+class Progress:
+    """One line with what runs and the time left; nothing of it runs while something is timed.
+
+    Parameters
+    ----------
+    cases : list of Case
+    quick : bool
+    """
+
+    def __init__(self, cases: list[Case], quick: bool) -> None:
+        self._expected = {
+            case.name: case.quick_seconds if quick else case.seconds for case in cases
+        }
+        self._titles = {case.name: case.title for case in cases}
+        self._terminal = sys.stderr.isatty()
+        self._start = time.monotonic()
+        self._done = 0.0
+
+    def of(self, name: str) -> Callable[[float], None]:
+        """Return what a case reports its fraction to."""
+        self._show(name, 0.0)
+        return lambda fraction: self._show(name, fraction)
+
+    def finish(self, name: str) -> None:
+        """Count a case as done."""
+        self._done += self._expected[name]
+        if self._terminal:
+            print("\r\033[K", end="", file=sys.stderr, flush=True)
+
+    def _show(self, name: str, fraction: float) -> None:
+        total = sum(self._expected.values())
+        done = self._done + fraction * self._expected[name]
+        elapsed = time.monotonic() - self._start
+        # Trust the expectation at first, what has been seen more and more.
+        pace = (elapsed + 5.0) / (done + 5.0)
+        left = (total - done) * pace
+        text = f"{done / total:4.0%}  {self._titles[name]}, about {left:.0f} s left in all"
+        if self._terminal:
+            print(f"\r\033[K{text}", end="", file=sys.stderr, flush=True)
+        elif fraction == 0.0:
+            print(text, file=sys.stderr, flush=True)
+
+
+def load_in_words(cores: float | None) -> str:
+    """Return what else the machine had to do, of a mean number of cores."""
+    average = f"load average {os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else ""
+    if cores is None:
+        return average or "the load is unknown"
+    return f"others kept {cores:.2f} cores busy" + (f", {average}" if average else "")
+
+
+def report(
+    machine: dict[str, str],
+    results: list[tuple[Case, Result, str]],
+    bars: list[Bar],
+    notes: list[str],
+) -> str:
+    """Return the report in Markdown."""
+    parts = [
+        "# Benchmarks",
+        "Written by `make bench`. What is compared ran in turns within one run; times are medians. "
+        "Timings are no tests: a miss here fails nothing.",
+        *notes,
+        "## Bars",
+        markdown_of(Table(BARS_HEADER, [bar.cells() for bar in bars])) if bars else "None here.",
+        "## Machine",
+        markdown_of(Table(("", ""), [[name, value] for name, value in machine.items()])),
+    ]
+    for case, result, load in results:
+        parts.append(f"## {case.title}")
+        parts += [part if isinstance(part, str) else markdown_of(part) for part in result.content]
+        parts.append(f"Meanwhile, {load}.")
+    return "\n\n".join(parts) + "\n"
+
+
+def main() -> None:
+    """Run the cases that the command line names."""
+    parser = argparse.ArgumentParser(
+        description="Measure holdfast and write benchmarks/RESULTS.md."
+    )
+    parser.add_argument("--quick", action="store_true", help="measure less, in about half a minute")
+    parser.add_argument(
+        "--only",
+        nargs="+",
+        metavar="NAME",
+        choices=[case.name for case in CASES],
+        help=f"only these: {', '.join(case.name for case in CASES)}",
+    )
+    parser.add_argument(
+        "--output", type=Path, help="where to write (default: RESULTS.md after a full run)"
+    )
+    options = parser.parse_args()
+    cases = [case for case in CASES if not options.only or case.name in options.only]
+    complete = not options.quick and len(cases) == len(CASES)
+    output = options.output or (RESULTS if complete else None)
+
+    console = Console()
+    progress = Progress(cases, options.quick)
+    machine, kernel = describe(), kernel_hash()
+    results = []
+    loads = []
+    for case in cases:
+        other = OtherLoad()
+        result = case.run(Context(options.quick, progress.of(case.name)))
+        progress.finish(case.name)
+        cores = other.cores()
+        loads.append(cores or 0.0)
+        load = load_in_words(cores)
+        results.append((case, result, load))
+        console.rule(case.title)
+        show(console, [*result.content, f"Meanwhile, {load}."])
+
+    bars = [bar for _, result, _ in results for bar in result.bars]
+    notes = []
+    if options.quick:
+        notes.append("**A quick run: few repetitions, rough numbers.**")
+    if max(loads) > LOUD:
+        notes.append(
+            f"**Other programs kept up to {max(loads):.1f} of {available_cores()} cores busy: "
+            "an idle machine is faster, on two threads above all.**"
+        )
+    if kernel_hash() != kernel:
+        notes.append("**The kernel was built again during this run: the sections differ in it.**")
+    show(console, notes)
+    if bars:
+        console.rule("Bars")
+        show(console, [Table(BARS_HEADER, [bar.cells() for bar in bars])])
+    if output is not None:
+        write_atomically(output, report(machine, results, bars, notes))
+        console.print(f"written to {output}", highlight=False)
+
+
+if __name__ == "__main__":
+    main()

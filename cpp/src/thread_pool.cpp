@@ -1,0 +1,185 @@
+#include "thread_pool.hpp"
+
+#include <pthread.h>
+#include <sched.h>
+
+#include <algorithm>
+#include <atomic>
+#include <condition_variable>
+#include <cstdlib>
+#include <exception>
+#include <memory>
+#include <mutex>
+#include <system_error>
+#include <thread>
+#include <vector>
+
+namespace holdfast {
+
+namespace {
+
+constexpr int max_threads = 256;
+/// Turns of a waiting loop before a thread goes to sleep: some tens of microseconds, less than
+/// waking costs.
+constexpr int patience = 2000;
+
+inline void pause_briefly() {
+#if defined(__x86_64__)
+    __builtin_ia32_pause();
+#elif defined(__aarch64__)
+    asm volatile("yield");
+#endif
+}
+
+/// One call's tasks. Helpers hold it by shared pointer: one that comes late finds nothing left to
+/// do.
+struct Job {
+    void (*function)(void*, std::size_t);
+    void* context;
+    std::size_t tasks;
+    std::atomic<std::size_t> next{0};
+    std::atomic<std::size_t> finished{0};
+    std::atomic<bool> failed{false};
+    std::exception_ptr failure;
+
+    /// Works until no task is left.
+    void work() {
+        std::size_t mine = 0;
+        for (std::size_t i; (i = next.fetch_add(1, std::memory_order_relaxed)) < tasks; ++mine) {
+            if (failed.load(std::memory_order_relaxed)) continue;
+            try {
+                function(context, i);
+            } catch (...) {
+                if (!failed.exchange(true)) failure = std::current_exception();
+            }
+        }
+        if (mine != 0) finished.fetch_add(mine, std::memory_order_release);
+    }
+};
+
+class Pool {
+  public:
+    void run(std::size_t tasks, int threads, void (*function)(void*, std::size_t), void* context) {
+        const auto job = std::make_shared<Job>();
+        job->function = function;
+        job->context = context;
+        job->tasks = tasks;
+        {
+            const std::lock_guard lock(mutex_);
+            add_helpers(threads - 1);
+            job_ = job;
+            wanted_ = threads - 1;
+            generation_.fetch_add(1, std::memory_order_release);
+        }
+        for (int i = 1; i < threads; ++i) wake_.notify_one();
+        job->work();
+        for (int turn = 0; job->finished.load(std::memory_order_acquire) != tasks; ++turn) {
+            if (turn < patience) {
+                pause_briefly();
+            } else {
+                std::this_thread::yield();
+            }
+        }
+        {
+            // Another caller's job may have taken the place already.
+            const std::lock_guard lock(mutex_);
+            if (job_ == job) job_.reset();
+        }
+        if (job->failed.load()) std::rethrow_exception(job->failure);
+    }
+
+  private:
+    void add_helpers(int number) {
+        while (static_cast<int>(helpers_) < std::min(number, max_threads)) {
+            try {
+                std::thread([this] { help(); }).detach();
+            } catch (const std::system_error&) {
+                return;  // the system has no more threads: those that are there do the work
+            }
+            ++helpers_;
+        }
+    }
+
+    void help() {
+        std::size_t seen = 0;
+        for (;;) {
+            for (int turn = 0; turn < patience; ++turn) {
+                if (generation_.load(std::memory_order_acquire) != seen) break;
+                pause_briefly();
+            }
+            std::shared_ptr<Job> job;
+            {
+                std::unique_lock lock(mutex_);
+                wake_.wait(lock, [&] { return generation_.load() != seen; });
+                seen = generation_.load();
+                if (wanted_ > 0) {
+                    --wanted_;
+                    job = job_;
+                }
+            }
+            if (job) job->work();
+        }
+    }
+
+    std::mutex mutex_;
+    std::condition_variable wake_;
+    std::shared_ptr<Job> job_;
+    int wanted_ = 0;  // helpers that may still join the current job
+    std::atomic<std::size_t> generation_{0};
+    int helpers_ = 0;
+};
+
+// Never destroyed: helpers sleep in it until the process ends. After a fork the child has no
+// helpers, so it starts with a new pool; the old one's mutex may be held by a thread that is not
+// there any more.
+std::atomic<Pool*> the_pool{nullptr};
+
+Pool& pool() {
+    static const int registered = pthread_atfork(
+        nullptr, nullptr, [] { the_pool.store(nullptr, std::memory_order_relaxed); });
+    (void)registered;
+    Pool* current = the_pool.load(std::memory_order_acquire);
+    if (current == nullptr) {
+        auto fresh = std::make_unique<Pool>();
+        if (the_pool.compare_exchange_strong(current, fresh.get())) current = fresh.release();
+    }
+    return *current;
+}
+
+/// As many as this process may run on, or fewer by the variable that all numerical libraries heed.
+int processors() {
+    if (const char* asked = std::getenv("OMP_NUM_THREADS")) {
+        const int number = std::atoi(asked);
+        if (number > 0) return number;
+    }
+#if defined(__linux__)
+    cpu_set_t set;
+    if (sched_getaffinity(0, sizeof set, &set) == 0) return std::max(1, CPU_COUNT(&set));
+#endif
+    return std::max(1, static_cast<int>(std::thread::hardware_concurrency()));
+}
+
+}  // namespace
+
+int thread_limit(int asked) {
+    static const int there_are = std::min(processors(), max_threads);
+    return asked <= 0 || asked > there_are ? there_are : asked;
+}
+
+int threads_for(double work, std::size_t tasks, int asked) {
+    constexpr double worth_a_thread = 25e3;
+    if (work < 2.0 * worth_a_thread) return 1;
+    const double worth = std::min(work / worth_a_thread, static_cast<double>(tasks));
+    return std::max(1, static_cast<int>(std::min(worth, static_cast<double>(thread_limit(asked)))));
+}
+
+void run_tasks(std::size_t tasks, int threads, void (*function)(void*, std::size_t),
+               void* context) {
+    if (threads <= 1 || tasks <= 1) {
+        for (std::size_t i = 0; i < tasks; ++i) function(context, i);
+        return;
+    }
+    pool().run(tasks, threads, function, context);
+}
+
+}  // namespace holdfast

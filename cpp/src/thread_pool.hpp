@@ -1,0 +1,35 @@
+// Work split over threads, without waiting for threads that do not come.
+//
+// A call offers its tasks to helper threads and works on them itself. It then waits only for tasks
+// that a helper has begun, never for the helper itself: on a machine that is busy with other
+// things, a helper that is not scheduled costs nothing. (A fork-join team, as of OpenMP, ends with
+// a barrier that every thread must reach; with one other busy process on two cores that made
+// decisions ten times slower.)
+//
+// Results must not depend on which thread ran a task: tasks write to places of their own.
+
+#pragma once
+
+#include <cstddef>
+#include <type_traits>
+
+namespace holdfast {
+
+/// Threads that a call may use: `asked`, or as many as there are processors for this process if 0.
+int thread_limit(int asked);
+
+/// How many threads are worth their waking for `work` nanoseconds in `tasks` parts.
+int threads_for(double work, std::size_t tasks, int asked);
+
+/// Calls `function(context, i)` for every i < tasks; passes on the first exception.
+void run_tasks(std::size_t tasks, int threads, void (*function)(void*, std::size_t), void* context);
+
+template <class Body>
+void parallel_for(std::size_t tasks, int threads, Body&& body) {
+    using Plain = std::remove_reference_t<Body>;
+    run_tasks(
+        tasks, threads, [](void* context, std::size_t i) { (*static_cast<Plain*>(context))(i); },
+        const_cast<void*>(static_cast<const void*>(&body)));
+}
+
+}  // namespace holdfast

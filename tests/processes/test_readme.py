@@ -1,0 +1,72 @@
+"""The README's commands and programs, run as a newcomer would run them."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+BLOCKS = re.findall(r"^```(\w+)\n(.*?)^```$", README, re.DOTALL | re.MULTILINE)
+COMMANDS = [
+    line.split("#")[0].strip()
+    for language, text in BLOCKS
+    if language == "sh"
+    for line in text.splitlines()
+    if line.strip()
+]
+PROGRAMS = [text for language, text in BLOCKS if language == "python"]
+
+
+@pytest.fixture(scope="module")
+def clone(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A directory with what a clone shows a command: the examples."""
+    directory = tmp_path_factory.mktemp("clone")
+    (directory / "examples").symlink_to(ROOT / "examples")
+    return directory
+
+
+def run(command: list[str], directory: Path) -> subprocess.CompletedProcess[str]:
+    environment = {**os.environ, "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
+    return subprocess.run(
+        command, cwd=directory, env=environment, capture_output=True, text=True, timeout=240
+    )
+
+
+def test_every_command_is_known() -> None:
+    """So that a command of another kind gets a test of its own."""
+    for command in COMMANDS:
+        assert command.startswith(("holdfast ", "make ", "git clone ")), command
+    assert sum(command.startswith("holdfast ") for command in COMMANDS) >= 3
+    assert len(PROGRAMS) >= 2
+
+
+def test_holdfast_commands(clone: Path) -> None:
+    for command in COMMANDS:
+        if not command.startswith("holdfast "):
+            continue
+        done = run(shlex.split(command), clone)
+        assert done.returncode == 0, f"{command}\n{done.stdout}{done.stderr}"
+    for name in ("trials.csv", "summary.json", "config.yaml", "journal.sqlite", "trial.png"):
+        assert (clone / "runs" / "first" / name).stat().st_size > 0
+
+
+def test_make_targets_exist() -> None:
+    # The targets themselves are what .ci/run runs.
+    for command in COMMANDS:
+        if command.startswith("make "):
+            done = run(["make", "--dry-run", *shlex.split(command)[1:]], ROOT)
+            assert done.returncode == 0, f"{command}\n{done.stderr}"
+
+
+@pytest.mark.parametrize("program", PROGRAMS, ids=[f"program-{i}" for i in range(len(PROGRAMS))])
+def test_programs(program: str, clone: Path) -> None:
+    done = run([sys.executable, "-W", "error", "-c", program], clone)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.strip()

@@ -1,0 +1,325 @@
+"""Weighted particles: Bayes' rule, means, resampling, and observations that nothing explains."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from holdfast.belief import (
+    Belief,
+    effective_sample_size,
+    estimate,
+    resample,
+    standard_deviation,
+    uniform_weights,
+    update,
+)
+from holdfast.errors import InvalidValueError, ProblemError
+from holdfast.problems.problem import FloatArray
+from holdfast.randomness import Purpose, stream
+
+STREAM = stream(21, 0, 0, Purpose.RESAMPLING)
+
+
+class Direct:
+    """Sensing action 0 shows the first coordinate, action 1 all of them."""
+
+    def __init__(self, *variance: float) -> None:
+        self.variance = np.array(variance)
+
+    def observation_mean(self, states: FloatArray, sensing_action: int) -> FloatArray:
+        return states[..., :1] if sensing_action == 0 else states
+
+    def observation_variance(self, states: FloatArray, sensing_action: int) -> FloatArray:
+        return self.variance[:1] if sensing_action == 0 else self.variance
+
+
+class Varying(Direct):
+    """The further from zero, the more noise."""
+
+    def observation_variance(self, states: FloatArray, sensing_action: int) -> FloatArray:
+        return 0.1 + states * states
+
+
+class General(Direct):
+    """A likelihood of its own: a box around the state, or what is given."""
+
+    def __init__(self, log_likelihood: FloatArray | None = None) -> None:
+        super().__init__(1.0)
+        self.given = log_likelihood
+
+    def log_likelihood(
+        self, states: FloatArray, sensing_action: int, observation: FloatArray
+    ) -> FloatArray:
+        if self.given is not None:
+            return self.given
+        return np.where(np.abs(states[..., 0] - observation[0]) < 1.0, 0.0, -np.inf)
+
+
+def some_belief(count: int = 50, size: int = 2) -> Belief:
+    return Belief.weighted(STREAM.normal((count, size)), STREAM.substream(1).uniform(count) + 0.01)
+
+
+class TestMaking:
+    def test_uniform(self) -> None:
+        belief = Belief.uniform([[1.0, 2.0], [3.0, 4.0]])
+        assert belief.states.dtype == np.float64
+        assert belief.states.flags.c_contiguous
+        assert belief.weights.tolist() == [0.5, 0.5]
+        assert uniform_weights(3).tolist() == [1.0 / 3.0] * 3
+
+    def test_weights_are_normalised(self) -> None:
+        belief = Belief.weighted([[1.0], [2.0], [3.0]], [2.0, 0.0, 6.0])
+        assert belief.weights.tolist() == [0.25, 0.0, 0.75]
+
+    @pytest.mark.parametrize("scale", [1e-300, 1.0, 1e300])
+    def test_the_scale_of_the_weights_does_not_matter(self, scale: float) -> None:
+        belief = Belief.weighted([[1.0], [2.0]], np.array([0.3, 0.1]) * scale)
+        np.testing.assert_allclose(belief.weights, [0.75, 0.25], rtol=1e-15)
+
+    @pytest.mark.parametrize("shape", [(0, 3), (3, 0), (3,), (2, 3, 1), ()])
+    def test_shapes_of_states(self, shape: tuple[int, ...]) -> None:
+        with pytest.raises(InvalidValueError, match=r"states of shape \(.*need \(num_particles"):
+            Belief.uniform(np.zeros(shape))
+
+    @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+    def test_states_must_be_finite(self, bad: float) -> None:
+        states = np.zeros((4, 2))
+        states[2, 1] = bad
+        with pytest.raises(InvalidValueError, match=rf"particle 2 is \[\s*0\. +{bad}\]: must be"):
+            Belief.uniform(states)
+
+    @pytest.mark.parametrize("bad", [np.nan, np.inf, -1e-9])
+    def test_weights_must_be_finite_and_not_negative(self, bad: float) -> None:
+        with pytest.raises(
+            InvalidValueError, match=rf"weight of particle 1 is {bad}: must be >= 0"
+        ):
+            Belief.weighted(np.zeros((3, 1)), [0.5, bad, 0.5])
+
+    @pytest.mark.parametrize("weights", [[0.0, 0.0], [1e308, 1e308]])
+    def test_weights_must_have_a_sum(self, weights: list[float]) -> None:
+        with pytest.raises(InvalidValueError, match=r"sum of the weights is (0\.0|inf): must be"):
+            Belief.weighted(np.zeros((2, 1)), weights)
+
+    def test_as_many_weights_as_states(self) -> None:
+        with pytest.raises(InvalidValueError, match=r"weights of shape \(3,\): need \(2,\)"):
+            Belief.weighted(np.zeros((2, 1)), [1.0, 1.0, 1.0])
+
+
+class TestSummaries:
+    def test_estimate_and_deviation(self) -> None:
+        belief = some_belief()
+        mean = np.average(belief.states, axis=0, weights=belief.weights)
+        variance = np.average((belief.states - mean) ** 2, axis=0, weights=belief.weights)
+        np.testing.assert_allclose(estimate(belief), mean, atol=1e-15)
+        np.testing.assert_allclose(standard_deviation(belief), np.sqrt(variance), rtol=1e-14)
+
+    def test_effective_sample_size(self) -> None:
+        assert effective_sample_size(Belief.uniform(np.zeros((8, 1)))) == 8.0
+        one = Belief.weighted(np.zeros((3, 1)), [0.0, 1.0, 0.0])
+        assert effective_sample_size(one) == 1.0
+        two = Belief.weighted(np.zeros((4, 1)), [0.0, 1.0, 1.0, 0.0])
+        assert effective_sample_size(two) == 2.0
+
+
+class TestUpdate:
+    @pytest.mark.parametrize("sensing_action", [0, 1])
+    def test_bayes(self, sensing_action: int) -> None:
+        """Against SciPy's normal density, for variances that are the same for all states or not."""
+        belief = some_belief()
+        observation = np.array([0.3, -0.2])[: 1 + sensing_action]
+        models: list[Direct] = [Direct(0.2, 0.5)]
+        if sensing_action == 1:
+            models.append(Varying())
+        for model in models:
+            mean = model.observation_mean(belief.states, sensing_action)
+            deviation = np.sqrt(model.observation_variance(belief.states, sensing_action))
+            likelihood = stats.norm.pdf(observation, mean, deviation).prod(axis=-1)
+            expected = belief.weights * likelihood / (belief.weights * likelihood).sum()
+            after, info = update(model, belief, sensing_action, observation)
+            np.testing.assert_allclose(after.weights, expected, rtol=1e-12)
+            assert after.states is belief.states
+            assert info.explained
+            assert np.isclose(info.effective_sample_size, 1.0 / (expected**2).sum(), rtol=1e-12)
+
+    def test_two_updates_are_one_of_both(self) -> None:
+        """Weights are multiplied, not overwritten."""
+        belief = some_belief()
+        model = Direct(0.4, 0.4)
+        one_by_one = update(model, update(model, belief, 0, [0.1])[0], 0, [0.5])[0]
+        # Two observations of variance 0.4 are one of their mean with variance 0.2.
+        at_once = update(Direct(0.2), belief, 0, [0.3])[0]
+        np.testing.assert_allclose(one_by_one.weights, at_once.weights, rtol=1e-12)
+
+    def test_a_particle_of_weight_zero_stays_so(self) -> None:
+        belief = Belief.weighted([[0.0], [1.0], [2.0]], [1.0, 0.0, 1.0])
+        assert update(Direct(1.0), belief, 0, [1.0])[0].weights.tolist() == [0.5, 0.0, 0.5]
+
+    def test_general_likelihood(self) -> None:
+        belief = Belief.weighted([[0.0], [0.5], [5.0]], [0.2, 0.6, 0.2])
+        after, info = update(General(), belief, 0, [0.1])
+        np.testing.assert_allclose(after.weights, [0.25, 0.75, 0.0], rtol=1e-15)
+        assert info.explained
+
+    def test_nothing_is_changed(self) -> None:
+        belief = some_belief()
+        observation = np.array([0.3, -0.2])
+        for array in (*belief, observation):
+            array.setflags(write=False)
+        after, _ = update(Direct(0.2, 0.5), belief, 1, observation)
+        assert not np.shares_memory(after.weights, belief.weights)
+
+
+class TestUnexplained:
+    """An observation that no particle can have made: the belief stays valid, and it is said."""
+
+    @pytest.mark.parametrize("away", [1e3, 1e6, 1e100, 1e150, -1e151])
+    @pytest.mark.parametrize("count", [1, 7, 8, 50])
+    def test_far_away(self, away: float, count: int) -> None:
+        belief = some_belief(count)
+        after, info = update(Direct(1e-3, 1e-3), belief, 1, [away, away])
+        assert not info.explained
+        assert np.isfinite(after.weights).all()
+        assert (after.weights >= 0.0).all()
+        assert np.isclose(after.weights.sum(), 1.0, rtol=0.0, atol=1e-12)
+        assert 1.0 <= info.effective_sample_size <= count * (1.0 + 1e-12)
+
+    def test_it_ranks_the_particles_all_the_same(self) -> None:
+        """A thousand deviations away every likelihood underflows, but their ratio does not."""
+        belief = Belief.uniform([[0.0], [1e-4]])
+        after, info = update(Direct(1.0), belief, 0, [1000.0])
+        assert not info.explained
+        ratio = after.weights[1] / after.weights[0]
+        assert np.isclose(ratio, np.exp(0.1 - 0.5e-8), rtol=1e-9)
+
+    def test_so_far_that_squares_overflow(self) -> None:
+        belief = some_belief()
+        with np.errstate(over="ignore"):
+            after, info = update(Direct(1e-3), belief, 0, [1e200])
+        assert not info.explained
+        assert after is belief
+
+    @pytest.mark.parametrize(("away", "explained"), [(7.99, True), (8.01, False)])
+    def test_the_limit_is_eight_deviations_from_the_nearest(
+        self, away: float, explained: bool
+    ) -> None:
+        belief = Belief.uniform([[0.0], [-1.0], [-2.0]])
+        assert update(Direct(0.25), belief, 0, [0.5 * away])[1].explained is explained
+
+    def test_a_general_likelihood_of_zero_everywhere(self) -> None:
+        belief = some_belief()
+        after, info = update(General(), belief, 0, [1e6])
+        assert after is belief
+        assert not info.explained
+        assert info.effective_sample_size == effective_sample_size(belief)
+
+    def test_only_particles_of_weight_zero_could_have_made_it(self) -> None:
+        belief = Belief.weighted([[0.0], [10.0]], [1.0, 0.0])
+        after, info = update(General(), belief, 0, [10.0])
+        assert after is belief
+        assert not info.explained
+
+    @pytest.mark.parametrize("log_likelihood", [-1e300, -1e305, -1e6, 1e6])
+    @pytest.mark.parametrize("count", [1, 4, 8, 13])
+    def test_extreme_but_finite_likelihoods(self, log_likelihood: float, count: int) -> None:
+        """Equal likelihoods leave the weights as they are, as far as there are digits for them."""
+        belief = some_belief(count)
+        after, info = update(General(np.full(count, log_likelihood)), belief, 0, [0.0])
+        lost = abs(log_likelihood) > 1e15
+        expected = uniform_weights(count) if lost else belief.weights
+        np.testing.assert_allclose(after.weights, expected, rtol=1e-9)
+        assert info.explained
+
+
+class TestBadInput:
+    @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+    def test_observation_not_finite(self, bad: float) -> None:
+        with pytest.raises(InvalidValueError, match=rf"observation \[ *0\.5 +{bad}\]: every coord"):
+            update(Direct(1.0, 1.0), some_belief(), 1, [0.5, bad])
+        with pytest.raises(InvalidValueError, match=rf"observation \[ *{bad}\]: every coordinate"):
+            update(General(), some_belief(), 0, [bad])
+
+    @pytest.mark.parametrize("size", [0, 1, 3])
+    def test_observation_of_another_size(self, size: int) -> None:
+        with pytest.raises(
+            InvalidValueError, match=rf"observation of {size} coordinates: sensing action 1 gives 2"
+        ):
+            update(Direct(1.0, 1.0), some_belief(), 1, np.zeros(size))
+
+    @pytest.mark.parametrize(
+        ("bad", "text"), [(0.0, r"0\."), (-0.5, r"-0\.5"), (np.nan, "nan"), (np.inf, "inf")]
+    )
+    def test_variance_not_positive(self, bad: float, text: str) -> None:
+        with pytest.raises(ProblemError, match=rf"variance \[ *1\. +{text}\]: every entry must be"):
+            update(Direct(1.0, bad), some_belief(), 1, [0.0, 0.0])
+
+    @pytest.mark.parametrize("bad", [np.nan, np.inf])
+    def test_mean_not_finite(self, bad: float) -> None:
+        class Broken(Direct):
+            def observation_mean(self, states: FloatArray, sensing_action: int) -> FloatArray:
+                return np.where(states > 1.0, bad, states)
+
+        with pytest.raises(ProblemError, match="observation_mean is not finite"):
+            update(Broken(1.0, 1.0), some_belief(), 1, [0.0, 0.0])
+
+    @pytest.mark.parametrize("bad", [np.nan, np.inf])
+    def test_likelihood_not_a_number(self, bad: float) -> None:
+        values = np.zeros(50)
+        values[7] = bad
+        with pytest.raises(ProblemError, match=r"log_likelihood of observation .* NaN or plus"):
+            update(General(values), some_belief(), 0, [0.0])
+
+
+class TestResample:
+    def test_counts(self) -> None:
+        belief = some_belief(200)
+        after = resample(belief, STREAM)
+        assert after.weights.tolist() == [1.0 / 200.0] * 200
+        shares = 200 * belief.weights
+        for n, state in enumerate(belief.states):
+            copies = int((after.states == state).all(axis=1).sum())
+            assert np.floor(shares[n] - 1e-9) <= copies <= np.ceil(shares[n] + 1e-9)
+
+    def test_equal_weights_stay_as_they_are(self) -> None:
+        belief = Belief.uniform(STREAM.normal((100, 3)))
+        after = resample(belief, STREAM)
+        assert after.states.tobytes() == belief.states.tobytes()
+        assert not np.shares_memory(after.states, belief.states)
+
+    def test_over_all_offsets_it_is_unbiased(self) -> None:
+        """E[copies of n] = N w_n over the offset, for each of twelve particles.
+
+        The number of copies is floor(N w) plus a coin of probability frac(N w), tossed 4,000 times.
+        One of the twelve bounds of 5 sigma fails by chance for 7e-6 of all seeds.
+        """
+        weights = np.array([0.01, 0.02, 0.05, 0.2, 0.11, 0.13, 0.08, 0.07, 0.15, 0.09, 0.06, 0.03])
+        count, tosses = 12, 4000
+        belief = Belief.weighted(np.arange(12.0).reshape(-1, 1), weights)
+        copies = np.zeros(count)
+        for index in range(tosses):
+            drawn = resample(belief, STREAM.substream(index)).states[:, 0].astype(np.int64)
+            copies += np.bincount(drawn, minlength=count)
+        share = count * belief.weights
+        coin = share - np.floor(share)
+        sigma = np.sqrt(tosses * coin * (1.0 - coin))
+        assert (np.abs(copies - tosses * share) <= 5.0 * sigma + 1e-9).all()
+
+    def test_one_tooth_of_the_comb_follows_the_weights(self) -> None:
+        """A tooth drawn at random is a draw from the belief: chi-square at 1e-6."""
+        belief = Belief.weighted(np.arange(5.0).reshape(-1, 1), [0.07, 0.4, 0.13, 0.25, 0.15])
+        offsets = 6000
+        teeth = (STREAM.substream(10**6).uniform(offsets) * 5).astype(np.int64)
+        drawn = np.array(
+            [
+                resample(belief, STREAM.substream(index)).states[tooth, 0]
+                for index, tooth in enumerate(teeth.tolist())
+            ]
+        ).astype(np.int64)
+        observed = np.bincount(drawn, minlength=5)
+        assert stats.chisquare(observed, offsets * belief.weights).pvalue > 1e-6
+
+    def test_the_same_stream_draws_the_same(self) -> None:
+        belief = some_belief()
+        first, second = resample(belief, STREAM), resample(belief, STREAM)
+        assert first.states.tobytes() == second.states.tobytes()

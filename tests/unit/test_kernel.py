@@ -1,0 +1,315 @@
+"""The kernel by itself: known answers, orders of sums, one result on every instruction set."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from holdfast import _kernel
+from holdfast.problems.problem import FloatArray, IntArray
+
+ALL_ONES = 0xFFFFFFFF
+WORDS = (7, 0, 3, 2, 1)
+
+# A bit of everything that has several compilations, in sizes that leave every remainder modulo 8,
+# and the functions that have one. Prints a hash for each, by name.
+WORKLOAD = """
+import hashlib, json
+import numpy as np
+from holdfast import _kernel as kernel
+from holdfast.geometry import BoxWorld, DiscWorld, RectangleWorld
+from holdfast.randomness import Stream
+
+words = (7, 0, 3, 2, 1)
+stream = Stream(words)
+hashes = {}
+
+def note(name, *arrays):
+    total = hashlib.sha256()
+    for array in arrays:
+        total.update(np.ascontiguousarray(array).tobytes())
+    hashes[name] = total.hexdigest()
+
+wide = np.concatenate([
+    stream.normal(4001) * 400.0,
+    stream.substream(1).normal(4000) * 1e-3,
+    [0.0, -0.0, np.inf, -np.inf, 5e-324, -5e-324, 2.0**30, 709.8, -707.71, 1e-300, 1e300],
+])
+positive = np.abs(wide)
+for function, values in (
+    (kernel.exp, wide), (kernel.log, positive), (kernel.sin, wide), (kernel.cos, wide)
+):
+    note(function.__name__, *(function(values[n:2 * n + 1]) for n in (0, 1, 5, 9, 300, 3999)),
+         function(values[np.isfinite(values)]), function(values[:16]))
+note("specials", *(np.isnan(f(wide)) for f in (kernel.exp, kernel.sin)), kernel.exp(wide[8001:]))
+note("arcsin", np.array([kernel.arcsin(x) for x in np.linspace(-1.0, 1.0, 1001)]))
+note("normals", *(kernel.normals(words, n) for n in (0, 1, 2, 3, 7, 15, 16, 17, 1001)))
+note("uniforms", *(kernel.uniforms(words, n) for n in (0, 1, 2, 3, 7, 15, 16, 17, 1001)))
+for n in (1, 7, 8, 9, 31, 1000):
+    values = stream.substream(2).normal(n)
+    note(f"sum {n}", np.array(kernel.sum(values)))
+    rows = stream.substream(3).normal((n, 5))
+    note(f"weighted sums {n}", kernel.weighted_sums(values, rows))
+    note(f"normalize {n}", kernel.normalize(values * 20.0)[0])
+    weights = kernel.normalize(values)[0]
+    note(f"resampling {n}", kernel.systematic_resample(weights, 0.37))
+
+# Every way to an entropy: pair by pair, grouped with one to four vectors, with a tree of its own.
+for count, dimension, kept, posteriors in (
+    (12, 1, 12, 3), (40, 2, 40, 2), (100, 3, 90, 7), (100, 3, 60, 30), (333, 2, 333, 13),
+    (600, 6, 500, 20), (1500, 1, 1400, 33), (1500, 3, 200, 2), (3000, 6, 3000, 1),
+):
+    draw = stream.substream(1000 * count + kept)
+    points = draw.normal((count, dimension))
+    points[::3] = np.round(points[::3], 1)
+    log_weights = draw.substream(1).normal((posteriors, count)) * 3.0
+    log_weights[:, kept:] = -np.inf
+    for neighbors in (1, 5, 30):
+        for resolution in (1e-6, 0.2, 2.0):
+            note(f"nearest {count} {dimension} {neighbors} {resolution}",
+                 kernel.entropies(points, log_weights, False, False, neighbors, resolution,
+                                  0.0, 0.0, 2)[0])
+    for exponent in (0.5, 0.125):
+        note(f"mixture {count} {dimension} {exponent}",
+             kernel.entropies(points * 3.0, log_weights, False, True, 1, 1.0, exponent, 0.3, 2)[0])
+
+for count in (5, 100, 1001):
+    draw = stream.substream(count)
+    states = draw.normal((count, 3))
+    predicted = np.ascontiguousarray(np.concatenate([states.T, states.T[:2]]))
+    weights = kernel.normalize(draw.substream(1).normal(count))[0]
+    for variance in (np.full((5, 1), 0.1), np.ascontiguousarray(0.1 + predicted**2)):
+        arguments = (weights, [1, 1, 1, 2], predicted, variance, 9, words)
+        found = kernel.hypothetical_entropies(
+            *arguments, np.ascontiguousarray(-states), False, 3, 0.05, 0.0, 0.0, 2)
+        note(f"hypotheses {count} {variance.shape}", *found[:2],
+             kernel.hypothetical_weights(*arguments))
+
+deviation = np.full(6, 0.1)
+flat = [(-3.0, -2.0, -1.0, -1.5), (0.5, -1.0, 0.7, 2.0)]
+boxes = [(-3.0, -2.0, -1.0, -1.0, -1.5, 1.0), (0.5, -1.0, -2.0, 0.7, 2.0, 0.3)]
+for world, size in ((DiscWorld(0.4, flat), 2), (RectangleWorld(0.6, 1.4, flat), 3),
+                    (BoxWorld((0.6, 1.0, 1.6), boxes), 6)):
+    states = stream.substream(size).normal((300, size)) * 2.0
+    states = states[~world.collides(states)]
+    note(type(world).__name__,
+         world.move(states, -states, deviation[:size], 1e-3, stream.substream(9)))
+print(json.dumps({"simd": kernel.simd(), "hashes": hashes}))
+"""
+
+
+def run_workload(simd: str | None) -> subprocess.CompletedProcess[str]:
+    environment = {key: value for key, value in os.environ.items() if key != "HOLDFAST_SIMD"}
+    if simd is not None:
+        environment["HOLDFAST_SIMD"] = simd
+    return subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", WORKLOAD],
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+
+
+@pytest.fixture(scope="module")
+def best_hashes() -> dict[str, str]:
+    """Return what the instruction set that this machine would choose gives."""
+    finished = run_workload(None)
+    assert finished.returncode == 0, finished.stderr
+    hashes = json.loads(finished.stdout)["hashes"]
+    assert isinstance(hashes, dict)
+    return hashes
+
+
+class TestInstructionSets:
+    @pytest.mark.parametrize("simd", ["baseline", "avx2", "avx512"])
+    def test_all_give_the_same_bits(self, simd: str, best_hashes: dict[str, str]) -> None:
+        finished = run_workload(simd)
+        if simd != "baseline" and "allowed here are baseline" in finished.stderr:
+            pytest.skip(f"this processor has no {simd}")
+        assert finished.returncode == 0, finished.stderr
+        result = json.loads(finished.stdout)
+        assert result["simd"] == simd
+        different = [name for name in best_hashes if result["hashes"][name] != best_hashes[name]]
+        assert not different
+        assert len(best_hashes) > 100
+
+    def test_an_unknown_one_is_refused_by_name(self) -> None:
+        finished = run_workload("mmx")
+        assert finished.returncode != 0
+        assert "HOLDFAST_SIMD=mmx: allowed here are baseline" in finished.stderr
+
+    def test_this_process_uses_a_known_one(self) -> None:
+        assert _kernel.simd() in {"baseline", "avx2", "avx512"}
+
+
+class TestPhilox:
+    """The known answers that the generator's authors publish with their code."""
+
+    @pytest.mark.parametrize(
+        ("counter", "key", "expected"),
+        [
+            ((0,) * 4, (0,) * 2, (0x6627E8D5, 0xE169C58D, 0xBC57AC4C, 0x9B00DBD8)),
+            (
+                (ALL_ONES,) * 4,
+                (ALL_ONES,) * 2,
+                (0x408F276D, 0x41C83B0E, 0xA20BC7C6, 0x6D5451FD),
+            ),
+            (
+                (0x243F6A88, 0x85A308D3, 0x13198A2E, 0x03707344),
+                (0xA4093822, 0x299F31D0),
+                (0xD16CFE09, 0x94FDCCEB, 0x5001E420, 0x24126EA1),
+            ),
+        ],
+    )
+    def test_known_answers(
+        self,
+        counter: tuple[int, int, int, int],
+        key: tuple[int, int],
+        expected: tuple[int, int, int, int],
+    ) -> None:
+        block, *above = counter
+        words = (*key, above[0], above[1], above[2])
+        assert tuple(_kernel.philox(words, block)[:4]) == expected
+
+    def test_uniforms_are_the_words_of_the_blocks(self) -> None:
+        expected = []
+        for block in range(4):
+            w = _kernel.philox(WORDS, block)
+            for high, low in ((w[0], w[1]), (w[2], w[3])):
+                expected.append(((high << 21) | (low >> 11)) * 2.0**-53)
+        assert _kernel.uniforms(WORDS, 8).tolist() == expected
+        assert _kernel.uniforms(WORDS, 7).tolist() == expected[:7]
+
+    def test_normals_are_made_of_pairs_of_uniforms(self) -> None:
+        """Box and Muller's formula, to rounding; and the same bits however many are asked for."""
+        count = 2000
+        uniforms = _kernel.uniforms(WORDS, count).reshape(-1, 2)
+        radius = np.sqrt(-2.0 * np.log1p(-uniforms[:, 0]))
+        angle = 2.0 * np.pi * uniforms[:, 1]
+        expected = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1).reshape(-1)
+        normals = _kernel.normals(WORDS, count)
+        np.testing.assert_allclose(normals, expected, rtol=1e-13, atol=1e-14)
+        for fewer in range(40):
+            assert _kernel.normals(WORDS, fewer).tobytes() == normals[:fewer].tobytes()
+
+
+class TestSums:
+    @pytest.mark.parametrize("count", [0, 1, 7, 8, 9, 64, 1001])
+    def test_elements_are_added_in_the_documented_order(self, count: int) -> None:
+        """Element i goes to partial sum i mod 8; the far four are added to the near four."""
+        values = _kernel.normals(WORDS, count) * 1e3
+        partial = [0.0] * 8
+        for i, value in enumerate(values.tolist()):
+            partial[i % 8] += value
+        a0, a1, a2, a3 = (partial[i] + partial[i + 4] for i in range(4))
+        result = _kernel.sum(values)
+        assert result == (a0 + a2) + (a1 + a3)
+        # Each of at most n additions rounds by half a unit of a partial sum, no larger than this.
+        bound = count * 2.0**-53 * math.fsum(abs(values))
+        assert abs(result - math.fsum(values)) <= bound
+
+    @pytest.mark.parametrize("count", [1, 7, 8, 9, 1001])
+    def test_weighted_sums_are_the_sums_of_products(self, count: int) -> None:
+        weights = _kernel.uniforms(WORDS, count)
+        rows = _kernel.normals(WORDS, count * 3).reshape(count, 3)
+        expected = [_kernel.sum(weights * np.ascontiguousarray(rows[:, c])) for c in range(3)]
+        assert _kernel.weighted_sums(weights, rows).tolist() == expected
+
+
+class TestNormalize:
+    """Log weights to weights that sum to 1, without overflow or underflow of the whole."""
+
+    @pytest.mark.parametrize("shift", [0.0, -1e6, 1e6, -1e300, 1e300])
+    def test_a_common_factor_makes_no_difference(self, shift: float) -> None:
+        log_weights = np.log(np.array([0.1, 0.2, 0.3, 0.4]))
+        weights, survivors = _kernel.normalize(log_weights + shift)
+        # Adding the shift rounds: half a unit of it is what is lost.
+        tolerance = 1e-15 + abs(shift) * 2.0**-52 if abs(shift) < 1e10 else 1.0
+        np.testing.assert_allclose(weights, [0.1, 0.2, 0.3, 0.4], atol=tolerance)
+        assert survivors == 4
+        assert math.isclose(float(weights.sum()), 1.0, abs_tol=1e-15)
+
+    def test_what_underflows_next_to_the_largest_is_not_counted(self) -> None:
+        weights, survivors = _kernel.normalize(np.array([0.0, -13.0, -700.0, -710.0, -np.inf]))
+        assert survivors == 3
+        assert weights[2] > 0.0
+        assert weights[3:].tolist() == [0.0, 0.0]
+
+    @pytest.mark.parametrize(
+        "log_weights",
+        [
+            [-np.inf, -np.inf],
+            [np.nan, 0.0],
+            [0.0, np.nan],
+            [0.0, -np.inf, np.nan, 1.0],
+            [np.inf, 0.0],
+        ],
+    )
+    def test_no_posterior_is_said_so(self, log_weights: list[float]) -> None:
+        assert _kernel.normalize(np.array(log_weights))[1] == 0
+
+
+class TestResampling:
+    def resample(self, weights: FloatArray, offset: float) -> IntArray:
+        indices = _kernel.systematic_resample(weights, offset)
+        assert indices.dtype == np.int64
+        return np.bincount(indices, minlength=weights.shape[0])
+
+    @pytest.mark.parametrize("offset", [0.0, 0.25, 0.5, 1.0 - 2.0**-53])
+    @pytest.mark.parametrize("count", [1, 2, 10, 1000])
+    def test_every_particle_is_there_its_share_rounded(self, count: int, offset: float) -> None:
+        weights = np.exp(_kernel.normals(WORDS, count) * 2.0)
+        weights /= weights.sum()
+        copies = self.resample(weights, offset)
+        assert copies.sum() == count
+        assert (copies >= np.floor(count * weights - 1e-9)).all()
+        assert (copies <= np.ceil(count * weights + 1e-9)).all()
+
+    @pytest.mark.parametrize("offset", [0.0, 0.5, 1.0 - 2.0**-53])
+    def test_particles_of_weight_zero_die(self, offset: float) -> None:
+        weights = np.array([0.0, 0.0, 0.3, 0.0, 0.7, 0.0, 0.0])
+        copies = self.resample(weights, offset)
+        assert copies[[0, 1, 3, 5, 6]].tolist() == [0] * 5
+        assert copies.sum() == 7
+
+    @pytest.mark.parametrize("factor", [0.25, 1.0 - 1e-9, 1.0 + 1e-9, 8.0])
+    def test_weights_need_not_sum_to_one(self, factor: float) -> None:
+        """The comb is as long as their sum, so that rounding in it does no harm."""
+        weights = np.array([0.125, 0.5, 0.25, 0.125])
+        for offset in (0.0, 0.3, 1.0 - 2.0**-53):
+            copies = self.resample(weights * factor, offset)
+            assert copies.sum() == 4
+            assert (np.abs(copies - 4 * weights) < 1.0).all()
+
+    def test_indices_are_in_order(self) -> None:
+        weights = _kernel.normalize(_kernel.normals(WORDS, 500))[0]
+        indices = _kernel.systematic_resample(weights, 0.6)
+        assert (np.diff(indices) >= 0).all()
+
+
+class TestThreads:
+    """As many threads as wanted: the same bits."""
+
+    @pytest.mark.parametrize("mixture", [False, True])
+    @pytest.mark.parametrize(("count", "posteriors"), [(100, 30), (1500, 40), (4000, 3)])
+    def test_entropies(self, count: int, posteriors: int, mixture: bool) -> None:
+        points = _kernel.normals(WORDS, count * 3).reshape(count, 3)
+        log_weights = _kernel.normals((8, 0, 3, 2, 1), posteriors * count).reshape(posteriors, -1)
+        # Posteriors of all sizes, so that all ways are taken.
+        for row in range(posteriors):
+            log_weights[row, count // (1 + row % 7) :] = -np.inf
+        results = {
+            _kernel.entropies(points, log_weights, False, mixture, 5, 0.1, 0.5, 0.0, threads)[
+                0
+            ].tobytes()
+            for threads in (0, 1, 2, 3, 64)
+        }
+        assert len(results) == 1
