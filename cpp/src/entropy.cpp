@@ -31,7 +31,7 @@ constexpr double grouped_cost_of_a_point = 1000.0;
 double cost_alone(std::size_t survivors) {
     const auto size = static_cast<double>(survivors);
     if (survivors <= compact_limit) return size * (60.0 + 5.0 * size);
-    return size * std::min(110.0 + 0.7 * size, 450.0);
+    return size * std::min(30.0 + 1.1 * size, 420.0);
 }
 
 /// [q] = log q - psi(q), psi(q) = -gamma + 1 + 1/2 + ... + 1/(q - 1). Grows and is kept per thread.

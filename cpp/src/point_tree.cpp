@@ -5,6 +5,10 @@
 
 namespace holdfast {
 
+namespace {
+constexpr std::size_t unsorted_leaves = 4;
+}
+
 PointTree::PointTree(const double* points, std::size_t count_, std::size_t dimension_)
     : count(count_), dimension(dimension_), leaves((count_ + leaf_size - 1) / leaf_size) {
     order.resize(leaves * leaf_size, no_point);
@@ -55,13 +59,16 @@ std::uint32_t PointTree::build(const double* points, std::uint32_t first_leaf,
         if (highest[c] - lowest[c] > highest[widest] - lowest[widest]) widest = c;
     }
     const std::uint32_t middle = first_leaf + (last_leaf - first_leaf) / 2;
-    // Ties broken by index make the two halves, as sets, the same with every standard library.
-    std::nth_element(begin, order.begin() + static_cast<std::ptrdiff_t>(middle * leaf_size), end,
-                     [&](std::uint32_t a, std::uint32_t b) {
-                         const double xa = points[a * dimension + widest];
-                         const double xb = points[b * dimension + widest];
-                         return xa != xb ? xa < xb : a < b;
-                     });
+    // Among so few points everything is near everything: their order is as good as any.
+    if (leaves > unsorted_leaves) {
+        // Ties broken by index make the two halves, as sets, the same with every standard library.
+        std::nth_element(begin, order.begin() + static_cast<std::ptrdiff_t>(middle * leaf_size),
+                         end, [&](std::uint32_t a, std::uint32_t b) {
+                             const double xa = points[a * dimension + widest];
+                             const double xb = points[b * dimension + widest];
+                             return xa != xb ? xa < xb : a < b;
+                         });
+    }
     const std::uint32_t left = build(points, first_leaf, middle);
     const std::uint32_t right = build(points, middle, last_leaf);
     nodes[node].left = left;

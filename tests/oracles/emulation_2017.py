@@ -26,7 +26,7 @@ import numpy as np
 import numpy.typing as npt
 
 from holdfast.problems.problem import FloatArray, IntArray, Problem
-from holdfast.randomness import Purpose, Stream, stream
+from holdfast.randomness import Purpose, stream
 
 BoolArray = npt.NDArray[np.bool_]
 
@@ -58,7 +58,18 @@ def emulate(
     num_particles: int,
     seed: int,
 ) -> Emulation:
-    """Run trials with the random selector as the implementation of 2017 did."""
+    """Run trials with the random selector as the implementation of 2017 did.
+
+    Parameters
+    ----------
+    problem : Problem
+        Whose observation variances are the same in all states.
+    sensing_interval : int
+        Steps without an observation after each step with one.
+    max_steps, num_trials, num_particles : int
+    seed : int
+        Names the streams; all trials share one stream per step and purpose.
+    """
     world = problem.initial_states(stream(seed, 0, 0, Purpose.WORLD_INITIAL_STATE), num_trials)
     particles = problem.initial_states(
         stream(seed, 0, 0, Purpose.INITIAL_BELIEF), num_trials * num_particles
@@ -105,30 +116,52 @@ def _sense(
     copied = np.zeros(len(world), dtype=np.int64)
     for action in range(num_actions):
         trials = np.flatnonzero(chosen == action)
-        likelihoods = _likelihoods(
-            problem, world[trials], particles[trials], action, noise.substream(action)
+        shape = (trials.size, *problem.observation_mean(world[:1], action).shape[1:])
+        weights = likelihoods(
+            problem, world[trials], particles[trials], action, noise.substream(action).normal(shape)
         )
-        copied[trials] = _drawn_particle(likelihoods, offsets[trials])
+        copied[trials] = drawn_particle(weights, offsets[trials])
     picked = particles[np.arange(len(world)), copied]
     return np.ascontiguousarray(np.broadcast_to(picked[:, None, :], particles.shape))
 
 
-def _likelihoods(
-    problem: Problem, world: FloatArray, particles: FloatArray, action: int, noise: Stream
+def likelihoods(
+    problem: Problem, world: FloatArray, particles: FloatArray, action: int, noise: FloatArray
 ) -> FloatArray:
-    """Return the density of an observation of each world in each of its particles, not scaled."""
-    mean = problem.observation_mean(world, action)
+    """Return the densities of one observation per world in each of its particles.
+
+    Parameters
+    ----------
+    problem : Problem
+    world : array of shape (trials, state_size)
+    particles : array of shape (trials, num_particles, state_size)
+    action : int
+        The sensing action.
+    noise : array of shape (trials, observation_size)
+        Standard normal numbers, from which the observations are made.
+
+    Returns
+    -------
+    array of shape (trials, num_particles)
+        Plain densities: far from the observation they underflow to zero, as they did in 2017.
+    """
     variance = problem.observation_variance(world, action)
-    observed = mean + np.sqrt(variance) * noise.normal(mean.shape)
+    observed = problem.observation_mean(world, action) + np.sqrt(variance) * noise
     difference = observed[:, None, :] - problem.observation_mean(particles, action)
     exponent = -0.5 * (difference * difference / variance).sum(axis=-1)
-    # Underflow to zero is what happened in 2017.
-    density: FloatArray = np.exp(exponent) / np.sqrt(np.prod(2.0 * np.pi * variance))
-    return density
+    return np.asarray(np.exp(exponent) / np.sqrt(np.prod(2.0 * np.pi * variance)))
 
 
-def _drawn_particle(weights: FloatArray, offsets: FloatArray) -> IntArray:
-    """Return the one particle per trial that all become: 0 where no weight is above zero."""
+def drawn_particle(weights: FloatArray, offsets: FloatArray) -> IntArray:
+    """Return the particle of each trial that all its particles become.
+
+    Parameters
+    ----------
+    weights : array of shape (trials, num_particles)
+        Need not sum to 1; where all are zero, particle 0 is returned.
+    offsets : array of shape (trials,)
+        Uniform on [0, 1); from 0 to 1 they go through the particles in proportion to the weights.
+    """
     cumulative = np.cumsum(weights, axis=1)
     reached = cumulative >= (offsets * cumulative[:, -1])[:, None]
     return np.asarray(np.argmax(reached, axis=1), dtype=np.int64)

@@ -287,9 +287,8 @@ static void sum_balls(const PosteriorGroup& group, const QueryLeaf& query, doubl
 /// The nearest points of sixteen query points, sorted: keys[v][rank] has those of eight of them.
 ///
 /// A key is a squared distance whose ten low bits are replaced by the number of the candidate, so
-/// that numbers travel with distances through the sorting. The order of two points may therefore be
-/// wrong where their squared distances differ by less than 2e-13 of their size; radii and sums are
-/// computed from the distances themselves.
+/// that numbers travel with distances through the sorting. The distance that is left is right
+/// to 2.3e-13 of its size, a quarter of what counts as a tie anyway.
 inline constexpr std::int64_t number_bits = 1023;
 inline constexpr std::size_t max_candidate_leaves = (number_bits + 1) / leaf_size;
 inline constexpr std::size_t query_vectors = leaf_size / lane_count;
@@ -503,13 +502,7 @@ static void walk_outwards(const PosteriorGroup& group, const QueryLeaf& query, s
         const std::size_t leaf = lists.leaves[number / leaf_size], other = number % leaf_size;
         const std::size_t other_slot = leaf * leaf_size + other;
         if (other_slot == slot) continue;
-        double distance = 0.0;
-        for (std::size_t c = 0; c < tree.dimension; ++c) {
-            const double difference =
-                query.points[i][c] -
-                tree.coordinates[(leaf * tree.dimension + c) * leaf_size + other];
-            distance += difference * difference;
-        }
+        const double distance = detail::from_bits<double>(detail::bits(key) & ~number_bits);
         const double reached_radius =
             distance > resolution_squared ? distance * tie_tolerance : resolution_squared;
         IntLanes any{};
@@ -545,6 +538,64 @@ static void walk_outwards(const PosteriorGroup& group, const QueryLeaf& query, s
                                 log_mass[lane] + constants.bias_correction[q]);
         }
     }
+}
+
+/// The terms of a leaf's points under a single posterior: eight points side by side instead of
+/// eight posteriors. Adds what the lists settle to `sum`, and tells by bits which points they do
+/// not.
+template <std::size_t length>
+static unsigned walk_single(const PosteriorGroup& group, const QueryLeaf& query, std::size_t v,
+                            const NearestLists<length>& lists,
+                            const NearestNeighborConstants& constants, double& sum) {
+    const TreeView& tree = group.tree;
+    const double resolution_squared = constants.resolution * constants.resolution * tie_tolerance;
+    const std::uint32_t neighbors = group.neighbors[0];
+    const Lanes last =
+        detail::from_bits<Lanes>(detail::bits(lists.keys[v][length - 1]) & ~number_bits);
+    const Lanes limit = select(last < lists.complete_below, last, splat(lists.complete_below));
+    Lanes mass{}, within{}, radius = splat(__builtin_inf());
+    for (std::size_t rank = 0; rank < length; ++rank) {
+        const Lanes key = lists.keys[v][rank];
+        const IntLanes known = key < limit;
+        const Lanes distance = detail::from_bits<Lanes>(detail::bits(key) & ~number_bits);
+        Lanes weight{};
+        const unsigned bits = bits_of(known);
+        for (std::size_t lane = 0; lane < lane_count; ++lane) {
+            if ((bits >> lane & 1) == 0) continue;
+            const auto number = static_cast<std::size_t>(detail::bits(key[lane]) & number_bits);
+            // The own leaf is the first one visited, so a point's own number is its place in it.
+            if (number == v * lane_count + lane) continue;
+            const std::size_t other =
+                lists.leaves[number / leaf_size] * leaf_size + number % leaf_size;
+            weight[lane] = group.weights[other * lane_count];
+        }
+        const IntLanes open = (distance <= radius) & (weight > 0.0);
+        if (bits_of(open) == 0 && rank > 0) {
+            if (bits_of(radius == __builtin_inf()) == 0) break;
+        }
+        mass += select(open, weight, Lanes{});
+        within += select(open, splat(1.0), Lanes{});
+        const IntLanes reached =
+            (within >= static_cast<double>(neighbors)) & (radius == __builtin_inf());
+        const Lanes wide = select(distance > resolution_squared, distance * tie_tolerance,
+                                  splat(resolution_squared));
+        radius = select(reached, wide, radius);
+    }
+    Lanes weight{};
+    for (std::size_t lane = 0; lane < lane_count; ++lane) {
+        weight[lane] = group.weights[(query.first_slot + v * lane_count + lane) * lane_count];
+    }
+    const unsigned settled = bits_of((radius < limit) & (weight > 0.0));
+    const Lanes spread = 0.5 * static_cast<double>(tree.dimension) * log_of(radius) -
+                         log_of(mass / (1.0 - weight)) + constants.log_ball_volume;
+    for (std::size_t lane = 0; lane < lane_count; ++lane) {
+        if ((settled >> lane & 1) == 0) continue;
+        const std::uint32_t q = radius[lane] > resolution_squared
+                                    ? neighbors
+                                    : static_cast<std::uint32_t>(within[lane]);
+        sum += weight[lane] * (spread[lane] + constants.bias_correction[q]);
+    }
+    return bits_of(weight > 0.0) & ~settled;
 }
 
 /// The terms of one point under every posterior from its ball's sums.
@@ -597,8 +648,19 @@ static void group_nearest_rows(const PosteriorGroup& group, const QueryLeaf& que
     }
     Lanes terms[vectors];
     for (std::size_t v = 0; v < vectors; ++v) terms[v] = load(out + v * lane_count);
+    unsigned open = (1u << query.used) - 1;
+    const bool single = group.members == 1;
+    if (single && !dense) {
+        double sum = 0.0;
+        open = 0;
+        for (std::size_t v = 0; v < query_vectors; ++v) {
+            open |= walk_single<length>(group, query, v, lists, constants, sum) << (v * lane_count);
+        }
+        terms[0][0] += sum;
+    }
     for (std::size_t i = 0; i < query.used; ++i) {
-        if (!dense) {
+        if ((open >> i & 1) == 0) continue;
+        if (!dense && !single) {
             // Without its number, so that no point as far as the last one is taken for nearer.
             const double last = detail::from_bits<double>(
                 detail::bits(lists.keys[i / lane_count][length - 1][i % lane_count]) &
