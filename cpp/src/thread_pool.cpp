@@ -19,17 +19,10 @@ namespace holdfast {
 namespace {
 
 constexpr int max_threads = 256;
-/// Turns of a waiting loop before a thread goes to sleep: some tens of microseconds, less than
-/// waking costs.
-constexpr int patience = 2000;
-
-inline void pause_briefly() {
-#if defined(__x86_64__)
-    __builtin_ia32_pause();
-#elif defined(__aarch64__)
-    asm volatile("yield");
-#endif
-}
+/// Turns of a waiting loop before a thread goes to sleep: some tens of microseconds, about what
+/// waking costs. Each turn offers the processor to others, first of all to the caller, who may be
+/// on it.
+constexpr int patience = 100;
 
 /// One call's tasks. Helpers hold it by shared pointer: one that comes late finds nothing left to
 /// do.
@@ -42,8 +35,8 @@ struct Job {
     std::atomic<bool> failed{false};
     std::exception_ptr failure;
 
-    /// Works until no task is left.
-    void work() {
+    /// Works until no task is left; tells whether there was any.
+    bool work() {
         std::size_t mine = 0;
         for (std::size_t i; (i = next.fetch_add(1, std::memory_order_relaxed)) < tasks; ++mine) {
             if (failed.load(std::memory_order_relaxed)) continue;
@@ -54,6 +47,7 @@ struct Job {
             }
         }
         if (mine != 0) finished.fetch_add(mine, std::memory_order_release);
+        return mine != 0;
     }
 };
 
@@ -73,13 +67,7 @@ class Pool {
         }
         for (int i = 1; i < threads; ++i) wake_.notify_one();
         job->work();
-        for (int turn = 0; job->finished.load(std::memory_order_acquire) != tasks; ++turn) {
-            if (turn < patience) {
-                pause_briefly();
-            } else {
-                std::this_thread::yield();
-            }
-        }
+        while (job->finished.load(std::memory_order_acquire) != tasks) std::this_thread::yield();
         {
             // Another caller's job may have taken the place already.
             const std::lock_guard lock(mutex_);
@@ -102,10 +90,12 @@ class Pool {
 
     void help() {
         std::size_t seen = 0;
+        bool worked = false;
         for (;;) {
-            for (int turn = 0; turn < patience; ++turn) {
+            // Whoever has just worked may soon be wanted again.
+            for (int turn = 0; worked && turn < patience; ++turn) {
                 if (generation_.load(std::memory_order_acquire) != seen) break;
-                pause_briefly();
+                std::this_thread::yield();
             }
             std::shared_ptr<Job> job;
             {
@@ -117,7 +107,7 @@ class Pool {
                     job = job_;
                 }
             }
-            if (job) job->work();
+            worked = job && job->work();
         }
     }
 
@@ -167,7 +157,7 @@ int thread_limit(int asked) {
 }
 
 int threads_for(double work, std::size_t tasks, int asked) {
-    constexpr double worth_a_thread = 25e3;
+    constexpr double worth_a_thread = 60e3;  // waking one takes its share of this
     if (work < 2.0 * worth_a_thread) return 1;
     const double worth = std::min(work / worth_a_thread, static_cast<double>(tasks));
     return std::max(1, static_cast<int>(std::min(worth, static_cast<double>(thread_limit(asked)))));

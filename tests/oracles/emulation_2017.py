@@ -1,5 +1,4 @@
-"""The implementation of 2017, emulated: its filter, defects included, around our models and
-policies.
+"""The implementation of 2017, emulated: its filter with its defects, our models and policies.
 
 A shared defect cannot hide a difference. If our worlds and policies, put into a loop that fails in
 the ways in which the first implementation's loop failed, succeed as often and earn as much as it

@@ -159,6 +159,8 @@ class TestWhatLoads:
     def test_an_example_loads_and_is_told_by_its_keys(self, path: Path, write: Write) -> None:
         named = load(path)
         text = path.read_text(encoding="utf-8")
+        if ":" in named.problem_name:  # a user's own problem can only be named
+            return
         inferred = load(write(re.sub(r"(?m)^problem: .*$", "", text)))
         assert inferred == named
 

@@ -1,0 +1,183 @@
+"""What every way of choosing a sensing action promises, on every registered problem.
+
+The promises: a valid index; a function of its arguments alone, to the last bit, whatever the number
+of threads; nothing changed that was handed in; finite entropies even where a belief has collapsed.
+"""
+
+from __future__ import annotations
+
+import itertools
+
+import msgspec
+import numpy as np
+import pytest
+
+from holdfast.belief import Belief
+from holdfast.problems import registry
+from holdfast.problems.problem import FloatArray, Problem
+from holdfast.randomness import Purpose, stream
+from holdfast.sensing import SensingInfo, choose_sensing_action
+from holdfast.settings import (
+    ActiveSensingSettings,
+    ParticleFilterSettings,
+    PlanningSettings,
+    SelectorSettings,
+)
+
+SEED = 17
+COUNT = 60
+
+LOOKING = [
+    SelectorSettings(
+        method=method,  # type: ignore[arg-type]
+        estimator=estimator,  # type: ignore[arg-type]
+        actions=actions,  # type: ignore[arg-type]
+        resolution=0.05,
+    )
+    for method, estimator, actions in itertools.product(
+        ("action_entropy", "state_entropy"),
+        ("nearest_neighbor", "gaussian_mixture_upper", "gaussian_mixture_lower"),
+        ("commanded", "executed"),
+    )
+]
+SELECTORS = [
+    *LOOKING,
+    SelectorSettings(),
+    SelectorSettings(method="random"),
+    SelectorSettings(method="fixed", sensing_action=1),
+]
+
+
+def describe(selector: SelectorSettings) -> str:
+    if selector.method in {"random", "fixed"}:
+        return selector.method
+    resolution = "" if selector.resolution else "default "
+    return f"{resolution}{selector.method} {selector.estimator} {selector.actions}"
+
+
+@pytest.fixture(scope="module", params=registry.names())
+def problem(request: pytest.FixtureRequest) -> Problem:
+    built = registry.problem_class(request.param).from_settings({}, {})
+    assert isinstance(built, Problem)
+    return built
+
+
+def settings_of(
+    selector: SelectorSettings, *, cores: int = 1, horizon: int = 1
+) -> PlanningSettings:
+    return PlanningSettings(
+        particle_filter=ParticleFilterSettings(num_particles=COUNT),
+        active_sensing=ActiveSensingSettings(
+            horizon=horizon, num_observation_samples=4, num_cores=cores
+        ),
+        selector=selector,
+    )
+
+
+def belief_of(problem: Problem, count: int = COUNT) -> Belief:
+    """Return a belief on the way, where limited actions differ too."""
+    draws = stream(SEED, 0, 0, Purpose.INITIAL_BELIEF)
+    states = problem.initial_states(draws, count)
+    for step in range(40):
+        actions = problem.execute(problem.policy(states, 0))
+        states = problem.move(states, actions, draws.substream(2).substream(step))
+    weights = draws.substream(1).uniform(count)
+    weights[::7] = 0.0
+    return Belief.weighted(states, weights)
+
+
+def choose(
+    problem: Problem, settings: PlanningSettings, belief: Belief, step: int = 0
+) -> tuple[int, SensingInfo]:
+    hypotheses = stream(SEED, 0, step, Purpose.HYPOTHESES)
+    selection = stream(SEED, 0, step, Purpose.SELECTION)
+    return choose_sensing_action(problem, settings, belief, 0, hypotheses, selection)
+
+
+def as_bytes(chosen: tuple[int, SensingInfo]) -> tuple[int, bytes, bytes]:
+    index, info = chosen
+    entropies = b"" if info.entropies is None else info.entropies.tobytes()
+    return index, entropies, b"" if info.samples is None else info.samples.tobytes()
+
+
+@pytest.mark.parametrize("selector", SELECTORS, ids=describe)
+class TestEverySelector:
+    def test_form(self, problem: Problem, selector: SelectorSettings) -> None:
+        count = len(problem.sensing_actions)
+        index, info = choose(problem, settings_of(selector), belief_of(problem))
+        assert type(index) is int
+        assert 0 <= index < count
+        if selector.method in {"random", "fixed"}:
+            assert info == SensingInfo(None, None, 0, 0)
+            return
+        assert info.entropies is not None
+        assert info.samples is not None
+        assert info.entropies.shape == (count,)
+        assert info.samples.shape == (count, 4)
+        assert np.isfinite(info.samples).all()
+        np.testing.assert_allclose(info.entropies, info.samples.mean(axis=1), rtol=1e-12)
+        assert index == int(np.argmin(info.entropies))
+
+    def test_a_function_of_its_arguments(
+        self, problem: Problem, selector: SelectorSettings
+    ) -> None:
+        settings, belief = settings_of(selector), belief_of(problem)
+        first = as_bytes(choose(problem, settings, belief))
+        choose(problem, settings, belief, step=1)
+        again = Belief(belief.states.copy(), belief.weights.copy())
+        assert as_bytes(choose(problem, settings, again)) == first
+        if selector.method not in {"random", "fixed"}:
+            assert as_bytes(choose(problem, settings, belief, step=1))[2] != first[2]
+
+    def test_nothing_is_changed(self, problem: Problem, selector: SelectorSettings) -> None:
+        belief = belief_of(problem)
+        before = belief.states.tobytes(), belief.weights.tobytes()
+        for array in belief:
+            array.setflags(write=False)
+        _, info = choose(problem, settings_of(selector, horizon=2), belief)
+        assert (belief.states.tobytes(), belief.weights.tobytes()) == before
+        for found in (info.entropies, info.samples):
+            assert found is None or not any(np.shares_memory(found, own) for own in belief)
+
+    def test_threads_change_nothing(self, problem: Problem, selector: SelectorSettings) -> None:
+        belief = belief_of(problem, 600)
+        results = {
+            as_bytes(choose(problem, settings_of(selector, cores=cores), belief))
+            for cores in (0, 1, 2, 7)
+        }
+        assert len(results) == 1
+
+    def test_collapsed_beliefs(self, problem: Problem, selector: SelectorSettings) -> None:
+        """All particles alike, or all weight on one: everything stays finite, and ties go low."""
+        states = belief_of(problem).states
+        one_weight = np.zeros(COUNT)
+        one_weight[5] = 1.0
+        copies: FloatArray = np.repeat(states[3:4], COUNT, axis=0)
+        for belief in (Belief.uniform(copies), Belief(states, one_weight)):
+            index, info = choose(problem, settings_of(selector), belief)
+            entropies = info.entropies
+            if entropies is not None:
+                assert np.isfinite(entropies).all()
+                np.testing.assert_allclose(entropies, entropies[0], rtol=1e-12)
+                assert index == 0
+
+
+@pytest.mark.parametrize("selector", [LOOKING[0], LOOKING[2], LOOKING[7]], ids=describe)
+def test_horizon(problem: Problem, selector: SelectorSettings) -> None:
+    """A longer horizon adds to what the next step's entropy is."""
+    belief = belief_of(problem)
+    _, near = choose(problem, settings_of(selector), belief)
+    _, far = choose(problem, settings_of(selector, horizon=3), belief)
+    assert near.samples is not None
+    assert far.samples is not None
+    assert np.isfinite(far.samples).all()
+    assert np.abs(far.samples - near.samples).max() > 1e-3
+    nothing_later = msgspec.structs.replace(
+        settings_of(selector, horizon=3),
+        active_sensing=msgspec.structs.replace(
+            settings_of(selector, horizon=3).active_sensing, discount=0.0
+        ),
+    )
+    _, discounted = choose(problem, nothing_later, belief)
+    assert discounted.samples is not None
+    np.testing.assert_array_equal(discounted.samples, near.samples)

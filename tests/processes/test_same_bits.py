@@ -1,0 +1,211 @@
+"""The same decisions, to the last bit, however the machine is set to compute them.
+
+Each case runs the same trials in a process of its own: with other numbers of threads and of worker
+processes, with the kernel compiled for other instruction sets, and with NumPy's and OpenBLAS's own
+choices by processor taken away, which stands in for another machine. What is compared is the digest
+of each trial: a hash of every decision, every action and every belief that an observation led to.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import platform
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+
+# name: the example, trials, and what is changed in it.
+RUNS: dict[str, tuple[str, int, dict[str, dict[str, object]]]] = {
+    "peg": ("peg_in_hole_2d", 50, {}),
+    # Enough work for a second thread.
+    "many particles": (
+        "peg_in_hole_2d",
+        2,
+        {"particle_filter": {"num_particles": 1500}, "simulator": {"max_steps": 40}},
+    ),
+    "few resamplings": (
+        "peg_in_hole_2d",
+        4,
+        {
+            "particle_filter": {"resampling_threshold": 0.3},
+            "selector": {"estimator": "gaussian_mixture_upper", "actions": "executed"},
+            "active_sensing": {"horizon": 2, "discount": 0.5},
+            "simulator": {"max_steps": 60},
+        },
+    ),
+    "capsule": ("capsule_robot", 4, {}),
+    "multitier": ("multitier_peg_in_hole_2d", 2, {}),
+    "peg in space": ("peg_in_hole_3d", 2, {"simulator": {"max_steps": 60}}),
+}
+
+SCRIPT = """
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from holdfast import _kernel
+from holdfast.configuration import load
+from holdfast.runtime import trials
+
+# As if workers cost nothing to start: they take all trials but the first.
+trials._WORKER_START_S = 0.0
+
+if __name__ == "__main__":
+    jobs = int(sys.argv[1])
+    digests = {}
+    for path in sys.argv[2:]:
+        results = []
+        trials.run_trials(load(Path(path)), jobs, (), results.append)
+        results.sort(key=lambda result: result.trial)
+        digests[Path(path).stem] = [result.digest for result in results]
+    features = np.show_config(mode="dicts")["SIMD Extensions"].get("found", [])
+    print(json.dumps({"digests": digests, "simd": _kernel.simd(), "numpy": features}))
+"""
+
+SETTINGS = ("HOLDFAST_SIMD", "NPY_DISABLE_CPU_FEATURES", "OPENBLAS_CORETYPE")
+
+Report = dict[str, object]
+Run = Callable[..., subprocess.CompletedProcess[str]]
+
+
+def numpy_features() -> list[str]:
+    """Return the instruction sets that this NumPy would use here beyond its baseline."""
+    found = np.show_config(mode="dicts")["SIMD Extensions"].get("found", [])
+    return list(found)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """Return a function that runs all trials in a fresh process."""
+    directory = tmp_path_factory.mktemp("same-bits")
+    (directory / "script.py").write_text(SCRIPT)
+
+    def run_them(
+        cores: int = 1, jobs: int = 1, names: tuple[str, ...] = tuple(RUNS), **settings: str
+    ) -> subprocess.CompletedProcess[str]:
+        paths = []
+        for name in names:
+            example, num_trials, changes = RUNS[name]
+            content = yaml.safe_load((EXAMPLES / f"{example}.yaml").read_text())
+            content["simulator"]["num_trials"] = num_trials
+            for section, keys in changes.items():
+                content.setdefault(section, {}).update(keys)
+            content["active_sensing"]["num_cores"] = cores
+            path = directory / f"cores-{cores}" / f"{name}.yaml"
+            path.parent.mkdir(exist_ok=True)
+            path.write_text(yaml.safe_dump(content))
+            paths.append(str(path))
+        environment = {key: value for key, value in os.environ.items() if key not in SETTINGS}
+        return subprocess.run(
+            [sys.executable, str(directory / "script.py"), str(jobs), *paths],
+            env=environment | settings,
+            capture_output=True,
+            text=True,
+            timeout=300,
+            check=False,
+        )
+
+    return run_them
+
+
+def report_of(finished: subprocess.CompletedProcess[str]) -> Report:
+    assert finished.returncode == 0, finished.stderr
+    report = json.loads(finished.stdout)
+    assert isinstance(report, dict)
+    return report
+
+
+@pytest.fixture(scope="module")
+def usual(run: Run) -> Report:
+    """Return what comes out with one thread, one process and this machine's own choices."""
+    report = report_of(run())
+    digests = report["digests"]
+    assert isinstance(digests, dict)
+    assert {name: len(found) for name, found in digests.items()} == {
+        name: num_trials for name, (_, num_trials, _) in RUNS.items()
+    }
+    # Trials differ, so a digest of nothing would be found.
+    every = [digest for found in digests.values() for digest in found]
+    assert len(set(every)) == len(every)
+    return report
+
+
+@pytest.mark.parametrize("cores", [0, 2, 3])
+def test_threads(run: Run, usual: Report, cores: int) -> None:
+    assert report_of(run(cores=cores))["digests"] == usual["digests"]
+
+
+def test_worker_processes(run: Run, usual: Report) -> None:
+    names = ("peg", "capsule")
+    digests = usual["digests"]
+    assert isinstance(digests, dict)
+    found = report_of(run(jobs=2, names=names))["digests"]
+    assert found == {name: digests[name] for name in names}
+
+
+@pytest.mark.parametrize("simd", ["baseline", "avx2", "avx512"])
+def test_instruction_sets(run: Run, usual: Report, simd: str) -> None:
+    finished = run(HOLDFAST_SIMD=simd)
+    if simd != "baseline" and "allowed here are baseline" in finished.stderr:
+        pytest.skip(f"this processor has no {simd}")
+    report = report_of(finished)
+    assert report["simd"] == simd
+    assert report["digests"] == usual["digests"]
+
+
+@pytest.mark.skipif(not numpy_features(), reason="NumPy makes no choices by processor here")
+def test_numpy_without_its_instruction_sets(run: Run, usual: Report) -> None:
+    report = report_of(run(NPY_DISABLE_CPU_FEATURES=" ".join(numpy_features())))
+    assert usual["numpy"] == numpy_features()
+    assert report["numpy"] == []
+    assert report["digests"] == usual["digests"]
+
+
+@pytest.mark.skipif(platform.machine() != "x86_64", reason="names of x86 processors")
+@pytest.mark.parametrize("core", ["Prescott", "Haswell"])
+def test_openblas_for_another_processor(run: Run, usual: Report, core: str) -> None:
+    assert report_of(run(OPENBLAS_CORETYPE=core))["digests"] == usual["digests"]
+
+
+@pytest.mark.skipif(not numpy_features(), reason="NumPy makes no choices by processor here")
+def test_all_at_once(run: Run, usual: Report) -> None:
+    """As far from the usual as one machine allows."""
+    report = report_of(
+        run(
+            cores=2,
+            HOLDFAST_SIMD="baseline",
+            NPY_DISABLE_CPU_FEATURES=" ".join(numpy_features()),
+            OPENBLAS_CORETYPE="Prescott",
+        )
+    )
+    assert report["digests"] == usual["digests"]
+
+
+@pytest.mark.parametrize("jobs", ["1", "2"])
+def test_the_command(tmp_path: Path, usual: Report, jobs: str) -> None:
+    """``holdfast run`` on the example itself, which leaves the number of threads open."""
+    command = [sys.executable, "-c", "from holdfast.cli import main; main()", "run"]
+    arguments = ["--trials", "50", "--jobs", jobs, "--out", str(tmp_path / "out")]
+    subprocess.run(
+        [*command, str(EXAMPLES / "peg_in_hole_2d.yaml"), *arguments],
+        env={key: value for key, value in os.environ.items() if key not in SETTINGS},
+        capture_output=True,
+        timeout=300,
+        check=True,
+    )
+    with (tmp_path / "out" / "trials.csv").open() as file:
+        found = [row["digest"] for row in csv.DictReader(file)]
+    digests = usual["digests"]
+    assert isinstance(digests, dict)
+    assert found == digests["peg"]

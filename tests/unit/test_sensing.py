@@ -1,0 +1,306 @@
+"""Choosing what to sense: ties, the choices that imagine nothing, and what is refused."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+import pytest
+from scipy import stats
+
+from holdfast.belief import Belief
+from holdfast.errors import InvalidValueError, ProblemError
+from holdfast.problems.problem import FloatArray, IntArray, Problem, ProblemBase
+from holdfast.randomness import Purpose, Stream, stream
+from holdfast.sensing import SensingInfo, choose_sensing_action
+from holdfast.settings import ActiveSensingSettings, PlanningSettings, SelectorSettings
+
+HYPOTHESES = stream(41, 0, 0, Purpose.HYPOTHESES)
+SELECTION = stream(41, 0, 0, Purpose.SELECTION)
+
+
+class Coordinates(ProblemBase):
+    """Go to the origin of the plane; each sensing action shows the coordinate given in ``rows``."""
+
+    name = "coordinates"
+    state_size = 2
+    action_size = 2
+    resolution = 0.1
+    motion_variance = np.array([0.01, 0.01])
+
+    def __init__(self, rows: Sequence[int] = (0, 1), variance: float = 0.01) -> None:
+        self.rows = rows
+        self.sensing_actions: Sequence[str] = [f"coordinate {row}" for row in rows]
+        self.variance = np.array([variance])
+
+    def initial_states(self, stream: Stream, count: int) -> FloatArray:
+        return stream.normal((count, 2))
+
+    def move(self, states: FloatArray, actions: FloatArray, stream: Stream) -> FloatArray:
+        return np.asarray(states + actions + 0.1 * stream.normal(states.shape))
+
+    def observation_mean(self, states: FloatArray, sensing_action: int) -> FloatArray:
+        row = self.rows[sensing_action]
+        return states[..., row : row + 1]
+
+    def observation_variance(self, states: FloatArray, sensing_action: int) -> FloatArray:
+        return self.variance
+
+    def policy(self, states: FloatArray, stage: int | IntArray) -> FloatArray:
+        return -states
+
+    def is_goal(self, states: FloatArray) -> npt.NDArray[np.bool_]:
+        return np.asarray((np.abs(states) < 0.1).all(axis=-1))
+
+
+def settings_of(selector: SelectorSettings | None = None, **sensing: int) -> PlanningSettings:
+    active_sensing = msgspec.structs.replace(ActiveSensingSettings(num_cores=1), **sensing)
+    return PlanningSettings(active_sensing=active_sensing, selector=selector or SelectorSettings())
+
+
+def belief_of(*deviations: float, count: int = 60) -> Belief:
+    noise = stream(41, 1, 0, Purpose.INITIAL_BELIEF).normal((count, 2))
+    return Belief.uniform(noise * np.array(deviations))
+
+
+def choose(
+    problem: Problem, settings: PlanningSettings, belief: Belief, stage: int = 0
+) -> tuple[int, SensingInfo]:
+    return choose_sensing_action(problem, settings, belief, stage, HYPOTHESES, SELECTION)
+
+
+class TestWhatIsChosen:
+    @pytest.mark.parametrize("method", ["action_entropy", "state_entropy"])
+    def test_the_coordinate_that_is_less_known(self, method: str) -> None:
+        settings = settings_of(SelectorSettings(method=method))  # type: ignore[arg-type]
+        assert choose(Coordinates(), settings, belief_of(0.2, 2.0))[0] == 1
+        assert choose(Coordinates(), settings, belief_of(2.0, 0.2))[0] == 0
+
+    def test_actions_count_and_states_do_not(self) -> None:
+        """Where the policy does not use a coordinate, only state entropy wants to know it."""
+
+        class Blind(Coordinates):
+            def policy(self, states: FloatArray, stage: int | IntArray) -> FloatArray:
+                return np.asarray(-states * np.array([1.0, 0.0]))
+
+        belief = belief_of(1.0, 5.0)
+        assert choose(Blind(), settings_of(), belief)[0] == 0
+        by_state = settings_of(SelectorSettings(method="state_entropy"))
+        assert choose(Blind(), by_state, belief)[0] == 1
+
+    def test_executed_actions(self) -> None:
+        """Where limits leave the same of all actions, commanded ones still differ."""
+
+        class Limited(Coordinates):
+            def execute(self, actions: FloatArray) -> FloatArray:
+                return np.clip(actions, -0.1, 0.1)
+
+        noise = belief_of(0.5, 0.05)
+        belief = Belief.uniform(noise.states + np.array([50.0, 0.0]))
+        assert choose(Limited(), settings_of(), belief)[0] == 0
+        executed = settings_of(SelectorSettings(actions="executed", resolution=0.01))
+        assert choose(Limited(), executed, belief)[0] == 1
+
+    def test_stage(self) -> None:
+        """The policy of the stage that the robot is in is the one that counts."""
+
+        class Staged(Coordinates):
+            num_stages = 2
+
+            def policy(self, states: FloatArray, stage: int | IntArray) -> FloatArray:
+                matters = [1.0, 0.0] if stage == 0 else [0.0, 1.0]
+                return np.asarray(-states * np.array(matters))
+
+        assert choose(Staged(), settings_of(), belief_of(1.0, 1.0), 0)[0] == 0
+        assert choose(Staged(), settings_of(), belief_of(1.0, 1.0), 1)[0] == 1
+
+    @pytest.mark.parametrize(
+        ("rows", "expected"), [([0, 0, 0], 0), ([1, 0, 0, 1], 1), ([1, 1, 0, 0], 2), ([0, 1, 0], 0)]
+    )
+    def test_of_equals_the_lowest(self, rows: list[int], expected: int) -> None:
+        """Sensing actions share their random numbers, so equal ones are equal to the last bit."""
+        index, info = choose(Coordinates(rows), settings_of(), belief_of(2.0, 0.2))
+        assert info.entropies is not None
+        for j, row in enumerate(rows):
+            assert info.entropies[j] == info.entropies[rows.index(row)]
+        assert index == expected
+
+    def test_observations_that_say_nothing(self) -> None:
+        """Then the entropy is that of the belief itself, whatever is sensed."""
+        problem = Coordinates(variance=1e12)
+        _, info = choose(problem, settings_of(), belief_of(1.0, 1.0))
+        assert info.samples is not None
+        np.testing.assert_allclose(info.samples, info.samples[0, 0], rtol=0.0, atol=1e-4)
+
+    def test_entropies_are_means_of_the_samples(self) -> None:
+        _, info = choose(Coordinates(), settings_of(num_observation_samples=7), belief_of(1.0, 2.0))
+        assert info.samples is not None
+        assert info.entropies is not None
+        assert info.samples.shape == (2, 7)
+        assert info.entropies.shape == (2,)
+        np.testing.assert_allclose(info.samples.mean(axis=1), info.entropies, rtol=1e-14)
+        assert info.likelihoods == 2 * 7 * 60
+        assert info.visits > 0
+
+
+class TestBlindChoices:
+    def test_fixed(self) -> None:
+        for index in (0, 1, 2):
+            selector = SelectorSettings(method="fixed", sensing_action=index)
+            problem = Coordinates([0, 1, 0])
+            chosen, info = choose(problem, settings_of(selector), belief_of(1.0, 1.0))
+            assert chosen == index
+            assert info == SensingInfo(None, None, 0, 0)
+
+    @pytest.mark.parametrize("index", [2, 7])
+    def test_fixed_out_of_range(self, index: int) -> None:
+        selector = SelectorSettings(method="fixed", sensing_action=index)
+        with pytest.raises(
+            InvalidValueError, match=rf"selector\.sensing_action {index}: .* actions 0 to 1"
+        ):
+            choose(Coordinates(), settings_of(selector), belief_of(1.0, 1.0))
+
+    @pytest.mark.parametrize("count", [1, 2, 3, 7])
+    def test_random_is_uniform(self, count: int) -> None:
+        """Chi-square at 1e-6 over 7,000 steps, and no memory from one step to the next."""
+        problem = Coordinates([0] * count)
+        settings = settings_of(SelectorSettings(method="random"))
+        belief = belief_of(1.0, 1.0)
+        steps = 7000
+        chosen = np.array(
+            [
+                choose_sensing_action(
+                    problem,
+                    settings,
+                    belief,
+                    0,
+                    HYPOTHESES,
+                    stream(42, 0, step, Purpose.SELECTION),
+                )[0]
+                for step in range(steps)
+            ]
+        )
+        observed = np.bincount(chosen, minlength=count)
+        assert len(observed) == count
+        if count > 1:
+            assert stats.chisquare(observed).pvalue > 1e-6
+            pairs = np.bincount(chosen[:-1] * count + chosen[1:], minlength=count * count)
+            assert stats.chisquare(pairs).pvalue > 1e-6
+
+    def test_random_is_a_function_of_its_stream(self) -> None:
+        settings = settings_of(SelectorSettings(method="random"))
+        problem = Coordinates([0, 1] * 50)
+        first = choose(problem, settings, belief_of(1.0, 1.0))
+        assert choose(problem, settings, belief_of(3.0, 0.1, count=10)) == first
+        assert first[1] == SensingInfo(None, None, 0, 0)
+
+    @pytest.mark.parametrize("method", ["random", "fixed"])
+    def test_one_particle_will_do(self, method: str) -> None:
+        selector = SelectorSettings(method=method)  # type: ignore[arg-type]
+        choose(Coordinates(), settings_of(selector), Belief.uniform([[1.0, 2.0]]))
+
+
+class Broken(Coordinates):
+    """Returns what it is told to."""
+
+    def __init__(self, **returned: FloatArray) -> None:
+        super().__init__()
+        self.returned = returned
+
+    def observation_mean(self, states: FloatArray, sensing_action: int) -> FloatArray:
+        return self.returned.get("mean", super().observation_mean(states, sensing_action))
+
+    def observation_variance(self, states: FloatArray, sensing_action: int) -> FloatArray:
+        return self.returned.get("variance", self.variance)
+
+    def policy(self, states: FloatArray, stage: int | IntArray) -> FloatArray:
+        return self.returned.get("policy", -states)
+
+
+class TestBadInput:
+    @pytest.mark.parametrize("neighbors", [60, 61, 1000])
+    def test_as_many_neighbours_as_particles(self, neighbors: int) -> None:
+        settings = settings_of(num_nearest_neighbors=neighbors)
+        expected = rf"active_sensing\.num_nearest_neighbors {neighbors}: must be below .*, 60"
+        with pytest.raises(InvalidValueError, match=expected):
+            choose(Coordinates(), settings, belief_of(1.0, 1.0))
+
+    @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+    def test_policy_not_finite(self, bad: float) -> None:
+        belief = belief_of(1.0, 1.0)
+        actions = -belief.states
+        actions[7, 1] = bad
+        for actions_that_count in ("commanded", "executed"):
+            selector = SelectorSettings(actions=actions_that_count)
+            with pytest.raises(ProblemError, match=rf"policy of coordinates returned \[.*{bad}\]"):
+                choose(Broken(policy=actions), settings_of(selector), belief)
+
+    def test_policy_of_another_shape(self) -> None:
+        for shape in ((59, 2), (60,), (2,)):
+            with pytest.raises(ProblemError, match=r"policy of coordinates returned shape"):
+                choose(Broken(policy=np.zeros(shape)), settings_of(), belief_of(1.0, 1.0))
+
+    @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+    def test_observation_mean_not_finite(self, bad: float) -> None:
+        mean = np.zeros((60, 1))
+        mean[3] = bad
+        with pytest.raises(ProblemError, match="observation_mean of coordinates is not finite"):
+            choose(Broken(mean=mean), settings_of(), belief_of(1.0, 1.0))
+
+    @pytest.mark.parametrize("bad", [0.0, -0.25, np.nan, np.inf])
+    def test_variance_not_positive(self, bad: float) -> None:
+        of_one_particle = np.full((60, 1), 0.1)
+        of_one_particle[3] = bad
+        for variance in (np.array([bad]), of_one_particle):
+            with pytest.raises(
+                ProblemError, match=r"observation_variance of coordinates has the entry"
+            ):
+                choose(Broken(variance=variance), settings_of(), belief_of(1.0, 1.0))
+
+    def test_negative_variance_is_named(self) -> None:
+        with pytest.raises(ProblemError, match=r"the entry -0\.25: every entry must be"):
+            choose(Broken(variance=np.array([-0.25])), settings_of(), belief_of(1.0, 1.0))
+
+    def test_mixture_without_a_motion_variance_for_the_states(self) -> None:
+        class Flat(Coordinates):
+            action_size = 1
+            motion_variance = np.array([0.01])
+
+            def policy(self, states: FloatArray, stage: int | IntArray) -> FloatArray:
+                return -states[..., :1]
+
+        selector = SelectorSettings(method="state_entropy", estimator="gaussian_mixture_upper")
+        belief = belief_of(1.0, 1.0)
+        with pytest.raises(InvalidValueError, match=r"motion variance of 1 .* 2: set selector"):
+            choose(Flat(), settings_of(selector), belief)
+        choose(Flat(), settings_of(msgspec.structs.replace(selector, resolution=0.1)), belief)
+
+    @pytest.mark.parametrize("variance", [[0.0, 0.01], [-1.0, 0.01]])
+    def test_mixture_of_a_problem_without_motion_noise(self, variance: list[float]) -> None:
+        class Exact(Coordinates):
+            motion_variance = np.array(variance)
+
+        selector = SelectorSettings(estimator="gaussian_mixture_lower")
+        with pytest.raises(InvalidValueError, match=r"variance \[.*\]: every entry must be > 0"):
+            choose(Exact(), settings_of(selector), belief_of(1.0, 1.0))
+
+    @pytest.mark.parametrize("bad", [np.nan, -np.inf])
+    @pytest.mark.parametrize("horizon", [1, 2])
+    def test_general_likelihood_that_is_none(self, bad: float, horizon: int) -> None:
+        """Its own draws are impossible under every particle: no entropy can be told."""
+
+        class General(Coordinates):
+            def log_likelihood(
+                self, states: FloatArray, sensing_action: int, observation: FloatArray
+            ) -> FloatArray:
+                return np.full(states.shape[:-1], bad)
+
+            def sample_observation(
+                self, state: FloatArray, sensing_action: int, stream: Stream
+            ) -> FloatArray:
+                return state[:1]
+
+        with pytest.raises(ProblemError, match="sensing action 0 of coordinates is not a number"):
+            choose(General(), settings_of(horizon=horizon), belief_of(1.0, 1.0))
