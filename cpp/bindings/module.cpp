@@ -8,6 +8,8 @@
 #include "vector_kernels.hpp"
 
 NB_MODULE(_kernel, module) {
+    // A problem that is alive when the interpreter ends, as in any script, is no leak.
+    nanobind::set_leak_warnings(false);
     module.def("simd", [] { return holdfast::vector_kernels().name; });
     holdfast::bind_numerics(module);
     holdfast::bind_entropy(module);

@@ -38,11 +38,11 @@ void holdfast::bind_numerics(nb::module_& module) {
                                        out);
         return result;
     });
-    module.def("normalize", [](const Input<1>& log_weights) {
+    module.def("normalize", [](const Input<1>& log_weights, bool drop_negligible) {
         double* out;
         auto result = make_array<double>({log_weights.shape(0)}, out);
-        const std::size_t survivors =
-            vector_kernels().normalize(log_weights.data(), log_weights.shape(0), false, out);
+        const std::size_t survivors = vector_kernels().normalize(
+            log_weights.data(), log_weights.shape(0), drop_negligible, out);
         return nb::make_tuple(result, survivors);
     });
     module.def("philox", [](const StreamWords& words, std::uint32_t block) {

@@ -169,7 +169,11 @@ HOLDFAST_INLINE detail::SineCosine<T> sine_cosine_of(T x) {
                                         -1.0 / 6402373705728000};
     const T shifted = x * two_over_pi + detail::rounding_shift;
     const T n = shifted - detail::rounding_shift;
-    const T r = ((x - n * half_pi_1) - n * half_pi_2) - n * half_pi_3;
+    // The first subtraction is exact; the rounding of the second is carried into the third.
+    const T a = x - n * half_pi_1;
+    const T b = n * half_pi_2;
+    const T difference = a - b;
+    const T r = difference - (n * half_pi_3 - ((a - difference) - b));
     const T r2 = r * r;
     const T sine = r + r * (r2 * detail::horner(r2, sine_series));
     const T cosine = detail::horner(r2, cosine_series);

@@ -193,7 +193,9 @@ def update(
                 f"observation of {observed.shape[0]} coordinates: sensing action {sensing_action} "
                 f"gives {mean.shape[-1]}"
             )
-        log_likelihood, explained = _gaussian_log_likelihood(observed, mean, variance)
+        log_likelihood, explained = _gaussian_log_likelihood(
+            observed, mean, variance, belief.weights
+        )
     else:
         log_likelihood = np.ascontiguousarray(
             general(belief.states, sensing_action, observed), dtype=np.float64
@@ -203,8 +205,8 @@ def update(
                 f"log_likelihood of observation {observed} under sensing action {sensing_action} "
                 "is NaN or plus infinity for a particle"
             )
-        explained = bool((log_likelihood > -np.inf).any())
-    weights, survivors = _kernel.normalize(numerics.log(belief.weights) + log_likelihood)
+        explained = bool(((log_likelihood > -np.inf) & (belief.weights > 0.0)).any())
+    weights, survivors = _kernel.normalize(numerics.log(belief.weights) + log_likelihood, False)
     if survivors == 0:
         return belief, UpdateInfo(effective_sample_size(belief), explained=False)
     after = Belief(belief.states, weights)
@@ -212,20 +214,23 @@ def update(
 
 
 def _gaussian_log_likelihood(
-    observed: FloatArray, mean: FloatArray, variance: FloatArray
+    observed: FloatArray, mean: FloatArray, variance: FloatArray, weights: FloatArray
 ) -> tuple[FloatArray, bool]:
     """Return log p(observed | state) up to a constant, and whether a particle explains it."""
     if not np.isfinite(mean).all():
         raise ProblemError("observation_mean is not finite for a particle")
     if not (variance > 0.0).all() or not np.isfinite(variance).all():
         raise ProblemError(f"observation_variance {variance}: every entry must be > 0 and finite")
-    difference = observed - mean
-    squares = difference * difference / variance
-    # Added column by column: np.sum may add in another order on another machine.
-    distance = squares[..., 0].copy()
-    for coordinate in range(1, squares.shape[-1]):
-        distance += squares[..., coordinate]
-    explained = bool(distance.min() <= UNEXPLAINED_DEVIATIONS_SQUARED)
+    # An observation of 1e200 is as good as one at infinity: no particle explains it.
+    with np.errstate(over="ignore"):
+        difference = observed - mean
+        squares = difference * difference / variance
+        # Added column by column: np.sum may add in another order on another machine.
+        distance = squares[..., 0].copy()
+        for coordinate in range(1, squares.shape[-1]):
+            distance += squares[..., coordinate]
+    nearest = np.where(weights > 0.0, distance, np.inf).min()
+    explained = bool(nearest <= UNEXPLAINED_DEVIATIONS_SQUARED)
     log_likelihood = -0.5 * distance
     if variance.ndim > 1:
         for coordinate in range(variance.shape[-1]):

@@ -24,6 +24,8 @@ __all__ = ["GaussianMixture", "NearestNeighbor", "entropy"]
 FloatArray = npt.NDArray[np.float64]
 
 MAX_DIMENSION = 64
+LARGEST = 1e150
+"""Bound on coordinates, and on the resolution and its inverse: their squares must be numbers."""
 
 
 class NearestNeighbor(NamedTuple):
@@ -92,6 +94,13 @@ class KernelEstimator(NamedTuple):
     scale: FloatArray | None
 
 
+def first_unbounded(points: FloatArray) -> int | None:
+    """Return the index of the first point with a coordinate that is NaN or too large, or None."""
+    # A comparison with NaN is false.
+    bounded = np.abs(points) <= LARGEST
+    return None if bounded.all() else int(np.argmin(bounded.all(axis=1)))
+
+
 def kernel_estimator(
     estimator: NearestNeighbor | GaussianMixture, dimension: int
 ) -> KernelEstimator:
@@ -109,9 +118,9 @@ def kernel_estimator(
     if isinstance(estimator, NearestNeighbor):
         if estimator.neighbors < 1:
             raise InvalidValueError(f"neighbors {estimator.neighbors}: must be at least 1")
-        if not 0.0 < estimator.resolution < np.inf:
+        if not 1.0 / LARGEST <= estimator.resolution <= LARGEST:
             raise InvalidValueError(
-                f"resolution {estimator.resolution}: must be positive and finite"
+                f"resolution {estimator.resolution}: allowed are {1.0 / LARGEST:g} to {LARGEST:g}"
             )
         return KernelEstimator(False, estimator.neighbors, estimator.resolution, 0.0, 0.0, None)
     variance = np.ascontiguousarray(estimator.variance, dtype=np.float64).reshape(-1)
@@ -162,9 +171,10 @@ def entropy(
     if array.ndim != 2 or array.shape[0] == 0:
         raise InvalidValueError(f"points of shape {array.shape}: need (n, d) with n >= 1")
     count = array.shape[0]
-    if not np.isfinite(array).all():
-        bad = int(np.argmin(np.isfinite(array).all(axis=1)))
-        raise InvalidValueError(f"point {bad} is {array[bad]}: every coordinate must be finite")
+    if (bad := first_unbounded(array)) is not None:
+        raise InvalidValueError(
+            f"point {bad} is {array[bad]}: every coordinate must be finite and at most {LARGEST:g}"
+        )
     kernel = kernel_estimator(estimator, array.shape[1])
     if isinstance(estimator, NearestNeighbor) and estimator.neighbors >= count > 1:
         raise InvalidValueError(

@@ -41,6 +41,7 @@ __all__ = [
     "SensingInfo",
     "TaskInfo",
     "advance",
+    "check_state",
     "choose_sensing_action",
     "choose_task_action",
     "decode_checkpoint",
@@ -142,6 +143,30 @@ def initial_state(
     states = problem.initial_states(stream(seed, trial, 0, Purpose.INITIAL_BELIEF), count)
     _check_states(problem, "initial_states", states, (count, problem.state_size))
     return PlanningState(seed, trial, 0, 0, False, Belief.uniform(states))
+
+
+def check_state(problem: Problem, settings: PlanningSettings, state: PlanningState) -> None:
+    """Check that a state belongs to a problem and settings: for states that come from outside.
+
+    Raises
+    ------
+    InvalidValueError
+        If the number of particles, their size or the stage is another than theirs.
+    """
+    count, size = state.belief.states.shape
+    if size != problem.state_size:
+        raise InvalidValueError(
+            f"state of {size} coordinates: {problem.name} has {problem.state_size}"
+        )
+    if count != settings.particle_filter.num_particles:
+        raise InvalidValueError(
+            f"state of {count} particles: particle_filter.num_particles is "
+            f"{settings.particle_filter.num_particles}"
+        )
+    if not 0 <= state.stage < problem.num_stages:
+        raise InvalidValueError(
+            f"stage {state.stage}: {problem.name} has 0 to {problem.num_stages - 1}"
+        )
 
 
 def needs_sensing(settings: PlanningSettings, state: PlanningState) -> bool:
@@ -360,7 +385,7 @@ def encode_checkpoint(state: PlanningState) -> bytes:
 
 
 def decode_checkpoint(data: bytes) -> PlanningState:
-    """Decode a state and check it.
+    """Decode a state and check it by itself; :func:`check_state` checks it against a problem.
 
     Raises
     ------

@@ -21,7 +21,14 @@ import numpy.typing as npt
 
 from holdfast import _kernel, numerics
 from holdfast.belief import Belief
-from holdfast.entropy import GaussianMixture, KernelEstimator, NearestNeighbor, kernel_estimator
+from holdfast.entropy import (
+    LARGEST,
+    GaussianMixture,
+    KernelEstimator,
+    NearestNeighbor,
+    first_unbounded,
+    kernel_estimator,
+)
 from holdfast.errors import InvalidValueError, ProblemError
 from holdfast.problems.problem import Problem
 from holdfast.randomness import Stream
@@ -162,11 +169,10 @@ def _estimator(
             f"policy of {problem.name} returned shape {points.shape} for states of shape "
             f"{belief.states.shape}: need ({belief.states.shape[0]}, {problem.action_size})"
         )
-    if not np.isfinite(points).all():
-        bad = int(np.argmin(np.isfinite(points).all(axis=1)))
+    if (bad := first_unbounded(points)) is not None:
         raise ProblemError(
             f"policy of {problem.name} returned {points[bad]} in state {belief.states[bad]}: every "
-            "coordinate must be finite"
+            f"coordinate must be finite and at most {LARGEST:g}"
         )
     dimension = points.shape[1]
     selector = settings.selector
@@ -299,7 +305,7 @@ def _later_entropies(
     actions = len(problem.sensing_actions)
     if hasattr(problem, "log_likelihood"):
         log_weights = _general_log_weights(problem, settings, belief, hypotheses)
-        rows = [_kernel.normalize(row)[0] for row in log_weights]
+        rows = [_kernel.normalize(row, True)[0] for row in log_weights]
         weights = np.array(rows).reshape(actions, samples, -1)
     else:
         sizes, predicted, variance = _predictions(problem, belief)

@@ -56,8 +56,8 @@ for n in (1, 7, 8, 9, 31, 1000):
     note(f"sum {n}", np.array(kernel.sum(values)))
     rows = stream.substream(3).normal((n, 5))
     note(f"weighted sums {n}", kernel.weighted_sums(values, rows))
-    note(f"normalize {n}", kernel.normalize(values * 20.0)[0])
-    weights = kernel.normalize(values)[0]
+    note(f"normalize {n}", kernel.normalize(values * 20.0, False)[0])
+    weights = kernel.normalize(values, False)[0]
     note(f"resampling {n}", kernel.systematic_resample(weights, 0.37))
 
 # Every way to an entropy: pair by pair, grouped with one to four vectors, with a tree of its own.
@@ -83,7 +83,7 @@ for count in (5, 100, 1001):
     draw = stream.substream(count)
     states = draw.normal((count, 3))
     predicted = np.ascontiguousarray(np.concatenate([states.T, states.T[:2]]))
-    weights = kernel.normalize(draw.substream(1).normal(count))[0]
+    weights = kernel.normalize(draw.substream(1).normal(count), False)[0]
     for variance in (np.full((5, 1), 0.1), np.ascontiguousarray(0.1 + predicted**2)):
         arguments = (weights, [1, 1, 1, 2], predicted, variance, 9, words)
         found = kernel.hypothetical_entropies(
@@ -230,7 +230,7 @@ class TestNormalize:
     @pytest.mark.parametrize("shift", [0.0, -1e6, 1e6, -1e300, 1e300])
     def test_a_common_factor_makes_no_difference(self, shift: float) -> None:
         log_weights = np.log(np.array([0.1, 0.2, 0.3, 0.4]))
-        weights, survivors = _kernel.normalize(log_weights + shift)
+        weights, survivors = _kernel.normalize(log_weights + shift, False)
         # Adding the shift rounds: half a unit of it is what is lost.
         tolerance = 1e-15 + abs(shift) * 2.0**-52 if abs(shift) < 1e10 else 1.0
         np.testing.assert_allclose(weights, [0.1, 0.2, 0.3, 0.4], atol=tolerance)
@@ -238,7 +238,9 @@ class TestNormalize:
         assert math.isclose(float(weights.sum()), 1.0, abs_tol=1e-15)
 
     def test_what_underflows_next_to_the_largest_is_not_counted(self) -> None:
-        weights, survivors = _kernel.normalize(np.array([0.0, -13.0, -700.0, -710.0, -np.inf]))
+        weights, survivors = _kernel.normalize(
+            np.array([0.0, -13.0, -700.0, -710.0, -np.inf]), False
+        )
         assert survivors == 3
         assert weights[2] > 0.0
         assert weights[3:].tolist() == [0.0, 0.0]
@@ -254,7 +256,7 @@ class TestNormalize:
         ],
     )
     def test_no_posterior_is_said_so(self, log_weights: list[float]) -> None:
-        assert _kernel.normalize(np.array(log_weights))[1] == 0
+        assert _kernel.normalize(np.array(log_weights), False)[1] == 0
 
 
 class TestResampling:
@@ -290,7 +292,7 @@ class TestResampling:
             assert (np.abs(copies - 4 * weights) < 1.0).all()
 
     def test_indices_are_in_order(self) -> None:
-        weights = _kernel.normalize(_kernel.normals(WORDS, 500))[0]
+        weights = _kernel.normalize(_kernel.normals(WORDS, 500), False)[0]
         indices = _kernel.systematic_resample(weights, 0.6)
         assert (np.diff(indices) >= 0).all()
 

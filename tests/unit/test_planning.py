@@ -16,6 +16,7 @@ from holdfast.belief import Belief, estimate, resample, update
 from holdfast.errors import CheckpointError, InvalidValueError, ProblemError
 from holdfast.planning import PlanningState, decode_checkpoint, digest, encode_checkpoint
 from holdfast.problems import registry
+from holdfast.problems.capsule_robot import CapsuleRobot
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.problems.problem import FloatArray, IntArray, Problem
 from holdfast.randomness import Purpose, Stream, stream
@@ -598,3 +599,20 @@ class TestBadInput:
         last = planning.advance(peg, configured, state._replace(step=2**32 - 1), np.zeros(3))
         with pytest.raises(InvalidValueError, match=rf"step {2**32}: allowed are 0 to {2**32 - 1}"):
             planning.advance(peg, configured, last, np.zeros(3))
+
+
+class TestCheckState:
+    def test_a_state_of_its_own_problem_passes(self) -> None:
+        problem, settings = PegInHole2D(), PlanningSettings()
+        planning.check_state(problem, settings, planning.initial_state(problem, settings, 1, 2))
+
+    def test_what_does_not_fit_is_named(self) -> None:
+        problem, settings = PegInHole2D(), PlanningSettings()
+        state = planning.initial_state(problem, settings, 1, 2)
+        with pytest.raises(InvalidValueError, match=r"stage 1: peg_in_hole_2d has 0 to 0"):
+            planning.check_state(problem, settings, state._replace(stage=1))
+        with pytest.raises(InvalidValueError, match=r"of 3 coordinates: capsule_robot has 2"):
+            planning.check_state(CapsuleRobot(), settings, state)
+        other = PlanningSettings(particle_filter=ParticleFilterSettings(num_particles=7))
+        with pytest.raises(InvalidValueError, match=r"of 100 particles.*num_particles is 7"):
+            planning.check_state(problem, other, state)

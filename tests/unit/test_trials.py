@@ -157,7 +157,7 @@ class TestOneTrial:
 
     def test_it_stops_at_the_goal_or_at_max_steps(self, tmp_path: Path) -> None:
         configuration = configuration_of(tmp_path)
-        results = [one(configuration, trial) for trial in range(12)]
+        results = [one(configuration, trial) for trial in range(40)]
         for result in results:
             assert result.steps == 60 or (result.success and result.steps < 60)
         assert {result.success for result in results} == {True, False}
