@@ -83,6 +83,32 @@ HOLDFAST_INLINE double point_to_box(const TreeView& tree, const double* point, s
     return least;
 }
 
+inline constexpr std::size_t query_vectors = leaf_size / lane_count;
+
+/// Least and greatest squared distance from eight points of a leaf to the box of a node.
+struct PointDistances {
+    Lanes least, greatest;
+};
+
+HOLDFAST_INLINE PointDistances point_distances(const TreeView& tree, std::size_t leaf,
+                                               std::size_t v, std::size_t node) {
+    PointDistances result{};
+    for (std::size_t c = 0; c < tree.dimension; ++c) {
+        const Lanes x =
+            load(tree.coordinates + (leaf * tree.dimension + c) * leaf_size + v * lane_count);
+        const Lanes from_low = x - tree.low[node * tree.dimension + c];
+        const Lanes to_high = tree.high[node * tree.dimension + c] - x;
+        Lanes span = from_low, gap = -to_high;
+        const IntLanes upper = to_high > from_low;
+        span = select(upper, to_high, span);
+        gap = select(upper, -from_low, gap);
+        gap = select(gap > 0.0, gap, Lanes{});
+        result.least += gap * gap;
+        result.greatest += span * span;
+    }
+    return result;
+}
+
 /// Squared distances from a point to eight slots of a leaf.
 HOLDFAST_INLINE Lanes leaf_distances(const TreeView& tree, const double* point, std::size_t leaf,
                                      std::size_t block) {
@@ -260,8 +286,21 @@ static void sum_balls(const PosteriorGroup& group, const QueryLeaf& query, doubl
             stack[depth++] = node.left;
             continue;
         }
-        *visits += query.used * leaf_size;
+        // The same two questions for each point of the leaf on its own, eight at a time.
+        unsigned inside = 0, reached = 0;
+        for (std::size_t v = 0; v < query_vectors; ++v) {
+            const PointDistances to_box = point_distances(tree, query.leaf, v, at);
+            inside |= bits_of(to_box.greatest <= radius_squared) << (v * lane_count);
+            reached |= bits_of(to_box.least <= radius_squared) << (v * lane_count);
+        }
         for (std::size_t i = 0; i < query.used; ++i) {
+            if ((inside >> i & 1) != 0) {
+                rows[i].add(group.node_weights + at * columns, group.node_counts + at * columns);
+                ++*visits;
+                continue;
+            }
+            if ((reached >> i & 1) == 0) continue;
+            *visits += leaf_size;
             Row<vectors> row = rows[i];
             for (std::size_t block = 0; block < leaf_size / lane_count; ++block) {
                 unsigned bits = bits_of(leaf_distances(tree, query.points[i], node.first_leaf,
@@ -291,7 +330,6 @@ static void sum_balls(const PosteriorGroup& group, const QueryLeaf& query, doubl
 /// to 2.3e-13 of its size, a quarter of what counts as a tie anyway.
 inline constexpr std::int64_t number_bits = 1023;
 inline constexpr std::size_t max_candidate_leaves = (number_bits + 1) / leaf_size;
-inline constexpr std::size_t query_vectors = leaf_size / lane_count;
 inline constexpr double far_away = 1e300;
 
 template <std::size_t length>
