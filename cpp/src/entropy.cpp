@@ -256,10 +256,11 @@ void entropies(const double* points, std::size_t count, std::size_t dimension,
 
     for (std::size_t first = 0; first < posteriors; first += batch) {
         const std::size_t number = std::min(batch, posteriors - first);
-        // A likelihood takes about a nanosecond.
+        // A likelihood takes about a nanosecond, and the entropies several times as long: helpers that are
+        // woken for the likelihoods are there when the entropies begin.
         const double likelihoods = static_cast<double>(number) * static_cast<double>(count);
         std::vector<std::uint64_t> visits(number);
-        parallel_for(number, threads_for(2.0 * likelihoods, number, settings.threads),
+        parallel_for(number, threads_for(10.0 * likelihoods, number, settings.threads),
                      [&](std::size_t i) { survivors[i] = source(first + i, &weights[i * count]); });
         counts.likelihoods += number * count;
 
