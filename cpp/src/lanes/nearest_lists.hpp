@@ -1,0 +1,260 @@
+// Sorted lists of the nearest points, made once for all posteriors (one compilation per instruction
+// set).
+//
+// For points that are sparser than the resolution. From its list each point walks outwards until
+// every posterior has found its k-th neighbour.
+
+#pragma once
+
+#include "sorting_network.hpp"
+#include "tree_search.hpp"
+
+namespace holdfast::HOLDFAST_ISA {
+
+/// The nearest points of sixteen query points, sorted: keys[v][rank] has those of eight of them.
+///
+/// A key is a squared distance whose ten low bits are replaced by the number of the candidate, so
+/// that numbers travel with distances through the sorting. The distance that is left is right
+/// to 2.3e-13 of its size, a quarter of what counts as a tie anyway.
+inline constexpr std::int64_t number_bits = 1023;
+inline constexpr std::size_t max_candidate_leaves = (number_bits + 1) / leaf_size;
+inline constexpr double far_away = 1e300;
+
+template <std::size_t length>
+struct NearestLists {
+    Lanes keys[query_vectors][length];
+    std::uint32_t leaves[max_candidate_leaves];  // number / leaf_size -> leaf
+    double complete_below;                       // no point nearer than this was left out
+};
+
+/// Sorts `block` and keeps in the sorted `best` the least of both, sorted: for eight lists at once.
+template <std::size_t length>
+static void merge_block(Lanes* best, Lanes* block) {
+    Lanes rows[length];
+    for (std::size_t i = 0; i < length; ++i) rows[i] = block[i];
+    apply<length, sorting<length>>(rows);
+    for (std::size_t i = 0; i < length; ++i) block[i] = rows[i];
+    for (std::size_t i = 0; i < length; ++i) {
+        rows[i] = best[i];
+        Lanes other = block[length - 1 - i];
+        order(rows[i], other);
+    }
+    apply<length, merging<length>>(rows);
+    for (std::size_t i = 0; i < length; ++i) best[i] = rows[i];
+}
+
+/// The largest of the last keys: no query point looks further.
+template <std::size_t length>
+HOLDFAST_INLINE double furthest(const NearestLists<length>& lists) {
+    Lanes largest = lists.keys[0][length - 1];
+    for (std::size_t v = 1; v < query_vectors; ++v) {
+        const Lanes last = lists.keys[v][length - 1];
+        largest = select(last > largest, last, largest);
+    }
+    return maximum_of(largest);
+}
+
+template <std::size_t length>
+static void find_nearest(const TreeView& tree, const QueryLeaf& query, NearestLists<length>& lists,
+                         std::uint64_t* visits) {
+    struct Pending {
+        std::uint32_t node;
+        double least;
+    } stack[stack_size];
+    std::size_t depth = 0, leaves = 0, in_block = 0;
+    Lanes block[query_vectors][length];
+    for (std::size_t v = 0; v < query_vectors; ++v) {
+        for (std::size_t i = 0; i < length; ++i) lists.keys[v][i] = splat(far_away);
+    }
+    lists.complete_below = __builtin_inf();
+    double bound = far_away;
+    // Lists of unused query slots would keep the bound up: they ask for nothing.
+    for (std::size_t i = query.used; i < leaf_size; ++i) {
+        for (std::size_t rank = 0; rank < length; ++rank) {
+            lists.keys[i / lane_count][rank][i % lane_count] = -1.0;
+        }
+    }
+    stack[depth++] = {0, 0.0};
+    while (depth > 0) {
+        const Pending pending = stack[--depth];
+        if (pending.least >= bound) continue;
+        const TreeNode& node = tree.nodes[pending.node];
+        if (leaves == max_candidate_leaves) {
+            if (pending.least < lists.complete_below) lists.complete_below = pending.least;
+            continue;
+        }
+        if (node.left != 0) {
+            double left_least, right_least, unused;
+            box_distances(tree, query.node, node.left, left_least, unused);
+            box_distances(tree, query.node, node.right, right_least, unused);
+            // The nearer one on top; the query's own side, where both touch it.
+            const bool own_side_left = query.leaf < tree.nodes[node.left].last_leaf;
+            const bool left_first =
+                left_least != right_least ? left_least < right_least : own_side_left;
+            if (left_first) {
+                stack[depth++] = {node.right, right_least};
+                stack[depth++] = {node.left, left_least};
+            } else {
+                stack[depth++] = {node.left, left_least};
+                stack[depth++] = {node.right, right_least};
+            }
+            continue;
+        }
+        const std::uint32_t leaf = node.first_leaf;
+        for (std::size_t other = 0; other < leaf_size; ++other) {
+            const auto number = static_cast<std::int64_t>(leaves * leaf_size + other);
+            for (std::size_t v = 0; v < query_vectors; ++v) {
+                Lanes distance{};
+                for (std::size_t c = 0; c < tree.dimension; ++c) {
+                    const double x =
+                        tree.coordinates[(leaf * tree.dimension + c) * leaf_size + other];
+                    const Lanes difference =
+                        load(tree.coordinates + (query.leaf * tree.dimension + c) * leaf_size +
+                             v * lane_count) -
+                        x;
+                    distance += difference * difference;
+                }
+                // Unused slots are at infinity from others and, as NaN, from each other.
+                distance = select(distance < far_away, distance, splat(far_away));
+                block[v][in_block] =
+                    detail::from_bits<Lanes>((detail::bits(distance) & ~number_bits) | number);
+            }
+            ++in_block;
+        }
+        *visits += query.used * leaf_size;
+        lists.leaves[leaves++] = leaf;
+        if (in_block == length) {
+            for (std::size_t v = 0; v < query_vectors; ++v)
+                merge_block<length>(lists.keys[v], block[v]);
+            bound = furthest(lists);
+            in_block = 0;
+        }
+    }
+    if (in_block > 0) {
+        for (std::size_t v = 0; v < query_vectors; ++v) {
+            for (std::size_t i = in_block; i < length; ++i) block[v][i] = splat(far_away);
+            merge_block<length>(lists.keys[v], block[v]);
+        }
+    }
+}
+
+/// The terms of one point under every posterior, walking outwards through its list.
+template <std::size_t vectors, std::size_t length>
+static void walk_outwards(const PosteriorGroup& group, const QueryLeaf& query, std::size_t i,
+                          const NearestLists<length>& lists, const Lanes* wanted, double limit,
+                          const NearestNeighborConstants& constants, double* scratch, Lanes* terms,
+                          std::uint64_t* visits) {
+    constexpr std::size_t columns = vectors * lane_count;
+    const TreeView& tree = group.tree;
+    const double resolution_squared = constants.resolution * constants.resolution * tie_tolerance;
+    const std::size_t slot = query.first_slot + i;
+    const double* own_weights = group.weights + slot * columns;
+    Lanes mass[vectors] = {}, within[vectors] = {}, radius[vectors];
+    for (std::size_t v = 0; v < vectors; ++v) {
+        radius[v] =
+            select(load(own_weights + v * lane_count) > 0.0, splat(__builtin_inf()), splat(-1.0));
+    }
+    for (std::size_t rank = 0; rank < length; ++rank) {
+        const double key = lists.keys[i / lane_count][rank][i % lane_count];
+        if (key >= limit) break;
+        const auto number = static_cast<std::size_t>(detail::bits(key) & number_bits);
+        const std::size_t leaf = lists.leaves[number / leaf_size], other = number % leaf_size;
+        const std::size_t other_slot = leaf * leaf_size + other;
+        if (other_slot == slot) continue;
+        const double distance = detail::from_bits<double>(detail::bits(key) & ~number_bits);
+        const double reached_radius =
+            distance > resolution_squared ? distance * tie_tolerance : resolution_squared;
+        IntLanes any{};
+        for (std::size_t v = 0; v < vectors; ++v) {
+            const Lanes weight = load(group.weights + other_slot * columns + v * lane_count);
+            const IntLanes open = distance <= radius[v];
+            any |= open;
+            mass[v] += select(open, weight, Lanes{});
+            within[v] += select(open & (weight > 0.0), splat(1.0), Lanes{});
+            const IntLanes reached = (within[v] >= wanted[v]) & (radius[v] == __builtin_inf());
+            radius[v] = select(reached, splat(reached_radius), radius[v]);
+        }
+        if (bits_of(any) == 0) break;
+    }
+    for (std::size_t v = 0; v < vectors; ++v) {
+        const Lanes weight = load(own_weights + v * lane_count);
+        const Lanes log_mass = log_of(mass[v] / (1.0 - weight));
+        const Lanes log_radius = 0.5 * log_of(radius[v]);
+        for (std::size_t lane = 0; lane < lane_count; ++lane) {
+            if (!(weight[lane] > 0.0)) continue;
+            const std::size_t column = v * lane_count + lane;
+            if (!(radius[v][lane] < limit)) {
+                terms[v][lane] +=
+                    searched_term(group, query.points[i], slot, column, constants, scratch, visits);
+                continue;
+            }
+            const std::uint32_t q = radius[v][lane] > resolution_squared
+                                        ? group.neighbors[column]
+                                        : static_cast<std::uint32_t>(within[v][lane]);
+            terms[v][lane] +=
+                weight[lane] * (constants.log_ball_volume +
+                                static_cast<double>(tree.dimension) * log_radius[lane] -
+                                log_mass[lane] + constants.bias_correction[q]);
+        }
+    }
+}
+
+/// The terms of a leaf's points under a single posterior: eight points side by side instead of
+/// eight posteriors. Adds what the lists settle to `sum`, and tells by bits which points they do
+/// not.
+template <std::size_t length>
+static unsigned walk_single(const PosteriorGroup& group, const QueryLeaf& query, std::size_t v,
+                            const NearestLists<length>& lists,
+                            const NearestNeighborConstants& constants, double& sum) {
+    const TreeView& tree = group.tree;
+    const double resolution_squared = constants.resolution * constants.resolution * tie_tolerance;
+    const std::uint32_t neighbors = group.neighbors[0];
+    const Lanes last =
+        detail::from_bits<Lanes>(detail::bits(lists.keys[v][length - 1]) & ~number_bits);
+    const Lanes limit = select(last < lists.complete_below, last, splat(lists.complete_below));
+    Lanes mass{}, within{}, radius = splat(__builtin_inf());
+    for (std::size_t rank = 0; rank < length; ++rank) {
+        const Lanes key = lists.keys[v][rank];
+        const IntLanes known = key < limit;
+        const Lanes distance = detail::from_bits<Lanes>(detail::bits(key) & ~number_bits);
+        Lanes weight{};
+        const unsigned bits = bits_of(known);
+        for (std::size_t lane = 0; lane < lane_count; ++lane) {
+            if ((bits >> lane & 1) == 0) continue;
+            const auto number = static_cast<std::size_t>(detail::bits(key[lane]) & number_bits);
+            // The own leaf is the first one visited, so a point's own number is its place in it.
+            if (number == v * lane_count + lane) continue;
+            const std::size_t other =
+                lists.leaves[number / leaf_size] * leaf_size + number % leaf_size;
+            weight[lane] = group.weights[other * lane_count];
+        }
+        const IntLanes open = (distance <= radius) & (weight > 0.0);
+        if (bits_of(open) == 0 && rank > 0) {
+            if (bits_of(radius == __builtin_inf()) == 0) break;
+        }
+        mass += select(open, weight, Lanes{});
+        within += select(open, splat(1.0), Lanes{});
+        const IntLanes reached =
+            (within >= static_cast<double>(neighbors)) & (radius == __builtin_inf());
+        const Lanes wide = select(distance > resolution_squared, distance * tie_tolerance,
+                                  splat(resolution_squared));
+        radius = select(reached, wide, radius);
+    }
+    Lanes weight{};
+    for (std::size_t lane = 0; lane < lane_count; ++lane) {
+        weight[lane] = group.weights[(query.first_slot + v * lane_count + lane) * lane_count];
+    }
+    const unsigned settled = bits_of((radius < limit) & (weight > 0.0));
+    const Lanes spread = 0.5 * static_cast<double>(tree.dimension) * log_of(radius) -
+                         log_of(mass / (1.0 - weight)) + constants.log_ball_volume;
+    for (std::size_t lane = 0; lane < lane_count; ++lane) {
+        if ((settled >> lane & 1) == 0) continue;
+        const std::uint32_t q = radius[lane] > resolution_squared
+                                    ? neighbors
+                                    : static_cast<std::uint32_t>(within[lane]);
+        sum += weight[lane] * (spread[lane] + constants.bias_correction[q]);
+    }
+    return bits_of(weight > 0.0) & ~settled;
+}
+
+}  // namespace holdfast::HOLDFAST_ISA

@@ -1,0 +1,114 @@
+// Distances between points and nodes of the tree, eight at a time (one compilation per instruction
+// set).
+//
+// Bounds of boxes are computed with the same operations in the same order as distances of points.
+// Rounding is monotone, so a box that is found inside (outside) has only points that would be found
+// inside (outside).
+
+#pragma once
+
+#include "../vector_kernels.hpp"
+
+namespace holdfast::HOLDFAST_ISA {
+
+inline constexpr std::size_t stack_size = 128;  // deeper than any balanced tree of 2^32 points
+
+/// Least and greatest squared distance between the boxes of two nodes.
+HOLDFAST_INLINE void box_distances(const TreeView& tree, std::size_t a, std::size_t b,
+                                   double& least, double& greatest) {
+    least = 0.0;
+    greatest = 0.0;
+    for (std::size_t c = 0; c < tree.dimension; ++c) {
+        const double a_low = tree.low[a * tree.dimension + c],
+                     a_high = tree.high[a * tree.dimension + c];
+        const double b_low = tree.low[b * tree.dimension + c],
+                     b_high = tree.high[b * tree.dimension + c];
+        const double gap_1 = b_low - a_high, gap_2 = a_low - b_high;
+        double gap = gap_1 > gap_2 ? gap_1 : gap_2;
+        if (gap < 0.0) gap = 0.0;
+        const double span_1 = b_high - a_low, span_2 = a_high - b_low;
+        const double span = span_1 > span_2 ? span_1 : span_2;
+        least += gap * gap;
+        greatest += span * span;
+    }
+}
+
+/// The same from one point to the box of a node; only the least distance is wanted.
+HOLDFAST_INLINE double point_to_box(const TreeView& tree, const double* point, std::size_t node) {
+    double least = 0.0;
+    for (std::size_t c = 0; c < tree.dimension; ++c) {
+        const double gap_1 = tree.low[node * tree.dimension + c] - point[c];
+        const double gap_2 = point[c] - tree.high[node * tree.dimension + c];
+        double gap = gap_1 > gap_2 ? gap_1 : gap_2;
+        if (gap < 0.0) gap = 0.0;
+        least += gap * gap;
+    }
+    return least;
+}
+
+inline constexpr std::size_t query_vectors = leaf_size / lane_count;
+
+/// Least and greatest squared distance from eight points of a leaf to the box of a node.
+struct PointDistances {
+    Lanes least, greatest;
+};
+
+HOLDFAST_INLINE PointDistances point_distances(const TreeView& tree, std::size_t leaf,
+                                               std::size_t v, std::size_t node) {
+    PointDistances result{};
+    for (std::size_t c = 0; c < tree.dimension; ++c) {
+        const Lanes x =
+            load(tree.coordinates + (leaf * tree.dimension + c) * leaf_size + v * lane_count);
+        const Lanes from_low = x - tree.low[node * tree.dimension + c];
+        const Lanes to_high = tree.high[node * tree.dimension + c] - x;
+        Lanes span = from_low, gap = -to_high;
+        const IntLanes upper = to_high > from_low;
+        span = select(upper, to_high, span);
+        gap = select(upper, -from_low, gap);
+        gap = select(gap > 0.0, gap, Lanes{});
+        result.least += gap * gap;
+        result.greatest += span * span;
+    }
+    return result;
+}
+
+/// Squared distances from a point to eight slots of a leaf.
+HOLDFAST_INLINE Lanes leaf_distances(const TreeView& tree, const double* point, std::size_t leaf,
+                                     std::size_t block) {
+    Lanes distance{};
+    for (std::size_t c = 0; c < tree.dimension; ++c) {
+        const Lanes difference =
+            load(tree.coordinates + (leaf * tree.dimension + c) * leaf_size + block * lane_count) -
+            point[c];
+        distance += difference * difference;
+    }
+    return distance;
+}
+
+/// A leaf whose points are the centres of the balls and lists that are asked for.
+struct QueryLeaf {
+    std::size_t leaf;
+    std::uint32_t node;
+    std::size_t first_slot;
+    std::size_t used;
+    double points[leaf_size][max_dimension];
+};
+
+HOLDFAST_INLINE void open_leaf(const TreeView& tree, std::size_t leaf, QueryLeaf& query) {
+    query.leaf = leaf;
+    query.node = 0;
+    while (tree.nodes[query.node].left != 0) {
+        const TreeNode& node = tree.nodes[query.node];
+        query.node = leaf < tree.nodes[node.left].last_leaf ? node.left : node.right;
+    }
+    query.first_slot = leaf * leaf_size;
+    const std::size_t left = tree.count - query.first_slot;
+    query.used = left < leaf_size ? left : leaf_size;
+    for (std::size_t i = 0; i < query.used; ++i) {
+        for (std::size_t c = 0; c < tree.dimension; ++c) {
+            query.points[i][c] = tree.coordinates[(leaf * tree.dimension + c) * leaf_size + i];
+        }
+    }
+}
+
+}  // namespace holdfast::HOLDFAST_ISA
