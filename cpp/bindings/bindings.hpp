@@ -11,6 +11,7 @@
 #include <initializer_list>
 
 #include "philox.hpp"
+#include "rounding.hpp"
 
 namespace holdfast {
 
@@ -37,6 +38,12 @@ Output<Value> make_array(std::initializer_list<std::size_t> shape, Value*& data)
     data = new Value[count];
     nanobind::capsule owner(data, [](void* p) noexcept { delete[] static_cast<Value*>(p); });
     return Output<Value>(data, shape, owner);
+}
+
+/// Adds a function to the module; all run in the standard floating-point mode.
+template <class Function>
+void define(nanobind::module_& module, const char* name, Function&& function) {
+    module.def(name, static_cast<Function&&>(function), nanobind::call_guard<StandardRounding>());
 }
 
 using StreamWords = std::array<std::uint32_t, 5>;

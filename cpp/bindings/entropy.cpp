@@ -9,6 +9,7 @@
 
 #include "bindings.hpp"
 #include "sensing.hpp"
+#include "thread_pool.hpp"
 #include "vector_kernels.hpp"
 
 namespace nb = nanobind;
@@ -42,33 +43,40 @@ double seconds_since(std::chrono::steady_clock::time_point start) {
 }  // namespace
 
 void holdfast::bind_entropy(nb::module_& module) {
-    module.def("entropies", [](const Input<2>& points, const Input<2>& log_weights, bool normalized,
-                               bool mixture, std::uint32_t neighbors, double resolution,
-                               double exponent, double offset, int threads) {
-        const std::size_t posteriors = log_weights.shape(0), count = points.shape(0);
-        double* out;
-        auto result = make_array<double>({posteriors}, out);
-        EntropyCounts counts;
-        {
-            nb::gil_scoped_release release;
-            const VectorKernels& kernels = vector_kernels();
-            const double* rows = log_weights.data();
-            const auto source = [&](std::size_t index, double* weights) {
-                if (normalized) {
-                    kernels.log(rows + index * count, weights, count);
-                    return kernels.normalize(weights, count, true, weights);
-                }
-                return kernels.normalize(rows + index * count, count, true, weights);
-            };
-            entropies(points.data(), count, points.shape(1), posteriors, source,
-                      make_settings(mixture, neighbors, resolution, exponent, offset, threads), out,
-                      counts);
-        }
-        return nb::make_tuple(result, counts.likelihoods, counts.visits);
-    });
+    define(module, "use_threads_from",
+           [](double nanoseconds) { return use_threads_from(nanoseconds); });
+    define(module, "threads_started", [] { return threads_started(); });
 
-    module.def(
-        "hypothetical_entropies",
+    define(module, "entropies",
+           [](const Input<2>& points, const Input<2>& rows_in, bool logarithms, bool mixture,
+              std::uint32_t neighbors, double resolution, double exponent, double offset,
+              int threads) {
+               const std::size_t posteriors = rows_in.shape(0), count = points.shape(0);
+               double* out;
+               auto result = make_array<double>({posteriors}, out);
+               EntropyCounts counts;
+               {
+                   nb::gil_scoped_release release;
+                   const VectorKernels& kernels = vector_kernels();
+                   const double* rows = rows_in.data();
+                   const auto source = [&](std::size_t index, double* weights) {
+                       const double* row = rows + index * count;
+                       if (logarithms) return kernels.normalize(row, count, true, weights);
+                       kernels.log(row, weights, count);
+                       return kernels.normalize(weights, count, true, weights);
+                   };
+                   entropies(
+                       points.data(), count, points.shape(1), posteriors, source,
+                       make_settings(mixture, neighbors, resolution, exponent, offset, threads),
+                       out, counts);
+               }
+               return nb::make_tuple(
+                   result, counts.likelihoods, counts.visits,
+                   nb::make_tuple(counts.pair_by_pair, counts.own_tree, counts.grouped));
+           });
+
+    define(
+        module, "hypothetical_entropies",
         [](const Input<1>& weights, const std::vector<std::uint32_t>& sizes,
            const Input<2>& predicted, const Input<2>& variance, std::size_t samples,
            const StreamWords& stream, const Input<2>& points, bool mixture, std::uint32_t neighbors,
@@ -94,19 +102,20 @@ void holdfast::bind_entropy(nb::module_& module) {
             return nb::make_tuple(means, result, counts.likelihoods, counts.visits);
         });
 
-    module.def("hypothetical_weights", [](const Input<1>& weights,
-                                          const std::vector<std::uint32_t>& sizes,
-                                          const Input<2>& predicted, const Input<2>& variance,
-                                          std::size_t samples, const StreamWords& stream) {
-        double* out;
-        auto result = make_array<double>({sizes.size(), samples, weights.shape(0)}, out);
-        nb::gil_scoped_release release;
-        hypothetical_weights(make_input(weights, sizes, predicted, variance, samples, stream), out);
-        return result;
-    });
+    define(module, "hypothetical_weights",
+           [](const Input<1>& weights, const std::vector<std::uint32_t>& sizes,
+              const Input<2>& predicted, const Input<2>& variance, std::size_t samples,
+              const StreamWords& stream) {
+               double* out;
+               auto result = make_array<double>({sizes.size(), samples, weights.shape(0)}, out);
+               nb::gil_scoped_release release;
+               hypothetical_weights(
+                   make_input(weights, sizes, predicted, variance, samples, stream), out);
+               return result;
+           });
 
     // For benchmarks: seconds that one vectorised exp, and one visit of a neighbour, take here.
-    module.def("measure_exp", [](std::size_t count, int repetitions) {
+    define(module, "measure_exp", [](std::size_t count, int repetitions) {
         std::vector<double> in(count, -0.5), out(count);
         const auto start = std::chrono::steady_clock::now();
         for (int i = 0; i < repetitions; ++i) {
@@ -115,7 +124,7 @@ void holdfast::bind_entropy(nb::module_& module) {
         }
         return seconds_since(start) / (static_cast<double>(count) * repetitions);
     });
-    module.def("measure_visit", [](std::size_t count, std::size_t dimension, int repetitions) {
+    define(module, "measure_visit", [](std::size_t count, std::size_t dimension, int repetitions) {
         // All pairs of `count` points, no selection: every neighbour lies within the resolution.
         const std::size_t stride = (count + lane_count - 1) / lane_count * lane_count;
         std::vector<double> coordinates(stride * dimension), weights(stride), scratch(stride + 1);

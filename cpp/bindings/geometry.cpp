@@ -124,13 +124,14 @@ template <class World>
 nb::class_<World> bind_world(nb::module_& module, const char* name) {
     return nb::class_<World>(module, name)
         .def("collides", &collides_batch<World>, nb::arg("states").noconvert(),
-             nb::arg("result").noconvert())
+             nb::arg("result").noconvert(), nb::call_guard<StandardRounding>())
         .def("move", &move_batch<World>, nb::arg("states").noconvert(),
              nb::arg("actions").noconvert(), nb::arg("standard_deviation").noconvert(),
-             nb::arg("tolerance"), nb::arg("stream"), nb::arg("next_states").noconvert())
+             nb::arg("tolerance"), nb::arg("stream"), nb::arg("next_states").noconvert(),
+             nb::call_guard<StandardRounding>())
         .def("draw_free", &draw_free_batch<World>, nb::arg("mean").noconvert(),
              nb::arg("standard_deviation").noconvert(), nb::arg("stream"),
-             nb::arg("states").noconvert());
+             nb::arg("states").noconvert(), nb::call_guard<StandardRounding>());
 }
 
 }  // namespace

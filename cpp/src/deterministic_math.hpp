@@ -12,7 +12,6 @@
 #pragma once
 
 #include <cstdint>
-#include <limits>
 
 #include "lanes/lanes.hpp"
 
@@ -106,7 +105,7 @@ HOLDFAST_INLINE T exp_of(T x) {
     const auto exponent = detail::bits(shifted) - detail::rounding_shift_bits + std::int64_t{1022};
     const T value = detail::horner(r, inverse_factorials) *
                     detail::from_bits<T>(shift_left(exponent, 52)) * 2.0;
-    const T infinite = detail::constant<T>(std::numeric_limits<double>::infinity());
+    const T infinite = detail::constant<T>(__builtin_inf());
     const T bounded = select(x > 709.782712893384, infinite, value);
     return select(x < -707.7, detail::constant<T>(0.0), bounded);
 }
@@ -139,8 +138,8 @@ HOLDFAST_INLINE T log_of(T x) {
     const T twice = s + s;
     const T value =
         e * log_2_high + (twice + (twice * (s2 * detail::horner(s2, series)) + e * log_2_low));
-    const T infinite = detail::constant<T>(std::numeric_limits<double>::infinity());
-    const T nan = detail::constant<T>(std::numeric_limits<double>::quiet_NaN());
+    const T infinite = detail::constant<T>(__builtin_inf());
+    const T nan = detail::constant<T>(__builtin_nan(""));
     T result = select(x < infinite, value, x);  // keeps +infinity and NaN
     result = select(x < 0.0, nan, result);
     return select(x == 0.0, -infinite, result);
@@ -183,7 +182,7 @@ HOLDFAST_INLINE detail::SineCosine<T> sine_cosine_of(T x) {
     const auto negate_cosine = ((quadrant + std::int64_t{1}) & std::int64_t{2}) != std::int64_t{0};
     const T s = select(swap, cosine, sine);
     const T c = select(swap, sine, cosine);
-    const T nan = detail::constant<T>(std::numeric_limits<double>::quiet_NaN());
+    const T nan = detail::constant<T>(__builtin_nan(""));
     const T size = select(x < 0.0, -x, x);
     const auto sensible = size <= 1073741824.0;
     return {select(sensible, select(negate_sine, -s, s), nan),
@@ -214,7 +213,7 @@ inline void sincos(double x, double& sine, double& cosine) {
 /// the sine is steep.
 inline double arcsin(double x) {
     constexpr double half_pi = 1.57079632679489661923;
-    if (!(x >= -1.0 && x <= 1.0)) return std::numeric_limits<double>::quiet_NaN();
+    if (!(x >= -1.0 && x <= 1.0)) return __builtin_nan("");
     const double size = x < 0.0 ? -x : x;
     if (size > 0.7) {
         const double half = arcsin(__builtin_sqrt(0.5 * (1.0 - size)));

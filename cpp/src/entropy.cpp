@@ -28,6 +28,8 @@ constexpr double grouped_share =
     0.12;  // below it the lists of near points hold too few of a posterior
 constexpr double grouped_cost_of_a_point = 1000.0;
 
+constexpr double work_that_follows = 10.0;  // nanoseconds for each likelihood, with the entropies
+
 double cost_alone(std::size_t survivors) {
     const auto size = static_cast<double>(survivors);
     if (survivors <= compact_limit) return size * (60.0 + 5.0 * size);
@@ -247,7 +249,8 @@ void entropies(const double* points, std::size_t count, std::size_t dimension,
                     {settings.resolution, mixture ? 0.0 : log_unit_ball(dimension),
                      mixture ? nullptr : bias_corrections(count)},
                     &vector_kernels()};
-    // Posteriors are taken in batches so that their weights fit in 64 MB whatever their number.
+    // Posteriors are taken in batches: their weights fill 64 MB, or those of one group if that is
+    // more.
     const std::size_t batch =
         std::max<std::size_t>(max_group_lanes, (std::size_t{8} << 20) / count);
     std::vector<double> weights(std::min(batch, posteriors) * count);
@@ -256,11 +259,12 @@ void entropies(const double* points, std::size_t count, std::size_t dimension,
 
     for (std::size_t first = 0; first < posteriors; first += batch) {
         const std::size_t number = std::min(batch, posteriors - first);
-        // A likelihood takes about a nanosecond, and the entropies several times as long: helpers that are
-        // woken for the likelihoods are there when the entropies begin.
+        // A likelihood takes about a nanosecond, and the entropies several times as long. Helpers
+        // that are woken for the likelihoods (from 400 particles and 30 posteriors on) are there
+        // when the entropies begin.
         const double likelihoods = static_cast<double>(number) * static_cast<double>(count);
         std::vector<std::uint64_t> visits(number);
-        parallel_for(number, threads_for(10.0 * likelihoods, number, settings.threads),
+        parallel_for(number, threads_for(work_that_follows * likelihoods, number, settings.threads),
                      [&](std::size_t i) { survivors[i] = source(first + i, &weights[i * count]); });
         counts.likelihoods += number * count;
 
@@ -286,8 +290,10 @@ void entropies(const double* points, std::size_t count, std::size_t dimension,
                                         : entropy_of_one(task) + settings.offset;
             } else if (group_them && s > compact_limit && static_cast<double>(s) >= shared_from) {
                 grouped.push_back(i);
+                ++counts.grouped;
             } else {
                 alone.push_back(i);
+                ++(s <= compact_limit ? counts.pair_by_pair : counts.own_tree);
                 work_alone += cost_alone(s);
             }
         }

@@ -37,6 +37,10 @@ struct EntropySettings {
 struct EntropyCounts {
     std::uint64_t likelihoods = 0;
     std::uint64_t visits = 0;
+    // Posteriors by the way that their entropy took (see entropy.cpp).
+    std::uint64_t pair_by_pair = 0;
+    std::uint64_t own_tree = 0;
+    std::uint64_t grouped = 0;
 };
 
 /// Fills `weights[count]` with posterior `index`, normalised and without negligible weights

@@ -28,6 +28,9 @@ struct PhiloxBlock {
 /// The marker of derived keys in the word of the purpose, which stays below it otherwise.
 inline constexpr std::uint32_t derivation_marker = 0x80000000u;
 
+// Inline functions may be compiled for several instruction sets: each has a name of its own.
+inline namespace HOLDFAST_ISA {
+
 HOLDFAST_INLINE PhiloxBlock philox(const Stream& stream, std::uint32_t block) {
     std::uint32_t c0 = block, c1 = stream.c1, c2 = stream.c2, c3 = stream.c3;
     std::uint32_t k0 = stream.key0, k1 = stream.key1;
@@ -79,11 +82,6 @@ inline double normal(const Stream& stream, std::uint64_t index) {
     return index & 1 ? second : first;
 }
 
-/// Draws number first, first + 1, ..., the same numbers as `normal` one by one, faster.
-void normals(const Stream& stream, std::uint64_t first, std::size_t count, double* out);
-
-void uniforms(const Stream& stream, std::uint64_t first, std::size_t count, double* out);
-
 /// An independent stream named by `index` below this one.
 ///
 /// Its key is a Philox output of this stream's key at a counter that no draw ever uses (the
@@ -95,5 +93,12 @@ HOLDFAST_INLINE Stream substream(const Stream& stream, std::uint32_t index) {
     const PhiloxBlock block = philox(deriving, index);
     return {block.words[0], block.words[1], 0, 0, 0};
 }
+
+}  // namespace HOLDFAST_ISA
+
+/// Draws number first, first + 1, ..., the same numbers as `normal` one by one, faster.
+void normals(const Stream& stream, std::uint64_t first, std::size_t count, double* out);
+
+void uniforms(const Stream& stream, std::uint64_t first, std::size_t count, double* out);
 
 }  // namespace holdfast

@@ -12,7 +12,8 @@
 
 namespace holdfast {
 
-/// indices[j] = the particle under tooth (j + offset) / count; offset in [0, 1), weights sum to 1.
+/// indices[j] = the particle under tooth (j + offset) / count; offset in [0, 1); the
+/// weights need not sum to 1.
 void systematic_resample(const double* weights, std::size_t count, double offset,
                          std::int64_t* indices);
 

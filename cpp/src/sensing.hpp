@@ -24,15 +24,13 @@ struct HypothesisInput {
     std::size_t count;                      // particles
     const double* weights;                  // [count], sum 1
     std::size_t sensing_actions;            // J
-    const std::uint32_t* observation_size;  // [J], at most max_observation_size
+    const std::uint32_t* observation_size;  // [J]
     const double* predicted;                // all coordinates of all actions: [total][count]
     const double* variance;                 // [total], or [total][count] if varying
     bool varying_variance;
     std::size_t samples;  // M
     Stream stream;
 };
-
-inline constexpr std::size_t max_observation_size = 1024;
 
 /// Entropies of the J x M hypothetical posteriors, row by row; NaN where an observation explains
 /// nothing.

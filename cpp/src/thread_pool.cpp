@@ -14,6 +14,8 @@
 #include <thread>
 #include <vector>
 
+#include "rounding.hpp"
+
 namespace holdfast {
 
 namespace {
@@ -46,7 +48,10 @@ struct Job {
                 if (!failed.exchange(true)) failure = std::current_exception();
             }
         }
-        if (mine != 0) finished.fetch_add(mine, std::memory_order_release);
+        if (mine != 0) {
+            finished.fetch_add(mine, std::memory_order_release);
+            finished.notify_one();
+        }
         return mine != 0;
     }
 };
@@ -67,13 +72,27 @@ class Pool {
         }
         for (int i = 1; i < threads; ++i) wake_.notify_one();
         job->work();
-        while (job->finished.load(std::memory_order_acquire) != tasks) std::this_thread::yield();
+        // A task that a helper has begun: soon done, unless the helper was put aside in the middle.
+        for (int turn = 0;; ++turn) {
+            const std::size_t finished = job->finished.load(std::memory_order_acquire);
+            if (finished == tasks) break;
+            if (turn < patience) {
+                std::this_thread::yield();
+            } else {
+                job->finished.wait(finished, std::memory_order_acquire);
+            }
+        }
         {
             // Another caller's job may have taken the place already.
             const std::lock_guard lock(mutex_);
             if (job_ == job) job_.reset();
         }
         if (job->failed.load()) std::rethrow_exception(job->failure);
+    }
+
+    int helpers() {
+        const std::lock_guard lock(mutex_);
+        return helpers_;
     }
 
   private:
@@ -89,6 +108,7 @@ class Pool {
     }
 
     void help() {
+        const StandardRounding standard_rounding;
         std::size_t seen = 0;
         bool worked = false;
         for (;;) {
@@ -136,6 +156,9 @@ Pool& pool() {
     return *current;
 }
 
+/// Work in nanoseconds that is worth a second thread; waking it takes its share of this.
+std::atomic<double> threads_from{120e3};
+
 /// As many as this process may run on, or fewer by the variable that all numerical libraries heed.
 int processors() {
     if (const char* asked = std::getenv("OMP_NUM_THREADS")) {
@@ -156,10 +179,18 @@ int thread_limit(int asked) {
     return asked <= 0 || asked > there_are ? there_are : asked;
 }
 
+double use_threads_from(double nanoseconds) {
+    return threads_from.exchange(nanoseconds);
+}
+
+int threads_started() {
+    return pool().helpers();
+}
+
 int threads_for(double work, std::size_t tasks, int asked) {
-    constexpr double worth_a_thread = 60e3;  // waking one takes its share of this
-    if (work < 2.0 * worth_a_thread) return 1;
-    const double worth = std::min(work / worth_a_thread, static_cast<double>(tasks));
+    const double from = threads_from.load(std::memory_order_relaxed);
+    if (work < from) return 1;
+    const double worth = std::min(2.0 * work / (from + 1.0), static_cast<double>(tasks));
     return std::max(1, static_cast<int>(std::min(worth, static_cast<double>(thread_limit(asked)))));
 }
 

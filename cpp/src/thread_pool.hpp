@@ -2,9 +2,9 @@
 //
 // A call offers its tasks to helper threads and works on them itself. It then waits only for tasks
 // that a helper has begun, never for the helper itself: on a machine that is busy with other
-// things, a helper that is not scheduled costs nothing. (A fork-join team, as of OpenMP, ends with
-// a barrier that every thread must reach; with one other busy process on two cores that made
-// decisions ten times slower.)
+// things, a helper that is not scheduled costs nothing; only one that is put aside in the middle of
+// a task costs a time slice. (A fork-join team, as of OpenMP, ends with a barrier that every thread
+// must reach; with one other busy process on two cores that made decisions ten times slower.)
 //
 // Results must not depend on which thread ran a task: tasks write to places of their own.
 
@@ -20,6 +20,13 @@ int thread_limit(int asked);
 
 /// How many threads are worth their waking for `work` nanoseconds in `tasks` parts.
 int threads_for(double work, std::size_t tasks, int asked);
+
+/// Sets the work in nanoseconds from which several threads are used; returns what it was. For
+/// tests.
+double use_threads_from(double nanoseconds);
+
+/// Helper threads that exist. For tests.
+int threads_started();
 
 /// Calls `function(context, i)` for every i < tasks; passes on the first exception.
 void run_tasks(std::size_t tasks, int threads, void (*function)(void*, std::size_t), void* context);

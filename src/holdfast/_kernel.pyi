@@ -25,14 +25,16 @@ def systematic_resample(weights: _Floats, offset: float) -> npt.NDArray[np.int64
 def entropies(
     points: _Floats,
     weights: _Floats,
-    normalized: bool,
+    logarithms: bool,
     mixture: bool,
     neighbors: int,
     resolution: float,
     exponent: float,
     offset: float,
     threads: int,
-) -> tuple[_Floats, int, int]: ...
+) -> tuple[_Floats, int, int, tuple[int, int, int]]: ...
+def use_threads_from(nanoseconds: float) -> float: ...
+def threads_started() -> int: ...
 def hypothetical_entropies(
     weights: _Floats,
     sizes: Sequence[int],

@@ -17,7 +17,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from holdfast import _kernel, numerics
+from holdfast import _kernel, contract, numerics
 from holdfast.errors import InvalidValueError, ProblemError
 from holdfast.randomness import Stream
 
@@ -52,9 +52,9 @@ class Belief(NamedTuple):
     Attributes
     ----------
     states : array of shape (num_particles, state_size)
-        C-contiguous, finite.
+        C-contiguous, finite, read-only.
     weights : array of shape (num_particles,)
-        Non-negative; their sum is 1 up to rounding.
+        Non-negative, read-only; their sum is 1 up to rounding.
     """
 
     states: FloatArray
@@ -73,7 +73,7 @@ class Belief(NamedTuple):
         InvalidValueError
             If there is no particle or a coordinate is not finite.
         """
-        array = np.ascontiguousarray(states, dtype=np.float64)
+        array = np.array(states, dtype=np.float64, order="C")
         if array.ndim != 2 or array.shape[0] == 0 or array.shape[1] == 0:
             raise InvalidValueError(
                 f"states of shape {array.shape}: need (num_particles, state_size), at least 1 each"
@@ -81,6 +81,7 @@ class Belief(NamedTuple):
         if not np.isfinite(array).all():
             bad = int(np.argmin(np.isfinite(array).all(axis=1)))
             raise InvalidValueError(f"state of particle {bad} is {array[bad]}: must be finite")
+        array.setflags(write=False)
         return cls(array, uniform_weights(array.shape[0]))
 
     @classmethod
@@ -111,13 +112,16 @@ class Belief(NamedTuple):
         total = numerics.sum(array)
         if not 0.0 < total < np.inf:
             raise InvalidValueError(f"sum of the weights is {total}: must be positive and finite")
-        return cls(belief.states, array / total)
+        normalized = array / total
+        normalized.setflags(write=False)
+        return cls(belief.states, normalized)
 
 
 def uniform_weights(count: int) -> FloatArray:
     """Return ``count`` weights of ``1 / count``."""
     weights = np.empty(count)
     weights.fill(1.0 / count)
+    weights.setflags(write=False)
     return weights
 
 
@@ -179,15 +183,14 @@ def update(
     InvalidValueError
         If the observation is not finite or of another size than the problem predicts.
     ProblemError
-        If the problem's likelihood is NaN or plus infinity.
+        If what the problem returns is not what its contract says.
     """
     observed = np.ascontiguousarray(observation, dtype=np.float64).reshape(-1)
     if not np.isfinite(observed).all():
         raise InvalidValueError(f"observation {observed}: every coordinate must be finite")
-    general = getattr(problem, "log_likelihood", None)
-    if general is None:
-        mean = problem.observation_mean(belief.states, sensing_action)
-        variance = problem.observation_variance(belief.states, sensing_action)
+    if not contract.has_general_observations(problem):
+        mean = contract.observation_mean(problem, belief.states, sensing_action)
+        variance = contract.observation_variance(problem, belief.states, sensing_action, mean)
         if mean.shape[-1] != observed.shape[0]:
             raise InvalidValueError(
                 f"observation of {observed.shape[0]} coordinates: sensing action {sensing_action} "
@@ -197,18 +200,12 @@ def update(
             observed, mean, variance, belief.weights
         )
     else:
-        log_likelihood = np.ascontiguousarray(
-            general(belief.states, sensing_action, observed), dtype=np.float64
-        )
-        if np.isnan(log_likelihood).any() or (log_likelihood == np.inf).any():
-            raise ProblemError(
-                f"log_likelihood of observation {observed} under sensing action {sensing_action} "
-                "is NaN or plus infinity for a particle"
-            )
+        log_likelihood = contract.log_likelihood(problem, belief.states, sensing_action, observed)
         explained = bool(((log_likelihood > -np.inf) & (belief.weights > 0.0)).any())
     weights, survivors = _kernel.normalize(numerics.log(belief.weights) + log_likelihood, False)
     if survivors == 0:
         return belief, UpdateInfo(effective_sample_size(belief), explained=False)
+    weights.setflags(write=False)
     after = Belief(belief.states, weights)
     return after, UpdateInfo(effective_sample_size(after), explained)
 
@@ -258,4 +255,6 @@ def resample(belief: Belief, stream: Stream) -> Belief:
     """
     offset = float(stream.uniform())
     indices = _kernel.systematic_resample(belief.weights, offset)
-    return Belief(belief.states[indices], uniform_weights(belief.weights.shape[0]))
+    states = belief.states[indices]
+    states.setflags(write=False)
+    return Belief(states, uniform_weights(belief.weights.shape[0]))

@@ -3,7 +3,9 @@
 A run is described by one file, and whoever reads an error has that file open. So every complaint
 names the file, the line, the key with its section, the value and what is allowed instead, and it
 comes before anything is run. The sections and keys are the thesis's, so that its files load
-unchanged; ``problem: NAME`` on top and the section ``selector`` are ours, and optional. Missing
+unchanged; ``problem: NAME`` on top and the section ``selector`` are ours, and optional. A problem
+of one's own is looked for beside the file and in the current directory, or where
+``problem_directory`` says. Missing
 sections and keys take their defaults, and :meth:`Configuration.to_yaml` writes down every value
 that is in use.
 
@@ -19,6 +21,7 @@ import json
 import re
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
+from importlib.machinery import PathFinder
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -35,6 +38,7 @@ from holdfast.settings import (
     SelectorSettings,
     SimulatorSettings,
 )
+from holdfast.user_code import account_of_user_error
 from holdfast.yaml_document import MAX_BYTES, Document, KeyPath, dotted, read, write
 
 __all__ = ["Configuration", "load"]
@@ -55,6 +59,8 @@ _SECTIONS = (
     "simulator",
     "selector",
 )
+
+_ON_TOP = ("problem", "problem_directory")
 
 # The thesis's files do not name their problem; these keys of `model` do, together.
 _TELLING_KEYS: Mapping[str, frozenset[str]] = {
@@ -87,6 +93,11 @@ class Configuration:
         The problem's two sections with all defaults filled in, as plain data.
     path : Path
         The file that this was read from.
+    problem_directory : Path or None
+        Where the module of ``module:Class`` was found; None for one that is installed.
+    unlisted : tuple of str
+        Arguments of the problem's constructor that have their default because a file cannot hold
+        it, so that they are not in ``model``.
     """
 
     problem: Problem = field(compare=False, repr=False)
@@ -96,6 +107,8 @@ class Configuration:
     model: Mapping[str, Any]
     state_space_planner: Mapping[str, Any]
     path: Path = field(compare=False)
+    problem_directory: Path | None = field(default=None, compare=False)
+    unlisted: tuple[str, ...] = field(default=(), compare=False)
 
     def to_yaml(self) -> str:
         """Return the resolved configuration as a file that loads to an equal configuration.
@@ -103,12 +116,18 @@ class Configuration:
         Returns
         -------
         str
-            YAML with every key, those of the defaults included.
+            YAML with every key, those of the defaults included. A comment names the arguments of
+            a problem's constructor whose defaults YAML cannot hold.
         """
-        return (
+        comment = (
             "# The configuration of a holdfast run, resolved: every key, with the value in use.\n"
-            + write(self._sections())
         )
+        if self.unlisted:
+            comment += (
+                "# Not listed, because YAML cannot hold what they are by default:\n"
+                f"# {', '.join(f'model.{key}' for key in self.unlisted)}\n"
+            )
+        return comment + write(self._sections())
 
     def plain(self) -> dict[str, Any]:
         """Return the configuration as plain data, from which another process can rebuild it.
@@ -154,8 +173,10 @@ class Configuration:
             "selector": self.planning.selector,
             "simulator": self.simulator,
         }
+        directory = self.problem_directory
         return {
             "problem": self.problem_name,
+            **({} if directory is None else {"problem_directory": str(directory)}),
             **{name: msgspec.to_builtins(sections[name]) for name in _SECTIONS},
         }
 
@@ -233,9 +254,10 @@ class _Source:
                 f" {', '.join(_SECTIONS)} is needed"
             )
         for name in data:
-            if name not in ("problem", *_SECTIONS):
-                raise self.unknown((name,), ("problem", *_SECTIONS))
+            if name not in (*_ON_TOP, *_SECTIONS):
+                raise self.unknown((name,), (*_ON_TOP, *_SECTIONS))
         self.problem: Any = data.get("problem")
+        self.problem_directory: Any = data.get("problem_directory")
         self.sections: dict[str, dict[str, Any]] = {}
         for name in _SECTIONS:
             section = data.get(name)
@@ -276,7 +298,7 @@ def _build(
 ) -> Configuration:
     """Check everything and build the problem."""
     source = _Source(document, path, overrides)
-    name, problem_class = _find_problem(source, problem_name)
+    name, problem_class, directory = _find_problem(source, problem_name)
     schemas: dict[str, type[msgspec.Struct]] = dict(_SETTINGS)
     for section, attribute in (("model", "Model"), ("state_space_planner", "StateSpacePlanner")):
         schema = getattr(problem_class, attribute, None)
@@ -286,7 +308,7 @@ def _build(
     active_sensing = _convert(source, "active_sensing", ActiveSensingSettings, schemas)
     selector = _convert(source, "selector", SelectorSettings, schemas)
     simulator = _convert(source, "simulator", SimulatorSettings, schemas)
-    problem, model, planner = _build_problem(source, name, problem_class, schemas)
+    problem, model, planner, unlisted = _build_problem(source, name, problem_class, schemas)
 
     num_particles = particle_filter.num_particles
     num_neighbors = active_sensing.num_nearest_neighbors
@@ -320,11 +342,16 @@ def _build(
         model=model,
         state_space_planner=planner,
         path=path,
+        problem_directory=directory,
+        unlisted=unlisted,
     )
 
 
-def _find_problem(source: _Source, name: str | None) -> tuple[str, type]:
-    """Return the problem's name, given, written in the file or told by its keys, and its class."""
+def _find_problem(source: _Source, name: str | None) -> tuple[str, type, Path | None]:
+    """Return the problem's name, its class and the directory where its module was looked up.
+
+    The name is given, written in the file or told by its keys.
+    """
     given = name is not None
     if name is None:
         if source.problem is None:
@@ -337,12 +364,57 @@ def _find_problem(source: _Source, name: str | None) -> tuple[str, type]:
                 f"is {_shown(source.problem)}; expected one of {', '.join(registry.names())},"
                 " or module:Class",
             )
+    directory = _problem_directory(source, name, given=given)
     try:
-        return name, registry.problem_class(name, search_directory=source.path.absolute().parent)
+        problem_class = registry.problem_class(
+            name, search_directory=directory or source.path.absolute().parent
+        )
     except UnknownProblemError as error:
         if given or source.problem is None:
             raise
         raise UnknownProblemError(f"{source.place(('problem',))}: {error}") from error
+    except Exception as error:
+        # Its module was found, but does not come through its own import.
+        account = account_of_user_error(error, name)
+        if account is None:
+            raise
+        raise ConfigurationError(f"{source.place(('problem',))}: {account}") from error
+    return name, problem_class, directory
+
+
+def _problem_directory(source: _Source, name: str, *, given: bool) -> Path | None:
+    """Return the directory that holds the module of ``module:Class``; None if it is installed.
+
+    Without ``problem_directory`` it is the file's own, else the current one: a resolved
+    configuration stands in the directory of its run, far from the problem.
+    """
+    value = source.problem_directory
+    key = ("problem_directory",)
+    if value is not None and not isinstance(value, str):
+        raise source.error(key, f"is {_shown(value)}; expected the path of a directory")
+    module, colon, _ = name.partition(":")
+    if not colon:
+        if value is not None and not given:
+            raise source.error(
+                key, f"is {_shown(value)}; only a problem that is named module:Class has one"
+            )
+        return None
+    package = module.partition(".")[0]
+    beside = source.path.absolute().parent.resolve()
+    if value is not None:
+        directory = beside / value
+        if not directory.is_dir():
+            raise source.error(key, f"is {_shown(value)}, where there is no directory")
+        if not _holds(directory, package):
+            raise source.error(key, f"is {_shown(value)}, where there is no module {package}")
+        return directory.resolve()
+    return next(
+        (directory for directory in (beside, Path.cwd()) if _holds(directory, package)), None
+    )
+
+
+def _holds(directory: Path, module: str) -> bool:
+    return PathFinder.find_spec(module, [str(directory)]) is not None
 
 
 def _infer_problem(source: _Source) -> str:
@@ -426,44 +498,54 @@ def _build_problem(
     name: str,
     problem_class: type,
     schemas: Mapping[str, type[msgspec.Struct]],
-) -> tuple[Problem, dict[str, Any], dict[str, Any]]:
-    """Return the problem and its two sections with their defaults."""
+) -> tuple[Problem, dict[str, Any], dict[str, Any], tuple[str, ...]]:
+    """Return the problem, its two sections with their defaults, and the defaults left out."""
     resolved: dict[str, dict[str, Any]] = {}
+    unlisted: tuple[str, ...] = ()
     for section in ("model", "state_space_planner"):
         if section in schemas:
             settings = _convert(source, section, schemas[section], schemas)
             resolved[section] = msgspec.to_builtins(settings)
         else:
             resolved[section] = source.sections[section]
+    arguments = resolved
     if "model" not in schemas and "state_space_planner" not in schemas:
-        given = {**resolved["model"], **resolved["state_space_planner"]}
         defaults = _keyword_arguments(source, problem_class)
+        arguments = {
+            section: {key: _in_the_form_of(defaults.get(key), value) for key, value in keys.items()}
+            for section, keys in resolved.items()
+        }
+        left = {
+            key: _as_plain(default)
+            for key, default in defaults.items()
+            if key not in resolved["model"] and key not in resolved["state_space_planner"]
+        }
+        unlisted = tuple(key for key, plain in left.items() if plain is _NOT_PLAIN)
         resolved["model"].update(
-            {key: value for key, value in defaults.items() if key not in given}
+            {key: plain for key, plain in left.items() if plain is not _NOT_PLAIN}
         )
     model, planner = resolved["model"], resolved["state_space_planner"]
     # A class that only has the members of the protocol is built as ProblemBase builds.
     build = getattr(problem_class, "from_settings", None)
     try:
         if build is None:
-            problem = ProblemBase.from_settings.__func__(problem_class, model, planner)  # type: ignore[attr-defined]
+            problem = ProblemBase.from_settings.__func__(  # type: ignore[attr-defined]
+                problem_class, arguments["model"], arguments["state_space_planner"]
+            )
         else:
-            problem = build(model, planner)
-    except (HoldfastError, msgspec.ValidationError, TypeError, ValueError) as error:
-        raise _at_mentioned_key(source, name, resolved, error) from error
+            problem = build(arguments["model"], arguments["state_space_planner"])
+    except Exception as error:
+        raise _cannot_be_built(source, name, resolved, error) from error
     missing = [member for member in _members(Problem) if not hasattr(problem, member)]
     if missing:
         raise ConfigurationError(
             f"{source.path}: {name} is no problem: it lacks {', '.join(missing)}"
         )
-    return problem, model, planner
+    return problem, model, planner, unlisted
 
 
 def _keyword_arguments(source: _Source, problem_class: type) -> dict[str, Any]:
-    """Check keys that are arguments of the constructor, and return those arguments' defaults.
-
-    Only defaults that a file can hold are returned; the constructor knows the others.
-    """
+    """Check keys that are arguments of the constructor, and return those arguments' defaults."""
     build = getattr(problem_class, "from_settings", None)
     if getattr(build, "__func__", None) not in (None, ProblemBase.from_settings.__func__):  # type: ignore[attr-defined]
         return {}
@@ -479,24 +561,57 @@ def _keyword_arguments(source: _Source, problem_class: type) -> dict[str, Any]:
                 if key not in named:
                     homes = [other for other, schema in _SETTINGS.items() if key in _fields(schema)]
                     raise source.unknown((section, key), list(named), homes)
-    return {key: default for key, default in named.items() if _is_plain(default)}
+    return {
+        key: default for key, default in named.items() if default is not inspect.Parameter.empty
+    }
 
 
-def _is_plain(value: Any) -> bool:
-    """Tell whether a file can hold a value so that the same value is read from it."""
-    if isinstance(value, list):
-        return all(map(_is_plain, value))
+_NOT_PLAIN = object()
+
+
+def _as_plain(value: Any) -> Any:
+    """Return what a file holds to mean ``value``; ``_NOT_PLAIN`` if there is no such thing."""
+    if isinstance(value, list | tuple):
+        items = [_as_plain(item) for item in value]
+        return _NOT_PLAIN if any(item is _NOT_PLAIN for item in items) else items
     if isinstance(value, dict):
-        return all(isinstance(key, str) and _is_plain(item) for key, item in value.items())
-    if isinstance(value, float):
-        return abs(value) < float("inf")
-    return value is None or isinstance(value, bool | int | str)
+        values = {key: _as_plain(item) for key, item in value.items()}
+        plain = all(isinstance(key, str) for key in values) and not any(
+            item is _NOT_PLAIN for item in values.values()
+        )
+        return values if plain else _NOT_PLAIN
+    # Exactly these types: a subclass (an enumeration, a NumPy number) would come back as another.
+    if value is None or type(value) in (bool, str):
+        return value
+    if type(value) is int:
+        return value if -(2**63) <= value < 2**63 else _NOT_PLAIN
+    if type(value) is float:
+        return value if abs(value) < float("inf") else _NOT_PLAIN
+    return _NOT_PLAIN
 
 
-def _at_mentioned_key(
+def _in_the_form_of(default: Any, value: Any) -> Any:
+    """Return ``value`` with a tuple for each list that stands where the default has a tuple.
+
+    So a constructor gets the same from a file in which its defaults are written down.
+    """
+    if not isinstance(value, list) or not isinstance(default, list | tuple):
+        return value
+    # A longer list continues like the default's last item.
+    forms = [*default[: len(value)], *default[-1:] * (len(value) - len(default))]
+    items = [_in_the_form_of(form, item) for form, item in zip(forms, value, strict=False)]
+    items += value[len(items) :]
+    return tuple(items) if isinstance(default, tuple) else items
+
+
+def _cannot_be_built(
     source: _Source, name: str, sections: Mapping[str, Mapping[str, Any]], error: Exception
-) -> ConfigurationError:
-    """Return the problem's own complaint, with the line of the first of its keys named there."""
+) -> Exception:
+    """Return the problem's own complaint, with the line of the first of its keys named there.
+
+    A complaint about no key is a defect of the problem: it comes with its frames. A defect of
+    nobody's but ours is returned as it is.
+    """
     text = str(error) or type(error).__name__
     mentioned = [
         (at.start(), (section, key))
@@ -504,9 +619,20 @@ def _at_mentioned_key(
         for key in keys
         if (at := re.search(rf"(?<!\w){re.escape(key)}(?!\w)", text))
     ]
-    if mentioned:
-        return ConfigurationError(f"{source.place(min(mentioned)[1])}: {text}")
-    return ConfigurationError(f"{source.path}: {name} cannot be built: {text}")
+    deliberate = isinstance(error, HoldfastError | msgspec.ValidationError | ValueError)
+    # What the constructor raises, ProblemBase may have wrapped.
+    cause = error.__cause__ if isinstance(error.__cause__, TypeError) else error
+    account = account_of_user_error(cause, name)
+    if deliberate and cause is error and (mentioned or account is None):
+        place = source.place(min(mentioned)[1]) if mentioned else f"{source.path}: {name}"
+        return ConfigurationError(
+            f"{place}: {text}" if mentioned else f"{place} cannot be built: {text}"
+        )
+    if account is not None:
+        return ConfigurationError(f"{source.path}: {account}")
+    if deliberate or isinstance(error, TypeError):
+        return ConfigurationError(f"{source.path}: {name} cannot be built: {text}")
+    return error
 
 
 def _members(protocol: type) -> list[str]:

@@ -195,10 +195,10 @@ def entropy(
         raise InvalidValueError(f"weights[{bad}] are all zero: one must be positive")
     if kernel.scale is not None:
         array = array * kernel.scale
-    result, _, _ = _kernel.entropies(
+    result, _, _, _ = _kernel.entropies(
         array,
         rows,
-        True,
+        False,
         kernel.mixture,
         kernel.neighbors,
         kernel.resolution,

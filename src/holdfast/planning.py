@@ -27,13 +27,13 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from holdfast import sensing
-from holdfast.belief import Belief, estimate, resample, update
+from holdfast import contract, sensing
+from holdfast.belief import Belief, estimate, resample, uniform_weights, update
 from holdfast.errors import CheckpointError, InvalidValueError, ProblemError
 from holdfast.problems.problem import Problem
 from holdfast.randomness import Purpose, stream
 from holdfast.sensing import SensingInfo
-from holdfast.settings import MAX_PARTICLES, PlanningSettings
+from holdfast.settings import MAX_PARTICLES, PlanningSettings, check_settings
 
 __all__ = [
     "ObservationInfo",
@@ -140,9 +140,11 @@ def initial_state(
         raise InvalidValueError(
             f"particle_filter.num_particles {count}: allowed are 1 to {MAX_PARTICLES}"
         )
-    states = problem.initial_states(stream(seed, trial, 0, Purpose.INITIAL_BELIEF), count)
-    _check_states(problem, "initial_states", states, (count, problem.state_size))
-    return PlanningState(seed, trial, 0, 0, False, Belief.uniform(states))
+    contract.check_problem(problem)
+    check_settings(settings)
+    drawn = problem.initial_states(stream(seed, trial, 0, Purpose.INITIAL_BELIEF), count)
+    states = contract.states_of(problem, "initial_states", drawn, (count, problem.state_size))
+    return PlanningState(seed, trial, 0, 0, False, Belief(states, uniform_weights(count)))
 
 
 def check_state(problem: Problem, settings: PlanningSettings, state: PlanningState) -> None:
@@ -153,6 +155,8 @@ def check_state(problem: Problem, settings: PlanningSettings, state: PlanningSta
     InvalidValueError
         If the number of particles, their size or the stage is another than theirs.
     """
+    contract.check_problem(problem)
+    check_settings(settings)
     count, size = state.belief.states.shape
     if size != problem.state_size:
         raise InvalidValueError(
@@ -266,9 +270,9 @@ def choose_task_action(
     """
     del settings  # the choice of the estimate will be one; callers should not have to change then
     mean = estimate(state.belief)
-    stage = int(problem.next_stage(mean, state.stage))
-    commanded = problem.policy(mean, stage)
-    action = problem.execute(commanded)
+    stage = contract.next_stage(problem, mean, state.stage)
+    commanded = contract.policy(problem, mean, stage)
+    action = contract.executed_action(problem, commanded)
     if not np.isfinite(action).all():
         raise ProblemError(f"policy of {problem.name} gives {action} in state {mean}")
     return action, TaskInfo(mean, commanded, stage)
@@ -301,26 +305,14 @@ def advance(
             f"task action {action}: {problem.name} needs {problem.action_size} finite coordinates"
         )
     belief = state.belief
-    stage = int(problem.next_stage(estimate(belief), state.stage))
+    # Computed again, not taken from whoever calls: the action may come from another machine.
+    stage = contract.next_stage(problem, estimate(belief), state.stage)
     motion = stream(state.seed, state.trial, state.step, Purpose.PREDICTION)
-    states = problem.move(belief.states, action, motion)
-    _check_states(problem, "move", states, belief.states.shape)
+    moved = problem.move(belief.states, action, motion)
+    states = contract.states_of(problem, "move", moved, belief.states.shape)
     return PlanningState(
         state.seed, state.trial, state.step + 1, stage, False, Belief(states, belief.weights)
     )
-
-
-def _check_states(
-    problem: Problem, function: str, states: FloatArray, shape: tuple[int, ...]
-) -> None:
-    if states.shape != shape or states.dtype != np.float64:
-        raise ProblemError(
-            f"{function} of {problem.name} returned {states.dtype} of shape {states.shape}: need "
-            f"float64 of shape {shape}"
-        )
-    if not np.isfinite(states).all():
-        bad = int(np.argmin(np.isfinite(states).all(axis=1)))
-        raise ProblemError(f"{function} of {problem.name} put particle {bad} at {states[bad]}")
 
 
 def digest(state: PlanningState) -> bytes:
@@ -408,6 +400,8 @@ def decode_checkpoint(data: bytes) -> PlanningState:
         )
     states = np.frombuffer(content.states, dtype="<f8").astype(np.float64).reshape(count, size)
     weights = np.frombuffer(content.weights, dtype="<f8").astype(np.float64)
+    states.setflags(write=False)
+    weights.setflags(write=False)
     if not np.isfinite(states).all():
         raise CheckpointError("checkpoint has a state that is not finite")
     if not (weights >= 0.0).all() or not abs(float(weights.sum()) - 1.0) < 1e-6:

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from holdfast import _kernel, numerics
+from holdfast import _kernel, contract, numerics
 from holdfast.belief import Belief
 from holdfast.entropy import (
     LARGEST,
@@ -114,9 +114,10 @@ def choose_sensing_action(
     points = points_of(belief.states, stage)
     estimator = _estimator(problem, settings, belief, points)
     threads = settings.active_sensing.num_cores
-    if hasattr(problem, "log_likelihood"):
+    log_weights = None
+    if contract.has_general_observations(problem):
         log_weights = _general_log_weights(problem, settings, belief, hypotheses)
-        samples, likelihoods, visits = _entropies(points, log_weights, False, estimator, threads)
+        samples, likelihoods, visits = _entropies(points, log_weights, True, estimator, threads)
         samples = samples.reshape(count, -1)
         entropies = _row_means(samples)
     else:
@@ -137,7 +138,9 @@ def choose_sensing_action(
             threads,
         )
     if settings.active_sensing.horizon > 1:
-        later = _later_entropies(problem, settings, belief, stage, hypotheses, estimator, points_of)
+        later = _later_entropies(
+            problem, settings, belief, stage, hypotheses, estimator, points_of, log_weights
+        )
         samples = samples + later
         entropies = _row_means(samples)
     index = int(entropies.argmin())
@@ -157,18 +160,15 @@ def _points_of(
     if settings.selector.method == "state_entropy":
         return lambda states, _: states
     if settings.selector.actions == "executed":
-        return lambda states, stage: problem.execute(problem.policy(states, stage))
-    return problem.policy
+        return lambda states, stage: contract.executed_action(
+            problem, contract.policy(problem, states, stage)
+        )
+    return lambda states, stage: contract.policy(problem, states, stage)
 
 
 def _estimator(
     problem: Problem, settings: PlanningSettings, belief: Belief, points: FloatArray
 ) -> KernelEstimator:
-    if points.ndim != 2 or points.shape[0] != belief.states.shape[0]:
-        raise ProblemError(
-            f"policy of {problem.name} returned shape {points.shape} for states of shape "
-            f"{belief.states.shape}: need ({belief.states.shape[0]}, {problem.action_size})"
-        )
     if (bad := first_unbounded(points)) is not None:
         raise ProblemError(
             f"policy of {problem.name} returned {points[bad]} in state {belief.states[bad]}: every "
@@ -208,8 +208,8 @@ def _predictions(problem: Problem, belief: Belief) -> tuple[list[int], FloatArra
     means = []
     variances = []
     for action in range(len(problem.sensing_actions)):
-        means.append(problem.observation_mean(states, action))
-        variances.append(problem.observation_variance(states, action))
+        means.append(contract.observation_mean(problem, states, action))
+        variances.append(contract.observation_variance(problem, states, action, means[-1]))
     sizes = [mean.shape[-1] for mean in means]
     predicted = np.empty((sum(sizes), count))
     varying = any(variance.ndim > 1 for variance in variances)
@@ -251,7 +251,7 @@ def _general_log_weights(
                 hypotheses.substream(_GENERAL_OBSERVATIONS).substream(i),
             )
             rows.append(
-                log_prior + problem.log_likelihood(belief.states, action, observation)  # type: ignore[attr-defined]
+                log_prior + contract.log_likelihood(problem, belief.states, action, observation)
             )
     return np.ascontiguousarray(rows, dtype=np.float64)
 
@@ -268,14 +268,14 @@ def _stratified(weights: FloatArray, samples: int, stream: Stream) -> list[int]:
 def _entropies(
     points: FloatArray,
     weights: FloatArray,
-    normalized: bool,
+    logarithms: bool,
     estimator: KernelEstimator,
     threads: int,
 ) -> tuple[FloatArray, int, int]:
-    result, likelihoods, visits = _kernel.entropies(
+    result, likelihoods, visits, _ = _kernel.entropies(
         np.ascontiguousarray(points if estimator.scale is None else points * estimator.scale),
         weights,
-        normalized,
+        logarithms,
         estimator.mixture,
         estimator.neighbors,
         estimator.resolution,
@@ -294,6 +294,7 @@ def _later_entropies(
     hypotheses: Stream,
     estimator: KernelEstimator,
     points_of: Callable[[FloatArray, int], FloatArray],
+    log_weights: FloatArray | None,
 ) -> FloatArray:
     """Return the discounted entropies of the steps after the first, shape (J, M).
 
@@ -303,10 +304,11 @@ def _later_entropies(
     sensing = settings.active_sensing
     samples = sensing.num_observation_samples
     actions = len(problem.sensing_actions)
-    if hasattr(problem, "log_likelihood"):
-        log_weights = _general_log_weights(problem, settings, belief, hypotheses)
-        rows = [_kernel.normalize(row, True)[0] for row in log_weights]
-        weights = np.array(rows).reshape(actions, samples, -1)
+    if log_weights is not None:
+        rows = [_kernel.normalize(row, True) for row in log_weights]
+        weights = np.array([row for row, _ in rows]).reshape(actions, samples, -1)
+        if not all(survivors for _, survivors in rows):
+            return np.full((actions, samples), np.nan)
     else:
         sizes, predicted, variance = _predictions(problem, belief)
         weights = _kernel.hypothetical_weights(
@@ -322,12 +324,15 @@ def _later_entropies(
             factor = 1.0
             for step in range(1, sensing.horizon):
                 mean = _kernel.weighted_sums(own_weights, states)
-                own_stage = int(problem.next_stage(mean, own_stage))
-                action = problem.execute(problem.policy(mean, own_stage))
-                states = problem.move(states, action, motion.substream(i).substream(step))
+                own_stage = contract.next_stage(problem, mean, own_stage)
+                action = contract.executed_action(
+                    problem, contract.policy(problem, mean, own_stage)
+                )
+                moved = problem.move(states, action, motion.substream(i).substream(step))
+                states = contract.states_of(problem, "move", moved, states.shape)
                 factor *= sensing.discount
                 row, _, _ = _entropies(
-                    points_of(states, own_stage), own_weights.reshape(1, -1), True, estimator, 1
+                    points_of(states, own_stage), own_weights.reshape(1, -1), False, estimator, 1
                 )
                 later[j, i] += factor * row[0]
     return later

@@ -2,9 +2,9 @@
 
 Each class is one section of the configuration file and has the key names of the thesis's YAML, so
 that its files load unchanged; the fields that the thesis does not have come after its own and have
-defaults. Bounds stand beside the fields, once: the loader reports a breach of them with file, key
-and value, and the constructor helper :func:`holdfast.configuration.load` is the only way in for
-outside data.
+defaults. Bounds stand beside the fields, once. :func:`holdfast.configuration.load` reports a breach
+of them with file, line, key and value; for settings that are made in Python :func:`check_settings`
+does, without the file, at the start of every trial.
 """
 
 from __future__ import annotations
@@ -13,12 +13,15 @@ from typing import Annotated, Literal
 
 import msgspec
 
+from holdfast.errors import InvalidValueError
+
 __all__ = [
     "ActiveSensingSettings",
     "ParticleFilterSettings",
     "PlanningSettings",
     "SelectorSettings",
     "SimulatorSettings",
+    "check_settings",
 ]
 
 MAX_PARTICLES = 10_000_000
@@ -60,7 +63,8 @@ class ActiveSensingSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=T
     num_nearest_neighbors : int
         The k of the nearest-neighbour estimate; below ``num_particles``.
     num_cores : int
-        Threads of the kernel; 0 means all cores. Changes time only, never a result.
+        Threads of a decision; 0 means all cores (or what ``OMP_NUM_THREADS`` says). Changes time
+        only, never a result. Moving 4,096 particles or more always uses all cores.
     """
 
     horizon: Annotated[int, msgspec.Meta(ge=1, le=1000)] = 1
@@ -110,7 +114,7 @@ class SimulatorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True,
         Steps between two sensing steps: the robot senses at every step t with
         ``t % (sensing_intervals + 1) == 0``. (The thesis's spelling of the key.)
     verbosity : int
-        Accepted because the thesis's files have it; the log level decides here.
+        Accepted because the thesis's files have it; without effect.
     seed : int
         Seed of every random stream.
     """
@@ -138,3 +142,17 @@ class PlanningSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
     active_sensing: ActiveSensingSettings = msgspec.field(default_factory=ActiveSensingSettings)
     selector: SelectorSettings = msgspec.field(default_factory=SelectorSettings)
     sensing_interval: NonNegativeCount = 8
+
+
+def check_settings(settings: PlanningSettings) -> None:
+    """Check the bounds of settings that were made in Python.
+
+    Raises
+    ------
+    InvalidValueError
+        If a value is not what its section allows; the message names section and key.
+    """
+    try:
+        msgspec.convert(msgspec.to_builtins(settings), PlanningSettings)
+    except (msgspec.ValidationError, TypeError) as error:
+        raise InvalidValueError(f"settings: {error}") from error

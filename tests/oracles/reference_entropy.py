@@ -14,18 +14,6 @@ from scipy.special import digamma
 FloatArray = npt.NDArray[np.float64]
 
 
-def without_negligible(weights: FloatArray) -> npt.NDArray[np.bool_]:
-    """The points that count: see holdfast.entropy.NearestNeighbor."""
-    largest, total = weights.max(), weights.sum()
-    for threshold in (1e-2, 1e-3, 1e-4, 1e-5):
-        if weights[weights < threshold * largest].sum() <= 0.005 * total:
-            break
-    else:
-        threshold = 1e-6
-    kept: npt.NDArray[np.bool_] = (weights >= threshold * largest) & (weights > 0.0)
-    return kept
-
-
 def significant(weights: FloatArray) -> npt.NDArray[np.bool_]:
     """Tell which points count: all but those that weigh nothing next to the others.
 
@@ -47,7 +35,7 @@ def log_unit_ball(dimension: int) -> float:
 def nearest_neighbor_entropy(
     points: FloatArray, weights: FloatArray, neighbors: int, resolution: float
 ) -> float:
-    kept = without_negligible(weights)
+    kept = significant(weights)
     points, weights = points[kept], weights[kept] / weights[kept].sum()
     count, dimension = points.shape
     log_ball = log_unit_ball(dimension)
@@ -82,7 +70,7 @@ def nearest_neighbor_entropy(
 def gaussian_mixture_entropy(
     points: FloatArray, weights: FloatArray, variance: FloatArray, upper: bool
 ) -> float:
-    kept = without_negligible(weights)
+    kept = significant(weights)
     points, weights = points[kept], weights[kept] / weights[kept].sum()
     dimension = points.shape[1]
     c = 0.5 if upper else 0.125

@@ -1,12 +1,15 @@
 """The kernel's entropies against the same estimates written for reading.
 
 The kernel has several ways to an entropy and chooses by counts alone (cpp/src/entropy.cpp). Each
-is driven here on purpose, across dimensions, numbers of neighbours, ties, weights of zero and
-weights of very different sizes. Both sides are sums of a few thousand terms of about ten nats, each
+is driven here on purpose, and the kernel's own count of the ways shows that it was taken, across
+dimensions, numbers of neighbours, ties, weights of zero and weights of very different sizes. Both
+sides are sums of a few thousand terms of about ten nats, each
 known to a few units in 1e16, so 1e-9 is generous for rounding and small for any mistake.
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -16,7 +19,8 @@ from tests.oracles.reference_entropy import (
     significant,
 )
 
-from holdfast.entropy import GaussianMixture, NearestNeighbor, entropy
+from holdfast import _kernel
+from holdfast.entropy import GaussianMixture, NearestNeighbor, entropy, kernel_estimator
 from holdfast.problems.problem import FloatArray
 
 TOLERANCE = 1e-9
@@ -44,6 +48,8 @@ def draw_weights(
     """Return rows of weights of which ``survivors`` are not zero."""
     if kind == "equal":
         weights = np.ones((posteriors, count))
+    elif kind == "similar":  # none of them negligible
+        weights = 0.2 + rng.exponential(size=(posteriors, count))
     elif kind == "spread":
         weights = rng.exponential(size=(posteriors, count))
     else:  # over many orders of magnitude, some negligible
@@ -68,52 +74,221 @@ def assert_matches(
         assert abs(found[row] - expected) <= TOLERANCE, f"row {row}"
 
 
-# name: points, survivors of each posterior, posteriors. The name says which way it drives.
+class Ways(NamedTuple):
+    """How many posteriors went each way; those with a single point go none."""
+
+    pair_by_pair: int = 0
+    own_tree: int = 0
+    grouped: int = 0
+
+
+class Found(NamedTuple):
+    """What the kernel tells."""
+
+    entropies: FloatArray
+    visits: int
+    ways: Ways
+
+
+def find(
+    points: FloatArray, weights: FloatArray, estimator: NearestNeighbor | GaussianMixture
+) -> Found:
+    """Return what :func:`holdfast.entropy.entropy` returns, with the ways to it."""
+    kernel = kernel_estimator(estimator, points.shape[1])
+    result, _, visits, ways = _kernel.entropies(
+        points if kernel.scale is None else points * kernel.scale,
+        weights,
+        False,
+        kernel.mixture,
+        kernel.neighbors,
+        kernel.resolution,
+        kernel.exponent,
+        kernel.offset,
+        1,
+    )
+    return Found(result, visits, Ways(*ways))
+
+
+class Case(NamedTuple):
+    """Posteriors over the same points, all with as many survivors."""
+
+    points: int
+    survivors: int
+    posteriors: int
+    way: str
+
+    def expected_ways(self) -> Ways:
+        return Ways()._replace(**{self.way: self.posteriors})
+
+
+# Posteriors of 25 points and more are grouped if there are enough of them: groups have up to 32,
+# eight to a vector. Where the points are fewer than the share of a group, each gets its own tree.
 WAYS = {
-    "pair by pair, two": (10, 2, 2),
-    "pair by pair, no more than k": (30, 5, 3),
-    "pair by pair, 16 of 16": (16, 16, 1),
-    "pair by pair, 33 of 100": (100, 33, 1),
-    "pair by pair, 64 of 2000": (2000, 64, 2),
-    "grouped, 17 of 100 under many": (100, 17, 120),
-    "grouped, 64 of 64 under many": (64, 64, 32),
-    "grouped, one vector": (100, 90, 7),
-    "grouped, two vectors": (65, 65, 9),
-    "grouped, three vectors": (200, 120, 24),
-    "grouped, four vectors": (100, 80, 25),
-    "grouped, two groups": (100, 70, 33),
-    "grouped, few of the near points count": (1000, 70, 3),
-    "grouped, many leaves": (1400, 1300, 2),
-    "grouped, a quarter of many": (1200, 300, 2),
-    "own tree": (2000, 200, 2),
-    "own tree, just above pair by pair": (1100, 65, 3),
+    "pair by pair, two": Case(10, 2, 2, "pair_by_pair"),
+    "pair by pair, no more than k": Case(30, 5, 3, "pair_by_pair"),
+    "pair by pair, a single full vector": Case(8, 8, 1, "pair_by_pair"),
+    "pair by pair, the most": Case(24, 24, 5, "pair_by_pair"),
+    "pair by pair, the most of many": Case(500, 24, 40, "pair_by_pair"),
+    "own tree, the fewest": Case(25, 25, 1, "own_tree"),
+    "own tree, the fewest of many": Case(1000, 25, 3, "own_tree"),
+    "own tree, alone": Case(300, 300, 1, "own_tree"),
+    "own tree, too few to share": Case(800, 64, 40, "own_tree"),
+    "own tree, more points than candidates": Case(1400, 1300, 1, "own_tree"),
+    "own tree, two of most points": Case(1100, 1080, 2, "own_tree"),
+    "grouped, the fewest points": Case(26, 26, 32, "grouped"),
+    "grouped, one vector, three": Case(500, 500, 3, "grouped"),
+    "grouped, one vector, full": Case(300, 290, 8, "grouped"),
+    "grouped, two vectors, nine": Case(300, 270, 9, "grouped"),
+    "grouped, two vectors, full": Case(400, 240, 16, "grouped"),
+    "grouped, three vectors, seventeen": Case(600, 320, 17, "grouped"),
+    "grouped, three vectors, full": Case(300, 165, 24, "grouped"),
+    "grouped, four vectors, twenty-five": Case(500, 200, 25, "grouped"),
+    "grouped, four vectors, full": Case(320, 300, 32, "grouped"),
+    "grouped, a third of the points": Case(1000, 330, 20, "grouped"),
+    "grouped, more points than candidates": Case(1400, 470, 12, "grouped"),
+    "grouped, a group of one": Case(300, 200, 33, "grouped"),
+    "grouped, two groups": Case(300, 250, 45, "grouped"),
+}
+
+# For each dimension a kind of points and a resolution: sparse and dense next to it, and in between.
+POINTS = {
+    1: ("spread", 0.01),
+    2: ("grid", 0.5),
+    3: ("spread", 1e-9),
+    4: ("clusters", 0.3),
+    5: ("spread", 20.0),
+    6: ("half at rest", 1e-9),
 }
 
 
-@pytest.mark.parametrize("dimension", [1, 2, 3, 6])
+@pytest.mark.parametrize("neighbors", [1, 5, 8, 9, 12, 30])
 @pytest.mark.parametrize("way", WAYS)
-def test_every_way(way: str, dimension: int) -> None:
-    """Each with sparse and with dense points next to the resolution, and in between."""
-    count, survivors, posteriors = WAYS[way]
-    rng = np.random.default_rng([count, survivors, posteriors, dimension])
-    for kind, resolution in (("spread", 1e-3), ("clusters", 0.3), ("grid", 0.5), ("spread", 3.0)):
-        points = draw_points(rng, kind, count, dimension)
-        weights = draw_weights(rng, "spread", posteriors, count, survivors)
-        some = rng.choice(posteriors, size=min(posteriors, 2), replace=False)
-        assert_matches(points, weights, 5, resolution, sorted(some.tolist()))
+def test_every_way(way: str, neighbors: int) -> None:
+    case = WAYS[way]
+    rng = np.random.default_rng([*case[:3], neighbors])
+    # Half of the dimensions with one number of neighbours, half with the next.
+    for dimension in (1, 4, 5) if neighbors in (1, 8, 12) else (2, 3, 6):
+        kind, resolution = POINTS[dimension]
+        points = draw_points(rng, kind, case.points, dimension)
+        weights = draw_weights(rng, "similar", case.posteriors, case.points, case.survivors)
+        k = min(neighbors, case.points - 1)
+        found = find(points, weights, NearestNeighbor(k, resolution))
+        assert found.ways == case.expected_ways(), f"dimension {dimension}"
+        # One posterior of the first vector or of the last one.
+        row = int(rng.choice([0, case.posteriors - 1]))
+        expected = nearest_neighbor_entropy(points, weights[row], k, resolution)
+        assert abs(found.entropies[row] - expected) <= TOLERANCE, f"dimension {dimension}"
 
 
-@pytest.mark.parametrize("neighbors", [1, 5, 12, 30])
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize(
+    "way",
+    ["own tree, alone", "own tree, more points than candidates", "grouped, two vectors, full"],
+)
+def test_balls_and_lists(way: str, dimension: int) -> None:
+    """Told apart by what is looked at.
+
+    With all points nearer than the resolution, the ball of each leaf is the whole tree, which is
+    looked at once. With none nearer, each point has a list, of the points of its leaf at least.
+    """
+    case = WAYS[way]
+    rng = np.random.default_rng([5, dimension])
+    points = draw_points(rng, "spread", case.points, dimension)
+    weights = draw_weights(rng, "similar", case.posteriors, case.points, case.survivors)
+    for resolution, least, most in (
+        (1e3, 1, case.points // 8),
+        (1e-9, 16 * case.survivors, np.inf),
+    ):
+        found = find(points, weights, NearestNeighbor(5, resolution))
+        assert found.ways == case.expected_ways()
+        assert least <= found.visits <= most
+        expected = nearest_neighbor_entropy(points, weights[0], 5, resolution)
+        assert abs(found.entropies[0] - expected) <= TOLERANCE
+
+
+@pytest.mark.parametrize("posteriors", [1, 33])
+def test_a_point_among_its_copies(posteriors: int) -> None:
+    """A point's list holds itself among its copies, and points without weight among the others.
+
+    All but the copies are far away from each other, so that the lists of their leaf are done early.
+    Few arrangements of a leaf are critical, so there are many small cases.
+    """
+    for seed in range(300):
+        rng = np.random.default_rng([4, seed])
+        count = int(rng.integers(48, 130)) if posteriors == 1 else int(rng.integers(130, 200))
+        points = rng.normal(size=(count, int(rng.integers(1, 4)))) * 1e3
+        points[rng.permutation(count)[: int(rng.integers(2, 40))]] = 0.0
+        survivors = count if posteriors == 1 else 2 * count // 3
+        weights = draw_weights(rng, "similar", posteriors, count, survivors)
+        neighbors = int(rng.choice([1, 2, 3, 9]))
+        found = find(points, weights, NearestNeighbor(neighbors, 1e-3))
+        assert found.ways == (Ways(own_tree=1) if posteriors == 1 else Ways(grouped=33))
+        expected = nearest_neighbor_entropy(points, weights[-1], neighbors, 1e-3)
+        assert abs(found.entropies[-1] - expected) <= TOLERANCE, f"seed {seed}"
+
+
+@pytest.mark.parametrize("neighbors", [8, 9, 12, 30])
+@pytest.mark.parametrize("dimension", [1, 2, 3, 6])
+def test_lists_that_end_before_the_last_neighbour(neighbors: int, dimension: int) -> None:
+    """Posteriors with a third of the points: of the nearest 64 only some 20 have weight."""
+    rng = np.random.default_rng([6, dimension])
+    points = draw_points(rng, "spread", 900, dimension)
+    for posteriors, survivors in ((8, 330), (14, 300), (20, 290), (32, 280)):
+        weights = draw_weights(rng, "similar", posteriors, 900, survivors)
+        found = find(points, weights, NearestNeighbor(neighbors, 1e-9))
+        assert found.ways == Ways(grouped=posteriors)
+        for row in (0, posteriors - 1):
+            expected = nearest_neighbor_entropy(points, weights[row], neighbors, 1e-9)
+            assert abs(found.entropies[row] - expected) <= TOLERANCE
+        if neighbors == 30:
+            # The lists are as long as for 9 neighbours, so what is looked at beyond are searches:
+            # at least a leaf of 16 points for a fifth of the terms.
+            lists = find(points, weights, NearestNeighbor(9, 1e-9)).visits
+            assert found.visits > lists + 3 * posteriors * survivors
+
+
+def test_all_ways_in_one_call() -> None:
+    """Posteriors of every size, each in its own place of the result."""
+    rng = np.random.default_rng(8)
+    count = 400
+    sizes = [1, 2, 24, 25, 30] + [390, 300, 200, 150] * 4 + [1, 40, 10]
+    rng.shuffle(sizes)
+    points = draw_points(rng, "grid", count, 3)
+    weights = np.concatenate([draw_weights(rng, "similar", 1, count, size) for size in sizes])
+    variance = np.full(3, 0.01)
+    for estimator in (NearestNeighbor(5, 0.2), GaussianMixture(variance)):
+        found = find(points, weights, estimator)
+        assert found.ways == Ways(pair_by_pair=3, own_tree=3, grouped=16)
+        for row in range(len(sizes)):
+            expected = (
+                nearest_neighbor_entropy(points, weights[row], 5, 0.2)
+                if isinstance(estimator, NearestNeighbor)
+                else gaussian_mixture_entropy(points, weights[row], variance, upper=True)
+            )
+            assert abs(found.entropies[row] - expected) <= TOLERANCE, f"{sizes[row]} points"
+
+
+@pytest.mark.parametrize("neighbors", [1, 5, 8, 9, 12, 30])
 @pytest.mark.parametrize(
     "kind", ["spread", "grid", "line", "half at rest", "clusters", "one place"]
 )
 def test_ties_and_numbers_of_neighbours(kind: str, neighbors: int) -> None:
     rng = np.random.default_rng([neighbors, len(kind)])
-    for count, survivors, posteriors in ((33, 33, 1), (100, 85, 9), (300, 290, 3), (1300, 250, 1)):
-        for dimension, resolution in ((1, 0.01), (2, 0.1), (3, 1.0), (4, 1e-6), (5, 0.5)):
-            points = draw_points(rng, kind, count, dimension)
-            weights = draw_weights(rng, "spread", posteriors, count, survivors)
-            assert_matches(points, weights, neighbors, resolution, [posteriors - 1])
+    for case in (
+        Case(24, 20, 2, "pair_by_pair"),
+        Case(33, 33, 1, "own_tree"),
+        Case(1300, 150, 1, "own_tree"),
+        Case(100, 85, 24, "grouped"),
+        Case(300, 290, 8, "grouped"),
+    ):
+        k = min(neighbors, case.points - 1)
+        for dimension, resolution in ((1, 0.01), (2, 0.1), (3, 1.0), (4, 1e-9), (5, 0.5)):
+            points = draw_points(rng, kind, case.points, dimension)
+            weights = draw_weights(rng, "similar", case.posteriors, case.points, case.survivors)
+            found = find(points, weights, NearestNeighbor(k, resolution))
+            assert found.ways == case.expected_ways()
+            expected = nearest_neighbor_entropy(points, weights[-1], k, resolution)
+            assert abs(found.entropies[-1] - expected) <= TOLERANCE
 
 
 @pytest.mark.parametrize("weighting", ["equal", "spread", "extreme"])
@@ -205,28 +380,18 @@ def test_anything(seed: int) -> None:
         assert_matches(points, weights, min(neighbors, count - 1), resolution, rows)
 
 
-MIXTURES = {
-    "pair by pair": (40, 40, 1),
-    "grouped": (100, 90, 9),
-    "grouped, four vectors": (300, 300, 32),
-    "grouped, many leaves": (1100, 1100, 1),
-    "own tree": (1100, 200, 1),
-}
-
-
 @pytest.mark.parametrize("upper", [True, False])
-@pytest.mark.parametrize("dimension", [1, 2, 3, 6])
-@pytest.mark.parametrize("way", MIXTURES)
-def test_gaussian_mixture(way: str, dimension: int, upper: bool) -> None:
+@pytest.mark.parametrize("way", WAYS)
+def test_gaussian_mixture(way: str, upper: bool) -> None:
     """Narrow components, which do not reach each other, wide ones, and both."""
-    count, survivors, posteriors = MIXTURES[way]
-    rng = np.random.default_rng([count, survivors, dimension])
-    for kind in ("spread", "grid", "clusters"):
-        for deviation in (0.01, 0.3, 5.0):
-            points = draw_points(rng, kind, count, dimension)
-            weights = draw_weights(rng, "spread", posteriors, count, survivors)
+    case = WAYS[way]
+    rng = np.random.default_rng([*case[:3], 2])
+    for dimension in (1, 2, 6) if upper else (3, 4, 5):
+        for kind, deviation in (("spread", 0.3), ("grid", 5.0), ("clusters", 0.01)):
+            points = draw_points(rng, kind, case.points, dimension)
+            weights = draw_weights(rng, "similar", case.posteriors, case.points, case.survivors)
             variance = deviation**2 * rng.uniform(0.5, 2.0, size=dimension)
-            found = entropy(points, weights, GaussianMixture(variance, upper))
-            assert isinstance(found, np.ndarray)
+            found = find(points, weights, GaussianMixture(variance, upper))
+            assert found.ways == case.expected_ways()
             expected = gaussian_mixture_entropy(points, weights[-1], variance, upper)
-            assert abs(found[-1] - expected) <= TOLERANCE
+            assert abs(found.entropies[-1] - expected) <= TOLERANCE

@@ -86,7 +86,7 @@ static std::size_t normalize(const double* log_weights, std::size_t count, bool 
     return normalize_in_place(weights, count, largest, drop_negligible);
 }
 
-/// log w_n - sum over c of (z_c - h_c(x_n))^2 / (2 R_c) + log R_c / 2, then normalised.
+/// log w_n - sum over c of ((z_c - h_c(x_n))^2 / (2 R_c) + log(R_c) / 2), then normalised.
 static std::size_t posterior(const PosteriorInput& in, double* weights) {
     const bool varying = in.log_normalizer != nullptr;
     Lanes largest = splat(-__builtin_inf());

@@ -7,7 +7,16 @@ is holdfast's. Write a class with the members of :class:`Problem`; subclassing i
 
 Arrays of states have any leading batch shape and the state's coordinates last: ``(state_size,)`` is
 one state, ``(num_particles, state_size)`` a belief, ``(trials, num_particles, state_size)`` many.
-A function is called with any of these and returns the same leading shape.
+A function is called with any of these and returns the same leading shape, as float64. The arrays
+that it is given are read-only: make a new one instead of changing them.
+
+Observations are Gaussian, by :meth:`Problem.observation_mean` and
+:meth:`Problem.observation_variance`, unless the problem has the two methods of
+:class:`GeneralObservationProblem`.
+
+Random numbers come from the :class:`~holdfast.randomness.Stream` that a function is given:
+``stream.normal(shape)`` and ``stream.uniform(shape)``. A stream gives the same numbers each time
+it is asked; for further ones ask ``stream.substream(1)``, ``stream.substream(2)``, ...
 
 To have the same decisions, bit for bit, on every machine, a problem uses only operations that IEEE
 754 defines exactly (``+ - * /``, ``np.sqrt``, comparisons, ``np.where``) and takes ``exp``,
@@ -26,7 +35,14 @@ import numpy.typing as npt
 from holdfast.errors import ProblemError
 from holdfast.randomness import Stream
 
-__all__ = ["FloatArray", "IntArray", "Problem", "ProblemBase", "Scene"]
+__all__ = [
+    "FloatArray",
+    "GeneralObservationProblem",
+    "IntArray",
+    "Problem",
+    "ProblemBase",
+    "Scene",
+]
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -91,6 +107,8 @@ class Problem(Protocol):
         noise's standard deviation), in the actions' unit.
     motion_variance : array of shape (action_size,)
         Variance of the noise on an executed action, for the Gaussian-mixture entropy.
+    state_labels : sequence of str
+        Names of the state's coordinates with units, for figures; empty for none.
     """
 
     name: str
@@ -147,6 +165,31 @@ class Problem(Protocol):
 
     def scene(self) -> Scene | None:
         """Return what can be drawn, or None."""
+        ...
+
+
+class GeneralObservationProblem(Protocol):
+    """Two more methods, for observations that are not Gaussian. Both or neither.
+
+    With them ``observation_mean`` and ``observation_variance`` are not used and need not be there.
+    Sensing costs more: the likelihood is evaluated in Python, once for each hypothetical
+    observation.
+    """
+
+    def log_likelihood(
+        self, states: FloatArray, sensing_action: int, observation: FloatArray
+    ) -> FloatArray:
+        """Return log p(observation | state) for each state, up to one constant.
+
+        ``states`` has the shape ``(num_particles, state_size)``, the result ``(num_particles,)``.
+        Minus infinity where a state cannot have made the observation; never NaN or plus infinity.
+        """
+        ...
+
+    def sample_observation(
+        self, state: FloatArray, sensing_action: int, stream: Stream
+    ) -> FloatArray:
+        """Draw an observation in one state, shape ``(observation_size,)``."""
         ...
 
 

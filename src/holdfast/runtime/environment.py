@@ -11,6 +11,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 import numpy.typing as npt
 
+from holdfast import contract
 from holdfast.errors import InvalidValueError
 from holdfast.problems.problem import Problem
 from holdfast.randomness import Purpose, stream
@@ -63,7 +64,9 @@ class SimulatedEnvironment:
         self._trial = trial
         self.step = 0
         initial = stream(seed, trial, 0, Purpose.WORLD_INITIAL_STATE)
-        self.state: FloatArray = problem.initial_states(initial, 1)[0]
+        drawn = problem.initial_states(initial, 1)
+        shape = (1, problem.state_size)
+        self.state: FloatArray = contract.states_of(problem, "initial_states", drawn, shape)[0]
 
     def perform_sensing(self, sensing_action: int) -> FloatArray:
         """Draw an observation of the true state.
@@ -84,18 +87,21 @@ class SimulatedEnvironment:
         if draw is not None:
             observation: FloatArray = draw(self.state, sensing_action, noise)
             return observation
-        mean = problem.observation_mean(self.state, sensing_action)
-        variance = problem.observation_variance(self.state, sensing_action)
+        mean = contract.observation_mean(problem, self.state, sensing_action)
+        variance = contract.observation_variance(problem, self.state, sensing_action, mean)
         shown: FloatArray = mean + np.sqrt(variance) * noise.normal(mean.shape)
         return shown
 
     def perform(self, task_action: FloatArray) -> float:
         """Move the true state by an executed task action and return the reward."""
         motion = stream(self._seed, self._trial, self.step, Purpose.WORLD_MOTION)
-        self.state = self._problem.move(self.state, task_action, motion)
+        problem = self._problem
+        moved = problem.move(self.state, task_action, motion)
+        self.state = contract.states_of(problem, "move", moved, self.state.shape)
         self.step += 1
-        return float(self._problem.reward(self.state, task_action))
+        return contract.scalar(problem, "reward", problem.reward(self.state, task_action))
 
     def is_done(self) -> bool:
         """Tell whether the true state is a goal."""
-        return bool(self._problem.is_goal(self.state))
+        problem = self._problem
+        return bool(contract.scalar(problem, "is_goal", problem.is_goal(self.state)))

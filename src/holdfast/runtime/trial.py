@@ -19,7 +19,7 @@ from typing import NamedTuple, Protocol
 import msgspec
 import numpy as np
 
-from holdfast.errors import InvalidValueError
+from holdfast.errors import InvalidValueError, ProblemError
 from holdfast.planning import (
     ObservationInfo,
     PlanningState,
@@ -254,6 +254,12 @@ def run_trial(
     -------
     TrialResult
         The outcome, with the decisions.
+
+    Raises
+    ------
+    HoldfastError
+        If holdfast refuses what the problem or the environment returned; :class:`ProblemError` for
+        a reward that is not finite.
     """
     seed = simulator.seed
     if environment is None:
@@ -286,6 +292,10 @@ def run_trial(
         executed, task_info = choose_task_action(problem, planning, state)
         reward = environment.perform(executed)
         if reward is not None:
+            if not np.isfinite(reward):
+                raise ProblemError(
+                    f"the reward of step {steps} is {float(reward)}; it must be a finite number"
+                )
             total_reward += float(reward)
         log += _TASK.pack(b"A", steps)
         log += np.asarray(executed, dtype="<f8").tobytes()

@@ -41,6 +41,7 @@ from holdfast.runtime.trial import (
     run_trial,
 )
 from holdfast.settings import PlanningSettings
+from holdfast.user_code import account_of_user_error
 
 __all__ = ["TrialCrashError", "TrialError", "WorkerDiedError", "available_cores", "run_trials"]
 
@@ -55,9 +56,11 @@ _LOOKAHEAD_S = 0.1
 
 _MAX_LOOKAHEAD = 16
 
+_ENDING_SIGNALS = frozenset({signal.SIGINT, signal.SIGTERM, signal.SIGHUP})
+
 
 class TrialError(HoldfastError):
-    """An error that holdfast raised on purpose, with the trial in which it happened."""
+    """What holdfast refused, or the problem's own code raised, with the trial where it happened."""
 
 
 class WorkerDiedError(HoldfastError):
@@ -152,7 +155,8 @@ def run_trials(
     Raises
     ------
     TrialError
-        If holdfast refuses something in a trial, for example what a problem's function returned.
+        If holdfast refuses something in a trial, for example what a problem's function returned,
+        or if such a function raises; the message then has the frames of that function.
     WorkerDiedError
         If a worker process was killed; the message names the trial that it was running.
     TrialCrashError
@@ -210,6 +214,9 @@ def _run_one(
     except HoldfastError as error:
         raise TrialError(f"{where}: {error}") from error
     except Exception as error:
+        account = account_of_user_error(error, configuration.problem_name)
+        if account is not None:
+            raise TrialError(f"{where}: {account}") from error
         error.add_note(f"in {where}")
         raise
 
@@ -249,9 +256,10 @@ def _run_in_workers(
                 mean_s = elapsed_s / count
             _feed(workers, pending, mean_s)
     finally:
-        # There is nothing to wait for: each result is sent whole or not wanted any more.
+        # There is nothing to wait for: each result is sent whole or not wanted any more. They
+        # block the gentler signals.
         for worker in workers:
-            worker.process.terminate()
+            worker.process.kill()
         for worker in workers:
             worker.process.join()
             worker.connection.close()
@@ -296,15 +304,16 @@ def _start_workers(workers: list[_Worker], configuration: Configuration, count: 
 
 @contextlib.contextmanager
 def _inherited_by_children(threads: int) -> Iterator[None]:
-    """Let children start with few threads and with SIGINT blocked.
+    """Let children start with few threads and with the signals blocked that end a run.
 
-    Ctrl-C reaches every process of the terminal; the parent alone answers it. Blocking the signal
-    here, not in the child, covers the child's first moments too, and delays it for us only.
+    Ctrl-C, a terminal that is closed and a batch system's SIGTERM reach every process of the group;
+    the parent alone answers them. Blocking the signals here, not in the child, covers the child's
+    first moments too, and delays them for us only.
     """
     variables = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
     saved = {name: os.environ.get(name) for name in variables}
     os.environ.update(dict.fromkeys(variables, str(threads)))
-    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, _ENDING_SIGNALS)
     try:
         yield
     finally:

@@ -1,0 +1,217 @@
+"""Holding problems to their contract, where what they return is used.
+
+A problem is somebody's own code, and NumPy forgives: a mean without its last axis broadcasts to
+something, a variance for one coordinate of two to something else, and the decisions are quietly
+wrong. So every array that a problem returns passes through here, and one that does not fit is an
+error that names the function, what came and what was needed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from holdfast.errors import ProblemError
+
+__all__ = [
+    "check_problem",
+    "executed_action",
+    "has_general_observations",
+    "log_likelihood",
+    "next_stage",
+    "observation_mean",
+    "observation_variance",
+    "policy",
+    "scalar",
+    "states_of",
+]
+
+FloatArray = npt.NDArray[np.float64]
+
+# The contract itself is holdfast.problems.problem.Problem. Here a problem is anything that may or
+# may not fulfil it.
+MAX_OBSERVATION_SIZE = 1024
+
+
+def check_problem(problem: Any) -> None:
+    """Check what can be checked without calling anything.
+
+    Raises
+    ------
+    ProblemError
+        If an attribute is missing or out of bounds, or only one of ``log_likelihood`` and
+        ``sample_observation`` is there.
+    """
+    kind = type(problem).__name__
+    name = getattr(problem, "name", "")
+    if not isinstance(name, str) or not name:
+        raise ProblemError(f"name of {kind} is {name!r}: must be a text, not empty")
+    for attribute in ("state_size", "action_size", "num_stages"):
+        size = getattr(problem, attribute, None)
+        if not isinstance(size, int) or size < 1:
+            raise ProblemError(f"{attribute} of {name} is {size!r}: must be a whole number >= 1")
+    actions = getattr(problem, "sensing_actions", ())
+    if isinstance(actions, str) or not isinstance(actions, Sequence) or not actions:
+        raise ProblemError(
+            f"sensing_actions of {name} is {actions!r}: must be a sequence of labels, not empty"
+        )
+    labels = getattr(problem, "state_labels", ())
+    if labels and len(labels) != problem.state_size:
+        raise ProblemError(
+            f"state_labels of {name} has {len(labels)} labels: must have {problem.state_size} or "
+            "none"
+        )
+    resolution = getattr(problem, "resolution", None)
+    if not isinstance(resolution, (int, float)) or not 0.0 < resolution < np.inf:
+        raise ProblemError(f"resolution of {name} is {resolution!r}: must be positive and finite")
+    variance = np.asarray(getattr(problem, "motion_variance", ()))
+    if variance.shape != (problem.action_size,) or not (variance >= 0.0).all():
+        raise ProblemError(
+            f"motion_variance of {name} is {variance}: must be {problem.action_size} numbers >= 0"
+        )
+    given = [
+        function
+        for function in ("log_likelihood", "sample_observation")
+        if hasattr(problem, function)
+    ]
+    if len(given) == 1:
+        raise ProblemError(
+            f"{name} has {given[0]} alone: log_likelihood and sample_observation go together"
+        )
+
+
+def has_general_observations(problem: object) -> bool:
+    """Tell whether a problem gives a likelihood of its own instead of a Gaussian one."""
+    return hasattr(problem, "log_likelihood")
+
+
+def observation_mean(problem: Any, states: FloatArray, sensing_action: int) -> FloatArray:
+    """Return the checked expected observation, shape ``(..., observation_size)``."""
+    mean = problem.observation_mean(states, sensing_action)
+    if not _is_array(mean, states.ndim) or mean.shape[:-1] != states.shape[:-1]:
+        raise _misfit(
+            problem,
+            f"observation_mean of sensing action {sensing_action}",
+            mean,
+            (*states.shape[:-1], "observation_size"),
+        )
+    if not 1 <= mean.shape[-1] <= MAX_OBSERVATION_SIZE:
+        raise ProblemError(
+            f"observation_mean of {_name(problem)} has {mean.shape[-1]} coordinates: allowed are "
+            f"1 to {MAX_OBSERVATION_SIZE}"
+        )
+    checked: FloatArray = mean
+    return checked
+
+
+def observation_variance(
+    problem: Any, states: FloatArray, sensing_action: int, mean: FloatArray
+) -> FloatArray:
+    """Return the checked variance, shape ``(observation_size,)`` or that of ``mean``."""
+    variance = problem.observation_variance(states, sensing_action)
+    if not isinstance(variance, np.ndarray) or variance.shape not in (mean.shape[-1:], mean.shape):
+        raise _misfit(
+            problem,
+            f"observation_variance of sensing action {sensing_action}",
+            variance,
+            mean.shape[-1:] if mean.ndim == 1 else f"{mean.shape[-1:]} or {mean.shape}",
+        )
+    checked: FloatArray = variance
+    return checked
+
+
+def log_likelihood(
+    problem: Any, states: FloatArray, sensing_action: int, observation: FloatArray
+) -> FloatArray:
+    """Return the checked log-likelihoods of an observation, shape ``(num_particles,)``."""
+    values = problem.log_likelihood(states, sensing_action, observation)
+    if not _is_array(values, 1) or values.shape != states.shape[:-1]:
+        raise _misfit(problem, "log_likelihood", values, states.shape[:-1])
+    if np.isnan(values).any() or (values == np.inf).any():
+        raise ProblemError(
+            f"log_likelihood of {_name(problem)}, observation {observation} under sensing action "
+            f"{sensing_action}, is NaN or plus infinity for a particle"
+        )
+    checked: FloatArray = values
+    return checked
+
+
+def policy(problem: Any, states: FloatArray, stage: int) -> FloatArray:
+    """Return the checked commanded actions, shape ``(..., action_size)``."""
+    actions = problem.policy(states, stage)
+    shape = (*states.shape[:-1], problem.action_size)
+    if not _is_array(actions, states.ndim) or actions.shape != shape:
+        raise _misfit(problem, "policy", actions, shape)
+    checked: FloatArray = actions
+    return checked
+
+
+def executed_action(problem: Any, commanded: FloatArray) -> FloatArray:
+    """Return the checked executed actions, of the shape of ``commanded``."""
+    actions = problem.execute(commanded)
+    if not _is_array(actions, commanded.ndim) or actions.shape != commanded.shape:
+        raise _misfit(problem, "execute", actions, commanded.shape)
+    checked: FloatArray = actions
+    return checked
+
+
+def next_stage(problem: Any, estimate: FloatArray, stage: int) -> int:
+    """Return the checked stage that follows."""
+    value = int(_single(problem, "next_stage", problem.next_stage(estimate, stage)))
+    if not 0 <= value < problem.num_stages:
+        raise ProblemError(
+            f"next_stage of {_name(problem)} is {value}: allowed are 0 to {problem.num_stages - 1}"
+        )
+    return value
+
+
+def states_of(
+    problem: Any, function: str, states: FloatArray, shape: tuple[int, ...]
+) -> FloatArray:
+    """Return states that a function of the problem made, checked, and read-only from now on."""
+    if not _is_array(states, len(shape)) or states.shape != shape:
+        raise _misfit(problem, function, states, shape)
+    if not np.isfinite(states).all():
+        rows = states.reshape(-1, shape[-1])
+        bad = int(np.argmin(np.isfinite(rows).all(axis=-1)))
+        raise ProblemError(f"{function} of {_name(problem)} put particle {bad} at {rows[bad]}")
+    contiguous = np.ascontiguousarray(states)
+    contiguous.setflags(write=False)
+    return contiguous
+
+
+def scalar(problem: Any, function: str, value: object) -> float:
+    """Return one number that a function of the problem gave for one state."""
+    return float(_single(problem, function, value))
+
+
+def _single(problem: Any, function: str, value: object) -> Any:
+    if value is None or isinstance(value, (str, list, tuple)) or np.ndim(value) != 0:  # type: ignore[arg-type]
+        raise _misfit(problem, function, value, ())
+    return value
+
+
+def _is_array(value: object, dimensions: int) -> bool:
+    return isinstance(value, np.ndarray) and value.dtype == np.float64 and value.ndim == dimensions
+
+
+def _name(problem: Any) -> str:
+    return getattr(problem, "name", "") or type(problem).__name__
+
+
+def _misfit(problem: Any, function: str, value: object, shape: object) -> ProblemError:
+    if isinstance(value, np.ndarray):
+        came = f"{value.dtype} of shape {value.shape}"
+    else:
+        came = f"{type(value).__name__} ({value!r:.40})"
+    need = "one number" if shape == () else f"a float64 array of shape {_written(shape)}"
+    return ProblemError(f"{function} of {_name(problem)} returned {came}: need {need}")
+
+
+def _written(shape: object) -> str:
+    if isinstance(shape, tuple):
+        return f"({', '.join(map(str, shape))}{',' if len(shape) == 1 else ''})"
+    return str(shape)

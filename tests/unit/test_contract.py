@@ -1,0 +1,175 @@
+"""What a problem returns is checked where it is used, by name, shape and value."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from holdfast import planning
+from holdfast.errors import InvalidValueError, ProblemError
+from holdfast.problems.problem import FloatArray, IntArray, ProblemBase
+from holdfast.randomness import Stream
+from holdfast.runtime.environment import SimulatedEnvironment
+from holdfast.settings import (
+    ActiveSensingSettings,
+    ParticleFilterSettings,
+    PlanningSettings,
+    SelectorSettings,
+    check_settings,
+)
+
+SETTINGS = PlanningSettings(particle_filter=ParticleFilterSettings(num_particles=30))
+
+
+class Line(ProblemBase):
+    """A point on a line with two coordinates, of which each sensing action shows one."""
+
+    name = "line"
+    state_size = 2
+    action_size = 1
+    sensing_actions: Any = ("first", "second")
+    motion_variance = np.array([0.01])
+
+    def initial_states(self, stream: Stream, count: int) -> FloatArray:
+        return stream.normal((count, 2))
+
+    def move(self, states: FloatArray, actions: FloatArray, stream: Stream) -> FloatArray:
+        return states + actions + 0.1 * stream.normal(states.shape)
+
+    def observation_mean(self, states: FloatArray, sensing_action: int) -> FloatArray:
+        return states[..., sensing_action : sensing_action + 1]
+
+    def observation_variance(self, states: FloatArray, sensing_action: int) -> FloatArray:
+        return np.array([0.01])
+
+    def policy(self, states: FloatArray, stage: int | IntArray) -> FloatArray:
+        return -states[..., :1]
+
+    def is_goal(self, states: FloatArray) -> Any:
+        return np.abs(states[..., 0]) < 0.1
+
+
+def run_a_step(problem: Any) -> None:
+    environment = SimulatedEnvironment(problem, 0, 0)
+    state = planning.initial_state(problem, SETTINGS, 0, 0)
+    action, _ = planning.choose_sensing_action(problem, SETTINGS, state)
+    state, _ = planning.observe(
+        problem, SETTINGS, state, action, environment.perform_sensing(action)
+    )
+    task_action, _ = planning.choose_task_action(problem, SETTINGS, state)
+    environment.perform(task_action)
+    environment.is_done()
+    planning.advance(problem, SETTINGS, state, task_action)
+
+
+def test_a_problem_that_keeps_the_contract_runs() -> None:
+    run_a_step(Line())
+
+
+MISFITS: dict[str, tuple[str, Any, str]] = {
+    "mean without its axis": (
+        "observation_mean",
+        lambda _self, states, action: states[..., action],
+        r"observation_mean of sensing action 0 of line returned float64 of shape \(.*\): need",
+    ),
+    "constant mean": (
+        "observation_mean",
+        lambda _self, _states, _action: np.zeros(1),
+        "observation_mean of sensing action 0 of line returned float64 of shape",
+    ),
+    "variance as a number": (
+        "observation_variance",
+        lambda _self, _states, _action: 0.01,
+        r"observation_variance of sensing action 0 of line returned float \(0.01\): need",
+    ),
+    "variance of another size": (
+        "observation_variance",
+        lambda _self, _states, _action: np.array([0.01, 0.01]),
+        r"observation_variance of sensing action 0 of line returned float64 of shape \(2,\)",
+    ),
+    "policy of another width": (
+        "policy",
+        lambda _self, states, _stage: -states,
+        r"policy of line returned float64 of shape \(30, 2\): need .* \(30, 1\)",
+    ),
+    "policy as a list": (
+        "policy",
+        lambda _self, states, _stage: [[0.0]] * len(states),
+        "policy of line returned list",
+    ),
+    "move without return": ("move", lambda *_: None, "move of line returned NoneType"),
+    "stage out of range": (
+        "next_stage",
+        lambda *_: 7,
+        "next_stage of line is 7: allowed are 0 to 0",
+    ),
+    "several rewards": (
+        "reward",
+        lambda *_: np.zeros(3),
+        r"reward of line returned float64 of shape \(3,\): need one number",
+    ),
+    "several goals": ("is_goal", lambda *_: np.array([True]), "is_goal of line returned bool"),
+    "integer states": (
+        "initial_states",
+        lambda _self, _stream, count: np.zeros((count, 2), np.int64),
+        "initial_states of line returned int64",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", MISFITS)
+def test_a_misfit_is_named(case: str) -> None:
+    function, replacement, message = MISFITS[case]
+    with pytest.raises(ProblemError, match=message):
+        run_a_step(type("Misfit", (Line,), {function: replacement})())
+
+
+@pytest.mark.parametrize(
+    ("attribute", "value", "message"),
+    [
+        ("name", "", "name of .* is ''"),
+        ("state_size", 0, "state_size of line is 0"),
+        ("sensing_actions", "abcd", "sensing_actions of line is 'abcd'"),
+        ("sensing_actions", (), "sensing_actions of line"),
+        ("state_labels", ("x",), "state_labels of line has 1 labels: must have 2"),
+        ("resolution", 0.0, "resolution of line is 0.0"),
+        ("motion_variance", np.array([0.1, 0.1]), "motion_variance of line"),
+        ("log_likelihood", lambda *_: 0.0, "log_likelihood alone"),
+        ("sample_observation", lambda *_: 0.0, "sample_observation alone"),
+    ],
+)
+def test_an_attribute_is_named(attribute: str, value: object, message: str) -> None:
+    broken: Any = type("Broken", (Line,), {attribute: value})()
+    with pytest.raises(ProblemError, match=message):
+        planning.initial_state(broken, SETTINGS, 0, 0)
+
+
+@pytest.mark.parametrize("function", ["policy", "move", "observation_mean"])
+def test_a_function_cannot_change_the_belief(function: str) -> None:
+    def in_place(_self: Line, states: FloatArray, *_: object) -> FloatArray:
+        states += 1.0
+        return states
+
+    broken: Any = type("InPlace", (Line,), {function: in_place})()
+    with pytest.raises(ValueError, match="read-only"):
+        run_a_step(broken)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        (PlanningSettings(selector=SelectorSettings(method="entropy")), r"selector\.method"),  # type: ignore[arg-type]
+        (PlanningSettings(selector=SelectorSettings(estimator="knn")), r"selector\.estimator"),  # type: ignore[arg-type]
+        (PlanningSettings(active_sensing=ActiveSensingSettings(horizon=0)), "horizon"),
+        (PlanningSettings(active_sensing=ActiveSensingSettings(discount=5.0)), "discount"),
+        (PlanningSettings(sensing_interval=-1), "sensing_interval"),
+        (PlanningSettings(selector=SelectorSettings(sensing_action=-1)), "sensing_action"),
+    ],
+)
+def test_settings_made_in_python_are_checked(settings: PlanningSettings, message: str) -> None:
+    with pytest.raises(InvalidValueError, match=message):
+        check_settings(settings)
+    with pytest.raises(InvalidValueError, match=message):
+        planning.initial_state(Line(), settings, 0, 0)
