@@ -40,7 +40,7 @@ FloatArray = npt.NDArray[np.float64]
 
 # Of the definition in holdfast.entropy.NearestNeighbor: weights below one of these fractions of the
 # greatest are left out, the first that loses no more than this share of the sum, else the last.
-NEGLIGIBLE = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
+NEGLIGIBLE = tuple(10.0**-i * (1.0 - 2.0**-40) for i in range(2, 7))
 LOST_SHARE = 0.005
 # Two distances count as equal if they differ by no more than rounding.
 TIE = 1.0 + 2.0**-41

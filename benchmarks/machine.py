@@ -28,7 +28,7 @@ def describe() -> dict[str, str]:
         "processor": _processor(),
         "cores": f"{available_cores()} of {os.cpu_count()} usable",
         "memory": _memory(),
-        "system": f"{platform.system()} {platform.release()}, {platform.machine()}",
+        "system": f"{platform.system()} {_major_version(platform.release())}, {platform.machine()}",
         "Python": f"{platform.python_implementation()} {platform.python_version()}",
         "NumPy, SciPy": f"{np.__version__}, {scipy.__version__}",
         "compiler of the kernel": _compiler(),
@@ -86,3 +86,7 @@ def _commit() -> str:
     except (OSError, subprocess.CalledProcessError):
         return "commit unknown"
     return f"commit {commit}" + (" with uncommitted changes" if changed else "")
+
+
+def _major_version(release: str) -> str:
+    return ".".join(release.split(".")[:2])

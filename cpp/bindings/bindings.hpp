@@ -6,9 +6,11 @@
 #include <nanobind/ndarray.h>
 
 #include <array>
+#include <chrono>
 #include <cstddef>
 #include <cstdint>
 #include <initializer_list>
+#include <thread>
 
 #include "philox.hpp"
 #include "rounding.hpp"
@@ -39,6 +41,33 @@ Output<Value> make_array(std::initializer_list<std::size_t> shape, Value*& data)
     nanobind::capsule owner(data, [](void* p) noexcept { delete[] static_cast<Value*>(p); });
     return Output<Value>(data, shape, owner);
 }
+
+/// Lets other Python threads run while it lives.
+///
+/// When the interpreter has begun to end, Python up to 3.13 ends a thread that asks for it back, by
+/// unwinding its stack, which aborts the process where that meets a noexcept destructor. So such a
+/// thread (a daemon, since the others have been joined) waits here for the process to end.
+class WithoutInterpreter {
+  public:
+    WithoutInterpreter() : state_(PyEval_SaveThread()) {}
+    ~WithoutInterpreter() {
+        while (finalizing()) std::this_thread::sleep_for(std::chrono::hours(1));
+        PyEval_RestoreThread(state_);
+    }
+    WithoutInterpreter(const WithoutInterpreter&) = delete;
+    WithoutInterpreter& operator=(const WithoutInterpreter&) = delete;
+
+  private:
+    static bool finalizing() {
+#if PY_VERSION_HEX >= 0x030D0000
+        return Py_IsFinalizing() != 0;
+#else
+        return _Py_IsFinalizing() != 0;
+#endif
+    }
+
+    PyThreadState* state_;
+};
 
 /// Adds a function to the module; all run in the standard floating-point mode.
 template <class Function>

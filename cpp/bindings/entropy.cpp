@@ -56,7 +56,7 @@ void holdfast::bind_entropy(nb::module_& module) {
                auto result = make_array<double>({posteriors}, out);
                EntropyCounts counts;
                {
-                   nb::gil_scoped_release release;
+                   WithoutInterpreter released;
                    const VectorKernels& kernels = vector_kernels();
                    const double* rows = rows_in.data();
                    const auto source = [&](std::size_t index, double* weights) {
@@ -87,7 +87,7 @@ void holdfast::bind_entropy(nb::module_& module) {
             auto means = make_array<double>({sizes.size()}, mean);
             EntropyCounts counts;
             {
-                nb::gil_scoped_release release;
+                WithoutInterpreter released;
                 hypothetical_entropies(
                     make_input(weights, sizes, predicted, variance, samples, stream), points.data(),
                     points.shape(1),
@@ -108,7 +108,7 @@ void holdfast::bind_entropy(nb::module_& module) {
               const StreamWords& stream) {
                double* out;
                auto result = make_array<double>({sizes.size(), samples, weights.shape(0)}, out);
-               nb::gil_scoped_release release;
+               WithoutInterpreter released;
                hypothetical_weights(
                    make_input(weights, sizes, predicted, variance, samples, stream), out);
                return result;

@@ -50,7 +50,7 @@ class ReleaseForLongWork {
     }
 
   private:
-    std::optional<nb::gil_scoped_release> release_;
+    std::optional<WithoutInterpreter> release_;
 };
 
 std::vector<AxisAlignedRectangle> rectangles(const Input<2>& limits) {

@@ -1,7 +1,9 @@
 """The command line: options in, a run, and what a person at a terminal wants to see of it.
 
-Nothing below this module prints or exits. Here an error that holdfast raises on purpose becomes one
-message and exit code 2, Ctrl-C becomes 130, and anything else is a defect and keeps its traceback.
+Nothing below this module prints or exits. Here an error that holdfast raises on purpose, or that a
+problem's own code raises, becomes one message and exit code 2; Ctrl-C, SIGTERM and a terminal that
+is closed end a run in order, with 128 and the signal's number; and anything else is a defect and
+keeps its traceback.
 
 Libraries that take long to import are imported where they are used, so that ``--help`` and a
 mistyped option answer at once.
@@ -11,7 +13,9 @@ from __future__ import annotations
 
 import contextlib
 import shlex
+import signal
 import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Annotated, Protocol
@@ -20,6 +24,7 @@ import typer
 
 from holdfast import __version__
 from holdfast.errors import HoldfastError
+from holdfast.user_code import account_of_user_error
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -34,7 +39,8 @@ if TYPE_CHECKING:
 __all__ = ["app", "main"]
 
 EXIT_ERROR = 2
-EXIT_INTERRUPTED = 130
+EXIT_SIGNAL = 128
+"""Added to the number of the signal that ended a run, as shells do it."""
 
 _RUNS = Path("runs")
 _PLAIN_INTERVAL_S = 5.0
@@ -50,19 +56,67 @@ app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
+    rich_markup_mode=None,  # its tables give flags a value and take a third of the columns
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 
 
 def main() -> None:
     """Run the command line and exit."""
+    first = sys.argv[1] if len(sys.argv) > 1 else ""
+    if first.endswith((".yaml", ".yml")):
+        command = shlex.join(["holdfast", "run", *sys.argv[1:]])
+        sys.stderr.write(f"holdfast: error: {first} is no command; did you mean: {command}\n")
+        sys.exit(EXIT_ERROR)
     try:
-        app()
+        app(prog_name="holdfast")
     except HoldfastError as error:
         sys.stderr.write(f"holdfast: error: {error}\n")
         sys.exit(EXIT_ERROR)
     except KeyboardInterrupt:
-        sys.exit(EXIT_INTERRUPTED)
+        sys.exit(EXIT_SIGNAL + signal.SIGINT)
+
+
+class _EndedBySignal(KeyboardInterrupt):
+    """A signal other than Ctrl-C's ended the run."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(number)
+        self.signal = signal.Signals(number)
+
+
+@contextlib.contextmanager
+def _ended_by_signals() -> Iterator[None]:
+    """Let SIGTERM and SIGHUP end what is inside as Ctrl-C does, and exit with their numbers."""
+
+    def end(number: int, frame: object) -> None:
+        del frame
+        # One is enough: another would cut short what the first one began.
+        for handled in saved:
+            signal.signal(handled, signal.SIG_IGN)
+        raise _EndedBySignal(number)
+
+    # What is ignored from the start stays so: nohup asks for that.
+    saved = {
+        number: before
+        for number in (signal.SIGTERM, signal.SIGHUP)
+        if (before := signal.getsignal(number)) is not signal.SIG_IGN
+    }
+    try:
+        for number in saved:
+            signal.signal(number, end)
+        yield
+    except KeyboardInterrupt as interruption:
+        raise typer.Exit(EXIT_SIGNAL + _signal_of(interruption)) from None
+    finally:
+        for number, before in saved.items():
+            signal.signal(number, before)
+
+
+def _signal_of(interruption: KeyboardInterrupt) -> signal.Signals:
+    if isinstance(interruption, _EndedBySignal):
+        return interruption.signal
+    return signal.SIGINT
 
 
 def _print_version(wanted: bool) -> None:
@@ -76,14 +130,17 @@ def _common(
     version: Annotated[
         bool,
         typer.Option(
-            "--version", callback=_print_version, is_eager=True, help="Show the version and exit."
+            "--version",
+            callback=_print_version,
+            is_eager=True,
+            help="Show the version and exit.",
         ),
     ] = False,
 ) -> None:
     del version
 
 
-@app.command(no_args_is_help=True)
+@app.command(no_args_is_help=True, short_help="Run the trials of a configuration.")
 def run(
     configuration_path: Annotated[
         Path,
@@ -119,8 +176,11 @@ def run(
             metavar="N",
             min=1,
             max=1024,
-            help="Largest number of processes. It changes time only, never a result.",
-            show_default="all cores",
+            help=(
+                "Largest number of processes (default: one for each core). It changes time only, "
+                "never a result."
+            ),
+            show_default=False,
         ),
     ] = None,
     out: Annotated[
@@ -129,19 +189,27 @@ def run(
             "--out",
             "-o",
             metavar="DIR",
-            help="Directory for the results.",
-            show_default="runs/CONFIG-seedS, numbered if taken",
+            help="Directory for the results (default: runs/CONFIG-seedS, numbered if taken).",
+            show_default=False,
         ),
     ] = None,
     resume: Annotated[
         bool,
         typer.Option(
             "--resume",
-            help="Go on with the run in DIR (by default: the latest) and run the missing trials.",
+            help=(
+                "Go on with the run in DIR (default: the latest) and run the missing trials; with "
+                "a larger --trials, more than it had."
+            ),
         ),
     ] = False,
     quiet: Annotated[
-        bool, typer.Option("--quiet", "-q", help="Show errors and nothing else.")
+        bool,
+        typer.Option(
+            "--quiet",
+            "-q",
+            help="Show no progress and no summary: only errors. The files are the same.",
+        ),
     ] = False,
 ) -> None:
     """Run the trials of CONFIG and write what they come to into a directory.
@@ -152,6 +220,21 @@ def run(
 
     Ctrl-C loses no finished trial: the same command with --resume goes on.
     """
+    with _ended_by_signals():
+        _run(configuration_path, trials, seed, problem, jobs, out, resume=resume, quiet=quiet)
+
+
+def _run(
+    configuration_path: Path,
+    trials: int | None,
+    seed: int | None,
+    problem: str | None,
+    jobs: int | None,
+    out: Path | None,
+    *,
+    resume: bool,
+    quiet: bool,
+) -> None:
     from holdfast.configuration import load
     from holdfast.recording.recorder import Recorder
     from holdfast.recording.run_directory import (
@@ -189,7 +272,9 @@ def run(
                     recorder,
                 )
             except BaseException:
-                display.stop()
+                # After SIGHUP there is no terminal to write to.
+                with contextlib.suppress(OSError):
+                    display.stop()
                 # Tables of what is finished; if the disk is the trouble, the first error says so.
                 with contextlib.suppress(HoldfastError):
                     directory.write_tables(perf_counter() - started)
@@ -199,16 +284,19 @@ def run(
             if not quiet:
                 _print_summary(summary)
             notes = _draw_figure(configuration, directory, recorder)
-        except KeyboardInterrupt:
+        except KeyboardInterrupt as interruption:
             command = _resume_command(
                 configuration_path, trials, seed, problem, jobs, directory_path
             )
             finished = directory.journal.tally().finished
-            sys.stderr.write(
-                f"\nInterrupted. {finished} of {configuration.simulator.num_trials} trials are "
-                f"finished and kept in {directory_path}\nGo on with: {command}\n"
-            )
-            raise typer.Exit(EXIT_INTERRUPTED) from None
+            ended = _signal_of(interruption)
+            how = "Interrupted" if ended == signal.SIGINT else f"Ended by {ended.name}"
+            with contextlib.suppress(OSError):
+                sys.stderr.write(
+                    f"\n{how}. {finished} of {configuration.simulator.num_trials} trials are "
+                    f"finished and kept in {directory_path}\nGo on with: {command}\n"
+                )
+            raise
         if not quiet:
             _print_files(directory_path, notes)
 
@@ -232,16 +320,34 @@ def _resume_command(
 def _draw_figure(
     configuration: Configuration, directory: RunDirectory, recorder: Recorder
 ) -> str | None:
-    """Draw trial 0 and return None, or why there is no figure."""
-    from holdfast.recording.run_directory import FIGURE_NAME
-    from holdfast.runtime.trial import run_trial
-
+    """Draw trial 0 and return None, or what is to be said about it."""
     try:
         from holdfast.recording.figure import trial_figure
     except ImportError as error:
         if error.name is None or error.name.split(".")[0] != "matplotlib":
             raise
-        return "matplotlib is not installed: pip install 'holdfast[figures]'"
+        return "no figure, because matplotlib is not installed: pip install matplotlib"
+
+    try:
+        note = _draw_trial(configuration, directory, recorder, trial_figure)
+    except HoldfastError:
+        raise
+    except Exception as error:
+        account = account_of_user_error(error, configuration.problem_name)
+        if account is None:
+            raise
+        raise HoldfastError(f"the figure of trial {recorder.trial}: {account}") from error
+    return note
+
+
+def _draw_trial(
+    configuration: Configuration,
+    directory: RunDirectory,
+    recorder: Recorder,
+    draw: Callable[[Configuration, TrialRecord, Path], None],
+) -> str | None:
+    from holdfast.recording.run_directory import FIGURE_NAME
+    from holdfast.runtime.trial import run_trial
 
     if recorder.record.result is None:
         # It ran in a worker or in an earlier part of the run; a trial can always be run again.
@@ -261,7 +367,7 @@ def _draw_figure(
                 f"trial {recorder.trial} decided otherwise when it was run again for the figure, "
                 f"so the problem {configuration.problem_name} is not deterministic"
             )
-    trial_figure(configuration, record, directory.path / FIGURE_NAME)
+    draw(configuration, record, directory.path / FIGURE_NAME)
     return note
 
 
@@ -446,6 +552,8 @@ def _print_summary(summary: RunSummary) -> None:
 
 
 def _summary_rows(summary: RunSummary) -> list[tuple[str, str]]:
+    from holdfast.belief import UNEXPLAINED_DEVIATIONS_SQUARED
+
     rows = []
     if summary.success_rate is not None and summary.success_rate_interval_95 is not None:
         low, high = summary.success_rate_interval_95
@@ -472,7 +580,15 @@ def _summary_rows(summary: RunSummary) -> list[tuple[str, str]]:
             )
         )
     if summary.unexplained_observations:
-        rows.append(("unexplained", _counted(summary.unexplained_observations, "observation")))
+        deviations = f"{UNEXPLAINED_DEVIATIONS_SQUARED**0.5:g}"
+        rows.append(
+            (
+                "surprises",
+                f"{summary.unexplained_observations:,} of "
+                f"{_counted(summary.sensing_decisions, 'observation')} over {deviations} sigma "
+                "from every particle",
+            )
+        )
     rows.append(("wall time", _duration(summary.wall_time_s)))
     rows.append(("digest", summary.digest[:16]))
     return rows

@@ -535,7 +535,10 @@ def _build_problem(
         else:
             problem = build(arguments["model"], arguments["state_space_planner"])
     except Exception as error:
-        raise _cannot_be_built(source, name, resolved, error) from error
+        complaint = _cannot_be_built(source, name, resolved, error)
+        if complaint is None:
+            raise
+        raise complaint from error
     missing = [member for member in _members(Problem) if not hasattr(problem, member)]
     if missing:
         raise ConfigurationError(
@@ -606,11 +609,11 @@ def _in_the_form_of(default: Any, value: Any) -> Any:
 
 def _cannot_be_built(
     source: _Source, name: str, sections: Mapping[str, Mapping[str, Any]], error: Exception
-) -> Exception:
+) -> ConfigurationError | None:
     """Return the problem's own complaint, with the line of the first of its keys named there.
 
-    A complaint about no key is a defect of the problem: it comes with its frames. A defect of
-    nobody's but ours is returned as it is.
+    A complaint about no key is a defect of the problem and comes with its frames; None means that
+    the defect is ours.
     """
     text = str(error) or type(error).__name__
     mentioned = [
@@ -619,20 +622,17 @@ def _cannot_be_built(
         for key in keys
         if (at := re.search(rf"(?<!\w){re.escape(key)}(?!\w)", text))
     ]
-    deliberate = isinstance(error, HoldfastError | msgspec.ValidationError | ValueError)
-    # What the constructor raises, ProblemBase may have wrapped.
+    # ProblemBase wraps the TypeError of a call that does not fit; the constructor may raise one.
     cause = error.__cause__ if isinstance(error.__cause__, TypeError) else error
+    refused = isinstance(error, HoldfastError | msgspec.ValidationError | ValueError)
     account = account_of_user_error(cause, name)
-    if deliberate and cause is error and (mentioned or account is None):
-        place = source.place(min(mentioned)[1]) if mentioned else f"{source.path}: {name}"
-        return ConfigurationError(
-            f"{place}: {text}" if mentioned else f"{place} cannot be built: {text}"
-        )
-    if account is not None:
+    if account is not None and not (refused and mentioned and cause is error):
         return ConfigurationError(f"{source.path}: {account}")
-    if deliberate or isinstance(error, TypeError):
-        return ConfigurationError(f"{source.path}: {name} cannot be built: {text}")
-    return error
+    if not refused and not isinstance(error, TypeError):
+        return None
+    if mentioned:
+        return ConfigurationError(f"{source.place(min(mentioned)[1])}: {text}")
+    return ConfigurationError(f"{source.path}: {name} cannot be built: {text}")
 
 
 def _members(protocol: type) -> list[str]:

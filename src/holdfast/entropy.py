@@ -195,6 +195,10 @@ def entropy(
         raise InvalidValueError(f"weights[{bad}] are all zero: one must be positive")
     if kernel.scale is not None:
         array = array * kernel.scale
+        if (bad := first_unbounded(array)) is not None:
+            raise InvalidValueError(
+                f"point {bad} is {array[bad]} standard deviations from zero: at most {LARGEST:g}"
+            )
     result, _, _, _ = _kernel.entropies(
         array,
         rows,

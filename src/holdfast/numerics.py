@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from holdfast import _kernel
-from holdfast.errors import ConfigurationError
+from holdfast.errors import ConfigurationError, InvalidValueError
 
 __all__ = ["arcsin", "cos", "exp", "log", "sin", "sum", "weighted_mean"]
 
@@ -71,7 +71,16 @@ def weighted_mean(rows: FloatArray, weights: FloatArray) -> FloatArray:
     Returns
     -------
     array of shape (d,)
+
+    Raises
+    ------
+    InvalidValueError
+        If the shapes do not fit.
     """
-    return _kernel.weighted_sums(
-        np.ascontiguousarray(weights, dtype=np.float64), np.ascontiguousarray(rows, np.float64)
-    )
+    values = np.ascontiguousarray(rows, dtype=np.float64)
+    shares = np.ascontiguousarray(weights, dtype=np.float64)
+    if values.ndim != 2 or shares.shape != values.shape[:1]:
+        raise InvalidValueError(
+            f"rows of shape {values.shape}, weights of shape {shares.shape}: need (n, d) and (n,)"
+        )
+    return _kernel.weighted_sums(shares, values)

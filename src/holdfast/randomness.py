@@ -130,9 +130,9 @@ def stream(seed: int, trial: int, step: int, purpose: Purpose) -> Stream:
 
 
 def _size(shape: int | tuple[int, ...]) -> int:
-    if isinstance(shape, int):
-        return shape
     size = 1
-    for extent in shape:
-        size *= extent
+    for extent in shape if isinstance(shape, tuple) else (shape,):
+        if extent < 0:
+            raise InvalidValueError(f"shape {shape}: no extent may be negative")
+        size *= int(extent)
     return size

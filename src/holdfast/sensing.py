@@ -331,9 +331,13 @@ def _later_entropies(
                 moved = problem.move(states, action, motion.substream(i).substream(step))
                 states = contract.states_of(problem, "move", moved, states.shape)
                 factor *= sensing.discount
-                row, _, _ = _entropies(
-                    points_of(states, own_stage), own_weights.reshape(1, -1), False, estimator, 1
-                )
+                points = points_of(states, own_stage)
+                if (bad := first_unbounded(points)) is not None:
+                    raise ProblemError(
+                        f"policy of {problem.name} returned {points[bad]} in the predicted state "
+                        f"{states[bad]}: every coordinate must be finite and at most {LARGEST:g}"
+                    )
+                row, _, _ = _entropies(points, own_weights.reshape(1, -1), False, estimator, 1)
                 later[j, i] += factor * row[0]
     return later
 

@@ -21,10 +21,11 @@ def significant(weights: FloatArray) -> npt.NDArray[np.bool_]:
     which lies at most 0.5 % of the sum; 1e-6 if there is none.
     """
     relative: FloatArray = weights / weights.max()
-    for threshold in (1e-2, 1e-3, 1e-4, 1e-5):
+    hair = 1.0 - 2.0**-40  # weights that are such fractions themselves stay
+    for threshold in (1e-2 * hair, 1e-3 * hair, 1e-4 * hair, 1e-5 * hair):
         if relative[relative < threshold].sum() <= 0.005 * relative.sum():
             return np.greater_equal(relative, threshold)
-    return np.greater_equal(relative, 1e-6)
+    return np.greater_equal(relative, 1e-6 * hair)
 
 
 def log_unit_ball(dimension: int) -> float:

@@ -20,10 +20,11 @@ from tests.oracles.reference_entropy import (
     significant,
 )
 
+from holdfast import _kernel
 from holdfast.belief import Belief
 from holdfast.problems.problem import FloatArray, IntArray, Problem, ProblemBase
 from holdfast.randomness import Purpose, Stream, stream
-from holdfast.sensing import choose_sensing_action
+from holdfast.sensing import _stratified, choose_sensing_action
 from holdfast.settings import (
     ActiveSensingSettings,
     ParticleFilterSettings,
@@ -392,3 +393,45 @@ def test_stratified_particles() -> None:
             assert upper[particle] > i / samples
             drawn[particle] += 1
     assert stats.chisquare(drawn, choices * samples * belief.weights).pvalue > 1e-6
+
+
+@pytest.mark.parametrize("kind", ["equal", "spread", "extreme", "zeros", "short", "one"])
+@pytest.mark.parametrize("samples", [1, 10, 97])
+def test_both_paths_imagine_from_the_same_particles(kind: str, samples: int) -> None:
+    """Problems with a general likelihood draw particles in Python, Gaussian ones in the kernel.
+
+    In the kernel a particle betrays itself: each one predicts its own number with hardly any noise,
+    so that of each hypothetical posterior only the particle that was drawn is left.
+    """
+    count = 50
+    for trial in range(20):
+        rng = np.random.default_rng([trial, samples])
+        weights = rng.exponential(size=count)
+        if kind == "equal":
+            weights[:] = 1.0
+        elif kind == "extreme":
+            weights = 10.0 ** rng.uniform(-12.0, 0.0, size=count)
+        elif kind in ("zeros", "short"):
+            weights[rng.random(count) < 0.5] = 0.0
+            weights[:2] = weights[-2:] = 0.0
+            weights[7] = 1.0
+        elif kind == "one":
+            weights[:] = 0.0
+            weights[rng.integers(count)] = 1.0
+        # "short": as if rounding had lost a tenth, so that draws go beyond the end.
+        weights *= (0.9 if kind == "short" else 1.0) / weights.sum()
+        hypotheses = stream(61, trial, 0, Purpose.HYPOTHESES)
+        posteriors = _kernel.hypothetical_weights(
+            weights,
+            [1],
+            np.arange(count, dtype=np.float64).reshape(1, -1),
+            np.full((1, 1), 1e-8),
+            samples,
+            hypotheses.words,
+        ).reshape(samples, count)
+        assert (posteriors.max(axis=1) == 1.0).all()
+        drawn = _stratified(weights, samples, hypotheses)
+        assert posteriors.argmax(axis=1).tolist() == drawn
+        assert (weights[drawn] > 0.0).all()
+        if kind == "equal" and samples == 97:
+            assert len(set(drawn)) > count // 2

@@ -29,7 +29,7 @@ def successes(configuration: Configuration, num_particles: int, max_steps: int, 
     )
     simulator = msgspec.structs.replace(configuration.simulator, max_steps=max_steps, seed=seed)
     assert planning.selector.method == "action_entropy"
-    assert planning.simulator.sensing_intervals == 8
+    assert planning.sensing_interval == 8
     return sum(
         run_trial(configuration.problem, planning, simulator, trial).success
         for trial in range(simulator.num_trials)

@@ -65,6 +65,15 @@ def test_make_targets_exist() -> None:
             assert done.returncode == 0, f"{command}\n{done.stderr}"
 
 
+@pytest.mark.parametrize("name", ["README.md", "ARCHITECTURE.md"])
+def test_nothing_is_left_to_fill_in(name: str) -> None:
+    """Words in capitals with an underscore, but for names in code, wait for their text."""
+    text = (ROOT / name).read_text(encoding="utf-8")
+    prose = re.sub(r"^```.*?^```$|`[^`\n]+`", "", text, flags=re.DOTALL | re.MULTILINE)
+    left = re.findall(r"\b[A-Z0-9]+(?:_[A-Z0-9]+)+\b|\b(?:TODO|FIXME|TBD|XXX)\b", prose)
+    assert left == []
+
+
 @pytest.mark.parametrize("program", PROGRAMS, ids=[f"program-{i}" for i in range(len(PROGRAMS))])
 def test_programs(program: str, clone: Path) -> None:
     done = run([sys.executable, "-W", "error", "-c", program], clone)

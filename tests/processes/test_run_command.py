@@ -194,9 +194,33 @@ class TestOutput:
             check=False,
         )
         assert done.returncode == 0, done.stderr
-        assert "pip install 'holdfast[figures]'" in done.stderr
+        assert "pip install matplotlib" in done.stderr
         assert not (workplace / "out" / "trial.png").exists()
         assert (workplace / "out" / "summary.json").exists()
+
+    def test_a_run_can_be_extended(self, workplace: Path) -> None:
+        arguments = ("run", "peg.yaml", "--jobs", "1", "--out")
+        assert holdfast(workplace, *arguments, "out", "--trials", "2").returncode == 0
+        done = holdfast(workplace, *arguments, "out", "--trials", "5", "--resume")
+        assert done.returncode == 0, done.stderr
+        assert "2 finished before" in done.stderr
+        assert holdfast(workplace, *arguments, "whole", "--trials", "5").returncode == 0
+        assert decided(workplace / "out") == decided(workplace / "whole")
+        resolved = [(workplace / name / "config.yaml").read_text() for name in ("out", "whole")]
+        assert resolved[0] == resolved[1]
+
+    def test_as_a_module(self, workplace: Path) -> None:
+        done = subprocess.run(
+            [sys.executable, "-m", "holdfast", "run", "--help"],
+            cwd=workplace,
+            capture_output=True,
+            text=True,
+            timeout=120,
+            check=False,
+        )
+        assert done.returncode == 0
+        assert done.stdout.startswith("Usage: holdfast run ")
+        assert "<bool>" not in done.stdout
 
     def test_version(self, workplace: Path) -> None:
         done = holdfast(workplace, "--version")
@@ -230,6 +254,27 @@ class TestInterruption:
         assert whole.returncode == 0, whole.stderr
         assert decided(workplace / "out") == decided(workplace / "whole")
         assert len(decided(workplace / "out")) == 16
+
+    @pytest.mark.parametrize("ending", [signal.SIGTERM, signal.SIGHUP])
+    @pytest.mark.parametrize("group", [False, True], ids=["parent", "group"])
+    def test_other_signals_end_a_run_in_order(
+        self, workplace: Path, slow_run: SlowRun, ending: signal.Signals, group: bool
+    ) -> None:
+        slow_run.wait_for_workers()
+        if group:
+            os.killpg(slow_run.process.pid, ending)
+        else:
+            slow_run.process.send_signal(ending)
+        errors = slow_run.end()
+        assert slow_run.process.returncode == 128 + ending
+        assert "Traceback" not in errors
+        assert f"Ended by {ending.name}." in errors
+        wait_until(
+            lambda: not any(is_alive(pid) for pid in slow_run.workers()), "the end of the workers"
+        )
+        kept = len(decided(workplace / "out"))
+        assert 0 < kept < 16
+        assert summary(workplace / "out")["finished"] == kept
 
     def test_a_killed_worker_is_reported_with_its_trial(
         self, workplace: Path, slow_run: SlowRun
@@ -289,14 +334,53 @@ class TestErrors:
     def test_nothing_to_resume(self, workplace: Path) -> None:
         assert "no run to resume" in self.fails(workplace, "run", "peg.yaml", "--resume")
 
-    def test_a_defect_keeps_its_traceback_and_names_the_trial(self, workplace: Path) -> None:
+    def test_what_a_problem_raises_is_shown_without_our_frames(self, workplace: Path) -> None:
         (workplace / "broken.py").write_text(
             "from holdfast.problems.peg_in_hole_2d import PegInHole2D\n"
             "class Broken(PegInHole2D):\n"
             "    def policy(self, states, stage):\n"
-            "        raise ZeroDivisionError\n"
+            "        return states + 'one'\n"
         )
-        done = holdfast(workplace, "run", "peg.yaml", "--problem", "broken:Broken", "--out", "out")
+        arguments = ("run", "peg.yaml", "--problem", "broken:Broken", "--out", "out", "--quiet")
+        error = self.fails(workplace, *arguments)
+        assert "trial 0 (seed 3): broken:Broken raised " in error
+        assert f'File "{workplace / "broken.py"}", line 4, in policy' in error
+        assert "return states + 'one'" in error
+        assert error.count("  File ") == 1
+        # Nothing is finished, so the mended problem may have the same directory.
+        (workplace / "broken.py").write_text(
+            "from holdfast.problems.peg_in_hole_2d import PegInHole2D\n"
+            "class Broken(PegInHole2D): pass\n"
+        )
+        assert holdfast(workplace, *arguments).returncode == 0
+
+    def test_a_figure_that_a_problem_fails_to_describe(self, workplace: Path) -> None:
+        (workplace / "unseen.py").write_text(
+            "from holdfast.problems.peg_in_hole_2d import PegInHole2D\n"
+            "class Unseen(PegInHole2D):\n"
+            "    def scene(self):\n"
+            "        return {}['scene']\n"
+        )
+        arguments = ("peg.yaml", "--problem", "unseen:Unseen", "--out", "out", "--quiet")
+        error = self.fails(workplace, "run", *arguments)
+        assert "the figure of trial 0: unseen:Unseen raised KeyError: 'scene'" in error
+        assert summary(workplace / "out")["finished"] == 6
+
+    def test_a_defect_of_ours_keeps_its_traceback_and_names_the_trial(
+        self, workplace: Path
+    ) -> None:
+        (workplace / "defective.py").write_text(
+            "from holdfast.problems.peg_in_hole_2d import PegInHole2D\n"
+            "class Defective(PegInHole2D):\n"
+            "    initial_states = 3\n"
+        )
+        done = holdfast(
+            workplace, "run", "peg.yaml", "--problem", "defective:Defective", "--out", "out"
+        )
         assert done.returncode == 1
         assert "Traceback" in done.stderr
         assert "in trial 0 (seed 3)" in done.stderr
+
+    def test_a_configuration_without_a_command(self, workplace: Path) -> None:
+        error = self.fails(workplace, "peg.yaml", "--jobs", "2")
+        assert error.endswith("did you mean: holdfast run peg.yaml --jobs 2\n")

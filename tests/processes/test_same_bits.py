@@ -26,11 +26,16 @@ EXAMPLES = Path(__file__).parents[2] / "examples"
 # name: the example, trials, and what is changed in it.
 RUNS: dict[str, tuple[str, int, dict[str, dict[str, object]]]] = {
     "peg": ("peg_in_hole_2d", 50, {}),
-    # Enough work for a second thread.
+    "more particles": (
+        "peg_in_hole_2d",
+        50,
+        {"particle_filter": {"num_particles": 500}, "simulator": {"max_steps": 60}},
+    ),
+    # From 4,096 particles on, motion runs on several threads, too.
     "many particles": (
         "peg_in_hole_2d",
         2,
-        {"particle_filter": {"num_particles": 1500}, "simulator": {"max_steps": 40}},
+        {"particle_filter": {"num_particles": 5000}, "simulator": {"max_steps": 20}},
     ),
     "few resamplings": (
         "peg_in_hole_2d",
@@ -60,6 +65,8 @@ from holdfast.runtime import trials
 
 # As if workers cost nothing to start: they take all trials but the first.
 trials._WORKER_START_S = 0.0
+# As if threads cost nothing to wake: they share all work that has more than one part.
+_kernel.use_threads_from(0.0)
 
 if __name__ == "__main__":
     jobs = int(sys.argv[1])
@@ -70,7 +77,8 @@ if __name__ == "__main__":
         results.sort(key=lambda result: result.trial)
         digests[Path(path).stem] = [result.digest for result in results]
     features = np.show_config(mode="dicts")["SIMD Extensions"].get("found", [])
-    print(json.dumps({"digests": digests, "simd": _kernel.simd(), "numpy": features}))
+    print(json.dumps({"digests": digests, "simd": _kernel.simd(), "numpy": features,
+                      "threads": _kernel.threads_started()}))
 """
 
 SETTINGS = ("HOLDFAST_SIMD", "NPY_DISABLE_CPU_FEATURES", "OPENBLAS_CORETYPE")
@@ -107,6 +115,8 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
             path.write_text(yaml.safe_dump(content))
             paths.append(str(path))
         environment = {key: value for key, value in os.environ.items() if key not in SETTINGS}
+        # The kernel takes it for the number of processors: threads even where there is only one.
+        environment["OMP_NUM_THREADS"] = str(cores or 4)
         return subprocess.run(
             [sys.executable, str(directory / "script.py"), str(jobs), *paths],
             env=environment | settings,
@@ -138,12 +148,27 @@ def usual(run: Run) -> Report:
     # Trials differ, so a digest of nothing would be found.
     every = [digest for found in digests.values() for digest in found]
     assert len(set(every)) == len(every)
+    assert report["threads"] == 0
     return report
 
 
 @pytest.mark.parametrize("cores", [0, 2, 3])
 def test_threads(run: Run, usual: Report, cores: int) -> None:
-    assert report_of(run(cores=cores))["digests"] == usual["digests"]
+    """With helpers that take their part of all work, however small."""
+    report = report_of(run(cores=cores))
+    assert report["threads"] == (cores or 4) - 1
+    assert report["digests"] == usual["digests"]
+
+
+@pytest.mark.parametrize("cores", [1, 2])
+@pytest.mark.parametrize("name", ["more particles", "many particles"])
+def test_helpers_take_part(run: Run, usual: Report, name: str, cores: int) -> None:
+    """In these very trials: the others have not woken the helpers before."""
+    report = report_of(run(cores=cores, names=(name,)))
+    assert report["threads"] == cores - 1
+    digests = usual["digests"]
+    assert isinstance(digests, dict)
+    assert report["digests"] == {name: digests[name]}
 
 
 def test_worker_processes(run: Run, usual: Report) -> None:

@@ -267,9 +267,7 @@ class TestBadInput:
     def test_likelihood_not_a_number(self, bad: float) -> None:
         values = np.zeros(50)
         values[7] = bad
-        with pytest.raises(
-            ProblemError, match=r"log_likelihood of General, .* NaN or plus"
-        ):
+        with pytest.raises(ProblemError, match=r"log_likelihood of General, .* NaN or plus"):
             update(General(values), some_belief(), 0, [0.0])
 
 

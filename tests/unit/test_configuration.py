@@ -81,11 +81,13 @@ class Keywords(ProblemBase):
     state_size = action_size = 1
     sensing_actions = ("left", "right")
 
-    def __init__(self, gain=1.0, brightness=(1, 2), colour="red", lamps=None):
+    def __init__(self, gain=1.0, brightness=(1, 2), colour="red", lamps=None, places=((0, 1),)):
         if gain < 0.0:
             raise ValueError(f"gain is {gain}; it must not be negative")
         self.gain = gain
         self.colour = colour
+        self.brightness = brightness
+        self.places = places
 
     def initial_states(self, stream, count): return np.zeros((count, 1))
     def move(self, states, actions, stream): return states + actions
@@ -109,6 +111,21 @@ class Structs(Keywords):
 
 class Unfinished(ProblemBase):
     state_size = 1
+
+
+class Arrays(Keywords):
+    def __init__(self, gain=1.0, matrix=np.eye(2), limit=float("inf")):
+        super().__init__(gain)
+
+
+class Broken(Keywords):
+    def __init__(self, gain=1.0):
+        {}["absent"]
+
+
+class WrongTypes(Keywords):
+    def __init__(self, gain=1.0):
+        gain + "one"
 """
 
 Write = Callable[[str], Path]
@@ -203,6 +220,63 @@ class TestWhatLoads:
         assert (configuration.problem.colour, configuration.problem.gain) == ("no", 2)  # type: ignore[attr-defined]
 
 
+class TestProblemDirectory:
+    """Where the module of a problem of one's own is looked for."""
+
+    @staticmethod
+    def elsewhere(path: Path, text: str) -> Path:
+        """Write a file into a directory that holds no module."""
+        directory = path.parent / "elsewhere"
+        directory.mkdir(exist_ok=True)
+        (directory / "config.yaml").write_text(text)
+        return directory / "config.yaml"
+
+    def test_a_resolved_file_loads_from_anywhere(self, write: Write) -> None:
+        path = write("problem: lamps:Keywords")
+        configuration = load(path)
+        assert configuration.problem_directory == path.parent
+        again = load(self.elsewhere(path, configuration.to_yaml()))
+        assert again == configuration
+        assert again.to_yaml() == configuration.to_yaml()
+
+    def test_the_current_directory_is_looked_in_too(
+        self, write: Write, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        path = write("")
+        monkeypatch.chdir(path.parent)
+        configuration = load(self.elsewhere(path, "problem: lamps:Keywords"))
+        assert configuration.problem_directory == path.parent
+
+    def test_beside_the_file_comes_first(
+        self, write: Write, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        (tmp_path / "current").mkdir()
+        (tmp_path / "current" / "lamps.py").write_text("Keywords = 3")
+        monkeypatch.chdir(tmp_path / "current")
+        assert load(write("problem: lamps:Keywords")).problem_directory == tmp_path
+
+    def test_it_may_be_relative_to_the_file(self, write: Write) -> None:
+        path = write("")
+        found = load(
+            self.elsewhere(path, "problem: lamps:Keywords\nproblem_directory: ..")
+        ).problem_directory
+        assert found == path.parent
+
+    @pytest.mark.parametrize(
+        ("text", "expected"),
+        [
+            ("lamps:Keywords\nproblem_directory: absent", 'is "absent", where there is no direc'),
+            ("lamps:Keywords\nproblem_directory: empty", 'is "empty", where there is no module'),
+            ("lamps:Keywords\nproblem_directory: 3", "is 3; expected the path of a directory"),
+            ("capsule_robot\nproblem_directory: .", 'is "."; only a problem that is named'),
+        ],
+    )
+    def test_what_is_refused(self, text: str, expected: str, write: Write) -> None:
+        path = write(f"problem: {text}")
+        (path.parent / "empty").mkdir()
+        assert f"line 2: problem_directory {expected}" in complaint(path)
+
+
 class TestResolved:
     @pytest.mark.parametrize(
         "text",
@@ -238,7 +312,28 @@ class TestResolved:
         self, write: Write
     ) -> None:
         resolved = load(write("problem: lamps:Keywords\nstate_space_planner: {gain: 2}")).to_yaml()
-        assert yaml.safe_load(resolved)["model"] == {"colour": "red", "lamps": None}
+        assert yaml.safe_load(resolved)["model"] == {
+            "brightness": [1, 2],
+            "colour": "red",
+            "lamps": None,
+            "places": [[0, 1]],
+        }
+        assert "Not listed" not in resolved
+
+    def test_defaults_that_yaml_cannot_hold_are_named_in_a_comment(self, write: Write) -> None:
+        resolved = load(write("problem: lamps:Arrays")).to_yaml()
+        assert yaml.safe_load(resolved)["model"] == {"gain": 1.0}
+        assert "# model.matrix, model.limit\n" in resolved
+        assert load(write(resolved)).to_yaml() == resolved
+
+    def test_a_constructor_gets_tuples_where_its_defaults_are_tuples(self, write: Write) -> None:
+        first = load(write("problem: lamps:Keywords")).problem
+        again = load(write(load(write("problem: lamps:Keywords")).to_yaml())).problem
+        other = load(write("problem: lamps:Keywords\nmodel: {places: [[1, 2], [3, 4]]}")).problem
+        for problem in (first, again):
+            assert problem.brightness == (1, 2)  # type: ignore[attr-defined]
+            assert problem.places == ((0, 1),)  # type: ignore[attr-defined]
+        assert other.places == ((1, 2), (3, 4))  # type: ignore[attr-defined]
 
     @pytest.mark.parametrize("text", [THESIS, "problem: lamps:Keywords"], ids=["thesis", "lamps"])
     def test_another_process_rebuilds_it(self, text: str, write: Write) -> None:
@@ -423,7 +518,7 @@ class TestKeysAndValues:
             (
                 "particle_filters: {num_particles: 10}",
                 "particle_filters is not a known section; did you mean particle_filter?\n"
-                "allowed: problem, model, particle_filter, state_space_planner, active_sensing,",
+                "allowed: problem, problem_directory, model, particle_filter, state_space_planner,",
             ),
             ("num_particles: 10", "line 2: num_particles is not a known section"),
             ("simulator: {'\\e[2J': 1}", "is not a known key"),
@@ -523,7 +618,7 @@ class TestProblems:
             (
                 "lamps:Keywords\nmodel:\n  color: red",
                 "line 3: model.color is not a known key; did you mean colour?\n"
-                "allowed: gain, brightness, colour, lamps",
+                "allowed: gain, brightness, colour, lamps, places",
             ),
             (
                 "lamps:Keywords\nmodel: {gain: 1}\nstate_space_planner: {gain: 1}",
@@ -545,6 +640,34 @@ class TestProblems:
     )
     def test_a_user_s_problem(self, text: str, expected: str, write: Write) -> None:
         assert expected in complaint(write(f"problem: {text}"))
+
+    @pytest.mark.parametrize(
+        ("name", "raised", "source"),
+        [
+            ("Broken", "KeyError: 'absent'", '{}["absent"]'),
+            ("WrongTypes", "TypeError: unsupported operand", 'gain + "one"'),
+        ],
+    )
+    def test_what_a_constructor_raises_comes_with_its_own_frames(
+        self, name: str, raised: str, source: str, write: Write
+    ) -> None:
+        path = write(f"problem: lamps:{name}")
+        with pytest.raises(ConfigurationError) as caught:
+            load(path)
+        message = str(caught.value)
+        assert f"{path}: lamps:{name} raised {raised}" in message
+        assert source in message
+        assert message.count("  File ") == 1
+        assert f'  File "{path.parent / "lamps.py"}", line ' in message
+
+    def test_a_module_that_cannot_be_parsed_is_shown(self, write: Write) -> None:
+        path = write("problem: unparsable_lamps:Keywords")
+        (path.parent / "unparsable_lamps.py").write_text("import sys\n\ndef f(:\n")
+        with pytest.raises(ConfigurationError) as caught:
+            load(path)
+        message = str(caught.value)
+        assert "line 1: unparsable_lamps:Keywords raised SyntaxError" in message
+        assert 'unparsable_lamps.py", line 3\n    def f(:' in message
 
     def test_what_a_problem_itself_refuses(self, write: Write) -> None:
         message = complaint(write("problem: capsule_robot\nmodel:\n  num_walls: 5"))

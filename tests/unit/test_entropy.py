@@ -301,3 +301,13 @@ class TestBadInput:
     def test_size_of_the_variance(self, size: int) -> None:
         with pytest.raises(InvalidValueError, match=rf"variance of shape \({size},\): need \(3,\)"):
             entropy(draw(20)[0], None, GaussianMixture(np.ones(size)))
+
+
+def test_the_scale_of_the_weights_does_not_matter() -> None:
+    """Not even where weights are exactly the fractions at which others become negligible."""
+    points = np.random.default_rng(0).normal(size=(200, 2))
+    weights = np.power(10.0, -np.random.default_rng(3).integers(0, 8, 200)).astype(np.float64)
+    expected = entropy(points, weights, NearestNeighbor(3, 0.01))
+    for scale in (0.1, 3.0, 1e-7, 1e12):
+        scaled = entropy(points, scale * weights, NearestNeighbor(3, 0.01))
+        assert scaled == pytest.approx(expected, abs=1e-12)

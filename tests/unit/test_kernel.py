@@ -5,8 +5,10 @@ from __future__ import annotations
 import json
 import math
 import os
+import platform
 import subprocess
 import sys
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -60,24 +62,40 @@ for n in (1, 7, 8, 9, 31, 1000):
     weights = kernel.normalize(values, False)[0]
     note(f"resampling {n}", kernel.systematic_resample(weights, 0.37))
 
-# Every way to an entropy: pair by pair, grouped with one to four vectors, with a tree of its own.
-for count, dimension, kept, posteriors in (
-    (12, 1, 12, 3), (40, 2, 40, 2), (100, 3, 90, 7), (100, 3, 60, 30), (333, 2, 333, 13),
-    (600, 6, 500, 20), (1500, 1, 1400, 33), (1500, 3, 200, 2), (3000, 6, 3000, 1),
+# Every way to an entropy, with its index in the kernel's own count: pair by pair, with a tree of
+# its own, and grouped in one to four vectors and in more than one group.
+kernel.use_threads_from(0.0)
+wrong_ways = []
+for count, dimension, kept, posteriors, way in (
+    (12, 1, 12, 3, 0), (24, 2, 24, 2, 0), (300, 6, 20, 40, 0),
+    (40, 2, 40, 2, 1), (333, 3, 333, 1, 1), (1500, 1, 1400, 1, 1), (1500, 3, 90, 2, 1),
+    (3000, 6, 3000, 1, 1),
+    (200, 3, 190, 7, 2), (300, 2, 300, 13, 2), (300, 6, 200, 20, 2), (300, 3, 150, 30, 2),
+    (64, 4, 64, 32, 2), (600, 5, 220, 20, 2), (300, 3, 270, 33, 2), (1500, 1, 1400, 12, 2),
 ):
     draw = stream.substream(1000 * count + kept)
     points = draw.normal((count, dimension))
     points[::3] = np.round(points[::3], 1)
-    log_weights = draw.substream(1).normal((posteriors, count)) * 3.0
-    log_weights[:, kept:] = -np.inf
-    for neighbors in (1, 5, 30):
-        for resolution in (1e-6, 0.2, 2.0):
-            note(f"nearest {count} {dimension} {neighbors} {resolution}",
-                 kernel.entropies(points, log_weights, False, False, neighbors, resolution,
-                                  0.0, 0.0, 2)[0])
+    normals = draw.substream(1).normal((posteriors, count))
+    normals[:, kept:] = -np.inf
+    # Weights within a factor of 50, of which none is negligible, and ones of which most are.
+    for deviation in (0.4, 3.0):
+        log_weights = normals * deviation
+        for neighbors in (1, 5, 8, 9, 30):
+            for resolution in (1e-9, 0.2, 20.0):
+                result, _, visits, ways = kernel.entropies(
+                    points, log_weights, True, False, neighbors, resolution, 0.0, 0.0, 2)
+                name = f"nearest {count} {dimension} {kept} {deviation} {neighbors} {resolution}"
+                note(name, result, np.array(visits))
+                if deviation < 1.0 and ways[way] != posteriors:
+                    wrong_ways.append(name)
     for exponent in (0.5, 0.125):
-        note(f"mixture {count} {dimension} {exponent}",
-             kernel.entropies(points * 3.0, log_weights, False, True, 1, 1.0, exponent, 0.3, 2)[0])
+        result, _, visits, ways = kernel.entropies(
+            points * 3.0, normals * 0.4, True, True, 1, 1.0, exponent, 0.3, 2)
+        name = f"mixture {count} {dimension} {kept} {exponent}"
+        note(name, result, np.array(visits))
+        if ways[way] != posteriors:
+            wrong_ways.append(name)
 
 for count in (5, 100, 1001):
     draw = stream.substream(count)
@@ -100,16 +118,39 @@ for world, size in ((DiscWorld(0.4, flat), 2), (RectangleWorld(0.6, 1.4, flat), 
     states = states[~world.collides(states)]
     note(type(world).__name__,
          world.move(states, -states, deviation[:size], 1e-3, stream.substream(9)))
-print(json.dumps({"simd": kernel.simd(), "hashes": hashes}))
+print(json.dumps({"simd": kernel.simd(), "threads": kernel.threads_started(),
+                  "wrong_ways": wrong_ways, "hashes": hashes}))
+"""
+
+# Makes the processor flush subnormal numbers to zero in this thread, and in those that it starts.
+FLUSHING = """
+import ctypes
+import numpy as np
+
+libm = ctypes.CDLL("libm.so.6")
+mode = (ctypes.c_uint32 * 8)()  # the C library's fenv_t; the last word is MXCSR
+assert libm.fegetenv(mode) == 0
+mode[7] |= 0x8040
+assert libm.fesetenv(mode) == 0
+smallest = np.array([5e-324])
+
+def is_flushing():
+    return not (smallest + smallest).any()
+
+assert is_flushing()
 """
 
 
-def run_workload(simd: str | None) -> subprocess.CompletedProcess[str]:
-    environment = {key: value for key, value in os.environ.items() if key != "HOLDFAST_SIMD"}
+def run_workload(
+    simd: str | None, before: str = "", after: str = ""
+) -> subprocess.CompletedProcess[str]:
+    # Two threads, however many processors there are.
+    environment = os.environ | {"OMP_NUM_THREADS": "2"}
+    environment.pop("HOLDFAST_SIMD", None)
     if simd is not None:
         environment["HOLDFAST_SIMD"] = simd
     return subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", WORKLOAD],
+        [sys.executable, "-W", "ignore", "-c", before + WORKLOAD + after],
         env=environment,
         capture_output=True,
         text=True,
@@ -123,7 +164,10 @@ def best_hashes() -> dict[str, str]:
     """Return what the instruction set that this machine would choose gives."""
     finished = run_workload(None)
     assert finished.returncode == 0, finished.stderr
-    hashes = json.loads(finished.stdout)["hashes"]
+    result = json.loads(finished.stdout)
+    assert result["wrong_ways"] == []
+    assert result["threads"] == 1
+    hashes = result["hashes"]
     assert isinstance(hashes, dict)
     return hashes
 
@@ -139,7 +183,7 @@ class TestInstructionSets:
         assert result["simd"] == simd
         different = [name for name in best_hashes if result["hashes"][name] != best_hashes[name]]
         assert not different
-        assert len(best_hashes) > 100
+        assert len(best_hashes) > 500
 
     def test_an_unknown_one_is_refused_by_name(self) -> None:
         finished = run_workload("mmx")
@@ -148,6 +192,21 @@ class TestInstructionSets:
 
     def test_this_process_uses_a_known_one(self) -> None:
         assert _kernel.simd() in {"baseline", "avx2", "avx512"}
+
+
+class TestFloatingPointMode:
+    """Whatever mode the calling thread is in: the same bits, and its mode as it was."""
+
+    @pytest.mark.skipif(
+        platform.machine() != "x86_64" or platform.libc_ver()[0] != "glibc",
+        reason="the mode is set through glibc's fenv_t of x86-64",
+    )
+    def test_flushing_of_subnormal_numbers(self, best_hashes: dict[str, str]) -> None:
+        finished = run_workload(None, FLUSHING, "assert is_flushing()")
+        assert finished.returncode == 0, finished.stderr
+        hashes = json.loads(finished.stdout)["hashes"]
+        different = [name for name in best_hashes if hashes[name] != best_hashes[name]]
+        assert not different
 
 
 class TestPhilox:
@@ -300,18 +359,35 @@ class TestResampling:
 class TestThreads:
     """As many threads as wanted: the same bits."""
 
+    @pytest.fixture(autouse=True)
+    def any_work_is_worth_a_thread(self) -> Iterator[None]:
+        usual = _kernel.use_threads_from(0.0)
+        yield
+        assert _kernel.use_threads_from(usual) == 0.0
+
     @pytest.mark.parametrize("mixture", [False, True])
     @pytest.mark.parametrize(("count", "posteriors"), [(100, 30), (1500, 40), (4000, 3)])
     def test_entropies(self, count: int, posteriors: int, mixture: bool) -> None:
         points = _kernel.normals(WORDS, count * 3).reshape(count, 3)
         log_weights = _kernel.normals((8, 0, 3, 2, 1), posteriors * count).reshape(posteriors, -1)
-        # Posteriors of all sizes, so that all ways are taken.
+        # Posteriors of all sizes, so that more than one way is taken.
         for row in range(posteriors):
             log_weights[row, count // (1 + row % 7) :] = -np.inf
-        results = {
-            _kernel.entropies(points, log_weights, False, mixture, 5, 0.1, 0.5, 0.0, threads)[
-                0
-            ].tobytes()
-            for threads in (0, 1, 2, 3, 64)
-        }
+        log_weights[0, 20:] = -np.inf
+        results = set()
+        for threads in (1, 2, 3, 64, 0):
+            result, _, visits, ways = _kernel.entropies(
+                points, log_weights, True, mixture, 5, 0.1, 0.5, 0.0, threads
+            )
+            results.add((result.tobytes(), visits, ways))
+            assert ways[0] > 0
+            assert ways[1] + ways[2] > 0
         assert len(results) == 1
+        if _processors() > 1:
+            assert _kernel.threads_started() > 0
+
+
+def _processors() -> int:
+    """Return how many threads the kernel uses at most."""
+    limit = os.environ.get("OMP_NUM_THREADS", "")
+    return int(limit) if limit.isdecimal() and int(limit) > 0 else len(os.sched_getaffinity(0))

@@ -580,9 +580,7 @@ class TestBadInput:
         configured = planning_settings()
         state = planning.initial_state(peg, configured, SEED, TRIAL)
         broken = Broken(**{function: states})
-        with pytest.raises(
-            ProblemError, match=rf"{function} of .* returned .* need a float64 arr"
-        ):
+        with pytest.raises(ProblemError, match=rf"{function} of .* returned .* need a float64 arr"):
             if function == "move":
                 planning.advance(broken, configured, state, np.zeros(3))
             else:

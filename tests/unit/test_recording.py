@@ -11,6 +11,7 @@ import msgspec
 import numpy as np
 import pytest
 import scipy.stats
+from matplotlib.image import imread
 
 from holdfast.configuration import Configuration, load
 from holdfast.recording.figure import trial_figure
@@ -30,6 +31,8 @@ from holdfast.recording.tables import (
     wilson_interval,
 )
 from holdfast.runtime.trial import Decisions, TrialResult, run_trial
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
 def result_of(
@@ -278,6 +281,79 @@ class TestRunDirectory:
         with pytest.raises(OutputError, match=r"model\.hole_tolerance is 0\.1 there and 0\.2 here"):
             RunDirectory.resume(tmp_path / "out", configuration_of(tmp_path, tolerance=0.2))
 
+    @staticmethod
+    def of_own_problem(tmp_path: Path, source: str) -> Configuration:
+        (tmp_path / "own_problem.py").write_text(source)
+        path = tmp_path / "own.yaml"
+        path.write_text("problem: own_problem:Own\nsimulator: {num_trials: 3, max_steps: 30}\n")
+        return load(path)
+
+    def test_resuming_with_another_source_of_the_problem_is_refused(self, tmp_path: Path) -> None:
+        source = (
+            "from holdfast.problems.peg_in_hole_2d import PegInHole2D\n"
+            "class Own(PegInHole2D): pass\n"
+        )
+        out = tmp_path / "out"
+        configuration = self.of_own_problem(tmp_path, source)
+        RunDirectory.create(out, configuration).close()
+        RunDirectory.resume(out, configuration).close()
+        changed = self.of_own_problem(tmp_path, source + "# changed\n")
+        with pytest.raises(OutputError, match=r"source has changed since \(module own_problem\)"):
+            RunDirectory.resume(out, changed)
+        RunDirectory.resume(out, self.of_own_problem(tmp_path, source)).close()
+
+    def test_resuming_with_another_holdfast_is_refused(self, tmp_path: Path) -> None:
+        configuration = configuration_of(tmp_path)
+        with RunDirectory.create(tmp_path / "out", configuration) as directory:
+            directory.journal.set_meta("holdfast_version", "0.0.1")
+        with pytest.raises(OutputError, match=r"by holdfast 0\.0\.1, this is .*--out"):
+            RunDirectory.resume(tmp_path / "out", configuration)
+
+    def test_resuming_may_ask_for_more_trials_but_not_for_fewer_than_finished(
+        self, tmp_path: Path
+    ) -> None:
+        path = tmp_path / "peg.yaml"
+        path.write_text("problem: peg_in_hole_2d\n")
+        out = tmp_path / "out"
+        with RunDirectory.create(out, load(path, num_trials=4)) as directory:
+            directory.add(result_of(0))
+            directory.add(result_of(2))
+        with RunDirectory.resume(out, load(path, num_trials=9)) as directory:
+            assert directory.write_tables(1.0).trials == 9
+        assert load(out / "config.yaml").simulator.num_trials == 9
+        RunDirectory.resume(out, load(path, num_trials=3)).close()
+        with pytest.raises(OutputError, match=r"trial 2 .* at least 3, not 2"):
+            RunDirectory.resume(out, load(path, num_trials=2))
+        assert load(out / "config.yaml").simulator.num_trials == 3
+
+    def test_a_run_without_a_finished_trial_keeps_no_directory(self, tmp_path: Path) -> None:
+        out = tmp_path / "out"
+        with RunDirectory.create(out, configuration_of(tmp_path)) as directory:
+            directory.write_tables(1.0)
+        other = configuration_of(tmp_path, seed=6)
+        with RunDirectory.create(out, other) as directory:
+            assert directory.earlier_wall_time_s == 0.0
+            assert not (out / "summary.json").exists()
+            with pytest.raises(OutputError, match="holds config"):
+                RunDirectory.create(out, other)  # in use by the run above
+            directory.add(result_of(0))
+        assert load(out / "config.yaml") == other
+        RunDirectory.resume(out, other).close()
+        with pytest.raises(OutputError, match=r"--resume.*--out"):
+            RunDirectory.create(out, other)
+
+    def test_a_default_directory_without_a_finished_trial_is_taken_again(
+        self, tmp_path: Path
+    ) -> None:
+        configuration = configuration_of(tmp_path)
+        for _ in range(2):
+            path = claim_default_directory(configuration, tmp_path / "runs")
+            assert path.name == "peg-seed5"
+            RunDirectory.create(path, configuration).close()
+        with RunDirectory.create(path, configuration) as directory:
+            directory.add(result_of(0))
+        assert claim_default_directory(configuration, tmp_path / "runs").name == "peg-seed5-2"
+
     def test_default_directories_are_numbered(self, tmp_path: Path) -> None:
         configuration = configuration_of(tmp_path)
         runs = tmp_path / "runs"
@@ -342,6 +418,16 @@ class TestRecorder:
 
 
 class TestFigure:
+    @pytest.mark.parametrize("example", ["light_dark_room", "capsule_robot", "peg_in_hole_3d"])
+    def test_nothing_is_cut_off(self, tmp_path: Path, example: str) -> None:
+        configuration = load(EXAMPLES / f"{example}.yaml")
+        recorder = TestRecorder.record(configuration, trial=0)
+        trial_figure(configuration, recorder.record, tmp_path / "trial.png")
+        picture = imread(tmp_path / "trial.png")[..., :3]
+        for edge in (picture[0], picture[-1], picture[:, 0], picture[:, -1]):
+            assert (edge == 1.0).all()
+        assert (picture < 1.0).any()
+
     @pytest.mark.parametrize("method", ["action_entropy", "random"])
     @pytest.mark.parametrize("problem", ["peg_in_hole_2d", "capsule_robot", "peg_in_hole_3d"])
     def test_every_kind_of_problem_is_drawn(

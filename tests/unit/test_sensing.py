@@ -239,9 +239,7 @@ class TestBadInput:
 
     def test_policy_of_another_shape(self) -> None:
         for shape in ((59, 2), (60,), (2,)):
-            with pytest.raises(
-                ProblemError, match=r"policy of coordinates returned float64"
-            ):
+            with pytest.raises(ProblemError, match=r"policy of coordinates returned float64"):
                 choose(Broken(policy=np.zeros(shape)), settings_of(), belief_of(1.0, 1.0))
 
     @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from holdfast.configuration import Configuration, load
-from holdfast.errors import InvalidValueError
+from holdfast.errors import InvalidValueError, ProblemError
 from holdfast.problems.problem import FloatArray
 from holdfast.recording.recorder import Recorder
 from holdfast.runtime import trials
@@ -56,6 +56,18 @@ def failing_configuration(tmp_path: Path, error: str) -> Configuration:
     (tmp_path / f"{name}.py").write_text(FAILING_PROBLEM.format(error=error))
     path = tmp_path / "failing.yaml"
     path.write_text(f"problem: {name}:Failing\nsimulator: {{num_trials: 4, seed: 3}}\n")
+    return load(path)
+
+
+def defective_configuration(tmp_path: Path) -> Configuration:
+    """A problem that makes holdfast fail with no function of the problem on the stack."""
+    (tmp_path / "defective.py").write_text(
+        "from holdfast.problems.peg_in_hole_2d import PegInHole2D\n"
+        "class Defective(PegInHole2D):\n"
+        "    initial_states = 3\n"
+    )
+    path = tmp_path / "defective.yaml"
+    path.write_text("problem: defective:Defective\nsimulator: {num_trials: 4, seed: 3}\n")
     return load(path)
 
 
@@ -196,17 +208,58 @@ class TestManyTrials:
         with pytest.raises(TrialError, match=r"trial 2 \(seed 3\): too heavy"):
             run_all(configuration, jobs=1, finished=(0, 1))
 
-    def test_a_defect_in_a_trial_is_raised_as_it_is_with_a_note(self, tmp_path: Path) -> None:
-        configuration = failing_configuration(tmp_path, "ZeroDivisionError")
-        with pytest.raises(ZeroDivisionError) as caught:
+    def test_what_a_problem_raises_comes_with_its_own_frames(self, tmp_path: Path) -> None:
+        configuration = failing_configuration(tmp_path, 'KeyError("lamp")')
+        with pytest.raises(TrialError) as caught:
+            run_all(configuration, jobs=1)
+        first, *frames = str(caught.value).splitlines()
+        name = configuration.problem_name
+        assert first == f"trial 0 (seed 3): {name} raised KeyError: 'lamp'"
+        assert sum(line.startswith("  File ") for line in frames) == 1
+        assert f"{tmp_path}" in frames[0]
+        assert frames[1].strip() == 'raise KeyError("lamp")'
+
+    def test_a_defect_without_a_frame_of_the_problem_is_raised_as_it_is(
+        self, tmp_path: Path
+    ) -> None:
+        configuration = defective_configuration(tmp_path)
+        with pytest.raises(TypeError, match="not callable") as caught:
             run_all(configuration, jobs=1)
         assert caught.value.__notes__ == ["in trial 0 (seed 3)"]
+
+    def test_a_defect_in_a_worker_comes_back_with_its_traceback(self, tmp_path: Path) -> None:
+        configuration = defective_configuration(tmp_path)
+        with pytest.raises(TrialCrashError, match=r"(?s)Traceback.*not callable.*in trial [01]"):
+            trials._run_in_workers(configuration, 2, iter(range(4)), 4, 1.0, lambda _: None)
+
+    @pytest.mark.parametrize("reward", [float("nan"), float("inf"), float("-inf")])
+    def test_a_reward_that_is_not_finite_is_refused(self, tmp_path: Path, reward: float) -> None:
+        configuration = configuration_of(tmp_path)
+
+        class Rewarding(SimulatedEnvironment):
+            def perform(self, task_action: FloatArray) -> float:
+                super().perform(task_action)
+                return reward if self.step == 3 else 0.0
+
+        environment = Rewarding(configuration.problem, configuration.simulator.seed, 0)
+        with pytest.raises(ProblemError, match=rf"the reward of step 2 is {reward}; it must be"):
+            run_trial(
+                configuration.problem,
+                configuration.planning,
+                configuration.simulator,
+                0,
+                environment,
+            )
 
     @pytest.mark.parametrize(
         ("error", "expected", "text"),
         [
             ('ProblemError("too heavy")', TrialError, r"trial [01] \(seed 3\): too heavy"),
-            ("ZeroDivisionError", TrialCrashError, r"(?s)ZeroDivisionError.*in trial [01]"),
+            (
+                "ZeroDivisionError",
+                TrialError,
+                r"(?s)trial [01] \(seed 3\): failing_.* raised ZeroDivisionError\n  File ",
+            ),
         ],
     )
     def test_errors_in_workers_come_back(

@@ -12,9 +12,9 @@
 
 namespace holdfast::HOLDFAST_ISA {
 
-/// Three ways to the same terms. Where the points are denser than the resolution, sums over balls;
-/// where they are not, sorted lists of the nearest points, made once for all posteriors; and for
-/// what neither settles (few of the near points have weight), a search for one posterior.
+/// Where the points are denser than the resolution, sums over balls; where they are not, sorted
+/// lists of the nearest points; and for what neither settles (few of the near points have weight),
+/// a search for one posterior. All give the same terms.
 template <std::size_t vectors, std::size_t length>
 static void group_nearest_rows(const PosteriorGroup& group, const QueryLeaf& query,
                                const NearestNeighborConstants& constants, double* scratch,

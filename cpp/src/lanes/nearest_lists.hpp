@@ -228,10 +228,8 @@ static unsigned walk_single(const PosteriorGroup& group, const QueryLeaf& query,
                 lists.leaves[number / leaf_size] * leaf_size + number % leaf_size;
             weight[lane] = group.weights[other * lane_count];
         }
+        if (bits_of(known & (distance <= radius)) == 0) break;
         const IntLanes open = (distance <= radius) & (weight > 0.0);
-        if (bits_of(open) == 0 && rank > 0) {
-            if (bits_of(radius == __builtin_inf()) == 0) break;
-        }
         mass += select(open, weight, Lanes{});
         within += select(open, splat(1.0), Lanes{});
         const IntLanes reached =

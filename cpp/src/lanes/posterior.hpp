@@ -21,7 +21,11 @@ static std::size_t normalize_in_place(double* weights, std::size_t count, double
     // observation.
     if (!(largest > -1.7976931348623157e308 && largest < 1.7976931348623157e308)) return 0;
     constexpr std::size_t steps = 5;
-    constexpr double thresholds[steps] = {1e-2, 1e-3, 1e-4, 1e-5, 1e-6};
+    // A hair less, so that weights that are such fractions themselves stay, however they are
+    // rounded.
+    constexpr double hair = 1.0 - 0x1p-40;
+    constexpr double thresholds[steps] = {1e-2 * hair, 1e-3 * hair, 1e-4 * hair, 1e-5 * hair,
+                                          1e-6 * hair};
     constexpr double may_be_lost = 0.005;
     Lanes total{}, below[steps] = {};
     for (std::size_t i = 0; i < count; i += lane_count) {

@@ -24,7 +24,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import to_rgba
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure, SubFigure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
@@ -51,6 +51,7 @@ _NUM_BODIES = 9
 _NUM_CLOUDS = 4
 _DISC_CORNERS = 48
 _NARROWEST, _WIDEST = 1.0, 1.35
+_HIGHEST_WORKSPACE = 8.0
 _MAX_MARKS = 120
 """With more sensing steps than this, marks on the paths would hide them; the strip has them all."""
 
@@ -103,9 +104,14 @@ def trial_figure(configuration: Configuration, record: TrialRecord, path: Path) 
         FigureCanvasAgg(figure)
         figure.suptitle(_title(configuration, record), x=0.012, ha="left", fontsize=12.0)
         if scene:
-            grid = figure.add_gridspec(1, 2, width_ratios=(1.08, 1.0))
-            left, right = (figure.add_subfigure(grid[0, column]) for column in range(2))
+            # A workspace as high as many panels would leave a gap between it and its legend.
+            filled = min(height, _HIGHEST_WORKSPACE) / height
+            grid = figure.add_gridspec(
+                2, 2, width_ratios=(1.08, 1.0), height_ratios=(filled, max(1.0 - filled, 1e-3))
+            )
+            left, right = figure.add_subfigure(grid[0, 0]), figure.add_subfigure(grid[:, 1])
             _draw_workspace(left.subplots(), problem, scene, record)
+            _draw_workspace_legend(left, problem, scene, record)
         else:
             right = figure.add_subfigure(figure.add_gridspec(1, 1)[0, 0])
         panels = right.subplots(
@@ -229,7 +235,6 @@ def _draw_workspace(panel: Axes, problem: Problem, scene: Scene, record: TrialRe
             edgecolor="white",
             zorder=5,
         )
-    _draw_workspace_legend(panel, problem, scene, record)
 
 
 def _shown_part(scene: Scene, points: Sequence[FloatArray]) -> FloatArray:
@@ -332,7 +337,7 @@ def _outline(body: FloatArray, scene: Scene, state: FloatArray) -> FloatArray:
 
 
 def _draw_workspace_legend(
-    panel: Axes, problem: Problem, scene: Scene, record: TrialRecord
+    figure: SubFigure, problem: Problem, scene: Scene, record: TrialRecord
 ) -> None:
     handles: list[Line2D | Patch] = []
     if record.true_states:
@@ -355,7 +360,7 @@ def _draw_workspace_legend(
                 linestyle="",
                 markerfacecolor="white",
                 color=_GOAL,
-                label="via point",
+                label="landmark",
             )
         )
     if scene.body is not None:
@@ -363,11 +368,10 @@ def _draw_workspace_legend(
     if len(scene.obstacles):
         handles.append(Patch(facecolor=_OBSTACLE, edgecolor=_OBSTACLE_EDGE, label="obstacle"))
     handles += _action_handles(problem, record)
-    panel.legend(
+    # Outside the axes, where the layout makes room for it however many rows it has.
+    figure.legend(
         handles=handles,
-        loc="upper center",
-        bbox_to_anchor=(0.5, 0.0),
-        borderaxespad=4.2,
+        loc="outside lower center",
         ncols=4 if max(map(len, problem.sensing_actions), default=0) <= _LABEL_WIDTH else 3,
         columnspacing=1.6,
         handletextpad=0.6,
@@ -375,11 +379,19 @@ def _draw_workspace_legend(
 
 
 def _action_handles(problem: Problem, record: TrialRecord) -> list[Line2D]:
-    used = sorted({sensing.sensing_action for sensing in record.sensing})
-    return [
-        _dot(*_look(action), fill(f"sensed {problem.sensing_actions[action]}", 30), size=5.5)
-        for action in used
-    ]
+    """Return a legend's entries for the actions that are drawn: chosen, or with an entropy."""
+    chosen = {sensing.sensing_action for sensing in record.sensing}
+    compared = any(sensing.entropies is not None for sensing in record.sensing)
+    handles = []
+    for action, name in enumerate(problem.sensing_actions):
+        if action in chosen:
+            handles.append(_dot(*_look(action), fill(f"sensed {name}", 30), size=5.5))
+        elif compared:
+            handle = _dot(*_look(action), fill(f"{name}, never sensed", 30), size=4.5)
+            handle.set_markerfacecolor("white")
+            handle.set_markeredgewidth(0.9)
+            handles.append(handle)
+    return handles
 
 
 def _dot(color: str, marker: str, label: str, *, size: float) -> Line2D:
@@ -435,12 +447,11 @@ def _draw_coordinates(
             Line2D(
                 [],
                 [],
-                marker="o",
+                marker="x",
                 linestyle="",
-                markerfacecolor="none",
-                markersize=8.0,
+                markersize=7.0,
                 color=_TRUE,
-                label="explained by no particle",
+                label="far from every particle",
             )
         )
     panels[0].legend(
@@ -483,9 +494,10 @@ def _draw_choices(panel: Axes, problem: Problem, record: TrialRecord) -> None:
             [sensing.step for sensing in unexplained],
             [float(sensing.sensing_action) for sensing in unexplained],
             s=3.0 * _marker_size(record),
-            facecolor="none",
-            edgecolor=_TRUE,
-            linewidth=0.8,
+            marker="x",
+            color=_TRUE,
+            linewidth=0.9,
+            zorder=5,
         )
     labels = [fill(str(label), _LABEL_WIDTH) for label in problem.sensing_actions]
     size = 9.0 if max(map(len, labels), default=0) <= _LABEL_WIDTH else 7.0

@@ -154,6 +154,23 @@ class Journal:
         with self._errors():
             self._connection.execute("INSERT OR REPLACE INTO meta VALUES (?, ?)", (key, value))
 
+    def restart(self, meta: dict[str, str]) -> None:
+        """Forget what was noted about a run without a finished trial, and note ``meta`` instead.
+
+        Raises
+        ------
+        OutputError
+            If a trial is finished.
+        """
+        if not self.is_empty():
+            raise OutputError(f"{self.path}: holds finished trials")
+        rows = {"schema_version": str(SCHEMA_VERSION)} | meta
+        with self._errors():
+            self._connection.execute("BEGIN IMMEDIATE")
+            self._connection.execute("DELETE FROM meta")
+            self._connection.executemany("INSERT INTO meta VALUES (?, ?)", rows.items())
+            self._connection.execute("COMMIT")
+
     def add(self, result: TrialResult) -> None:
         """Keep a finished trial; when this returns, it is on the disk.
 
@@ -177,6 +194,11 @@ class Journal:
         with self._errors():
             # Outside an explicit transaction, a statement is one of its own.
             self._connection.execute("INSERT INTO trials VALUES (?, ?, ?)", row)
+
+    def is_empty(self) -> bool:
+        """Tell whether no trial is kept."""
+        with self._errors():
+            return self._connection.execute("SELECT 1 FROM trials LIMIT 1").fetchone() is None
 
     def finished(self) -> set[int]:
         """Return the numbers of the trials that are kept."""

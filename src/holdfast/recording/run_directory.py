@@ -2,12 +2,13 @@
 
 A run's directory is claimed before its first trial, so that a wrong path costs no computing. The
 journal is the truth; ``trials.csv`` and ``summary.json`` are made from it, and are made again when
-a run is resumed.
+a run is resumed. Only the same configuration and the same code go on with a run, because a table
+of trials that were decided in two ways would say nothing about either.
 """
 
 from __future__ import annotations
 
-import hashlib
+import contextlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import TracebackType
@@ -16,6 +17,7 @@ from typing import Any, Self
 from holdfast import __version__
 from holdfast.configuration import Configuration
 from holdfast.recording.files import OutputError, write_atomically
+from holdfast.recording.fingerprint import difference, fingerprint
 from holdfast.recording.journal import Journal
 from holdfast.recording.tables import RunSummary, SummaryBuilder, csv_lines
 from holdfast.runtime.trial import TrialResult
@@ -56,6 +58,8 @@ class RunDirectory:
     def create(cls, path: Path, configuration: Configuration) -> Self:
         """Claim a directory for a new run; it is made if it is not there.
 
+        A run of which no trial is finished does not keep its directory.
+
         Raises
         ------
         OutputError
@@ -68,32 +72,39 @@ class RunDirectory:
             raise OutputError(f"{path}: is a file, not a directory") from error
         except OSError as error:
             raise OutputError(f"{path}: cannot be made: {error.strerror}") from error
-        if taken:
-            raise OutputError(
-                f"{path}: holds {', '.join(taken)} already; go on with that run (--resume) or "
-                "choose another directory (--out)"
-            )
         text = configuration.to_yaml()
-        # First, because it is an ordinary file: it shows whether the directory can be written.
-        write_atomically(path / CONFIGURATION_NAME, text)
-        journal = Journal.create(
-            path / JOURNAL_NAME,
-            {
-                "configuration": text,
-                "configuration_hash": _hash(text),
-                "holdfast_version": __version__,
-            },
-        )
-        return cls(path, configuration, journal)
+        meta = {"configuration": text} | fingerprint(configuration)
+        journal = _journal_without_trials(path)
+        if taken and journal is None:
+            raise OutputError(
+                f"{path}: holds {', '.join(taken)} already; go on with that run (--resume), or "
+                "choose another directory (--out) if the problem or the settings have changed"
+            )
+        try:
+            if journal is not None:
+                journal.restart(meta)
+                for name in (TRIALS_NAME, SUMMARY_NAME, FIGURE_NAME):
+                    (path / name).unlink(missing_ok=True)
+            # Before the journal is made: an ordinary file shows whether the directory can be
+            # written.
+            write_atomically(path / CONFIGURATION_NAME, text)
+            if journal is None:
+                journal = Journal.create(path / JOURNAL_NAME, meta)
+            return cls(path, configuration, journal)
+        except BaseException:
+            if journal is not None:
+                journal.close()
+            raise
 
     @classmethod
     def resume(cls, path: Path, configuration: Configuration) -> Self:
-        """Open the directory of a run that shall go on.
+        """Open the directory of a run that shall go on, perhaps to more trials than it had.
 
         Raises
         ------
         OutputError
-            If it holds no run, one with another configuration, or one that is in use.
+            If it holds no run, one of other code or with another configuration, one with a finished
+            trial that the configuration does not ask for, or one that is in use.
         """
         if not path.is_dir():
             raise OutputError(f"{path}: there is no such directory, so no run to resume")
@@ -101,7 +112,14 @@ class RunDirectory:
             raise OutputError(f"{path}: holds no {JOURNAL_NAME}, so no run to resume")
         journal = Journal.open(path / JOURNAL_NAME)
         try:
-            _require_same(path, journal.meta(), configuration.to_yaml())
+            text = configuration.to_yaml()
+            meta = journal.meta()
+            _require_same_code(path, meta, fingerprint(configuration))
+            _require_same_configuration(path, meta.get("configuration", ""), text)
+            _require_enough_trials(path, journal.finished(), configuration.simulator.num_trials)
+            if meta.get("configuration") != text:
+                journal.set_meta("configuration", text)
+                write_atomically(path / CONFIGURATION_NAME, text)
             return cls(path, configuration, journal)
         except BaseException:
             journal.close()
@@ -166,13 +184,13 @@ def output_names() -> tuple[str, ...]:
 
 
 def claim_default_directory(configuration: Configuration, parent: Path) -> Path:
-    """Make and return a new directory named after the configuration and the seed.
+    """Return a directory named after the configuration and the seed that is free for a new run.
 
     Parameters
     ----------
     configuration : Configuration
     parent : Path
-        Where to make it; it is made too.
+        Where it is made if it is not there; this one is made too.
 
     Returns
     -------
@@ -185,6 +203,10 @@ def claim_default_directory(configuration: Configuration, parent: Path) -> Path:
         If it cannot be made.
     """
     for path in _default_directories(configuration, parent):
+        free = _journal_without_trials(path)
+        if free is not None:
+            free.close()
+            return path
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             # Making it is also the test whether it is free, so two runs never share one.
@@ -225,27 +247,58 @@ def _default_directories(configuration: Configuration, parent: Path) -> Iterator
         yield parent / f"{name}-{number}"
 
 
-def _hash(text: str) -> str:
-    return hashlib.blake2b(text.encode(), digest_size=32).hexdigest()
+def _journal_without_trials(path: Path) -> Journal | None:
+    """Return the open journal of a run of which no trial is finished, None if there is no such."""
+    # Absent, in use or no journal of ours: then nothing there is free to be used.
+    with contextlib.suppress(OutputError):
+        journal = Journal.open(path / JOURNAL_NAME)
+        if journal.is_empty():
+            return journal
+        journal.close()
+    return None
 
 
-def _require_same(path: Path, meta: Mapping[str, str], text: str) -> None:
-    if meta.get("configuration_hash") == _hash(text):
-        return
-    key, there, here = _first_difference(meta.get("configuration", ""), text)
-    raise OutputError(
-        f"{path}: that run has another configuration: {key} is {there} there and {here} here; "
-        "use the same one, or another directory (--out)"
-    )
+def _require_same_code(path: Path, there: Mapping[str, str], here: Mapping[str, str]) -> None:
+    what = difference(there, here)
+    if what is not None:
+        raise OutputError(
+            f"{path}: that run cannot go on: {what}, so the trials would not compare; "
+            "another directory (--out) starts anew"
+        )
 
 
-def _first_difference(there: str, here: str) -> tuple[str, str, str]:
-    """Return the key and both values of the first difference of two resolved configurations."""
+def _require_same_configuration(path: Path, there: str, here: str) -> None:
     import yaml
 
     # Both were written by us, so the same plain loader reads both in the same way.
-    found = _difference_in(yaml.safe_load(there), yaml.safe_load(here), "")
-    return found or ("its text", "written one way", "in another")
+    found = _difference_in(_compared(yaml.safe_load(there)), _compared(yaml.safe_load(here)), "")
+    if found is not None:
+        key, old, new = found
+        raise OutputError(
+            f"{path}: that run has another configuration: {key} is {old} there and {new} here; "
+            "use the same one, or another directory (--out)"
+        )
+
+
+def _compared(configuration: Any) -> Any:
+    """Leave out what changes no trial: how many there are, and where the problem's file lies."""
+    if not isinstance(configuration, Mapping):
+        return configuration
+    kept = {key: value for key, value in configuration.items() if key != "problem_directory"}
+    if isinstance(kept.get("simulator"), Mapping):
+        kept["simulator"] = {
+            key: value for key, value in kept["simulator"].items() if key != "num_trials"
+        }
+    return kept
+
+
+def _require_enough_trials(path: Path, finished: set[int], num_trials: int) -> None:
+    last = max(finished, default=-1)
+    if last >= num_trials:
+        raise OutputError(
+            f"{path}: trial {last} of that run is finished, so simulator.num_trials (--trials) is "
+            f"at least {last + 1}, not {num_trials}; use another directory (--out) for fewer"
+        )
 
 
 def _difference_in(there: Any, here: Any, key: str) -> tuple[str, str, str] | None:
