@@ -7,6 +7,16 @@
 
 namespace holdfast {
 
+namespace isa_baseline {
+extern const VectorKernels table;
+}
+namespace isa_avx2 {
+extern const VectorKernels table;
+}
+namespace isa_avx512 {
+extern const VectorKernels table;
+}
+
 namespace {
 
 const VectorKernels& choose() {

@@ -90,14 +90,4 @@ struct VectorKernels {
 /// The best of the compiled sets that this processor runs; HOLDFAST_SIMD names another one.
 const VectorKernels& vector_kernels();
 
-namespace isa_baseline {
-extern const VectorKernels table;
-}
-namespace isa_avx2 {
-extern const VectorKernels table;
-}
-namespace isa_avx512 {
-extern const VectorKernels table;
-}
-
 }  // namespace holdfast

@@ -8,7 +8,7 @@
 
 #include "tree_search.hpp"
 
-namespace holdfast::HOLDFAST_ISA {
+namespace holdfast::inline HOLDFAST_ISA {
 
 /// A row of sums over posteriors: weights, and numbers of points.
 template <std::size_t vectors>
@@ -123,4 +123,4 @@ static void ball_terms(const PosteriorGroup& group, const QueryLeaf& query, std:
     }
 }
 
-}  // namespace holdfast::HOLDFAST_ISA
+}  // namespace holdfast::inline HOLDFAST_ISA

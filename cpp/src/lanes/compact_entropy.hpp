@@ -4,7 +4,7 @@
 
 #include "../vector_kernels.hpp"
 
-namespace holdfast::HOLDFAST_ISA {
+namespace holdfast::inline HOLDFAST_ISA {
 
 /// Keeps `smallest[0..kept)`, the least values seen so far in ascending order, at most `wanted`.
 HOLDFAST_INLINE void insert_smallest(double* smallest, std::uint32_t& kept, std::uint32_t wanted,
@@ -110,4 +110,4 @@ static double compact_mixture(const CompactPosterior& posterior, double exponent
     return entropy;
 }
 
-}  // namespace holdfast::HOLDFAST_ISA
+}  // namespace holdfast::inline HOLDFAST_ISA

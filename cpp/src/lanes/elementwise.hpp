@@ -4,7 +4,7 @@
 
 #include "../vector_kernels.hpp"
 
-namespace holdfast::HOLDFAST_ISA {
+namespace holdfast::inline HOLDFAST_ISA {
 
 template <class Function>
 HOLDFAST_INLINE void map(const double* in, double* out, std::size_t count, Function function) {
@@ -83,4 +83,4 @@ static void normals_array(const Stream& stream, std::uint64_t first, std::size_t
     }
 }
 
-}  // namespace holdfast::HOLDFAST_ISA
+}  // namespace holdfast::inline HOLDFAST_ISA

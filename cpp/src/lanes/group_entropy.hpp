@@ -10,7 +10,7 @@
 #include "ball_sums.hpp"
 #include "nearest_lists.hpp"
 
-namespace holdfast::HOLDFAST_ISA {
+namespace holdfast::inline HOLDFAST_ISA {
 
 /// Where the points are denser than the resolution, sums over balls; where they are not, sorted
 /// lists of the nearest points; and for what neither settles (few of the near points have weight),
@@ -173,4 +173,4 @@ static void group_mixture(const PosteriorGroup& group, std::size_t leaf, double 
     }
 }
 
-}  // namespace holdfast::HOLDFAST_ISA
+}  // namespace holdfast::inline HOLDFAST_ISA

@@ -10,7 +10,7 @@
 #include "group_entropy.hpp"
 #include "posterior.hpp"
 
-namespace holdfast::HOLDFAST_ISA {
+namespace holdfast::inline HOLDFAST_ISA {
 
 extern const VectorKernels table;
 const VectorKernels table = {
@@ -19,4 +19,4 @@ const VectorKernels table = {
     compact_nearest,   compact_mixture, group_nearest, group_mixture,
 };
 
-}  // namespace holdfast::HOLDFAST_ISA
+}  // namespace holdfast::inline HOLDFAST_ISA

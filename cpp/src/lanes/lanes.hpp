@@ -45,9 +45,6 @@ inline constexpr std::size_t registers = 64 / register_bytes;
 using DoubleRegister = double __attribute__((vector_size(register_bytes)));
 using IntRegister = std::int64_t __attribute__((vector_size(register_bytes)));
 using UnsignedRegister = std::uint64_t __attribute__((vector_size(register_bytes)));
-// May lie anywhere in an array of double.
-using LooseRegister =
-    double __attribute__((vector_size(register_bytes), aligned(alignof(double)), may_alias));
 using CountLanes = std::uint32_t __attribute__((vector_size(32)));
 
 // A loop over the registers, written out: compilers keep the parts of a structure in registers only
@@ -165,14 +162,14 @@ HOLDFAST_INLINE std::int64_t shift_right(std::int64_t a, int by) {
 HOLDFAST_INLINE Lanes load(const double* from) {
     constexpr std::size_t width = lane_count / registers;
     Lanes result;
-    HOLDFAST_EACH_REGISTER(result.part[r] =
-                               *reinterpret_cast<const LooseRegister*>(from + r * width))
+    HOLDFAST_EACH_REGISTER(
+        __builtin_memcpy(&result.part[r], from + r * width, sizeof(DoubleRegister)))
     return result;
 }
 
 HOLDFAST_INLINE void store(double* to, const Lanes& lanes) {
     constexpr std::size_t width = lane_count / registers;
-    HOLDFAST_EACH_REGISTER(*reinterpret_cast<LooseRegister*>(to + r * width) = lanes.part[r])
+    HOLDFAST_EACH_REGISTER(__builtin_memcpy(to + r * width, &lanes.part[r], sizeof(DoubleRegister)))
 }
 
 /// Loads `count` < 8 doubles and fills up with `filler`.

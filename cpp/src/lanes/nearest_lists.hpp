@@ -9,7 +9,7 @@
 #include "sorting_network.hpp"
 #include "tree_search.hpp"
 
-namespace holdfast::HOLDFAST_ISA {
+namespace holdfast::inline HOLDFAST_ISA {
 
 /// The nearest points of sixteen query points, sorted: keys[v][rank] has those of eight of them.
 ///
@@ -255,4 +255,4 @@ static unsigned walk_single(const PosteriorGroup& group, const QueryLeaf& query,
     return bits_of(weight > 0.0) & ~settled;
 }
 
-}  // namespace holdfast::HOLDFAST_ISA
+}  // namespace holdfast::inline HOLDFAST_ISA

@@ -12,7 +12,7 @@
 
 #include "../vector_kernels.hpp"
 
-namespace holdfast::HOLDFAST_ISA {
+namespace holdfast::inline HOLDFAST_ISA {
 
 /// In place: log weights (in `weights`) to normalised weights; returns the number of non-zero ones.
 static std::size_t normalize_in_place(double* weights, std::size_t count, double largest,
@@ -119,4 +119,4 @@ static std::size_t posterior(const PosteriorInput& in, double* weights) {
     return normalize_in_place(weights, in.count, maximum_of(largest), true);
 }
 
-}  // namespace holdfast::HOLDFAST_ISA
+}  // namespace holdfast::inline HOLDFAST_ISA

@@ -5,7 +5,7 @@
 
 #include "lanes.hpp"
 
-namespace holdfast::HOLDFAST_ISA {
+namespace holdfast::inline HOLDFAST_ISA {
 
 template <std::size_t... i>
 struct Indices {};
@@ -83,4 +83,4 @@ HOLDFAST_INLINE void apply(Lanes* rows) {
     }
 }
 
-}  // namespace holdfast::HOLDFAST_ISA
+}  // namespace holdfast::inline HOLDFAST_ISA

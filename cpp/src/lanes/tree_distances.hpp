@@ -9,7 +9,7 @@
 
 #include "../vector_kernels.hpp"
 
-namespace holdfast::HOLDFAST_ISA {
+namespace holdfast::inline HOLDFAST_ISA {
 
 inline constexpr std::size_t stack_size = 128;  // deeper than any balanced tree of 2^32 points
 
@@ -111,4 +111,4 @@ HOLDFAST_INLINE void open_leaf(const TreeView& tree, std::size_t leaf, QueryLeaf
     }
 }
 
-}  // namespace holdfast::HOLDFAST_ISA
+}  // namespace holdfast::inline HOLDFAST_ISA

@@ -7,7 +7,7 @@
 #include "compact_entropy.hpp"
 #include "tree_distances.hpp"
 
-namespace holdfast::HOLDFAST_ISA {
+namespace holdfast::inline HOLDFAST_ISA {
 
 /// Squared distance to the k-th nearest other point that column `column` gives weight.
 static double kth_distance(const PosteriorGroup& group, const double* point, std::size_t own_slot,
@@ -119,4 +119,4 @@ static double searched_term(const PosteriorGroup& group, const double* point, st
                         resolved ? neighbors : found.count, constants);
 }
 
-}  // namespace holdfast::HOLDFAST_ISA
+}  // namespace holdfast::inline HOLDFAST_ISA
