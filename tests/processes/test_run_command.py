@@ -384,3 +384,27 @@ class TestErrors:
     def test_a_configuration_without_a_command(self, workplace: Path) -> None:
         error = self.fails(workplace, "peg.yaml", "--jobs", "2")
         assert error.endswith("did you mean: holdfast run peg.yaml --jobs 2\n")
+
+
+def test_of_two_runs_at_once_in_one_directory_one_is_done(tmp_path: Path) -> None:
+    """And what lies there afterwards is that one's, the configuration too."""
+    configuration = Path(__file__).parents[2] / "examples" / "peg_in_hole_2d.yaml"
+    for attempt in range(4):
+        directory = tmp_path / str(attempt)
+        both = [
+            subprocess.Popen(
+                [
+                    *(sys.executable, "-m", "holdfast", "run", str(configuration), "--trials", "2"),
+                    *("--seed", str(seed), "--out", str(directory), "--quiet", "--jobs", "1"),
+                ],
+                stderr=subprocess.PIPE,
+                text=True,
+            )
+            for seed in (1, 2)
+        ]
+        errors = [process.communicate(timeout=60)[1] for process in both]
+        codes = [process.returncode for process in both]
+        assert sorted(codes) == [0, 2], errors
+        winner = 1 + codes.index(0)
+        assert f"seed: {winner}\n" in (directory / "config.yaml").read_text(encoding="utf-8")
+        assert f'"seed": {winner},' in (directory / "summary.json").read_text(encoding="utf-8")

@@ -8,6 +8,7 @@ resumed run reads from it which trials are missing.
 from __future__ import annotations
 
 import contextlib
+import os
 import sqlite3
 from collections.abc import Iterator
 from pathlib import Path
@@ -74,20 +75,35 @@ class Journal:
         OutputError
             If there is a file already or it cannot be written.
         """
-        if path.exists():
-            raise OutputError(f"{path}: there is a journal already")
-        journal = cls(path, cls._connect(path, create=True))
-        with journal._errors():
-            rows = {"schema_version": str(SCHEMA_VERSION)} | meta
-            statements = [
-                "BEGIN IMMEDIATE",
-                *(part for part in _SCHEMA.split(";") if part.strip()),
-            ]
-            for statement in statements:
-                journal._connection.execute(statement)
-            journal._connection.executemany("INSERT INTO meta VALUES (?, ?)", rows.items())
-            journal._connection.execute("COMMIT")
-        return journal
+        # Made under a name of its own and then linked to the right one, which fails if that is
+        # taken: nobody ever sees a journal that is half made, and of two runs one has it.
+        unfinished = path.with_name(f".{path.name}.{os.getpid()}")
+        unfinished.unlink(missing_ok=True)
+        try:
+            journal = cls(unfinished, cls._connect(unfinished, create=True))
+            try:
+                with journal._errors():
+                    rows = {"schema_version": str(SCHEMA_VERSION)} | meta
+                    statements = [
+                        "BEGIN IMMEDIATE",
+                        *(part for part in _SCHEMA.split(";") if part.strip()),
+                    ]
+                    for statement in statements:
+                        journal._connection.execute(statement)
+                    journal._connection.executemany("INSERT INTO meta VALUES (?, ?)", rows.items())
+                    journal._connection.execute("COMMIT")
+            finally:
+                journal.close()
+            try:
+                os.link(unfinished, path)
+            except FileExistsError as error:
+                raise OutputError(f"{path}: there is a journal already") from error
+            except OSError as error:
+                raise OutputError(f"{path}: cannot be made: {error.strerror}") from error
+        finally:
+            unfinished.unlink(missing_ok=True)
+            unfinished.with_name(f"{unfinished.name}-journal").unlink(missing_ok=True)
+        return cls.open(path)
 
     @classmethod
     def open(cls, path: Path) -> Self:

@@ -9,6 +9,7 @@ of trials that were decided in two ways would say nothing about either.
 from __future__ import annotations
 
 import contextlib
+import tempfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import TracebackType
@@ -85,11 +86,11 @@ class RunDirectory:
                 journal.restart(meta)
                 for name in (TRIALS_NAME, SUMMARY_NAME, FIGURE_NAME):
                     (path / name).unlink(missing_ok=True)
-            # Before the journal is made: an ordinary file shows whether the directory can be
-            # written.
-            write_atomically(path / CONFIGURATION_NAME, text)
-            if journal is None:
+            else:
+                _require_writable(path)
                 journal = Journal.create(path / JOURNAL_NAME, meta)
+            # After the journal, which only one run can have: so both are the same run's.
+            write_atomically(path / CONFIGURATION_NAME, text)
             return cls(path, configuration, journal)
         except BaseException:
             if journal is not None:
@@ -256,6 +257,15 @@ def _journal_without_trials(path: Path) -> Journal | None:
             return journal
         journal.close()
     return None
+
+
+def _require_writable(path: Path) -> None:
+    """Find out by an ordinary file: SQLite's own errors do not say why."""
+    try:
+        with tempfile.TemporaryFile(dir=path):
+            pass
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written: {error.strerror}") from error
 
 
 def _require_same_code(path: Path, there: Mapping[str, str], here: Mapping[str, str]) -> None:
