@@ -24,11 +24,11 @@ constexpr double infinity = std::numeric_limits<double>::infinity();
 // The costs are nanoseconds, measured in three dimensions; they need to be right within a factor of
 // two.
 constexpr std::size_t compact_limit = 24;
-constexpr double grouped_share =
-    0.12;  // below it the lists of near points hold too few of a posterior
+// Of all points: below it the lists of near points hold too few of a posterior.
+constexpr double grouped_share = 0.12;
 constexpr double grouped_cost_of_a_point = 1000.0;
-
-constexpr double work_that_follows = 10.0;  // nanoseconds for each likelihood, with the entropies
+// Nanoseconds for each likelihood, with the entropies that follow.
+constexpr double work_that_follows = 10.0;
 
 double cost_alone(std::size_t survivors) {
     const auto size = static_cast<double>(survivors);

@@ -114,12 +114,13 @@ def choose_sensing_action(
     points = points_of(belief.states, stage)
     estimator = _estimator(problem, settings, belief, points)
     threads = settings.active_sensing.num_cores
-    log_weights = None
+    several_steps = settings.active_sensing.horizon > 1
     if contract.has_general_observations(problem):
         log_weights = _general_log_weights(problem, settings, belief, hypotheses)
         samples, likelihoods, visits = _entropies(points, log_weights, True, estimator, threads)
         samples = samples.reshape(count, -1)
         entropies = _row_means(samples)
+        weights = _normalized(log_weights) if several_steps else None
     else:
         sizes, predicted, variance = _predictions(problem, belief)
         entropies, samples, likelihoods, visits = _kernel.hypothetical_entropies(
@@ -137,9 +138,21 @@ def choose_sensing_action(
             estimator.offset,
             threads,
         )
-    if settings.active_sensing.horizon > 1:
+        weights = None
+        if several_steps:
+            weights = _kernel.hypothetical_weights(
+                belief.weights, sizes, predicted, variance, samples.shape[1], hypotheses.words
+            )
+    if weights is not None and not np.isnan(entropies).any():
         later = _later_entropies(
-            problem, settings, belief, stage, hypotheses, estimator, points_of, log_weights
+            problem,
+            settings,
+            belief.states,
+            weights.reshape(*samples.shape, -1),
+            stage,
+            hypotheses,
+            estimator,
+            points_of,
         )
         samples = samples + later
         entropies = _row_means(samples)
@@ -169,11 +182,7 @@ def _points_of(
 def _estimator(
     problem: Problem, settings: PlanningSettings, belief: Belief, points: FloatArray
 ) -> KernelEstimator:
-    if (bad := first_unbounded(points)) is not None:
-        raise ProblemError(
-            f"policy of {problem.name} returned {points[bad]} in state {belief.states[bad]}: every "
-            f"coordinate must be finite and at most {LARGEST:g}"
-        )
+    _require_bounded(problem, points, belief.states, "state")
     dimension = points.shape[1]
     selector = settings.selector
     if selector.estimator == "nearest_neighbor":
@@ -196,6 +205,14 @@ def _estimator(
                 f"{variance.shape[0]} coordinates, the points {dimension}: set selector.resolution"
             )
     return kernel_estimator(GaussianMixture(variance, upper), dimension)
+
+
+def _require_bounded(problem: Problem, points: FloatArray, states: FloatArray, which: str) -> None:
+    if (bad := first_unbounded(points)) is not None:
+        raise ProblemError(
+            f"policy of {problem.name} returned {points[bad]} in {which} {states[bad]}: every "
+            f"coordinate must be finite and at most {LARGEST:g}"
+        )
 
 
 def _predictions(problem: Problem, belief: Belief) -> tuple[list[int], FloatArray, FloatArray]:
@@ -256,6 +273,11 @@ def _general_log_weights(
     return np.ascontiguousarray(rows, dtype=np.float64)
 
 
+def _normalized(log_weights: FloatArray) -> FloatArray:
+    """Return the weights, row by row, without the negligible ones."""
+    return np.array([_kernel.normalize(row, True)[0] for row in log_weights])
+
+
 def _stratified(weights: FloatArray, samples: int, stream: Stream) -> list[int]:
     """Draw one particle from each ``samples``-th of the cumulated weight."""
     positions = (np.arange(samples) + stream.uniform(samples)) / samples
@@ -289,36 +311,26 @@ def _entropies(
 def _later_entropies(
     problem: Problem,
     settings: PlanningSettings,
-    belief: Belief,
+    states_now: FloatArray,
+    weights: FloatArray,
     stage: int,
     hypotheses: Stream,
     estimator: KernelEstimator,
     points_of: Callable[[FloatArray, int], FloatArray],
-    log_weights: FloatArray | None,
 ) -> FloatArray:
     """Return the discounted entropies of the steps after the first, shape (J, M).
 
+    ``weights`` are those of the hypothetical posteriors, shape (J, M, N).
     Each hypothetical belief takes the action of its own estimate and is moved by it. The motion
     noise is the same for every sensing action, as the observation noise is.
     """
     sensing = settings.active_sensing
-    samples = sensing.num_observation_samples
-    actions = len(problem.sensing_actions)
-    if log_weights is not None:
-        rows = [_kernel.normalize(row, True) for row in log_weights]
-        weights = np.array([row for row, _ in rows]).reshape(actions, samples, -1)
-        if not all(survivors for _, survivors in rows):
-            return np.full((actions, samples), np.nan)
-    else:
-        sizes, predicted, variance = _predictions(problem, belief)
-        weights = _kernel.hypothetical_weights(
-            belief.weights, sizes, predicted, variance, samples, hypotheses.words
-        )
+    actions, samples, _ = weights.shape
     motion = hypotheses.substream(_HORIZON_MOTION)
     later = np.zeros((actions, samples))
     for j in range(actions):
         for i in range(samples):
-            states = belief.states
+            states = states_now
             own_weights = np.ascontiguousarray(weights[j, i])
             own_stage: int = stage
             factor = 1.0
@@ -332,11 +344,7 @@ def _later_entropies(
                 states = contract.states_of(problem, "move", moved, states.shape)
                 factor *= sensing.discount
                 points = points_of(states, own_stage)
-                if (bad := first_unbounded(points)) is not None:
-                    raise ProblemError(
-                        f"policy of {problem.name} returned {points[bad]} in the predicted state "
-                        f"{states[bad]}: every coordinate must be finite and at most {LARGEST:g}"
-                    )
+                _require_bounded(problem, points, states, "the predicted state")
                 row, _, _ = _entropies(points, own_weights.reshape(1, -1), False, estimator, 1)
                 later[j, i] += factor * row[0]
     return later
