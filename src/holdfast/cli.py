@@ -31,10 +31,10 @@ if TYPE_CHECKING:
     from rich.progress import Progress
 
     from holdfast.configuration import Configuration
+    from holdfast.outcome import TrialResult
     from holdfast.recording.recorder import Recorder, TrialRecord
     from holdfast.recording.run_directory import RunDirectory
     from holdfast.recording.tables import RunSummary
-    from holdfast.runtime.trial import TrialResult
 
 __all__ = ["app", "main"]
 

@@ -13,6 +13,7 @@ __all__ = [
     "HoldfastError",
     "InvalidValueError",
     "ProblemError",
+    "TransportError",
     "UnknownProblemError",
 ]
 
@@ -39,3 +40,7 @@ class ProblemError(HoldfastError):
 
 class CheckpointError(HoldfastError):
     """A checkpoint does not decode to a valid planning state."""
+
+
+class TransportError(HoldfastError):
+    """An endpoint cannot be used: it is malformed, taken, or lacks its credentials."""

@@ -17,8 +17,10 @@ from holdfast.errors import InvalidValueError
 
 __all__ = [
     "ActiveSensingSettings",
+    "OffloadSettings",
     "ParticleFilterSettings",
     "PlanningSettings",
+    "RecoverySettings",
     "SelectorSettings",
     "SimulatorSettings",
     "check_settings",
@@ -30,6 +32,7 @@ MAX_PARTICLES = 10_000_000
 Count = Annotated[int, msgspec.Meta(ge=1)]
 NonNegativeCount = Annotated[int, msgspec.Meta(ge=0)]
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
+Milliseconds = Annotated[float, msgspec.Meta(gt=0.0, le=3_600_000.0)]
 Seed = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
 
 
@@ -124,6 +127,69 @@ class SimulatorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True,
     sensing_intervals: NonNegativeCount = 8
     verbosity: NonNegativeCount = 0
     seed: Seed = 0
+
+
+class OffloadSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The section ``offload``: which services decide, and how soon one is given up.
+
+    Nothing here changes a decision, only when and where it is made.
+
+    Attributes
+    ----------
+    services : tuple of str
+        Endpoints of the services in order of preference, in Zenoh's form (``tcp/10.0.0.7:7447``).
+        None: the planner runs in the robot's own process.
+    detection_timeout_ms : float
+        A service from which a decision is awaited and that shows no sign of progress for this long
+        counts as dead. (A killed one is found sooner, by its broken link.)
+    startup_timeout_ms : float
+        At the start of a run, how long to wait for a service that has never been seen yet.
+    lease_ms : float
+        A link over which nothing comes for this long is given up.
+    decision_deadline_ms : float or None
+        A decision that is not there this long after it was needed is asked of the local service
+        as well, if that is running; the first answer wins.
+    max_hedged_share : float
+        Bound on the decisions that are asked of two services because of the deadline, as a share of
+        all.
+    decision_timeout_ms : float
+        A decision that takes longer than this is given up even if its service shows progress.
+    tls : str or None
+        Directory with this robot's credentials, as ``holdfast keys`` makes it.
+    """
+
+    services: tuple[str, ...] = ()
+    detection_timeout_ms: Milliseconds = 250.0
+    startup_timeout_ms: Milliseconds = 1000.0
+    lease_ms: Annotated[float, msgspec.Meta(ge=50.0, le=60_000.0)] = 400.0
+    decision_deadline_ms: Milliseconds | None = None
+    max_hedged_share: Annotated[float, msgspec.Meta(ge=0.0, le=1.0)] = 0.1
+    decision_timeout_ms: Milliseconds = 60_000.0
+    tls: str | None = None
+
+
+class RecoverySettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The section ``recovery``: the local service that decides while no other can.
+
+    Attributes
+    ----------
+    launch : {"on_failure", "at_start", "never"}
+        When it is started: once the services named are found dead, with the run, or never; then
+        the robot holds still until one of them answers.
+    launch_timeout_ms : float
+        A local service that has not been seen this long after its launch is ended and launched
+        again.
+    relaunch_delay_ms : float
+        Pause after a failed launch; it doubles with each failure in a row, up to 32 times.
+    journal_survives : {"process_crash", "power_cut"}
+        What each journalled step outlives: the end of the process (microseconds), or of the whole
+        machine (the time that a disk takes to write).
+    """
+
+    launch: Literal["on_failure", "at_start", "never"] = "on_failure"
+    launch_timeout_ms: Milliseconds = 5000.0
+    relaunch_delay_ms: Milliseconds = 100.0
+    journal_survives: Literal["process_crash", "power_cut"] = "process_crash"
 
 
 class PlanningSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

@@ -14,6 +14,7 @@ import scipy.stats
 from matplotlib.image import imread
 
 from holdfast.configuration import Configuration, load
+from holdfast.outcome import Decisions, TrialResult
 from holdfast.recording.figure import trial_figure
 from holdfast.recording.files import OutputError, write_atomically
 from holdfast.recording.journal import Journal
@@ -30,7 +31,7 @@ from holdfast.recording.tables import (
     csv_lines,
     wilson_interval,
 )
-from holdfast.runtime.trial import Decisions, TrialResult, run_trial
+from holdfast.runtime.trial import run_trial
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 

@@ -9,17 +9,12 @@ import pytest
 
 from holdfast.configuration import Configuration, load
 from holdfast.errors import InvalidValueError, ProblemError
+from holdfast.outcome import Decisions, SensingDecision, TaskDecision, TrialResult
 from holdfast.problems.problem import FloatArray
 from holdfast.recording.recorder import Recorder
 from holdfast.runtime import trials
 from holdfast.runtime.environment import SimulatedEnvironment
-from holdfast.runtime.trial import (
-    Decisions,
-    SensingDecision,
-    TaskDecision,
-    TrialResult,
-    run_trial,
-)
+from holdfast.runtime.trial import run_trial
 from holdfast.runtime.trials import TrialCrashError, TrialError, run_trials
 
 FAILING_PROBLEM = """

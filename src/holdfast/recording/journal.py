@@ -17,8 +17,8 @@ from typing import NamedTuple, Self
 
 import msgspec
 
+from holdfast.outcome import Decisions, TrialResult
 from holdfast.recording.files import OutputError
-from holdfast.runtime.trial import Decisions, TrialResult
 
 __all__ = ["SCHEMA_VERSION", "Journal", "Tally"]
 

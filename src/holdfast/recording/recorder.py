@@ -7,10 +7,11 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from holdfast.belief import Belief, estimate, standard_deviation
+from holdfast.outcome import TrialResult
 from holdfast.planning import PlanningState
 from holdfast.problems.problem import FloatArray
 from holdfast.runtime.environment import Environment
-from holdfast.runtime.trial import SensingStep, TaskStep, TrialResult
+from holdfast.runtime.trial import SensingStep, TaskStep
 
 __all__ = ["Recorder", "SensingRecord", "TrialRecord"]
 

@@ -17,11 +17,11 @@ from typing import Any, Self
 
 from holdfast import __version__
 from holdfast.configuration import Configuration
+from holdfast.outcome import TrialResult
 from holdfast.recording.files import OutputError, write_atomically
 from holdfast.recording.fingerprint import difference, fingerprint
 from holdfast.recording.journal import Journal
 from holdfast.recording.tables import RunSummary, SummaryBuilder, csv_lines
-from holdfast.runtime.trial import TrialResult
 
 __all__ = ["RunDirectory", "claim_default_directory", "latest_default_directory", "output_names"]
 

@@ -13,7 +13,7 @@ from collections.abc import Iterable, Iterator
 import msgspec
 import numpy as np
 
-from holdfast.runtime.trial import TrialResult
+from holdfast.outcome import TrialResult
 
 __all__ = [
     "CSV_COLUMNS",

@@ -10,16 +10,13 @@ An observer may look on (to draw a figure, say). The default one looks away and 
 
 from __future__ import annotations
 
-import hashlib
-import struct
-from collections.abc import Iterator
 from time import perf_counter
 from typing import NamedTuple, Protocol
 
-import msgspec
 import numpy as np
 
-from holdfast.errors import InvalidValueError, ProblemError
+from holdfast.errors import ProblemError
+from holdfast.outcome import DecisionLog, TrialResult
 from holdfast.planning import (
     ObservationInfo,
     PlanningState,
@@ -39,130 +36,12 @@ from holdfast.settings import PlanningSettings, SimulatorSettings
 
 __all__ = [
     "NULL_OBSERVER",
-    "Decisions",
     "NullObserver",
-    "SensingDecision",
     "SensingStep",
-    "TaskDecision",
     "TaskStep",
     "TrialObserver",
-    "TrialResult",
     "run_trial",
 ]
-
-_DIGEST_SIZE = 32
-_SENSING = struct.Struct(f"<cQI{_DIGEST_SIZE}s")
-_TASK = struct.Struct("<cQ")
-_END = struct.Struct(f"<cQ{_DIGEST_SIZE}s")
-
-
-class SensingDecision(NamedTuple):
-    """A sensing action that was chosen, and the digest of the state that its observation led to."""
-
-    step: int
-    sensing_action: int
-    state_digest: bytes
-
-
-class TaskDecision(NamedTuple):
-    """A task action as it was performed."""
-
-    step: int
-    action: tuple[float, ...]
-
-
-class Decisions(msgspec.Struct, frozen=True):
-    """All decisions of a trial in order, in a few bytes each.
-
-    Iterating yields :class:`SensingDecision` and :class:`TaskDecision`.
-
-    Attributes
-    ----------
-    action_size : int
-        Coordinates of a task action.
-    log : bytes
-        The records: ``S`` step, sensing action, state digest; ``A`` step, executed action;
-        ``E`` steps, digest of the last state. Numbers are little-endian; steps have 8 bytes,
-        sensing actions 4, coordinates are float64. The trial's digest is the hash of these bytes.
-    """
-
-    action_size: int
-    log: bytes
-
-    def digest(self) -> str:
-        """Return the BLAKE2b-256 of the log in hexadecimal."""
-        return hashlib.blake2b(self.log, digest_size=_DIGEST_SIZE).hexdigest()
-
-    def __iter__(self) -> Iterator[SensingDecision | TaskDecision]:
-        action = struct.Struct(f"<{self.action_size}d")
-        position = 0
-        while position < len(self.log):
-            kind = self.log[position : position + 1]
-            try:
-                if kind == b"S":
-                    _, step, sensing_action, state_digest = _SENSING.unpack_from(self.log, position)
-                    yield SensingDecision(step, sensing_action, state_digest)
-                    position += _SENSING.size
-                elif kind == b"A":
-                    _, step = _TASK.unpack_from(self.log, position)
-                    yield TaskDecision(step, action.unpack_from(self.log, position + _TASK.size))
-                    position += _TASK.size + action.size
-                elif kind == b"E":
-                    _END.unpack_from(self.log, position)
-                    position += _END.size
-                else:
-                    raise InvalidValueError(
-                        f"decision log: byte {position} is {kind!r}, not b'S', b'A' or b'E'"
-                    )
-            except struct.error as error:
-                raise InvalidValueError(
-                    f"decision log: the record at byte {position} of {len(self.log)} is cut short"
-                ) from error
-
-
-class TrialResult(msgspec.Struct, frozen=True, kw_only=True):
-    """What is left of a trial: one row of ``trials.csv``, and the single sensing times.
-
-    Attributes
-    ----------
-    trial : int
-        Number of the trial, from 0.
-    seed : int
-        Seed of the run; the trial's random streams follow from it and from ``trial``.
-    success : bool
-        Whether the goal was reached.
-    steps : int
-        Task actions performed.
-    reward : float
-        Sum of the rewards of all steps, 0 where the environment reports none.
-    sensing_decisions : int
-        Sensing actions chosen.
-    mean_sensing_ms : float
-        Mean wall time of choosing a sensing action, 0 if none was chosen.
-    recoveries : int
-        Times that another service took over; 0 with the planner in process.
-    unexplained_observations : int
-        Observations that no particle of the belief explained.
-    digest : str
-        BLAKE2b-256 of the decisions, in hexadecimal.
-    sensing_ms : tuple of float
-        Wall time of choosing each sensing action, in order.
-    decisions : Decisions or None
-        What was decided; None in a result that was read back without them.
-    """
-
-    trial: int
-    seed: int
-    success: bool
-    steps: int
-    reward: float
-    sensing_decisions: int
-    mean_sensing_ms: float
-    recoveries: int
-    unexplained_observations: int
-    digest: str
-    sensing_ms: tuple[float, ...]
-    decisions: Decisions | None = None
 
 
 class SensingStep(NamedTuple):
@@ -267,7 +146,7 @@ def run_trial(
     state = initial_state(problem, planning, seed, trial)
     observer.trial_began(environment, state)
 
-    log = bytearray()
+    log = DecisionLog(problem.action_size)
     sensing_ms: list[float] = []
     total_reward = 0.0
     unexplained = 0
@@ -283,7 +162,7 @@ def run_trial(
             state, observation_info = observe(problem, planning, state, sensing_action, observation)
             if not observation_info.explained:
                 unexplained += 1
-            log += _SENSING.pack(b"S", steps, sensing_action, digest(state))
+            log.sensed(steps, sensing_action, digest(state))
             observer.sensed(
                 SensingStep(
                     before, sensing_action, sensing_info, observation, state, observation_info
@@ -297,15 +176,14 @@ def run_trial(
                     f"the reward of step {steps} is {float(reward)}; it must be a finite number"
                 )
             total_reward += float(reward)
-        log += _TASK.pack(b"A", steps)
-        log += np.asarray(executed, dtype="<f8").tobytes()
+        log.acted(steps, executed)
         observer.acted(TaskStep(environment, state, task_info, executed, reward))
         state = advance(problem, planning, state, executed)
         steps += 1
         success = environment.is_done()
-    log += _END.pack(b"E", steps, digest(state))
+    log.ended(steps, digest(state))
 
-    decisions = Decisions(problem.action_size, bytes(log))
+    decisions = log.decisions()
     result = TrialResult(
         trial=trial,
         seed=seed,

@@ -30,6 +30,7 @@ import msgspec
 
 from holdfast.configuration import Configuration
 from holdfast.errors import HoldfastError, InvalidValueError
+from holdfast.outcome import TrialResult
 from holdfast.problems.problem import Problem
 from holdfast.runtime.trial import (
     NULL_OBSERVER,
@@ -37,7 +38,6 @@ from holdfast.runtime.trial import (
     SensingStep,
     TaskStep,
     TrialObserver,
-    TrialResult,
     run_trial,
 )
 from holdfast.settings import PlanningSettings

@@ -1,0 +1,354 @@
+"""What crosses the wire: one kind of request, a few kinds of reply, MessagePack, a version.
+
+A robot asks one question, always the same: *this is my state; what do I do until I have sensed
+again?* The answer comes in up to two parts: the task actions up to the next sensing step, which
+need no new observation and so are known at once, and the sensing action of that step, which takes
+longer and is computed while the robot moves. A service that holds the robot's state needs only what
+the robot has sensed since; the digest shows whether both mean the same state, bit for bit. One that
+does not says so, and is handed the state.
+
+Every request can be sent twice, to two services, or late: a decision is a function of the state
+that the digest names.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, TypeAlias
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from holdfast.errors import HoldfastError
+from holdfast.settings import PlanningSettings
+
+__all__ = [
+    "DIGEST_SIZE",
+    "MAX_OBSERVATIONS",
+    "MAX_TASK_ACTIONS",
+    "PROTOCOL_VERSION",
+    "Busy",
+    "MessageError",
+    "NeedState",
+    "Observed",
+    "Opening",
+    "Progress",
+    "Refused",
+    "Reply",
+    "Request",
+    "SensingAnswer",
+    "TaskAnswer",
+    "decode_reply",
+    "decode_request",
+    "encode",
+    "numbers_from",
+    "numbers_to",
+]
+
+FloatArray = npt.NDArray[np.float64]
+
+PROTOCOL_VERSION = 1
+"""Raised whenever a message changes its form or its meaning."""
+
+MAX_TASK_ACTIONS = 64
+"""Bound on the task actions of one answer; a robot that senses more rarely asks again."""
+
+MAX_OBSERVATIONS = 64
+"""Bound on the observations of one request; a service further behind is handed the state."""
+
+DIGEST_SIZE = 16
+"""Bytes of a state's digest that are sent: the first ones of :func:`holdfast.planning.digest`."""
+
+Word = Annotated[int, msgspec.Meta(ge=0, le=2**32 - 1)]
+Name = Annotated[str, msgspec.Meta(min_length=1, max_length=200)]
+Session = Annotated[bytes, msgspec.Meta(min_length=16, max_length=16)]
+Digest = Annotated[bytes, msgspec.Meta(min_length=DIGEST_SIZE, max_length=DIGEST_SIZE)]
+Numbers = Annotated[bytes, msgspec.Meta(max_length=8 * 4096 * MAX_TASK_ACTIONS)]
+
+
+class MessageError(HoldfastError):
+    """Bytes that are no message, or one that is out of bounds.
+
+    Attributes
+    ----------
+    code : str
+        As in :class:`Refused`.
+    """
+
+    def __init__(self, code: str, text: str) -> None:
+        super().__init__(text)
+        self.code = code
+
+
+class Observed(msgspec.Struct, array_like=True, frozen=True):
+    """An observation that the robot has folded into its belief.
+
+    Attributes
+    ----------
+    step : int
+        When; it belongs to the state of that step, before its task action.
+    sensing_action : int
+    observation : bytes
+        Little-endian float64.
+    """
+
+    step: Word
+    sensing_action: Word
+    observation: Annotated[bytes, msgspec.Meta(max_length=8 * 4096)]
+
+
+class Opening(msgspec.Struct, array_like=True, frozen=True):
+    """What a service must know of a robot's run to plan for it: names and plain data, never code.
+
+    Attributes
+    ----------
+    problem : str
+        Registered name of the problem.
+    model, state_space_planner : dict
+        The problem's two sections of the configuration.
+    planning : PlanningSettings
+    seed : int
+    """
+
+    problem: Name
+    model: dict[str, object]
+    state_space_planner: dict[str, object]
+    planning: PlanningSettings
+    seed: Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
+
+
+class Request(msgspec.Struct, array_like=True, frozen=True):
+    """A robot's question: what to do from this state on, until it has sensed again.
+
+    Attributes
+    ----------
+    version : int
+        :data:`PROTOCOL_VERSION`.
+    session : bytes
+        16 random bytes, drawn once for a run.
+    epoch : int
+        Raised by each restart of the robot; a service refuses one lower than it has seen.
+    number : int
+        Of this request within the session and epoch; every reply repeats it.
+    trial, step : int
+        Of the state.
+    sensed : bool
+        Whether the step's observation is part of the state.
+    digest : bytes
+        Of the state.
+    observations : tuple of Observed
+        What was sensed in this trial since the state that this service acknowledged last, in
+        order; all of it if ``checkpoint`` is None and it acknowledged nothing of this trial.
+    opening : Opening or None
+        Sent to a service that may not know the session.
+    checkpoint : bytes or None
+        The state itself (:func:`holdfast.planning.encode_checkpoint`); then ``observations`` is
+        empty.
+    """
+
+    version: int
+    session: Session
+    epoch: Word
+    number: Word
+    trial: Word
+    step: Word
+    sensed: bool
+    digest: Digest
+    observations: Annotated[tuple[Observed, ...], msgspec.Meta(max_length=MAX_OBSERVATIONS)] = ()
+    opening: Opening | None = None
+    checkpoint: bytes | None = None
+
+
+class TaskAnswer(msgspec.Struct, array_like=True, frozen=True, tag=1):
+    """The task actions from the state on, up to the next sensing step.
+
+    Attributes
+    ----------
+    number : int
+        Of the request.
+    count : int
+        Task actions, for the request's step and those that follow.
+    actions : bytes
+        Executed actions one after another, little-endian float64.
+    computed_us : int
+        How long the service computed on it.
+    """
+
+    number: Word
+    count: Annotated[int, msgspec.Meta(ge=1, le=MAX_TASK_ACTIONS)]
+    actions: Numbers
+    computed_us: Word
+
+
+class SensingAnswer(msgspec.Struct, array_like=True, frozen=True, tag=2):
+    """The sensing action of the next sensing step.
+
+    Attributes
+    ----------
+    number : int
+        Of the request.
+    step : int
+        The sensing step: the request's own if its state still has to sense, else the one after the
+        task actions.
+    sensing_action : int
+    digest : bytes
+        Of the state in which it was chosen; only in exactly that state the robot follows it.
+    computed_us : int
+        How long the service computed on it.
+    """
+
+    number: Word
+    step: Word
+    sensing_action: Word
+    digest: Digest
+    computed_us: Word
+
+
+class Progress(msgspec.Struct, array_like=True, frozen=True, tag=3):
+    """The request is in work: a sign of life from the service's own loop.
+
+    Attributes
+    ----------
+    number : int
+        Of the request.
+    waiting : bool
+        Whether it still waits for its turn.
+    """
+
+    number: Word
+    waiting: bool
+
+
+class NeedState(msgspec.Struct, array_like=True, frozen=True, tag=4):
+    """The service does not have the state: send the opening and the checkpoint.
+
+    Attributes
+    ----------
+    number : int
+        Of the request.
+    differs : bool
+        True if the service holds the session and came to another digest.
+    """
+
+    number: Word
+    differs: bool
+
+
+class Busy(msgspec.Struct, array_like=True, frozen=True, tag=5):
+    """The service has more work than it may take: ask another, or again later.
+
+    Attributes
+    ----------
+    number : int
+        Of the request; 0 if it was turned away unread.
+    retry_after_ms : int
+    """
+
+    number: Word
+    retry_after_ms: Word
+
+
+class Refused(msgspec.Struct, array_like=True, frozen=True, tag=6):
+    """The request can never be answered as it is.
+
+    Attributes
+    ----------
+    number : int
+        Of the request; 0 if that could not be read.
+    code : str
+        ``malformed``, ``too_large``, ``version``, ``stale_epoch``, ``unknown_problem``,
+        ``invalid`` (settings or state out of bounds) or ``failed`` (the problem's own functions
+        failed in this state).
+    text : str
+        For a person.
+    """
+
+    number: Word
+    code: Annotated[str, msgspec.Meta(max_length=40)]
+    text: Annotated[str, msgspec.Meta(max_length=4000)]
+
+
+Reply: TypeAlias = TaskAnswer | SensingAnswer | Progress | NeedState | Busy | Refused
+
+_ENCODER = msgspec.msgpack.Encoder()
+_REQUEST_DECODER = msgspec.msgpack.Decoder(Request)
+_REPLY_DECODER: msgspec.msgpack.Decoder[Reply] = msgspec.msgpack.Decoder(Reply)
+_VERSION_DECODER = msgspec.msgpack.Decoder(list[msgspec.Raw])
+
+
+def encode(message: Request | Reply) -> bytes:
+    """Encode a message."""
+    return _ENCODER.encode(message)
+
+
+def decode_request(payload: bytes) -> Request:
+    """Decode a request and check all of it that can be checked by itself.
+
+    Raises
+    ------
+    MessageError
+        If the bytes are no request (``malformed``), or one of another version (``version``).
+    """
+    try:
+        request = _REQUEST_DECODER.decode(payload)
+    except (msgspec.DecodeError, RecursionError, UnicodeDecodeError) as error:
+        version = _version_of(payload)
+        if version is not None and version != PROTOCOL_VERSION:
+            raise _other_version(version) from None
+        raise MessageError("malformed", f"{len(payload)} bytes are no request: {error}") from error
+    if request.version != PROTOCOL_VERSION:
+        raise _other_version(request.version)
+    if request.checkpoint is not None and request.observations:
+        raise MessageError("malformed", "a request has a checkpoint and observations as well")
+    return request
+
+
+def decode_reply(payload: bytes) -> Reply:
+    """Decode a reply.
+
+    Raises
+    ------
+    MessageError
+        If the bytes are no reply.
+    """
+    try:
+        return _REPLY_DECODER.decode(payload)
+    except (msgspec.DecodeError, RecursionError, UnicodeDecodeError) as error:
+        raise MessageError("malformed", f"{len(payload)} bytes are no reply: {error}") from error
+
+
+def numbers_to(array: npt.ArrayLike) -> bytes:
+    """Encode numbers as little-endian float64."""
+    return np.ascontiguousarray(array, dtype="<f8").tobytes()
+
+
+def numbers_from(data: bytes, size: int) -> FloatArray:
+    """Decode ``size`` numbers.
+
+    Raises
+    ------
+    MessageError
+        If there is another number of them, or one is not finite.
+    """
+    if len(data) != 8 * size:
+        raise MessageError("malformed", f"{len(data)} bytes are not {size} numbers")
+    numbers = np.frombuffer(data, dtype="<f8").astype(np.float64)
+    if not np.isfinite(numbers).all():
+        raise MessageError("malformed", f"{numbers} are not all finite")
+    return numbers
+
+
+def _version_of(payload: bytes) -> int | None:
+    """Return the version of what looks like a request of ours, whatever its other fields are."""
+    try:
+        fields = _VERSION_DECODER.decode(payload)
+        version = msgspec.msgpack.decode(fields[0]) if fields else None
+    except (msgspec.DecodeError, RecursionError):
+        return None
+    return version if isinstance(version, int) else None
+
+
+def _other_version(version: int) -> MessageError:
+    return MessageError(
+        "version", f"protocol version {version}: this holdfast speaks version {PROTOCOL_VERSION}"
+    )
