@@ -1,14 +1,31 @@
-"""What happens between a robot and its services, as seen from the robot's end of the wire.
+"""What happens to a robot: on its wire to the services, and in the world that it acts on.
 
 A call is one request and any number of replies; it always ends. A call that ends without the answer
-says that whoever was asked is gone.
+says that whoever was asked is gone. What a robot asks of its world ends in one event, too, and that
+may be a failure.
 """
 
 from __future__ import annotations
 
 from typing import NamedTuple, TypeAlias
 
-__all__ = ["Appeared", "Ended", "Replied", "TransportEvent", "Vanished"]
+import numpy as np
+import numpy.typing as npt
+
+__all__ = [
+    "Acted",
+    "Appeared",
+    "Begun",
+    "Ended",
+    "EnvironmentEvent",
+    "EnvironmentFailed",
+    "Replied",
+    "Sensed",
+    "TransportEvent",
+    "Vanished",
+]
+
+FloatArray = npt.NDArray[np.float64]
 
 
 class Appeared(NamedTuple):
@@ -47,3 +64,76 @@ class Ended(NamedTuple):
 
 
 TransportEvent: TypeAlias = Appeared | Vanished | Replied | Ended
+
+
+class Begun(NamedTuple):
+    """The environment of a trial is there.
+
+    Attributes
+    ----------
+    done : bool
+        Whether the task is done already.
+    steps_performed : int or None
+        Task actions performed in this trial so far, as the environment itself has counted; None if
+        it was not asked or does not count.
+    """
+
+    done: bool
+    steps_performed: int | None
+
+
+class Sensed(NamedTuple):
+    """A sensing action has been performed.
+
+    Attributes
+    ----------
+    step : int
+    observation : array of shape (observation_size,)
+        Finite, read-only.
+    """
+
+    step: int
+    observation: FloatArray
+
+
+class Acted(NamedTuple):
+    """A task action has been performed.
+
+    Attributes
+    ----------
+    step : int
+    reward : float or None
+        Finite; None where the environment gives none.
+    done : bool
+        Whether the task is done.
+    """
+
+    step: int
+    reward: float | None
+    done: bool
+
+
+class EnvironmentFailed(NamedTuple):
+    """The environment raised, returned what nobody can use, or did not return in time.
+
+    Nothing more comes of this environment.
+
+    Attributes
+    ----------
+    step : int
+    what : str
+        The method, or the name of the environment where it could not be made.
+    text : str
+        For a person: what happened, and where in the environment's own code.
+    performance_unknown : bool
+        True if the step's task action may have been performed: it was begun, and no
+        :class:`Acted` came of it. Only the environment can say.
+    """
+
+    step: int
+    what: str
+    text: str
+    performance_unknown: bool
+
+
+EnvironmentEvent: TypeAlias = Begun | Sensed | Acted | EnvironmentFailed

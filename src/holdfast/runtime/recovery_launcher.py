@@ -1,0 +1,122 @@
+"""Starting the local service: a process of the same program, and nobody's orphan.
+
+It connects to the robot, which already listens, so that it need not be looked for; and it ends when
+its standard input does, so that it outlives the robot by no more than that, however the robot died.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import IO, NamedTuple
+
+__all__ = ["RecoveryExited", "RecoveryLauncher"]
+
+
+class RecoveryExited(NamedTuple):
+    """A process of the local service has ended, or could not be started.
+
+    Attributes
+    ----------
+    launch : int
+        The number that it was launched by.
+    reason : str
+    """
+
+    launch: int
+    reason: str
+
+
+class RecoveryLauncher:
+    """Starts the local service, watches it, and ends it.
+
+    Parameters
+    ----------
+    arguments : sequence of str
+        Of ``holdfast serve``.
+    deliver : callable
+        Is told when a process has ended that was not ended by :meth:`launch` or :meth:`close`;
+        called from a thread.
+    log_path : Path or None
+        Gets what the service writes; None for nowhere.
+
+    Attributes
+    ----------
+    process_id : int or None
+        Of the process that was started last; None if it has ended.
+    """
+
+    def __init__(
+        self,
+        arguments: Sequence[str],
+        deliver: Callable[[RecoveryExited], None],
+        log_path: Path | None = None,
+    ) -> None:
+        self._command = [sys.executable, "-m", "holdfast", "serve", *arguments]
+        self._deliver = deliver
+        self._log_path = log_path
+        self._process: subprocess.Popen[bytes] | None = None
+        self._lock = threading.Lock()
+
+    @property
+    def process_id(self) -> int | None:
+        """Of the process that was started last; None if it has ended."""
+        process = self._process
+        return process.pid if process is not None and process.poll() is None else None
+
+    def launch(self, number: int) -> None:
+        """Start a process, and end the one before; whatever goes wrong is delivered."""
+        self.close()
+        try:
+            with self._output() as output:
+                process = subprocess.Popen(
+                    self._command,
+                    stdin=subprocess.PIPE,
+                    stdout=output,
+                    stderr=output,
+                    # Ctrl-C is the robot's to answer; it may still need this service to end well.
+                    start_new_session=True,
+                )
+        except OSError as error:
+            self._deliver(RecoveryExited(number, f"cannot be started: {error.strerror}"))
+            return
+        self._process = process
+        threading.Thread(
+            target=self._watch, args=(process, number), name="holdfast-recovery", daemon=True
+        ).start()
+
+    def close(self) -> None:
+        """End the process, if there is one."""
+        with self._lock:
+            process, self._process = self._process, None
+        if process is None:
+            return
+        # It holds nothing that would have to be kept, and it may be stopped or stuck.
+        process.kill()
+        process.wait()
+        if process.stdin is not None:
+            with contextlib.suppress(OSError):
+                process.stdin.close()
+
+    def _watch(self, process: subprocess.Popen[bytes], number: int) -> None:
+        code = process.wait()
+        with self._lock:
+            if self._process is not process:
+                return
+        if code < 0:
+            reason = f"was ended by {signal.Signals(-code).name}"
+        else:
+            reason = f"ended with exit code {code}"
+            if self._log_path is not None:
+                reason += f"; see {self._log_path}"
+        self._deliver(RecoveryExited(number, reason))
+
+    def _output(self) -> contextlib.AbstractContextManager[IO[bytes] | int]:
+        if self._log_path is None:
+            return contextlib.nullcontext(subprocess.DEVNULL)
+        return self._log_path.open("ab")

@@ -1,0 +1,612 @@
+"""The robot's loop as a machine: sense, decide, write down, act, once and in order.
+
+The robot holds the truth: its belief, folded from what it sensed and did. Services only compute
+what follows from it. So each turn is: take the next decision from the answer to the last question,
+write it down, carry it out, fold in what came of it; and when the answer is used up, ask again.
+
+While the robot moves through the task actions of an answer, the sensing action that comes after
+them is already being computed; it is used only if the state in which it was chosen is, bit for bit,
+the one in which the robot arrives.
+
+The machine touches nothing. Each method takes what happened and the time and returns effects
+(:mod:`holdfast.session.effects`), which the shell carries out in their order; when
+:meth:`Robot.next_wakeup` is reached before anything else happens, it calls :meth:`Robot.wake`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from holdfast.errors import HoldfastError
+from holdfast.outcome import DecisionLog, TrialResult
+from holdfast.planning import (
+    PlanningState,
+    advance,
+    digest,
+    initial_state,
+    needs_sensing,
+    observe,
+)
+from holdfast.problems.problem import Problem
+from holdfast.session.dispatcher import Dispatcher, Provenance, Question
+from holdfast.session.effects import (
+    Act,
+    Effect,
+    EndTrial,
+    Journal,
+    Paused,
+    Report,
+    Sense,
+    Stop,
+    Timing,
+)
+from holdfast.session.events import (
+    Acted,
+    Begun,
+    EnvironmentEvent,
+    EnvironmentFailed,
+    Sensed,
+    TransportEvent,
+)
+from holdfast.session.messages import (
+    DIGEST_SIZE,
+    MAX_OBSERVATIONS,
+    MessageError,
+    Observed,
+    numbers_from,
+    numbers_to,
+)
+from holdfast.session.records import (
+    ActingRecord,
+    ObservedRecord,
+    PausedRecord,
+    PerformedRecord,
+    Record,
+    RecordError,
+)
+from holdfast.session.status import Status
+from holdfast.settings import PlanningSettings, SimulatorSettings
+
+__all__ = ["HeldError", "History", "Robot", "UnknownPerformanceError", "replay"]
+
+FloatArray = npt.NDArray[np.float64]
+
+
+class HeldError(HoldfastError):
+    """The robot holds still: its environment failed. The run can be resumed."""
+
+
+class UnknownPerformanceError(HoldfastError):
+    """After a crash nobody can say whether the last task action was performed."""
+
+
+class History:
+    """An unfinished trial, folded from its records.
+
+    Attributes
+    ----------
+    state : PlanningState
+        After everything that is known to have been performed.
+    observations : tuple of Observed
+        The last ones, as many as a request can carry.
+    num_observations : int
+        All of this trial.
+    log : DecisionLog
+        Of the same.
+    actions : list of array
+        Task actions that the records show to be performed, in order.
+    total_reward : float
+    pending : array or None
+        A task action that was written down and of which nothing more is known.
+    paused : bool
+        Whether the process before ended in order.
+    num_unexplained : int
+        Observations that no particle explained.
+    """
+
+    def __init__(self, problem: Problem, settings: PlanningSettings, seed: int, trial: int) -> None:
+        self.state = initial_state(problem, settings, seed, trial)
+        self.observations: tuple[Observed, ...] = ()
+        self.num_observations = 0
+        self.log = DecisionLog(problem.action_size)
+        self.actions: list[FloatArray] = []
+        self.total_reward = 0.0
+        self.pending: FloatArray | None = None
+        self.paused = False
+        self.num_unexplained = 0
+
+    @property
+    def begun(self) -> bool:
+        """Whether anything has happened yet."""
+        return self.num_observations > 0 or self.state.step > 0 or self.pending is not None
+
+    def observed(self, record: ObservedRecord, after: PlanningState, *, explained: bool) -> None:
+        """Fold in an observation that led to a state."""
+        kept = Observed(record.step, record.sensing_action, record.observation)
+        self.observations = (*self.observations, kept)[-MAX_OBSERVATIONS:]
+        self.num_observations += 1
+        self.num_unexplained += not explained
+        self.log.sensed(record.step, record.sensing_action, record.digest)
+        self.state = after
+
+    def performed(self, problem: Problem, settings: PlanningSettings, reward: float | None) -> None:
+        """Fold in that the pending task action has been performed."""
+        assert self.pending is not None
+        self.log.acted(self.state.step, self.pending)
+        self.state = advance(problem, settings, self.state, self.pending)
+        self.total_reward += 0.0 if reward is None else reward
+        self.pending = None
+
+
+def replay(
+    problem: Problem,
+    settings: PlanningSettings,
+    seed: int,
+    trial: int,
+    records: Sequence[Record],
+) -> History:
+    """Fold the records of an unfinished trial.
+
+    Parameters
+    ----------
+    problem : Problem
+    settings : PlanningSettings
+    seed, trial : int
+    records : sequence of Record
+        In the order in which they were written.
+
+    Returns
+    -------
+    History
+
+    Raises
+    ------
+    RecordError
+        If a record does not follow from those before it, or leads to another state than it did.
+    """
+    history = History(problem, settings, seed, trial)
+    for position, record in enumerate(records):
+        history.paused = isinstance(record, PausedRecord)
+        try:
+            _replay_record(problem, settings, history, record)
+        except (RecordError, MessageError) as error:
+            raise RecordError(f"trial {trial}: record {position} of its journal {error}") from error
+    return history
+
+
+def _replay_record(
+    problem: Problem, settings: PlanningSettings, history: History, record: Record
+) -> None:
+    if isinstance(record, PausedRecord):
+        return
+    state = history.state
+    if not isinstance(record, PerformedRecord) and history.pending is not None:
+        raise RecordError("comes before the action of that step is known to be performed")
+    if record.step != state.step:
+        raise RecordError(f"is of step {record.step}, where step {state.step} is due")
+    if isinstance(record, ObservedRecord):
+        _replay_observation(problem, settings, history, record)
+    elif isinstance(record, ActingRecord):
+        if needs_sensing(settings, state):
+            raise RecordError("is a task action where an observation is due")
+        history.pending = numbers_from(record.action, problem.action_size)
+    elif history.pending is None:
+        raise RecordError("is of a performance of which no action was written down")
+    else:
+        history.actions.append(history.pending)
+        history.performed(problem, settings, record.reward)
+
+
+def _replay_observation(
+    problem: Problem, settings: PlanningSettings, history: History, record: ObservedRecord
+) -> None:
+    state = history.state
+    if not needs_sensing(settings, state):
+        raise RecordError("is an observation where a task action is due")
+    observation = numbers_from(record.observation, len(record.observation) // 8)
+    after, info = observe(problem, settings, state, record.sensing_action, observation)
+    reached = digest(after)
+    if reached != record.digest:
+        raise RecordError(
+            "leads to another state than it did when it was written: the problem is not "
+            "deterministic, its code has changed, or the journal is damaged"
+        )
+    history.observed(record, after, explained=info.explained)
+
+
+class Robot:
+    """The loop of one robot over the trials of a run.
+
+    Parameters
+    ----------
+    problem : Problem
+    planning : PlanningSettings
+    simulator : SimulatorSettings
+        Seed, and the number of steps after which a trial has failed.
+    dispatcher : Dispatcher
+        Puts the questions to the services; it is this robot's alone.
+    rate_hz : float or None
+        Task actions a second; None acts as soon as it can.
+
+    Attributes
+    ----------
+    missed_ticks : int
+        Ticks of ``rate_hz`` that passed while the robot was not ready.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        planning: PlanningSettings,
+        simulator: SimulatorSettings,
+        dispatcher: Dispatcher,
+        rate_hz: float | None = None,
+    ) -> None:
+        self._problem = problem
+        self._planning = planning
+        self._simulator = simulator
+        self._dispatcher = dispatcher
+        self._period_s = None if rate_hz is None else 1.0 / rate_hz
+        # One list for both, because the order of all effects counts.
+        self._effects = dispatcher.effects
+        self._history: History | None = None
+        self._trial = 0
+        self._done = False
+        self._in_environment = False
+        self._sensing_action = 0
+        self._unwritten: list[Record] = []
+        self._pausing = False
+        self._stopped = False
+        self._next_tick: float | None = None
+        self._asleep_until: float | None = None
+        self._sensing_ms: list[float] = []
+        self._recoveries_before = 0
+        self.missed_ticks = 0
+
+    @property
+    def status(self) -> Status:
+        """Who decides."""
+        return self._dispatcher.status
+
+    @property
+    def trial(self) -> int | None:
+        """The trial that is running, None between two."""
+        return None if self._history is None else self._trial
+
+    def start(self, now: float) -> list[Effect]:
+        """Begin the run: from now on services are looked for."""
+        self._dispatcher.start(now)
+        return self._take()
+
+    def begin_trial(
+        self, trial: int, history: History, begun: Begun, now: float, *, tail_is_certain: bool
+    ) -> list[Effect]:
+        """Begin a trial, or go on with one.
+
+        Parameters
+        ----------
+        trial : int
+        history : History
+            From :func:`replay`; of no records for a new trial.
+        begun : Begun
+            What the environment says: whether the task is done and, if it can tell, how many task
+            actions it has performed in this trial.
+        now : float
+        tail_is_certain : bool
+            Whether the records are surely all that were ever written: no power was cut since.
+        """
+        self._trial = trial
+        self._history = history
+        self._done = begun.done
+        self._in_environment = False
+        self._unwritten = []
+        self._sensing_ms = []
+        self._recoveries_before = self._dispatcher.recoveries
+        self._next_tick = None
+        resumed = history.begun
+        if resumed:
+            self._report("resumed_trial", trial=trial, step=history.state.step)
+        try:
+            again = self._settle_performance(begun.steps_performed, resumed, tail_is_certain)
+        except UnknownPerformanceError as error:
+            self._stop(error)
+            return self._take()
+        if again is not None:
+            # It is in the journal already, and the environment says that it was not performed.
+            self._in_environment = True
+            self._effects.append(Act(history.state.step, again))
+        else:
+            self._go_on(now)
+        return self._take()
+
+    def _settle_performance(
+        self, performed: int | None, resumed: bool, tail_is_certain: bool
+    ) -> FloatArray | None:
+        """Find out whether the last action written down was performed; return it if it was not."""
+        history = self._history
+        assert history is not None
+        known = history.state.step
+        where = f"trial {self._trial}, step {history.state.step}"
+        if performed is None:
+            if not resumed or (history.pending is None and (history.paused or tail_is_certain)):
+                return None
+            what = (
+                "the journal ends with a task action and does not say whether it was performed"
+                if history.pending is not None
+                else "the machine was restarted, so the journal may lack its last records"
+            )
+            raise UnknownPerformanceError(
+                f"{where}: {what}, and the environment has no method steps_performed that could "
+                "tell; nothing is performed, because it must never be performed twice. Begin that "
+                "trial anew in another directory (--out)"
+            )
+        if history.pending is not None and performed == known + 1:
+            self._unwritten.append(PerformedRecord(known, None))
+            self._report("performed_unseen", trial=self._trial, step=known)
+            history.performed(self._problem, self._planning, None)
+            return None
+        if performed != known:
+            raise UnknownPerformanceError(
+                f"{where}: the environment says that {performed} task actions were performed in "
+                f"this trial, the journal has {known}"
+                f"{' and one that may have been' if history.pending is not None else ''}; "
+                "they do not belong together, so nothing is performed"
+            )
+        return history.pending
+
+    # -- what happens ----------------------------------------------------------------------------
+
+    def handle(self, event: TransportEvent | EnvironmentEvent, now: float) -> list[Effect]:
+        """Take note of what a transport or the environment delivered."""
+        if isinstance(event, Sensed | Acted | EnvironmentFailed):
+            # Between trials, or after a stop, whatever comes late is of no use.
+            if self._history is not None and self._in_environment and not self._stopped:
+                self._in_environment = False
+                if isinstance(event, Sensed):
+                    self._sensed(event, now)
+                elif isinstance(event, Acted):
+                    self._acted(event)
+                else:
+                    self._failed(event)
+        elif not isinstance(event, Begun):
+            self._dispatcher.handle(event, now)
+        self._go_on(now)
+        return self._take()
+
+    def recovery_exited(self, launch: int, reason: str, now: float) -> list[Effect]:
+        """Take note that a process of the local service has ended, or could not be started."""
+        self._dispatcher.recovery_exited(launch, reason, now)
+        self._go_on(now)
+        return self._take()
+
+    def wake(self, now: float) -> list[Effect]:
+        """Take note of the time."""
+        self._dispatcher.wake(now)
+        self._go_on(now)
+        return self._take()
+
+    def pause(self, now: float) -> list[Effect]:
+        """End in order: after what is being performed, write everything down and stand still."""
+        self._pausing = True
+        self._go_on(now)
+        return self._take()
+
+    def next_wakeup(self) -> float | None:
+        """Return when :meth:`wake` must be called if nothing happens before."""
+        times = [
+            due for due in (self._asleep_until, self._dispatcher.next_wakeup()) if due is not None
+        ]
+        return min(times, default=None)
+
+    # -- the environment -------------------------------------------------------------------------
+
+    def _sensed(self, event: Sensed, now: float) -> None:
+        history = self._history
+        assert history is not None
+        state = history.state
+        try:
+            after, info = observe(
+                self._problem, self._planning, state, self._sensing_action, event.observation
+            )
+        except HoldfastError as error:
+            self._stop(error)
+            return
+        reached = digest(after)
+        record = ObservedRecord(
+            state.step, self._sensing_action, numbers_to(event.observation), reached
+        )
+        history.observed(record, after, explained=info.explained)
+        self._write(record)
+        if not self._pausing:
+            self._ask(reached, now)
+
+    def _acted(self, event: Acted) -> None:
+        history = self._history
+        assert history is not None
+        self._unwritten.append(PerformedRecord(history.state.step, event.reward))
+        self._done = event.done
+        try:
+            history.performed(self._problem, self._planning, event.reward)
+        except HoldfastError as error:
+            self._write()
+            self._stop(error)
+
+    def _failed(self, event: EnvironmentFailed) -> None:
+        self._write()
+        unknown = (
+            "; whether that task action was performed is not known"
+            if event.performance_unknown
+            else ""
+        )
+        self._stop(
+            HeldError(
+                f"the robot holds still in trial {self._trial}, step {event.step}: {event.what}: "
+                f"{event.text}{unknown}"
+            )
+        )
+
+    # -- the loop --------------------------------------------------------------------------------
+
+    def _go_on(self, now: float) -> None:
+        """Do the next thing if nothing has to be waited for."""
+        self._asleep_until = None
+        history = self._history
+        self._stopped = self._stopped or self._dispatcher.stopped
+        if history is None or self._in_environment or self._stopped:
+            if self._pausing and history is None:
+                self._effects.append(Paused())
+            return
+        if self._pausing:
+            self._unwritten.append(PausedRecord())
+            self._write()
+            self._history = None
+            self._dispatcher.drop()
+            self._effects.append(Paused())
+            return
+        state = history.state
+        if self._done or state.step >= self._simulator.max_steps:
+            self._end_trial()
+            return
+        if needs_sensing(self._planning, state):
+            self._next_sensing(state, now)
+        else:
+            self._next_action(state, now)
+
+    def _next_sensing(self, state: PlanningState, now: float) -> None:
+        question = self._dispatcher.question
+        if question is None or question.sensing_step != state.step:
+            self._ask(digest(state), now)
+            question = self._dispatcher.question
+            assert question is not None
+        answer = question.sensing
+        if answer is None:
+            self._dispatcher.need(now)
+            return
+        if question.state is not state and answer.digest != digest(state)[:DIGEST_SIZE]:
+            # Chosen for another state than this: the service's belief has drifted from ours.
+            self._report("prefetch_unused", trial=self._trial, step=state.step)
+            self._ask(digest(state), now)
+            self._dispatcher.need(now)
+            return
+        source = question.sensing_source
+        assert source is not None
+        self._sensing_ms.append(1e3 * source.computed_s)
+        self._timed("sensing", question, source, now)
+        self._sensing_action = answer.sensing_action
+        self._in_environment = True
+        self._effects.append(Sense(state.step, answer.sensing_action))
+
+    def _next_action(self, state: PlanningState, now: float) -> None:
+        question = self._dispatcher.question
+        offset = -1 if question is None else state.step - question.state.step
+        if question is None or question.task_count == 0 or not 0 <= offset < question.task_count:
+            self._ask(digest(state), now)
+            question = self._dispatcher.question
+            assert question is not None
+            offset = 0
+        if question.tasks is None:
+            self._dispatcher.need(now)
+            return
+        if offset == 0 and question.task_source is not None:
+            self._timed("task", question, question.task_source, now)
+            question.task_source = None
+            question.needed_at = None
+        if not self._is_due(now):
+            return
+        action = question.tasks[offset]
+        self._write(ActingRecord(state.step, numbers_to(action)))
+        history = self._history
+        assert history is not None
+        history.pending = action
+        self._in_environment = True
+        self._effects.append(Act(state.step, action))
+
+    def _ask(self, state_digest: bytes, now: float) -> None:
+        history = self._history
+        assert history is not None
+        question = Question(
+            self._planning,
+            history.state,
+            state_digest,
+            history.observations,
+            history.num_observations,
+        )
+        self._dispatcher.ask(question, now)
+
+    def _is_due(self, now: float) -> bool:
+        """Tell whether it is time for the next task action; if not, sleep until it is."""
+        if self._period_s is None:
+            return True
+        tick = now if self._next_tick is None else self._next_tick
+        if now < tick:
+            self._asleep_until = tick
+            return False
+        missed = int((now - tick) / self._period_s)
+        if missed:
+            self.missed_ticks += missed
+            self._report("missed_ticks", missed=missed, total=self.missed_ticks)
+        self._next_tick = tick + (missed + 1) * self._period_s
+        return True
+
+    def _end_trial(self) -> None:
+        history = self._history
+        assert history is not None
+        state = history.state
+        history.log.ended(state.step, digest(state))
+        decisions = history.log.decisions()
+        sensing_ms = tuple(self._sensing_ms)
+        result = TrialResult(
+            trial=self._trial,
+            seed=self._simulator.seed,
+            success=self._done,
+            steps=state.step,
+            reward=history.total_reward,
+            sensing_decisions=history.num_observations,
+            mean_sensing_ms=sum(sensing_ms) / len(sensing_ms) if sensing_ms else 0.0,
+            recoveries=self._dispatcher.recoveries - self._recoveries_before,
+            unexplained_observations=history.num_unexplained,
+            digest=decisions.digest(),
+            sensing_ms=sensing_ms,
+            decisions=decisions,
+        )
+        self._history = None
+        self._dispatcher.drop()
+        self._effects.append(EndTrial(result))
+
+    # -- effects ---------------------------------------------------------------------------------
+
+    def _write(self, *records: Record) -> None:
+        self._unwritten += records
+        if self._unwritten:
+            # What the dispatcher wants to send may rest on these records, so they go first.
+            self._effects.append(Journal(self._trial, tuple(self._unwritten)))
+            self._unwritten = []
+
+    def _timed(self, kind: str, question: Question, source: Provenance, now: float) -> None:
+        waited_s = 0.0 if question.needed_at is None else now - question.needed_at
+        step = question.state.step if kind == "task" else question.sensing_step
+        self._effects.append(
+            Timing(
+                self._trial,
+                step if step is not None else question.state.step,
+                kind,
+                source.service,
+                self._dispatcher.status.value,
+                1e3 * waited_s,
+                1e3 * source.round_trip_s,
+                1e3 * source.computed_s,
+            )
+        )
+
+    def _report(self, name: str, **fields: object) -> None:
+        self._effects.append(Report(name, fields))
+
+    def _stop(self, error: HoldfastError) -> None:
+        self._stopped = True
+        self._effects.append(Stop(error))
+
+    def _take(self) -> list[Effect]:
+        return self._dispatcher.take()

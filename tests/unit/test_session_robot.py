@@ -1,0 +1,887 @@
+"""The robot's machine against small services of this file's own, under a virtual clock."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from holdfast.outcome import TrialResult
+from holdfast.planning import (
+    PlanningState,
+    advance,
+    check_state,
+    choose_sensing_action,
+    choose_task_action,
+    decode_checkpoint,
+    digest,
+    initial_state,
+    needs_sensing,
+    observe,
+)
+from holdfast.problems.peg_in_hole_2d import PegInHole2D
+from holdfast.runtime.environment import SimulatedEnvironment
+from holdfast.runtime.trial import run_trial
+from holdfast.session.dispatcher import Dispatcher, ServiceRefusedError, StaleEpochError
+from holdfast.session.effects import (
+    Abandon,
+    Act,
+    Effect,
+    EndTrial,
+    Journal,
+    Launch,
+    Paused,
+    Report,
+    Send,
+    Sense,
+    Stop,
+    Timing,
+)
+from holdfast.session.events import (
+    Acted,
+    Appeared,
+    Begun,
+    Ended,
+    EnvironmentFailed,
+    Replied,
+    Sensed,
+    Vanished,
+)
+from holdfast.session.messages import (
+    DIGEST_SIZE,
+    MAX_TASK_ACTIONS,
+    Busy,
+    NeedState,
+    Opening,
+    Progress,
+    Refused,
+    Reply,
+    Request,
+    SensingAnswer,
+    TaskAnswer,
+    decode_request,
+    encode,
+    numbers_from,
+    numbers_to,
+)
+from holdfast.session.records import ActingRecord, ObservedRecord, PerformedRecord, Record
+from holdfast.session.robot import HeldError, Robot, UnknownPerformanceError, replay
+from holdfast.session.status import Status
+from holdfast.settings import (
+    OffloadSettings,
+    ParticleFilterSettings,
+    PlanningSettings,
+    RecoverySettings,
+    SimulatorSettings,
+)
+
+PROBLEM = PegInHole2D()
+PLANNING = PlanningSettings(
+    particle_filter=ParticleFilterSettings(num_particles=30), sensing_interval=3
+)
+SIMULATOR = SimulatorSettings(num_trials=2, max_steps=40, seed=11)
+OPENING = Opening("peg_in_hole_2d", {}, {}, PLANNING, SIMULATOR.seed)
+LOCAL = "local"
+
+
+class SmallService:
+    """Answers from a table of states; ``rule`` may answer a request in its place."""
+
+    def __init__(self, latency_s: float = 0.001) -> None:
+        self.states: dict[bytes, PlanningState] = {}
+        self.latency_s = latency_s
+        self.up = True
+        self.boot = 0
+        self.stopped = False
+        self.requests: list[Request] = []
+        self.rule: Callable[[Request], list[Reply] | None] = lambda _: None
+
+    def answer(self, payload: bytes) -> list[Reply]:
+        request = decode_request(payload)
+        self.requests.append(request)
+        special = self.rule(request)
+        if special is not None:
+            return special
+        number = request.number
+        state = self._state(request)
+        if state is None:
+            return [NeedState(number, request.session in self.states)]
+        self.states[request.session] = state
+        replies: list[Reply] = []
+        if not needs_sensing(PLANNING, state):
+            actions: list[np.ndarray] = []
+            while len(actions) < MAX_TASK_ACTIONS and not needs_sensing(PLANNING, state):
+                action, _ = choose_task_action(PROBLEM, PLANNING, state)
+                actions.append(action)
+                state = advance(PROBLEM, PLANNING, state, action)
+            replies.append(TaskAnswer(number, len(actions), numbers_to(actions), 1))
+        index, _ = choose_sensing_action(PROBLEM, PLANNING, state)
+        replies.append(SensingAnswer(number, state.step, index, digest(state)[:DIGEST_SIZE], 1))
+        return replies
+
+    def _state(self, request: Request) -> PlanningState | None:
+        if request.checkpoint is not None:
+            state = decode_checkpoint(request.checkpoint)
+            check_state(PROBLEM, PLANNING, state)
+        elif request.session not in self.states and request.opening is None:
+            return None
+        else:
+            kept = self.states.get(request.session)
+            if kept is None or kept.trial != request.trial:
+                kept = initial_state(PROBLEM, PLANNING, SIMULATOR.seed, request.trial)
+            state = kept
+            for item in request.observations:
+                while state.step < item.step:
+                    action, _ = choose_task_action(PROBLEM, PLANNING, state)
+                    state = advance(PROBLEM, PLANNING, state, action)
+                shown = numbers_from(item.observation, len(item.observation) // 8)
+                state, _ = observe(PROBLEM, PLANNING, state, item.sensing_action, shown)
+        return state if digest(state)[:DIGEST_SIZE] == request.digest else None
+
+
+class Sent(NamedTuple):
+    at: float
+    service: str
+    request: Request
+
+
+class World:
+    """A robot, its services, its environment and a clock."""
+
+    def __init__(
+        self,
+        *,
+        services: tuple[str, ...] = ("cloud",),
+        launch: str = "on_failure",
+        deadline_ms: float | None = None,
+        rate_hz: float | None = None,
+        planning: PlanningSettings = PLANNING,
+        simulator: SimulatorSettings = SIMULATOR,
+    ) -> None:
+        self.now = 0.0
+        self.offload = OffloadSettings(services=services, decision_deadline_ms=deadline_ms)
+        self.services = {name: SmallService() for name in (*services, LOCAL)}
+        self.services[LOCAL].up = False
+        self.launchable = True
+        self.launch_s = 0.2
+        recovery = RecoverySettings(launch=launch)  # type: ignore[arg-type]
+        dispatcher = Dispatcher(
+            services,
+            LOCAL,
+            self.offload,
+            recovery,
+            b"s" * 16,
+            1,
+            OPENING,
+            PROBLEM.action_size,
+            len(PROBLEM.sensing_actions),
+        )
+        self.planning, self.simulator = planning, simulator
+        self.robot = Robot(PROBLEM, planning, simulator, dispatcher, rate_hz)
+        self.environment = SimulatedEnvironment(PROBLEM, simulator.seed, 0)
+        self.heap: list[tuple[float, int, Callable[[], list[Effect]]]] = []
+        self.count = 0
+        self.trace: list[tuple[float, Effect]] = []
+        self.journal: list[Record] = []
+        self.sent: list[Sent] = []
+        self.calls: dict[int, str] = {}
+        self.results: list[TrialResult] = []
+        self.stopped: Stop | None = None
+        self.ended = False
+        self.acted: list[tuple[int, np.ndarray]] = []
+        self.on_act: Callable[[int], None] = lambda _: None
+
+    # -- faults ----------------------------------------------------------------------------------
+
+    def kill(self, name: str, found_after_s: float = 0.01) -> None:
+        service = self.services[name]
+        if not service.up:
+            return
+        service.up = False
+        service.states.clear()
+        boot = str(service.boot)
+        lost = [call for call, asked in self.calls.items() if asked == name]
+        self.after(found_after_s, lambda: self.robot.handle(Vanished(name, boot), self.now))
+        for call in lost:
+            self.after(found_after_s, lambda call=call: self.end(call))  # type: ignore[misc]
+
+    def bring_up(self, name: str, after_s: float = 0.0) -> None:
+        def appear() -> list[Effect]:
+            service = self.services[name]
+            service.up = True
+            service.boot += 1
+            return self.robot.handle(Appeared(name, str(service.boot)), self.now)
+
+        self.after(after_s, appear)
+
+    # -- running ---------------------------------------------------------------------------------
+
+    def after(self, seconds: float, do: Callable[[], list[Effect]]) -> None:
+        self.count += 1
+        heapq.heappush(self.heap, (self.now + seconds, self.count, do))
+
+    def start(self, *, present: bool = True, records: tuple[Record, ...] = ()) -> None:
+        self.carry_out(self.robot.start(self.now))
+        if present:
+            for name in self.offload.services:
+                self.bring_up(name)
+        self.journal = list(records)
+        self.begin(0)
+
+    def begin(self, trial: int) -> None:
+        history = replay(PROBLEM, self.planning, self.simulator.seed, trial, self.journal)
+        self.environment = SimulatedEnvironment(PROBLEM, self.simulator.seed, trial)
+        for action in history.actions:
+            self.environment.perform(action)
+        begun = Begun(self.environment.is_done(), self.environment.step)
+        self.carry_out(
+            self.robot.begin_trial(trial, history, begun, self.now, tail_is_certain=True)
+        )
+
+    def run(self, until_s: float = 60.0) -> None:
+        while not self.ended and self.stopped is None:
+            wake = self.robot.next_wakeup()
+            event_at = self.heap[0][0] if self.heap else None
+            if event_at is None and wake is None:
+                raise AssertionError(f"nothing will ever happen again at {self.now}")
+            if event_at is None or (wake is not None and wake < event_at):
+                assert wake is not None
+                self.now = max(self.now, wake)
+                self.carry_out(self.robot.wake(self.now))
+                following = self.robot.next_wakeup()
+                assert following is None or following > self.now or self.ended or self.stopped, (
+                    "the machine asks to be woken at a time that has passed"
+                )
+            else:
+                self.now, _, do = heapq.heappop(self.heap)
+                self.carry_out(do())
+            if self.now > until_s:
+                return
+
+    def carry_out(self, effects: list[Effect]) -> None:
+        for effect in effects:
+            self.trace.append((self.now, effect))
+            if isinstance(effect, Journal):
+                self.journal += effect.records
+            elif isinstance(effect, Send):
+                self.send(effect)
+            elif isinstance(effect, Abandon):
+                self.calls.pop(effect.call, None)
+            elif isinstance(effect, Sense):
+                shown = self.environment.perform_sensing(effect.sensing_action)
+                self.after(0.001, self.later(Sensed(effect.step, shown)))
+            elif isinstance(effect, Act):
+                self.act(effect)
+            elif isinstance(effect, Launch):
+                self.launch(effect)
+            elif isinstance(effect, EndTrial):
+                self.results.append(effect.result)
+                self.journal = []
+                if len(self.results) == self.simulator.num_trials:
+                    self.ended = True
+                else:
+                    self.begin(len(self.results))
+            elif isinstance(effect, Stop):
+                self.stopped = effect
+            elif isinstance(effect, Paused):
+                self.ended = True
+
+    def later(self, event: Sensed | Acted) -> Callable[[], list[Effect]]:
+        return lambda: self.robot.handle(event, self.now)
+
+    def act(self, effect: Act) -> None:
+        last = self.journal[-1]
+        assert isinstance(last, ActingRecord), "acted without having written it down"
+        assert last.step == effect.step
+        self.acted.append((effect.step, effect.action))
+        reward = self.environment.perform(effect.action)
+        self.on_act(effect.step)
+        self.after(0.01, self.later(Acted(effect.step, reward, self.environment.is_done())))
+
+    def launch(self, effect: Launch) -> None:
+        self.kill(LOCAL)
+        if self.launchable:
+            self.bring_up(LOCAL, self.launch_s)
+        else:
+            self.after(
+                0.01,
+                lambda: self.robot.recovery_exited(effect.number, "no such program", self.now),
+            )
+
+    def send(self, effect: Send) -> None:
+        service = self.services[effect.service]
+        self.sent.append(Sent(self.now, effect.service, decode_request(effect.payload)))
+        self.calls[effect.call] = effect.service
+        if not service.up:
+            self.after(0.0001, lambda: self.end(effect.call))
+            return
+        if service.stopped:
+            return
+        delay = service.latency_s
+        for reply in service.answer(effect.payload):
+            delay += service.latency_s
+            self.after(delay, lambda reply=reply: self.reply(effect.call, reply))  # type: ignore[misc]
+        self.after(delay + 0.0001, lambda: self.end(effect.call))
+
+    def reply(self, call: int, reply: Reply) -> list[Effect]:
+        name = self.calls.get(call)
+        if name is None or not self.services[name].up:
+            return []
+        return self.robot.handle(Replied(call, encode(reply)), self.now)
+
+    def end(self, call: int) -> list[Effect]:
+        if self.calls.pop(call, None) is None:
+            return []
+        return self.robot.handle(Ended(call), self.now)
+
+    # -- looking ---------------------------------------------------------------------------------
+
+    def reports(self, name: str) -> list[dict[str, object]]:
+        return [e.fields for _, e in self.trace if isinstance(e, Report) and e.name == name]
+
+    def statuses(self) -> list[object]:
+        return [fields["to"] for fields in self.reports("status")]
+
+    def longest_wait_ms(self) -> float:
+        return max(e.waited_ms for _, e in self.trace if isinstance(e, Timing))
+
+    def assert_same_as_without_faults(self) -> None:
+        assert len(self.results) == self.simulator.num_trials
+        for result in self.results:
+            expected = run_trial(PROBLEM, self.planning, self.simulator, result.trial)
+            assert result.digest == expected.digest
+            assert result.reward == expected.reward
+            assert (result.success, result.steps) == (expected.success, expected.steps)
+            assert result.sensing_decisions == expected.sensing_decisions
+            assert result.unexplained_observations == expected.unexplained_observations
+
+
+def test_without_faults_it_decides_as_in_process_with_one_request_per_sensing_step() -> None:
+    world = World()
+    world.start()
+    world.run()
+    world.assert_same_as_without_faults()
+    assert world.statuses() == []
+    asked = [sent.request for sent in world.sent]
+    # The first question of a trial is for its first sensing action; then one for each observation.
+    decisions = sum(result.sensing_decisions for result in world.results)
+    assert len(asked) == decisions + len(world.results)
+    assert [request.opening is not None for request in asked].count(True) == 1
+    assert all(request.checkpoint is None for request in asked)
+    assert all(len(request.observations) <= 1 for request in asked)
+
+
+def test_the_prefetched_sensing_action_is_there_before_it_is_needed() -> None:
+    world = World()
+    world.start()
+    world.run()
+    waits = [e for _, e in world.trace if isinstance(e, Timing) and e.kind == "sensing"]
+    assert all(wait.waited_ms == 0.0 for wait in waits if wait.step > 0)
+
+
+@pytest.mark.parametrize("step", range(13))
+@pytest.mark.parametrize("launch", ["on_failure", "at_start"])
+def test_killed_at_any_step_and_back_again(step: int, launch: str) -> None:
+    world = World(launch=launch)
+    if launch == "at_start":
+        world.launch_s = 0.0
+
+    def fault(performed: int) -> None:
+        if performed == step and not world.results and world.services["cloud"].boot == 1:
+            world.kill("cloud")
+            world.bring_up("cloud", 0.5)
+
+    world.on_act = fault
+    world.start()
+    world.run()
+    world.assert_same_as_without_faults()
+    assert world.statuses() == ["local_recovery", "keep_alive"]
+    limit_s = 0.01 + (world.launch_s if launch == "on_failure" else 0.0) + 0.02
+    assert world.longest_wait_ms() <= 1e3 * limit_s
+
+
+def test_dead_before_the_first_request() -> None:
+    world = World()
+    world.start(present=False)
+    world.run()
+    world.assert_same_as_without_faults()
+    assert world.statuses() == ["local_recovery"]
+    lost_at = next(at for at, e in world.trace if isinstance(e, Report) and e.name == "status")
+    assert lost_at == pytest.approx(1e-3 * world.offload.startup_timeout_ms)
+
+
+def test_stopped_for_longer_than_the_timeout_is_found_by_its_silence() -> None:
+    world = World()
+
+    def fault(performed: int) -> None:
+        world.services["cloud"].stopped = not world.results and 3 <= performed < 20
+
+    world.on_act = fault
+    world.start()
+    world.run()
+    world.assert_same_as_without_faults()
+    assert world.statuses() == ["local_recovery", "keep_alive"]
+    assert any("no sign" in str(f["reason"]) for f in world.reports("service_suspected"))
+
+
+def test_kill_again_after_failback() -> None:
+    world = World()
+    times = iter([2, 14, 25])
+    following = next(times)
+
+    def fault(performed: int) -> None:
+        nonlocal following
+        if performed == following and not world.results:
+            following = next(times, -1)
+            world.kill("cloud")
+            world.bring_up("cloud", 0.012)
+
+    world.on_act = fault
+    world.start()
+    world.run()
+    world.assert_same_as_without_faults()
+    assert world.statuses() == ["local_recovery", "keep_alive"] * 3
+    assert sum(result.recoveries for result in world.results) == 3
+
+
+def test_cloud_and_recovery_killed_together() -> None:
+    world = World()
+
+    def fault(performed: int) -> None:
+        if performed == 4 and not world.results:
+            world.kill("cloud")
+        if performed == 10 and not world.results:
+            world.kill(LOCAL)
+
+    world.on_act = fault
+    world.start()
+    world.run()
+    world.assert_same_as_without_faults()
+    assert world.statuses() == ["local_recovery"]
+    assert len([e for _, e in world.trace if isinstance(e, Launch)]) == 2
+
+
+def test_two_replicas_killed_in_turn_stay_standard_until_both_are_dead() -> None:
+    world = World(services=("first", "second"))
+
+    def fault(performed: int) -> None:
+        if world.results:
+            return
+        if performed == 4:
+            world.kill("first")
+        if performed == 12:
+            world.kill("second")
+            world.bring_up("first", 0.3)
+
+    world.on_act = fault
+    world.start()
+    world.run()
+    world.assert_same_as_without_faults()
+    assert world.statuses() == ["local_recovery", "keep_alive"]
+    assert {sent.service for sent in world.sent} == {"first", "second", LOCAL}
+
+
+def test_without_recovery_it_holds_says_why_and_goes_on() -> None:
+    world = World(launch="never")
+
+    def fault(performed: int) -> None:
+        if performed == 4 and not world.results:
+            world.kill("cloud")
+            world.bring_up("cloud", 3.0)
+
+    world.on_act = fault
+    world.start()
+    world.run()
+    world.assert_same_as_without_faults()
+    assert world.statuses() == []
+    (held,) = world.reports("holding")
+    assert "cloud: is not there" in str(held["reason"])
+    (resumed,) = world.reports("resumed")
+    assert 2500.0 < float(str(resumed["held_ms"])) < 3100.0
+
+
+def test_recovery_that_cannot_be_launched_holds_the_robot_until_anything_answers() -> None:
+    world = World()
+    world.launchable = False
+
+    def fault(performed: int) -> None:
+        if performed == 4 and not world.results:
+            world.kill("cloud")
+            world.bring_up("cloud", 5.0)
+
+    world.on_act = fault
+    world.start()
+    world.run()
+    world.assert_same_as_without_faults()
+    assert world.statuses() == ["local_recovery", "keep_alive"]
+    launches = [e for _, e in world.trace if isinstance(e, Launch)]
+    assert 3 < len(launches) < 12
+
+
+def test_a_lost_reply_is_asked_for_again() -> None:
+    world = World(launch="never")
+    cloud = world.services["cloud"]
+    dropped = 0
+
+    def lose_some(request: Request) -> list[Reply] | None:
+        nonlocal dropped
+        if request.number in (2, 3, 7):
+            dropped += 1
+            return []
+        return None
+
+    cloud.rule = lose_some
+    world.start()
+    world.run()
+    world.assert_same_as_without_faults()
+    assert dropped == 3
+
+
+def test_swallowed_requests_are_sent_again_after_the_timeout() -> None:
+    world = World(launch="never")
+    cloud = world.services["cloud"]
+
+    def fault(performed: int) -> None:
+        cloud.stopped = performed == 3 and not world.results
+        if cloud.stopped:
+            world.after(2.0, wake_up)
+
+    def wake_up() -> list[Effect]:
+        cloud.stopped = False
+        return []
+
+    world.on_act = fault
+    world.start()
+    world.run()
+    world.assert_same_as_without_faults()
+
+
+def test_a_service_that_lost_the_session_is_handed_the_state() -> None:
+    world = World()
+    cloud = world.services["cloud"]
+
+    def fault(performed: int) -> None:
+        if performed in (5, 6):
+            cloud.states.clear()
+
+    world.on_act = fault
+    world.start()
+    world.run()
+    world.assert_same_as_without_faults()
+    assert world.statuses() == []
+    assert any(request.checkpoint is not None for request in cloud.requests)
+
+
+def test_busy_is_waited_for_if_short_and_evaded_if_long() -> None:
+    world = World()
+    cloud = world.services["cloud"]
+    cloud.rule = lambda r: [Busy(r.number, 20)] if r.number in (3, 4) else None
+    world.start()
+    world.run()
+    world.assert_same_as_without_faults()
+    assert world.statuses() == []
+
+    world = World()
+    cloud = world.services["cloud"]
+    cloud.rule = lambda r: [Busy(r.number, 5000)] if r.number == 3 else None
+    world.start()
+    world.run()
+    world.assert_same_as_without_faults()
+    assert world.statuses()[0] == "local_recovery"
+
+
+def test_progress_keeps_a_slow_service_trusted() -> None:
+    world = World()
+    cloud = world.services["cloud"]
+    cloud.latency_s = 0.1
+
+    def slow(request: Request) -> list[Reply] | None:
+        if request.number != 3:
+            return None
+        cloud.rule = lambda _: None
+        signs: list[Reply] = [Progress(request.number, False) for _ in range(10)]
+        replies = cloud.answer(encode(request))
+        cloud.rule = slow
+        return signs + replies
+
+    cloud.rule = slow
+    world.start()
+    world.run()
+    world.assert_same_as_without_faults()
+    assert world.statuses() == []
+
+
+def test_deadline_hedges_within_its_budget() -> None:
+    world = World(launch="at_start", deadline_ms=20.0)
+    cloud = world.services["cloud"]
+    world.start()
+    world.services["cloud"].latency_s = 0.1
+    world.run()
+    world.assert_same_as_without_faults()
+    assert world.statuses() == []
+    hedged = len(world.reports("hedge"))
+    questions = len({sent.request.digest for sent in world.sent})
+    assert 1 <= hedged <= 3 + 0.1 * questions
+    assert cloud.requests
+
+
+def test_a_problem_that_every_service_refuses_stops_the_robot() -> None:
+    world = World()
+
+    def refuse(request: Request) -> list[Reply] | None:
+        return [Refused(request.number, "failed", "policy gives nan")]
+
+    world.services["cloud"].rule = refuse
+    world.services[LOCAL].rule = refuse
+    world.start()
+    world.run()
+    assert world.stopped is not None
+    assert isinstance(world.stopped.error, ServiceRefusedError)
+    assert "policy gives nan" in str(world.stopped.error)
+
+
+def test_a_stale_epoch_stops_the_robot() -> None:
+    world = World()
+    world.services["cloud"].rule = lambda r: (
+        [Refused(r.number, "stale_epoch", "epoch 1, seen was 2")] if r.number == 3 else None
+    )
+    world.start()
+    world.run()
+    assert world.stopped is not None
+    assert isinstance(world.stopped.error, StaleEpochError)
+
+
+@pytest.mark.parametrize("number", range(1, 8))
+def test_a_reply_to_another_request_is_not_taken(number: int) -> None:
+    world = World()
+    cloud = world.services["cloud"]
+
+    def confuse(request: Request) -> list[Reply] | None:
+        if request.number != number:
+            return None
+        return [TaskAnswer(request.number + 1, 4, bytes(8 * 12), 1)]
+
+    cloud.rule = confuse
+    world.start()
+    world.run()
+    world.assert_same_as_without_faults()
+
+
+def test_wrong_answers_are_refused() -> None:
+    world = World()
+    cloud = world.services["cloud"]
+
+    def lie(request: Request) -> list[Reply] | None:
+        lies: dict[int, Reply] = {
+            2: TaskAnswer(2, 3, bytes(8 * 9), 1),
+            4: TaskAnswer(4, 4, numbers_to([np.nan] * 12), 1),
+            6: SensingAnswer(6, 8, 17, b"d" * DIGEST_SIZE, 1),
+            8: SensingAnswer(8, 1, 0, b"d" * DIGEST_SIZE, 1),
+        }
+        return [lies[request.number]] if request.number in lies else None
+
+    cloud.rule = lie
+    world.start()
+    world.run()
+    world.assert_same_as_without_faults()
+    assert world.reports("malformed_reply")
+
+
+def test_a_sensing_action_for_another_state_is_not_followed() -> None:
+    world = World()
+    cloud = world.services["cloud"]
+
+    def drift(request: Request) -> list[Reply] | None:
+        if request.number != 3:
+            return None
+        cloud.rule = lambda _: None
+        replies = cloud.answer(encode(request))
+        cloud.rule = drift
+        return [
+            reply
+            if isinstance(reply, TaskAnswer)
+            else SensingAnswer(3, request.step + 4, 2, b"x" * DIGEST_SIZE, 1)
+            for reply in replies
+        ]
+
+    cloud.rule = drift
+    world.start()
+    world.run()
+    world.assert_same_as_without_faults()
+    assert len(world.reports("prefetch_unused")) == 1
+
+
+# -- the robot's own death ------------------------------------------------------------------------
+
+
+def recorded() -> tuple[list[tuple[Record, ...]], World]:
+    """Return what the journal held at each moment of a run without faults."""
+    world = World(simulator=SimulatorSettings(num_trials=1, max_steps=14, seed=11))
+    stages: list[tuple[Record, ...]] = [()]
+    world.start()
+    carry_out = world.carry_out
+
+    def watching(effects: list[Effect]) -> None:
+        for effect in effects:
+            carry_out([effect])
+            if isinstance(effect, Journal):
+                stages.append(tuple(world.journal))
+
+    world.carry_out = watching  # type: ignore[method-assign]
+    world.run()
+    return stages, world
+
+
+@pytest.mark.parametrize("performed", [True, False])
+def test_resumed_from_any_moment(performed: bool) -> None:
+    stages, whole = recorded()
+    for records in stages:
+        world = World(simulator=SimulatorSettings(num_trials=1, max_steps=14, seed=11))
+        history = replay(PROBLEM, PLANNING, 11, 0, records)
+        world.journal = list(records)
+        world.environment = SimulatedEnvironment(PROBLEM, 11, 0)
+        for action in history.actions:
+            world.environment.perform(action)
+        pending = history.pending
+        if pending is not None and performed:
+            world.environment.perform(pending)
+        world.carry_out(world.robot.start(0.0))
+        world.bring_up("cloud")
+        begun = Begun(world.environment.is_done(), world.environment.step)
+        world.carry_out(world.robot.begin_trial(0, history, begun, 0.0, tail_is_certain=False))
+        world.run()
+        (result,) = world.results
+        (expected,) = whole.results
+        assert result.digest == expected.digest
+        missing = 1 if pending is not None and performed else 0
+        steps = [step for step, _ in world.acted]
+        assert steps == list(range(14 - len(steps), 14))
+        assert len(history.actions) + missing + len(steps) == 14
+
+
+def begin_after(
+    records: tuple[Record, ...], steps_performed: int | None, *, tail_is_certain: bool = True
+) -> World:
+    world = World()
+    history = replay(PROBLEM, PLANNING, 11, 0, records)
+    world.journal = list(records)
+    world.environment = SimulatedEnvironment(PROBLEM, 11, 0)
+    for action in history.actions:
+        world.environment.perform(action)
+    world.carry_out(
+        world.robot.begin_trial(
+            0, history, Begun(False, steps_performed), 0.0, tail_is_certain=tail_is_certain
+        )
+    )
+    return world
+
+
+def test_an_unknown_performance_stops_unless_the_environment_can_tell() -> None:
+    stages, _ = recorded()
+    pending = next(s for s in stages if s and isinstance(s[-1], ActingRecord) and len(s) > 6)
+    known = len([r for r in pending if isinstance(r, PerformedRecord)])
+    stopped = begin_after(pending, None).stopped
+    assert stopped is not None
+    assert isinstance(stopped.error, UnknownPerformanceError)
+    assert f"step {known}" in str(stopped.error)
+    for count in (known - 1, known + 2):
+        stopped = begin_after(pending, count).stopped
+        assert stopped is not None
+        assert isinstance(stopped.error, UnknownPerformanceError)
+    for count in (known, known + 1):
+        assert begin_after(pending, count).stopped is None
+
+
+def test_a_tail_that_may_be_lost_stops_unless_the_environment_can_tell() -> None:
+    stages, _ = recorded()
+    settled = next(s for s in stages if s and isinstance(s[-1], ObservedRecord) and len(s) > 6)
+    known = len([r for r in settled if isinstance(r, PerformedRecord)])
+    assert begin_after(settled, None, tail_is_certain=True).stopped is None
+    assert begin_after(settled, None, tail_is_certain=False).stopped is not None
+    assert begin_after(settled, known, tail_is_certain=False).stopped is None
+    assert begin_after(settled, known + 1, tail_is_certain=False).stopped is not None
+
+
+def test_an_environment_that_fails_holds_the_robot() -> None:
+    world = World()
+    world.start()
+
+    def fail(step: int) -> None:
+        if step == 5:
+            world.heap.clear()
+            failure = EnvironmentFailed(5, "perform", "the arm is stuck", True)
+            world.after(0.1, lambda: world.robot.handle(failure, world.now))
+
+    world.on_act = fail
+    act = world.act
+
+    def act_or_fail(effect: Act) -> None:
+        act(effect)
+        if effect.step == 5:
+            # What the environment would have delivered never comes.
+            world.heap = [item for item in world.heap if item[0] - world.now > 0.05]
+            heapq.heapify(world.heap)
+
+    world.act = act_or_fail  # type: ignore[method-assign]
+    world.run()
+    assert world.stopped is not None
+    assert isinstance(world.stopped.error, HeldError)
+    assert "the arm is stuck" in str(world.stopped.error)
+    assert "not known" in str(world.stopped.error)
+    assert isinstance(world.journal[-1], ActingRecord)
+
+
+def test_pause_writes_everything_down_and_a_new_robot_goes_on() -> None:
+    world = World(simulator=SimulatorSettings(num_trials=1, max_steps=14, seed=11))
+    world.on_act = lambda step: (
+        world.after(0.0001, lambda: world.robot.pause(world.now)) if step == 6 else None
+    )
+    world.start()
+    world.run()
+    assert world.ended
+    assert not world.results
+    history = replay(PROBLEM, PLANNING, 11, 0, world.journal)
+    assert history.paused
+    assert history.pending is None
+    assert history.state.step == 7
+    begun = begin_after(tuple(world.journal), None, tail_is_certain=False)
+    assert begun.stopped is None
+
+
+def test_rate_paces_the_steps_and_counts_missed_ticks() -> None:
+    world = World(rate_hz=20.0, launch="never")
+
+    def fault(performed: int) -> None:
+        if performed == 8 and not world.results:
+            world.kill("cloud")
+            world.bring_up("cloud", 0.42)
+
+    world.on_act = fault
+    world.start()
+    world.run()
+    world.assert_same_as_without_faults()
+    times = [at for at, e in world.trace if isinstance(e, Act)][:20]
+    gaps = np.diff(times)
+    assert np.count_nonzero(np.abs(gaps - 0.05) < 1e-9) >= 17
+    assert 3 <= world.robot.missed_ticks <= 6
+    assert sum(int(str(f["missed"])) for f in world.reports("missed_ticks")) == (
+        world.robot.missed_ticks
+    )
+
+
+def test_effects_before_sending_are_written() -> None:
+    world = World()
+    world.start()
+    world.run()
+    written = 0
+    for _, effect in world.trace:
+        if isinstance(effect, Journal):
+            written += len([r for r in effect.records if isinstance(r, ObservedRecord)])
+        if isinstance(effect, Send):
+            request = decode_request(effect.payload)
+            if request.sensed:
+                assert written >= 1
+    assert world.robot.status is Status.STANDARD
