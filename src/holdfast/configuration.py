@@ -3,11 +3,11 @@
 A run is described by one file, and whoever reads an error has that file open. So every complaint
 names the file, the line, the key with its section, the value and what is allowed instead, and it
 comes before anything is run. The sections and keys are the thesis's, so that its files load
-unchanged; ``problem: NAME`` on top and the section ``selector`` are ours, and optional. A problem
-of one's own is looked for beside the file and in the current directory, or where
-``problem_directory`` says. Missing
-sections and keys take their defaults, and :meth:`Configuration.to_yaml` writes down every value
-that is in use.
+unchanged; ``problem: NAME`` on top and the sections ``selector``, ``offload``, ``recovery`` and
+``environment`` are ours, and optional. A problem or an environment of one's own is looked for
+beside the file and in the current directory, or where ``problem_directory`` and
+``environment.directory`` say. Missing sections and keys take their defaults, and
+:meth:`Configuration.to_yaml` writes down every value that is in use.
 
 The bounds themselves stand with the settings (:mod:`holdfast.settings`) and with each problem (its
 ``Model`` and ``StateSpacePlanner``); what involves two keys is checked here.
@@ -19,6 +19,7 @@ import difflib
 import inspect
 import json
 import re
+import sys
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from importlib.machinery import PathFinder
@@ -33,21 +34,27 @@ from holdfast.problems import registry
 from holdfast.problems.problem import Problem, ProblemBase
 from holdfast.settings import (
     ActiveSensingSettings,
+    EnvironmentSettings,
+    OffloadSettings,
     ParticleFilterSettings,
     PlanningSettings,
+    RecoverySettings,
     SelectorSettings,
     SimulatorSettings,
 )
 from holdfast.user_code import account_of_user_error
 from holdfast.yaml_document import MAX_BYTES, Document, KeyPath, dotted, read, write
 
-__all__ = ["Configuration", "load"]
+__all__ = ["Configuration", "build_problem", "load"]
 
 _SETTINGS: Mapping[str, type[msgspec.Struct]] = {
     "particle_filter": ParticleFilterSettings,
     "active_sensing": ActiveSensingSettings,
     "simulator": SimulatorSettings,
     "selector": SelectorSettings,
+    "offload": OffloadSettings,
+    "recovery": RecoverySettings,
+    "environment": EnvironmentSettings,
 }
 
 # In the order in which a resolved configuration lists them.
@@ -58,6 +65,9 @@ _SECTIONS = (
     "active_sensing",
     "simulator",
     "selector",
+    "offload",
+    "recovery",
+    "environment",
 )
 
 _ON_TOP = ("problem", "problem_directory")
@@ -98,6 +108,13 @@ class Configuration:
     unlisted : tuple of str
         Arguments of the problem's constructor that have their default because a file cannot hold
         it, so that they are not in ``model``.
+    offload : OffloadSettings
+        Which services decide. ``tls`` is an absolute path.
+    recovery : RecoverySettings
+        The local service that decides while no other can.
+    environment : EnvironmentSettings
+        The world that the robot acts on. ``directory`` is where its module was found; None for one
+        that is installed.
     """
 
     problem: Problem = field(compare=False, repr=False)
@@ -109,6 +126,9 @@ class Configuration:
     path: Path = field(compare=False)
     problem_directory: Path | None = field(default=None, compare=False)
     unlisted: tuple[str, ...] = field(default=(), compare=False)
+    offload: OffloadSettings = field(default_factory=OffloadSettings)
+    recovery: RecoverySettings = field(default_factory=RecoverySettings)
+    environment: EnvironmentSettings = field(default_factory=EnvironmentSettings)
 
     def to_yaml(self) -> str:
         """Return the resolved configuration as a file that loads to an equal configuration.
@@ -172,6 +192,9 @@ class Configuration:
             "active_sensing": self.planning.active_sensing,
             "selector": self.planning.selector,
             "simulator": self.simulator,
+            "offload": self.offload,
+            "recovery": self.recovery,
+            "environment": self.environment,
         }
         directory = self.problem_directory
         return {
@@ -187,6 +210,7 @@ def load(
     problem: str | None = None,
     num_trials: int | None = None,
     seed: int | None = None,
+    overrides: Mapping[str, Any] | None = None,
 ) -> Configuration:
     """Read a configuration file.
 
@@ -198,6 +222,9 @@ def load(
         Name of the problem, instead of the one that the file gives or implies.
     num_trials, seed : int, optional
         Instead of the file's ``simulator.num_trials`` and ``simulator.seed``.
+    overrides : mapping, optional
+        Further values instead of the file's, by ``section.key`` (``offload.services``). None leaves
+        the file's. Paths among them are relative to the current directory.
 
     Returns
     -------
@@ -213,13 +240,50 @@ def load(
     """
     path = Path(path)
     document = read(_content(path), str(path))
-    overrides = {"num_trials": num_trials, "seed": seed}
+    given = {
+        "simulator.num_trials": num_trials,
+        "simulator.seed": seed,
+        **(overrides or {}),
+    }
     return _build(
         document,
         path,
         problem,
-        {key: value for key, value in overrides.items() if value is not None},
+        {_section_and_key(name): value for name, value in given.items() if value is not None},
     )
+
+
+def build_problem(
+    name: str,
+    problem_class: type,
+    model: Mapping[str, Any],
+    state_space_planner: Mapping[str, Any],
+) -> Problem:
+    """Build a problem from plain data that did not come from a file.
+
+    Parameters
+    ----------
+    name : str
+        What the problem is called in messages.
+    problem_class : type
+        As :func:`holdfast.problems.registry.problem_class` returns it.
+    model, state_space_planner : mapping
+        The problem's two sections.
+
+    Raises
+    ------
+    ConfigurationError
+        If the data does not fit the problem.
+    """
+    sections = {"model": model, "state_space_planner": state_space_planner}
+    source = _Source(Document(sections, {}), Path(name), {})
+    schemas = {**_SETTINGS, **_schemas_of(problem_class)}
+    return _build_problem(source, name, problem_class, schemas)[0]
+
+
+def _section_and_key(name: str) -> tuple[str, str]:
+    section, _, key = name.partition(".")
+    return section, key
 
 
 def _content(path: Path) -> bytes:
@@ -239,10 +303,12 @@ def _content(path: Path) -> bytes:
 class _Source:
     """A configuration before it is checked, and the way to say where in it something is wrong."""
 
-    def __init__(self, document: Document, path: Path, overrides: Mapping[str, Any]) -> None:
+    def __init__(
+        self, document: Document, path: Path, overrides: Mapping[tuple[str, str], Any]
+    ) -> None:
         self.path = path
         self._document = document
-        self._overrides = {("simulator", key) for key in overrides}
+        self._overrides = frozenset(overrides)
         data = document.data
         if data is None:
             raise ConfigurationError(
@@ -264,16 +330,27 @@ class _Source:
             if section is not None and not isinstance(section, Mapping):
                 raise self.error((name,), f"is {_shown(section)}; expected a mapping of keys")
             self.sections[name] = dict(section or {})
-        self.sections["simulator"].update(overrides)
+        for (name, key), value in overrides.items():
+            if name not in _SECTIONS:
+                raise self.unknown((name,), _SECTIONS)
+            self.sections[name][key] = value
 
     def place(self, path: KeyPath) -> str:
         """Return the file, and the line of the value at ``path`` where there is one."""
         line = self._document.line(path)
         return f"{self.path}" if line is None else f"{self.path}, line {line}"
 
+    def is_overridden(self, path: KeyPath) -> bool:
+        """Tell whether the value at ``path`` was given instead of the file's."""
+        return path[:2] in self._overrides
+
+    def directory_of(self, path: KeyPath) -> Path:
+        """Return the directory to which a relative path that stands at ``path`` is relative."""
+        return Path.cwd() if self.is_overridden(path) else self.path.absolute().parent.resolve()
+
     def error(self, path: KeyPath, message: str) -> ConfigurationError:
         """Return an error about the value at ``path``."""
-        if path[:2] in self._overrides:
+        if self.is_overridden(path):
             return ConfigurationError(
                 f"{dotted(path)}, given instead of what {self.path} says, {message}"
             )
@@ -294,20 +371,26 @@ class _Source:
 
 
 def _build(
-    document: Document, path: Path, problem_name: str | None, overrides: Mapping[str, Any]
+    document: Document,
+    path: Path,
+    problem_name: str | None,
+    overrides: Mapping[tuple[str, str], Any],
 ) -> Configuration:
     """Check everything and build the problem."""
     source = _Source(document, path, overrides)
     name, problem_class, directory = _find_problem(source, problem_name)
-    schemas: dict[str, type[msgspec.Struct]] = dict(_SETTINGS)
-    for section, attribute in (("model", "Model"), ("state_space_planner", "StateSpacePlanner")):
-        schema = getattr(problem_class, attribute, None)
-        if isinstance(schema, type) and issubclass(schema, msgspec.Struct):
-            schemas[section] = schema
+    schemas = {**_SETTINGS, **_schemas_of(problem_class)}
     particle_filter = _convert(source, "particle_filter", ParticleFilterSettings, schemas)
     active_sensing = _convert(source, "active_sensing", ActiveSensingSettings, schemas)
     selector = _convert(source, "selector", SelectorSettings, schemas)
     simulator = _convert(source, "simulator", SimulatorSettings, schemas)
+    recovery = _convert(source, "recovery", RecoverySettings, schemas)
+    offload = _checked_offload(
+        source, _convert(source, "offload", OffloadSettings, schemas), recovery
+    )
+    environment = _located_environment(
+        source, _convert(source, "environment", EnvironmentSettings, schemas)
+    )
     problem, model, planner, unlisted = _build_problem(source, name, problem_class, schemas)
 
     num_particles = particle_filter.num_particles
@@ -344,7 +427,20 @@ def _build(
         path=path,
         problem_directory=directory,
         unlisted=unlisted,
+        offload=offload,
+        recovery=recovery,
+        environment=environment,
     )
+
+
+def _schemas_of(problem_class: type) -> dict[str, type[msgspec.Struct]]:
+    """Return the types of a problem's own sections, as far as it declares them."""
+    schemas: dict[str, type[msgspec.Struct]] = {}
+    for section, attribute in (("model", "Model"), ("state_space_planner", "StateSpacePlanner")):
+        schema = getattr(problem_class, attribute, None)
+        if isinstance(schema, type) and issubclass(schema, msgspec.Struct):
+            schemas[section] = schema
+    return schemas
 
 
 def _find_problem(source: _Source, name: str | None) -> tuple[str, type, Path | None]:
@@ -383,11 +479,7 @@ def _find_problem(source: _Source, name: str | None) -> tuple[str, type, Path | 
 
 
 def _problem_directory(source: _Source, name: str, *, given: bool) -> Path | None:
-    """Return the directory that holds the module of ``module:Class``; None if it is installed.
-
-    Without ``problem_directory`` it is the file's own, else the current one: a resolved
-    configuration stands in the directory of its run, far from the problem.
-    """
+    """Return the directory that holds the problem's module; None if it is installed."""
     value = source.problem_directory
     key = ("problem_directory",)
     if value is not None and not isinstance(value, str):
@@ -399,17 +491,97 @@ def _problem_directory(source: _Source, name: str, *, given: bool) -> Path | Non
                 key, f"is {_shown(value)}; only a problem that is named module:Class has one"
             )
         return None
+    return _module_directory(source, key, value, module)
+
+
+def _module_directory(source: _Source, key: KeyPath, value: str | None, module: str) -> Path | None:
+    """Return the directory that holds a user's module, as ``value`` at ``key`` says.
+
+    If it is None, that is the file's own, else the current one, for a resolved configuration stands
+    in the directory of its run, far from the module; None if it is in neither.
+    """
     package = module.partition(".")[0]
-    beside = source.path.absolute().parent.resolve()
     if value is not None:
-        directory = beside / value
+        directory = source.directory_of(key) / value
         if not directory.is_dir():
             raise source.error(key, f"is {_shown(value)}, where there is no directory")
         if not _holds(directory, package):
             raise source.error(key, f"is {_shown(value)}, where there is no module {package}")
         return directory.resolve()
+    beside = source.path.absolute().parent.resolve()
     return next(
         (directory for directory in (beside, Path.cwd()) if _holds(directory, package)), None
+    )
+
+
+def _checked_offload(
+    source: _Source, offload: OffloadSettings, recovery: RecoverySettings
+) -> OffloadSettings:
+    """Check what involves two values, and make paths absolute."""
+    for index, service in enumerate(offload.services):
+        first = offload.services.index(service)
+        if first != index:
+            raise source.error(
+                ("offload", "services", index),
+                f"is {_shown(service)}, as offload.services[{first}] is already; each stands once,"
+                " in order of preference",
+            )
+    deadline_ms, timeout_ms = offload.decision_deadline_ms, offload.decision_timeout_ms
+    if deadline_ms is not None:
+        key = ("offload", "decision_deadline_ms")
+        if recovery.launch == "never":
+            raise source.error(
+                key,
+                f"is {deadline_ms:g}; then the local service decides instead, which is never there"
+                " with recovery.launch never; leave one of the two out",
+            )
+        if deadline_ms >= timeout_ms:
+            raise source.error(
+                key,
+                f"is {deadline_ms:g}; it must be below offload.decision_timeout_ms, after which a"
+                f" decision is given up, which is {timeout_ms:g}",
+            )
+    if offload.detection_timeout_ms > timeout_ms:
+        raise source.error(
+            ("offload", "detection_timeout_ms"),
+            f"is {offload.detection_timeout_ms:g}; it must be at most offload.decision_timeout_ms,"
+            f" after which a decision is given up, which is {timeout_ms:g}",
+        )
+    if offload.tls is None:
+        return offload
+    directory = source.directory_of(("offload", "tls")) / offload.tls
+    return msgspec.structs.replace(offload, tls=str(directory.resolve()))
+
+
+def _located_environment(source: _Source, settings: EnvironmentSettings) -> EnvironmentSettings:
+    """Check the name of the environment and find its module, without importing it."""
+    name = settings.object
+    if name is None:
+        return settings
+    key = ("environment", "object")
+    module, colon, class_name = name.partition(":")
+    if not colon:
+        if settings.directory is not None and not source.is_overridden(key):
+            raise source.error(
+                ("environment", "directory"),
+                f"is {_shown(settings.directory)}; only an environment that is named module:Class"
+                " has one",
+            )
+        return msgspec.structs.replace(settings, directory=None)
+    if not all(part.isidentifier() for part in [*module.split("."), class_name]):
+        raise source.error(
+            key, f"is {_shown(name)}; expected module:Class or the name of an entry point"
+        )
+    directory = _module_directory(source, ("environment", "directory"), settings.directory, module)
+    package = module.partition(".")[0]
+    if directory is None and package not in sys.modules and PathFinder.find_spec(package) is None:
+        raise source.error(
+            key,
+            f"is {_shown(name)}; there is no module {package} beside {source.path.name}, in the"
+            " current directory or among the installed ones",
+        )
+    return msgspec.structs.replace(
+        settings, directory=None if directory is None else str(directory)
     )
 
 
@@ -703,7 +875,7 @@ def _described(field_type: msgspec.inspect.Type | None) -> str:
             case msgspec.inspect.FloatType():
                 words.append(f"a number{_bounds(candidate)}")
             case msgspec.inspect.StrType():
-                words.append("text")
+                words.append(f"text{_lengths(candidate, ' characters')}")
             case msgspec.inspect.BoolType():
                 words.append("true or false")
             case msgspec.inspect.NoneType():
@@ -715,6 +887,8 @@ def _described(field_type: msgspec.inspect.Type | None) -> str:
                 words.append(f"a list of {len(candidate.item_types)}")
             case msgspec.inspect.ListType() | msgspec.inspect.VarTupleType():
                 words.append(f"a list{_lengths(candidate)}")
+            case msgspec.inspect.DictType():
+                words.append("a mapping of keys")
             case msgspec.inspect.StructType():
                 words.append(f"a mapping with the keys {', '.join(_keys(candidate))}")
             case _:
@@ -732,10 +906,13 @@ def _bounds(number: msgspec.inspect.IntType | msgspec.inspect.FloatType) -> str:
     return f" {' and '.join(given)}" if given else ""
 
 
-def _lengths(items: msgspec.inspect.ListType | msgspec.inspect.VarTupleType) -> str:
+def _lengths(
+    items: msgspec.inspect.ListType | msgspec.inspect.VarTupleType | msgspec.inspect.StrType,
+    unit: str = "",
+) -> str:
     bounds = (("at least", items.min_length), ("at most", items.max_length))
     given = [f"{sign} {bound}" for sign, bound in bounds if bound is not None]
-    return f" of {' and '.join(given)}" if given else ""
+    return f" of {' and '.join(given)}{unit}" if given else ""
 
 
 def _close_match(text: str, allowed: Iterable[str]) -> str:

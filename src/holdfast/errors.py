@@ -10,6 +10,7 @@ from __future__ import annotations
 __all__ = [
     "CheckpointError",
     "ConfigurationError",
+    "EnvironmentFailedError",
     "HoldfastError",
     "InvalidValueError",
     "ProblemError",
@@ -36,6 +37,10 @@ class UnknownProblemError(ConfigurationError):
 
 class ProblemError(HoldfastError):
     """A problem's own function returned something that the contract does not allow."""
+
+
+class EnvironmentFailedError(HoldfastError):
+    """The robot's world raised, stalled, or returned something that the contract does not allow."""
 
 
 class CheckpointError(HoldfastError):

@@ -9,7 +9,7 @@ does, without the file, at the start of every trial.
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 
@@ -17,6 +17,7 @@ from holdfast.errors import InvalidValueError
 
 __all__ = [
     "ActiveSensingSettings",
+    "EnvironmentSettings",
     "OffloadSettings",
     "ParticleFilterSettings",
     "PlanningSettings",
@@ -29,11 +30,15 @@ __all__ = [
 MAX_PARTICLES = 10_000_000
 """Bound on ``num_particles``: states of six coordinates then fill 480 MB."""
 
+MAX_SERVICES = 16
+"""Bound on ``offload.services``: each has links of its own."""
+
 Count = Annotated[int, msgspec.Meta(ge=1)]
 NonNegativeCount = Annotated[int, msgspec.Meta(ge=0)]
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 Milliseconds = Annotated[float, msgspec.Meta(gt=0.0, le=3_600_000.0)]
 Seed = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
+Text = Annotated[str, msgspec.Meta(min_length=1, max_length=4096)]
 
 
 class ParticleFilterSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -137,8 +142,8 @@ class OffloadSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
     Attributes
     ----------
     services : tuple of str
-        Endpoints of the services in order of preference, in Zenoh's form (``tcp/10.0.0.7:7447``).
-        None: the planner runs in the robot's own process.
+        Endpoints of the services in order of preference, in Zenoh's form (``tcp/10.0.0.7:7447``);
+        at most 16, each once. None: the planner runs in the robot's own process.
     detection_timeout_ms : float
         A service from which a decision is awaited and that shows no sign of progress for this long
         counts as dead. (A killed one is found sooner, by its broken link.)
@@ -155,17 +160,18 @@ class OffloadSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
     decision_timeout_ms : float
         A decision that takes longer than this is given up even if its service shows progress.
     tls : str or None
-        Directory with this robot's credentials, as ``holdfast keys`` makes it.
+        Directory with this robot's credentials, as ``holdfast keys`` makes it. In a file it may be
+        relative to that file.
     """
 
-    services: tuple[str, ...] = ()
+    services: Annotated[tuple[Text, ...], msgspec.Meta(max_length=MAX_SERVICES)] = ()
     detection_timeout_ms: Milliseconds = 250.0
     startup_timeout_ms: Milliseconds = 1000.0
     lease_ms: Annotated[float, msgspec.Meta(ge=50.0, le=60_000.0)] = 400.0
     decision_deadline_ms: Milliseconds | None = None
     max_hedged_share: Annotated[float, msgspec.Meta(ge=0.0, le=1.0)] = 0.1
     decision_timeout_ms: Milliseconds = 60_000.0
-    tls: str | None = None
+    tls: Text | None = None
 
 
 class RecoverySettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -190,6 +196,32 @@ class RecoverySettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
     launch_timeout_ms: Milliseconds = 5000.0
     relaunch_delay_ms: Milliseconds = 100.0
     journal_survives: Literal["process_crash", "power_cut"] = "process_crash"
+
+
+class EnvironmentSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The section ``environment``: the world that the robot acts on.
+
+    Nothing here changes a decision, given what was sensed.
+
+    Attributes
+    ----------
+    object : str or None
+        Class of an environment of one's own, ``module:Class`` or the name of an entry point of the
+        group ``holdfast.environments``. None: the world is simulated from the problem.
+    directory : str or None
+        Directory of the module of ``module:Class``. None: the file's own or the current one, else
+        the module is installed. In a file it may be relative to that file.
+    arguments : dict
+        Plain data, passed to the class as keyword arguments.
+    timeout_ms : float
+        Sensing, performing or any other call of the environment that takes longer than this has
+        failed.
+    """
+
+    object: Text | None = None
+    directory: Text | None = None
+    arguments: dict[str, Any] = msgspec.field(default_factory=dict)
+    timeout_ms: Milliseconds = 60_000.0
 
 
 class PlanningSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

@@ -1,17 +1,23 @@
-"""Errors in code that is not ours: what the author of a problem needs to see of them.
+"""Code that is not ours: how it is found by name, and what its author needs to see of its errors.
 
-A problem is a person's own code that holdfast calls. When it fails, the frames that matter are that
-person's; those of holdfast and of the libraries between them only hide these. When no frame is the
-person's, the defect is ours and nothing may be hidden.
+A problem or an environment is a person's own code that holdfast calls. When it fails, the frames
+that matter are that person's; those of holdfast and of the libraries between them only hide these.
+When no frame is the person's, the defect is ours and nothing may be hidden.
 """
 
 from __future__ import annotations
 
+import difflib
+import importlib
+import sys
 import sysconfig
 import traceback
 from pathlib import Path
+from typing import Any
 
-__all__ = ["account_of_user_error", "is_users_file"]
+from holdfast.errors import ConfigurationError
+
+__all__ = ["account_of_user_error", "find_class", "is_users_file", "registered_names"]
 
 _HOLDFAST = Path(__file__).resolve().parent
 _LIBRARIES = tuple(
@@ -71,3 +77,109 @@ def account_of_user_error(error: BaseException, name: str) -> str | None:
     text = error.msg if isinstance(error, SyntaxError) else str(error)
     kind = type(error).__name__
     return f"{name} raised {kind}{': ' if text else ''}{text}\n{where}"
+
+
+def registered_names(group: str) -> list[str]:
+    """Return the names of a group of entry points, sorted.
+
+    Parameters
+    ----------
+    group : str
+        Such as ``holdfast.problems``.
+    """
+    import importlib.metadata
+
+    return sorted(
+        {entry_point.name for entry_point in importlib.metadata.entry_points(group=group)}
+    )
+
+
+def find_class(
+    name: str,
+    *,
+    what: str,
+    group: str,
+    search_directory: Path | None,
+    error_type: type[ConfigurationError],
+) -> type[Any]:
+    """Find a class by its name.
+
+    Parameters
+    ----------
+    name : str
+        Of an entry point, or ``module:Class``.
+    what : str
+        What it is for, usually the key of the configuration; messages begin with it.
+    group : str
+        Of the entry points.
+    search_directory : Path or None
+        Directory in which ``module`` is looked for first. It goes on the import path and stays
+        there, as a script's directory does, for the module may import its neighbours later.
+    error_type : type
+        What is raised.
+
+    Returns
+    -------
+    type
+
+    Raises
+    ------
+    error_type
+        If the name is not registered, or the module or its class cannot be imported.
+    """
+    if ":" in name:
+        return _imported_class(name, what, search_directory, error_type)
+    import importlib.metadata
+
+    for entry_point in importlib.metadata.entry_points(group=group, name=name):
+        try:
+            loaded = entry_point.load()
+        except (ImportError, AttributeError) as error:
+            raise error_type(
+                f"{what}: {name}, is registered as {entry_point.value}, which cannot be imported: "
+                f"{error}"
+            ) from error
+        return _as_class(name, what, loaded, error_type)
+    known = registered_names(group)
+    close = difflib.get_close_matches(name, known, n=3)
+    suggestion = f"did you mean {' or '.join(close)}? " if close else ""
+    raise error_type(
+        f"{what}: {name}, is not registered; {suggestion}Registered are "
+        f"{', '.join(known) or 'none'}; a class of your own is named module:Class"
+    )
+
+
+def _imported_class(
+    name: str, what: str, search_directory: Path | None, error_type: type[ConfigurationError]
+) -> type[Any]:
+    module_name, _, class_name = name.partition(":")
+    if not all(part.isidentifier() for part in [*module_name.split("."), class_name]):
+        raise error_type(f"{what}: {name}, must be a registered name or module:Class")
+    if search_directory is not None:
+        directory = str(search_directory.resolve())
+        if directory not in sys.path:
+            sys.path.insert(0, directory)
+            importlib.invalidate_caches()
+    try:
+        module = importlib.import_module(module_name)
+    except ImportError as error:
+        where = "" if search_directory is None else f" (looked in {search_directory} first)"
+        raise error_type(
+            f"{what}: {name}, the module {module_name} cannot be imported{where}: {error}"
+        ) from error
+    if not hasattr(module, class_name):
+        classes = [key for key, value in vars(module).items() if isinstance(value, type)]
+        close = difflib.get_close_matches(class_name, classes, n=3)
+        suggestion = f"; did you mean {' or '.join(close)}?" if close else ""
+        raise error_type(
+            f"{what}: {name}, the module {module_name} has no {class_name}{suggestion}"
+        )
+    return _as_class(name, what, getattr(module, class_name), error_type)
+
+
+def _as_class(
+    name: str, what: str, found: object, error_type: type[ConfigurationError]
+) -> type[Any]:
+    if not isinstance(found, type):
+        raise error_type(f"{what}: {name}, is not a class but {type(found).__name__}")
+    return found

@@ -16,6 +16,7 @@ import yaml
 from holdfast.configuration import Configuration, load
 from holdfast.errors import ConfigurationError, UnknownProblemError
 from holdfast.problems import registry
+from holdfast.settings import EnvironmentSettings, OffloadSettings, RecoverySettings
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
@@ -128,6 +129,9 @@ class WrongTypes(Keywords):
         gain + "one"
 """
 
+# A user's environment beside the configuration; it must not be imported to load that.
+ROBOT = "raise RuntimeError('imported')"
+
 Write = Callable[[str], Path]
 
 
@@ -139,6 +143,7 @@ def write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Write:
 
     def write_file(text: str) -> Path:
         (tmp_path / "lamps.py").write_text(LAMPS)
+        (tmp_path / "own_robot.py").write_text(ROBOT)
         path = tmp_path / "run.yaml"
         path.write_text(textwrap.dedent(text), encoding="utf-8")
         return path
@@ -172,7 +177,7 @@ class TestWhatLoads:
         assert example.pop("problem") == "peg_in_hole_2d"
         assert example == yaml.safe_load(THESIS)
 
-    @pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.yaml")), ids=lambda path: path.stem)
+    @pytest.mark.parametrize("path", sorted(EXAMPLES.rglob("*.yaml")), ids=lambda path: path.stem)
     def test_an_example_loads_and_is_told_by_its_keys(self, path: Path, write: Write) -> None:
         named = load(path)
         text = path.read_text(encoding="utf-8")
@@ -577,6 +582,233 @@ class TestTwoKeys:
         assert "sensing actions 0 to 2 (x, y, θ)" in message
         assert load(write(text % ("fixed", 2))).planning.selector.sensing_action == 2
         assert load(write(text % ("action_entropy", 3))).planning.selector.sensing_action == 3
+
+
+class TestOffload:
+    """The sections `offload` and `recovery`."""
+
+    def test_what_they_are_without_the_sections(self, write: Write) -> None:
+        configuration = load(write("problem: peg_in_hole_2d"))
+        assert configuration.offload == OffloadSettings()
+        assert configuration.recovery == RecoverySettings()
+        assert configuration.environment == EnvironmentSettings()
+        assert configuration.offload.services == ()
+        assert configuration.recovery.launch == "on_failure"
+        assert configuration.environment.object is None
+
+    def test_they_load_and_come_back(self, write: Write) -> None:
+        configuration = load(
+            write(
+                """\
+                problem: peg_in_hole_2d
+                offload:
+                  services: [tcp/127.0.0.1:7447, quic/10.0.0.7:7447]
+                  detection_timeout_ms: 5000
+                  decision_deadline_ms: 20.5
+                recovery: {launch: at_start, journal_survives: power_cut}
+                """
+            )
+        )
+        assert configuration.offload == OffloadSettings(
+            services=("tcp/127.0.0.1:7447", "quic/10.0.0.7:7447"),
+            detection_timeout_ms=5000.0,
+            decision_deadline_ms=20.5,
+        )
+        assert configuration.recovery == RecoverySettings(
+            launch="at_start", journal_survives="power_cut"
+        )
+        assert load(write(configuration.to_yaml())) == configuration
+        assert Configuration.from_plain(configuration.plain()) == configuration
+
+    def test_they_count_in_comparisons(self, write: Write) -> None:
+        text = "problem: peg_in_hole_2d\n"
+        plain = load(write(text))
+        for section in (
+            "offload: {services: [tcp/a:1]}",
+            "recovery: {launch: never}",
+            "environment: {timeout_ms: 1}",
+        ):
+            assert load(write(text + section)) != plain
+
+    @pytest.mark.parametrize(
+        ("text", "expected"),
+        [
+            (
+                "offload:\n  lease_ms: 10",
+                "line 3: offload.lease_ms is 10; expected a number >= 50 and <= 60000",
+            ),
+            ("offload: {services: tcp/a:1}", 'is "tcp/a:1"; expected a list of at most 16'),
+            ("offload: {services: [3]}", "offload.services[0] is 3; expected text of at least 1"),
+            (
+                "offload:\n  services:\n    - tcp/a:1\n    - ''",
+                'line 5: offload.services[1] is ""; expected text of at least 1',
+            ),
+            (
+                f"offload: {{services: [{', '.join(f'tcp/a:{port}' for port in range(17))}]}}",
+                "(a list of 17); expected a list of at most 16",
+            ),
+            (
+                "offload:\n  services:\n    - tcp/a:1\n    - tcp/b:1\n    - tcp/a:1",
+                'line 6: offload.services[2] is "tcp/a:1", as offload.services[0] is already',
+            ),
+            ("offload: {tls: 3}", "offload.tls is 3; expected text of at least 1"),
+            (
+                "recovery: {launch: always}",
+                'recovery.launch is "always"; expected one of at_start, never, on_failure',
+            ),
+            ("recovery: {lauch: never}", "recovery.lauch is not a known key; did you mean launch?"),
+            ("recovery: {lease_ms: 100}", "lease_ms is a key of offload, not of recovery"),
+            (
+                "recovery: {launch: never}\noffload:\n  decision_deadline_ms: 50",
+                "line 4: offload.decision_deadline_ms is 50; then the local service decides instead"
+                ", which is never there with recovery.launch never",
+            ),
+            (
+                "offload: {decision_deadline_ms: 200, decision_timeout_ms: 200,"
+                " detection_timeout_ms: 100}",
+                "decision_deadline_ms is 200; it must be below offload.decision_timeout_ms",
+            ),
+            (
+                "offload: {decision_timeout_ms: 200}",
+                "detection_timeout_ms is 250; it must be at most offload.decision_timeout_ms, after"
+                " which a decision is given up, which is 200",
+            ),
+        ],
+    )
+    def test_what_is_refused(self, text: str, expected: str, write: Write) -> None:
+        assert expected in complaint(write(f"problem: peg_in_hole_2d\n{text}"))
+
+    def test_credentials_are_relative_to_the_file(self, write: Write) -> None:
+        path = write("problem: peg_in_hole_2d\noffload: {tls: keys/robot}")
+        configuration = load(path)
+        assert configuration.offload.tls == str(path.parent / "keys" / "robot")
+        (path.parent / "run").mkdir()
+        (path.parent / "run" / "config.yaml").write_text(configuration.to_yaml())
+        assert load(path.parent / "run" / "config.yaml") == configuration
+
+    def test_credentials_given_instead_are_relative_to_the_current_directory(
+        self, write: Write, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        (tmp_path / "current").mkdir()
+        monkeypatch.chdir(tmp_path / "current")
+        path = write("problem: peg_in_hole_2d\noffload: {tls: keys}")
+        found = load(path, overrides={"offload.tls": "mine"}).offload.tls
+        assert found == str(tmp_path / "current" / "mine")
+
+
+class TestOverrides:
+    def test_they_rule_over_the_file(self, write: Write) -> None:
+        path = write(
+            "problem: peg_in_hole_2d\noffload: {services: [tcp/a:1], lease_ms: 100}\n"
+            "recovery: {launch: never}"
+        )
+        configuration = load(
+            path,
+            seed=3,
+            overrides={
+                "offload.services": ("tcp/b:1", "tcp/c:1"),
+                "recovery.launch": "at_start",
+                "offload.decision_deadline_ms": 10,
+                "offload.tls": None,
+            },
+        )
+        assert configuration.offload.services == ("tcp/b:1", "tcp/c:1")
+        assert configuration.offload.lease_ms == 100
+        assert configuration.offload.decision_deadline_ms == 10
+        assert configuration.offload.tls is None
+        assert configuration.recovery.launch == "at_start"
+        assert configuration.simulator.seed == 3
+        assert load(write(configuration.to_yaml())) == configuration
+
+    @pytest.mark.parametrize(
+        ("name", "value", "expected"),
+        [
+            (
+                "offload.services",
+                ["tcp/a:1", "tcp/a:1"],
+                r"services\[1\], given instead of what .*run.yaml says, is",
+            ),
+            ("offload.lease", 3, "offload.lease, given instead of .* is not a known key; did you"),
+            ("recovery.launch", "now", 'recovery.launch, given instead .*run.yaml says, is "now"'),
+            ("ofload.lease_ms", 3, "ofload.* is not a known section; did you mean offload"),
+        ],
+    )
+    def test_what_is_refused(self, name: str, value: object, expected: str, write: Write) -> None:
+        message = complaint(write("problem: peg_in_hole_2d"), overrides={name: value})
+        assert re.search(expected, message)
+
+
+class TestEnvironment:
+    """The section `environment`."""
+
+    TEXT = "problem: peg_in_hole_2d\nenvironment: "
+
+    def test_it_loads_without_importing_it_and_comes_back(self, write: Write) -> None:
+        path = write(
+            self.TEXT + "{object: 'own_robot:Robot', arguments: {port: 3, at: [1, {a: null}]}}"
+        )
+        configuration = load(path)
+        assert configuration.environment == EnvironmentSettings(
+            object="own_robot:Robot",
+            directory=str(path.parent),
+            arguments={"port": 3, "at": [1, {"a": None}]},
+        )
+        (path.parent / "run").mkdir()
+        (path.parent / "run" / "config.yaml").write_text(configuration.to_yaml())
+        assert load(path.parent / "run" / "config.yaml") == configuration
+        assert Configuration.from_plain(configuration.plain()) == configuration
+
+    def test_the_current_directory_is_looked_in_too(
+        self, write: Write, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        path = write("")
+        (path.parent / "elsewhere").mkdir()
+        other = path.parent / "elsewhere" / "run.yaml"
+        other.write_text(self.TEXT + "{object: 'own_robot:Robot'}")
+        monkeypatch.chdir(path.parent)
+        assert load(other).environment.directory == str(path.parent)
+
+    def test_one_that_is_installed_has_no_directory(self, write: Write) -> None:
+        found = load(write(self.TEXT + "{object: 'holdfast.runtime.environment:Mine'}"))
+        assert found.environment.directory is None
+
+    def test_an_entry_point_is_looked_up_later(self, write: Write) -> None:
+        assert load(write(self.TEXT + "{object: turtle}")).environment.object == "turtle"
+
+    def test_the_argument_names_one(self, write: Write) -> None:
+        path = write(self.TEXT + "{arguments: {port: 3}}")
+        assert load(path).environment.directory is None
+        found = load(path, overrides={"environment.object": "own_robot:Robot"}).environment
+        assert (found.object, found.arguments) == ("own_robot:Robot", {"port": 3})
+        assert found.directory == str(path.parent)
+
+    @pytest.mark.parametrize(
+        ("text", "expected"),
+        [
+            ("{object: 3}", "line 2: environment.object is 3; expected text"),
+            ("{object: ''}", 'environment.object is ""; expected text of at least 1'),
+            ("{object: 'a:'}", 'environment.object is "a:"; expected module:Class or the name of'),
+            ("{object: 'a-b:C'}", 'object is "a-b:C"; expected module:Class or the name of an'),
+            (
+                "\n  object: absent_robot:Robot",
+                'line 3: environment.object is "absent_robot:Robot"; there is no module'
+                " absent_robot beside run.yaml",
+            ),
+            (
+                "\n  object: own_robot:Robot\n  directory: absent",
+                'line 4: environment.directory is "absent", where there is no directory',
+            ),
+            (
+                "{object: 'own_robot:Robot', directory: /}",
+                'environment.directory is "/", where there is no module own_robot',
+            ),
+            ("{object: turtle, directory: .}", 'is "."; only an environment that is named module:'),
+            ("{arguments: [3]}", "arguments is [3] (a list of 1); expected a mapping of keys"),
+            ("{timeout_ms: 0}", "environment.timeout_ms is 0; expected a number > 0 and <="),
+        ],
+    )
+    def test_what_is_refused(self, text: str, expected: str, write: Write) -> None:
+        assert expected in complaint(write(self.TEXT + text))
 
 
 class TestProblems:

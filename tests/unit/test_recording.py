@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import json
 import sqlite3
@@ -14,9 +15,9 @@ import scipy.stats
 from matplotlib.image import imread
 
 from holdfast.configuration import Configuration, load
+from holdfast.files import OutputError, write_atomically
 from holdfast.outcome import Decisions, TrialResult
 from holdfast.recording.figure import trial_figure
-from holdfast.recording.files import OutputError, write_atomically
 from holdfast.recording.journal import Journal
 from holdfast.recording.recorder import MAX_PARTICLES_KEPT, Recorder
 from holdfast.recording.run_directory import (
@@ -32,6 +33,7 @@ from holdfast.recording.tables import (
     wilson_interval,
 )
 from holdfast.runtime.trial import run_trial
+from holdfast.session.records import PausedRecord
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
@@ -155,16 +157,22 @@ class TestJournal:
         with pytest.raises(OutputError, match="not a usable journal"):
             Journal.open(path)
         path.unlink()
-        sqlite3.connect(path).close()
         path.touch()
+        with pytest.raises(OutputError, match="is empty"):
+            Journal.open(path)
+        path.unlink()
+        with contextlib.closing(sqlite3.connect(path)) as connection:
+            connection.execute("CREATE TABLE other (value INTEGER)")
+        before = path.read_bytes()
         with pytest.raises(OutputError, match="no such table: meta"):
             Journal.open(path)
+        assert path.read_bytes() == before
 
     def test_another_version_is_refused(self, tmp_path: Path) -> None:
         path = tmp_path / "journal.sqlite"
         with Journal.create(path, {}) as journal:
             journal.set_meta("schema_version", "999")
-        with pytest.raises(OutputError, match="schema version 999; this holdfast reads version 1"):
+        with pytest.raises(OutputError, match="schema version 999; this holdfast reads version 2"):
             Journal.open(path)
 
 
@@ -331,10 +339,16 @@ class TestRunDirectory:
         out = tmp_path / "out"
         with RunDirectory.create(out, configuration_of(tmp_path)) as directory:
             directory.write_tables(1.0)
+        for name in ("events.jsonl", "timings.csv"):
+            (out / name).write_text("of the run that has done nothing\n")
         other = configuration_of(tmp_path, seed=6)
         with RunDirectory.create(out, other) as directory:
             assert directory.earlier_wall_time_s == 0.0
-            assert not (out / "summary.json").exists()
+            assert {path.name for path in out.iterdir()} == {
+                "config.yaml",
+                "journal.sqlite",
+                "journal.sqlite-wal",
+            }
             with pytest.raises(OutputError, match="holds config"):
                 RunDirectory.create(out, other)  # in use by the run above
             directory.add(result_of(0))
@@ -342,6 +356,53 @@ class TestRunDirectory:
         RunDirectory.resume(out, other).close()
         with pytest.raises(OutputError, match=r"--resume.*--out"):
             RunDirectory.create(out, other)
+
+    def test_a_run_with_a_begun_trial_keeps_its_directory(self, tmp_path: Path) -> None:
+        configuration = configuration_of(tmp_path)
+        path = claim_default_directory(configuration, tmp_path / "runs")
+        with RunDirectory.create(path, configuration) as directory:
+            directory.journal.append(1, [PausedRecord()])
+        with pytest.raises(OutputError, match=r"holds config.*--resume"):
+            RunDirectory.create(path, configuration)
+        assert claim_default_directory(configuration, tmp_path / "runs").name == "peg-seed5-2"
+        with pytest.raises(OutputError, match=r"trial 1 of that run is begun.* at least 2, not 1"):
+            RunDirectory.resume(path, load(tmp_path / "peg.yaml", num_trials=1))
+        with RunDirectory.resume(path, configuration) as directory:
+            unfinished = directory.journal.unfinished()
+            assert unfinished is not None
+            assert (unfinished.trial, unfinished.records) == (1, [PausedRecord()])
+            directory.add(result_of(0))
+            assert directory.journal.unfinished_trial() == 1
+            directory.add(result_of(1))
+            assert directory.journal.unfinished_trial() is None
+
+    def test_who_decides_may_change_between_the_parts_of_a_run(self, tmp_path: Path) -> None:
+        out = tmp_path / "out"
+        path = tmp_path / "peg.yaml"
+        configuration = configuration_of(tmp_path)
+        RunDirectory.create(out, configuration).close()
+        path.write_text(
+            path.read_text() + "offload: {services: [tcp/127.0.0.1:1], lease_ms: 300}\n"
+            "recovery: {journal_survives: power_cut}\n"
+            "environment: {timeout_ms: 20}\n"
+        )
+        with RunDirectory.resume(out, load(path)) as directory:
+            assert directory.journal.survives == "power_cut"
+        assert load(out / "config.yaml").offload.services == ("tcp/127.0.0.1:1",)
+        with RunDirectory.resume(out, configuration) as directory:
+            assert directory.journal.survives == "process_crash"
+
+    def test_a_damaged_journal_is_neither_resumed_nor_taken_over(self, tmp_path: Path) -> None:
+        configuration = configuration_of(tmp_path)
+        out = tmp_path / "out"
+        RunDirectory.create(out, configuration).close()
+        damaged = (out / "journal.sqlite").read_bytes()[:-4096]
+        (out / "journal.sqlite").write_bytes(damaged)
+        with pytest.raises(OutputError, match=r"the journal is damaged .*--out"):
+            RunDirectory.resume(out, configuration)
+        with pytest.raises(OutputError, match=r"holds config"):
+            RunDirectory.create(out, configuration)
+        assert (out / "journal.sqlite").read_bytes() == damaged
 
     def test_a_default_directory_without_a_finished_trial_is_taken_again(
         self, tmp_path: Path

@@ -30,8 +30,8 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
 from holdfast.configuration import Configuration
+from holdfast.files import write_atomically
 from holdfast.problems.problem import FloatArray, Problem, Scene
-from holdfast.recording.files import write_atomically
 from holdfast.recording.recorder import SensingRecord, TrialRecord
 
 __all__ = ["trial_figure"]

@@ -1,37 +1,80 @@
-"""The journal of a run: each finished trial, kept the moment it is finished.
+"""The journal of a run: each finished trial, and each step of the one that is not finished.
 
-It is one SQLite file, and each trial is one transaction: after a crash or a power cut, a trial is
-in it whole or not at all. Tables and summary are made from it and can be made again at any time; a
-resumed run reads from it which trials are missing.
+It is one SQLite file. A finished trial is one transaction, so after a crash or a power cut it is in
+the journal whole or not at all. The steps of an unfinished trial are appended before the robot acts
+on them, so that a new process can go on where the old one died; they go when their trial is
+finished. Tables and summary are made from the journal and can be made again at any time.
+
+SQLite writes ahead (WAL): a commit is one append to ``journal.sqlite-wal``, which takes some
+microseconds and outlives the death of the process. To outlive the death of the machine it has to be
+on the disk as well; that is done for what begins or finishes a trial, and on demand for every step.
+The writer has the file for itself, so the index of that log is kept in its memory and no third file
+is needed.
 """
 
 from __future__ import annotations
 
 import contextlib
+import fcntl
+import hashlib
 import os
+import shutil
 import sqlite3
-from collections.abc import Iterator
+import struct
+import tempfile
+import weakref
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import NamedTuple, Self
+from typing import Literal, NamedTuple, Self, TypeAlias
 
 import msgspec
 
+from holdfast.errors import InvalidValueError
+from holdfast.files import OutputError
 from holdfast.outcome import Decisions, TrialResult
-from holdfast.recording.files import OutputError
+from holdfast.session.records import Record, RecordError, decode_record, encode_record
 
-__all__ = ["SCHEMA_VERSION", "Journal", "Tally"]
+__all__ = ["SCHEMA_VERSION", "Journal", "Survives", "Tally", "UnfinishedTrial"]
 
-SCHEMA_VERSION = 1
+Survives: TypeAlias = Literal["process_crash", "power_cut"]
+"""What a journalled step outlives; see :class:`holdfast.settings.RecoverySettings`."""
+
+SCHEMA_VERSION = 2
 """Raised whenever the tables or what is in them change their form."""
 
-_SCHEMA = """
-CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
-CREATE TABLE trials (trial INTEGER PRIMARY KEY, result BLOB NOT NULL, decisions BLOB NOT NULL);
-"""
+_SCHEMA = (
+    "CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL, checksum BLOB NOT NULL) "
+    "WITHOUT ROWID",
+    "CREATE TABLE trials (trial INTEGER PRIMARY KEY, result BLOB NOT NULL, "
+    "result_checksum BLOB NOT NULL, decisions BLOB NOT NULL, decisions_checksum BLOB NOT NULL)",
+    "CREATE TABLE steps (sequence INTEGER PRIMARY KEY, trial INTEGER NOT NULL, "
+    "record BLOB NOT NULL, checksum BLOB NOT NULL)",
+)
+
+_SESSION_SIZE = 16
+_MAX_EPOCH = 2**32 - 1
+_CHECKSUM_SIZE = 8
+_BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
+
+_BUSY_TIMEOUT_S = 1.0
+_MAX_LOG_PAGES = 4096
+"""The log is moved into the main file beyond 16 MiB at the latest: read back after a crash in some
+10 ms, and reached only in trials of thousands of steps."""
+
+# SQLite's locks are on these bytes of the file, which it never writes; the range is the shared one.
+_SHARED_LOCK_START = 0x40000002
+_SHARED_LOCK_SIZE = 510
+
+_START_ANEW = "start anew in another directory (--out)"
 
 _RESULT_DECODER = msgspec.msgpack.Decoder(TrialResult)
 _DECISIONS_DECODER = msgspec.msgpack.Decoder(Decisions)
+_NUMBERS = struct.Struct("<qq")
+
+# Closing any descriptor of a file drops this process's locks on it, SQLite's too; so a journal that
+# is open here must be opened a second time by SQLite alone, which knows that.
+_open_here: weakref.WeakValueDictionary[tuple[int, int], Journal] = weakref.WeakValueDictionary()
 
 
 class Tally(NamedTuple):
@@ -41,10 +84,37 @@ class Tally(NamedTuple):
     successes: int
 
 
-class Journal:
-    """The journal of one run, open. It is this process's alone until it is closed.
+class UnfinishedTrial(NamedTuple):
+    """A trial of which steps are journalled, but no end.
 
-    Use :meth:`create` or :meth:`open`, and close it or use it in a ``with`` statement.
+    Attributes
+    ----------
+    trial : int
+    records : list of Record
+        In the order in which they were appended.
+    same_boot : bool
+        Whether the machine has not been started anew since the last of them was written; False if
+        that is not known.
+    on_disk : bool
+        Whether each of them was on the disk before it was acted on (``survives="power_cut"``).
+    """
+
+    trial: int
+    records: list[Record]
+    same_boot: bool
+    on_disk: bool
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether no record can have been lost: what happened after the last one is not known."""
+        return self.same_boot or self.on_disk
+
+
+class Journal:
+    """The journal of one run, open. Unless it is only read, no other process can open it.
+
+    Use :meth:`create`, :meth:`open` or :meth:`read`, and close it or use it in a ``with``
+    statement. It belongs to the thread that opened it.
 
     Parameters
     ----------
@@ -52,15 +122,30 @@ class Journal:
         The file.
     connection : sqlite3.Connection
         The open database.
+    survives : {"process_crash", "power_cut"}
+        What each appended step outlives.
     """
 
-    def __init__(self, path: Path, connection: sqlite3.Connection) -> None:
+    def __init__(
+        self, path: Path, connection: sqlite3.Connection, survives: Survives = "process_crash"
+    ) -> None:
         self.path = path
+        self.survives = survives
         self._connection = connection
         self._encode = msgspec.msgpack.Encoder().encode
+        self._steps: _Steps | None = None
+        self._version_read: tuple[int, ...] | None = None
+        self._close = contextlib.ExitStack()
+        self._close.callback(connection.close)
+
+    # -----------------------------------------------------------------------------------------
+    # Opening and closing
+    # -----------------------------------------------------------------------------------------
 
     @classmethod
-    def create(cls, path: Path, meta: dict[str, str]) -> Self:
+    def create(
+        cls, path: Path, meta: dict[str, str], *, survives: Survives = "process_crash"
+    ) -> Self:
         """Make a new journal.
 
         Parameters
@@ -68,7 +153,9 @@ class Journal:
         path : Path
             Where; there must be no file yet.
         meta : dict of str
-            What to note about the run. The schema's version is added.
+            What to note about the run. The schema's version and a session are added.
+        survives : {"process_crash", "power_cut"}
+            What each appended step outlives.
 
         Raises
         ------
@@ -79,23 +166,24 @@ class Journal:
         # taken: nobody ever sees a journal that is half made, and of two runs one has it.
         unfinished = path.with_name(f".{path.name}.{os.getpid()}")
         unfinished.unlink(missing_ok=True)
+        if not path.exists():
+            for log in _logs_of(path):
+                # SQLite would take it for the new journal's, and put its pages in.
+                raise OutputError(
+                    f"{log}: is the log of a journal that is gone; restore that, or {_START_ANEW}"
+                )
         try:
-            journal = cls(unfinished, cls._connect(unfinished, create=True))
+            journal = cls(unfinished, _connect(unfinished, create=True))
             try:
-                with journal._errors():
-                    rows = {"schema_version": str(SCHEMA_VERSION)} | meta
-                    statements = [
-                        "BEGIN IMMEDIATE",
-                        *(part for part in _SCHEMA.split(";") if part.strip()),
-                    ]
-                    for statement in statements:
+                with journal._transaction():
+                    for statement in _SCHEMA:
                         journal._connection.execute(statement)
-                    journal._connection.executemany("INSERT INTO meta VALUES (?, ?)", rows.items())
-                    journal._connection.execute("COMMIT")
+                    journal._note(_first_rows(meta))
             finally:
-                journal.close()
+                journal._connection.close()
             try:
                 os.link(unfinished, path)
+                _synchronize_directory(path.parent)
             except FileExistsError as error:
                 raise OutputError(f"{path}: there is a journal already") from error
             except OSError as error:
@@ -103,92 +191,368 @@ class Journal:
         finally:
             unfinished.unlink(missing_ok=True)
             unfinished.with_name(f"{unfinished.name}-journal").unlink(missing_ok=True)
-        return cls.open(path)
+        return cls.open(path, survives=survives, check=False)
 
     @classmethod
-    def open(cls, path: Path) -> Self:
-        """Open a journal that is there.
+    def open(cls, path: Path, *, survives: Survives = "process_crash", check: bool = True) -> Self:
+        """Open a journal that is there, to go on with it.
+
+        Parameters
+        ----------
+        path : Path
+        survives : {"process_crash", "power_cut"}
+            What each appended step outlives.
+        check : bool
+            Whether to read all of it first, to find out whether it is whole.
 
         Raises
         ------
         OutputError
-            If there is none, it is no journal, another version's, or in use by another process.
+            If there is none, it is no journal, damaged, another version's, or in use by another
+            process.
         """
-        if not path.is_file():
-            raise OutputError(f"{path}: there is no journal of a run")
-        journal = cls(path, cls._connect(path, create=False))
+        _require_file(path)
+        journal = cls(path, _connect(path, create=False), survives)
         try:
-            version = journal.meta().get("schema_version")
-        except OutputError:
+            journal._require_version()
+            if check:
+                journal.check()
+            journal._write_ahead()
+        except BaseException:
             journal.close()
             raise
-        if version != str(SCHEMA_VERSION):
-            journal.close()
-            raise OutputError(
-                f"{path}: schema version {version}; this holdfast reads version {SCHEMA_VERSION}"
-            )
+        # An empty log would stay behind otherwise, and a plain file can be read by anything.
+        journal._close.callback(journal._merge_log)
+        identity = _identity(path)
+        _open_here[identity] = journal
+        journal._close.callback(_open_here.pop, identity, None)
         return journal
 
-    @staticmethod
-    def _connect(path: Path, *, create: bool) -> sqlite3.Connection:
+    @classmethod
+    def read(cls, path: Path) -> Self:
+        """Open a journal that nobody is using, to read it; neither it nor its directory change.
+
+        What a killed process left behind in the log is read as well. That needs a copy, which is
+        removed by :meth:`close`.
+
+        Raises
+        ------
+        OutputError
+            If there is none, it is no journal, damaged, another version's, or in use.
+        """
+        _require_file(path)
+        close = contextlib.ExitStack()
         try:
-            connection = sqlite3.connect(
-                f"{path.absolute().as_uri()}?mode={'rwc' if create else 'rw'}",
-                uri=True,
-                timeout=1.0,
-                isolation_level=None,
+            before = _version_of_file(path)
+            connection = _connect_to_read(path, close)
+            journal = cls(path, connection)
+            journal._version_read = before
+            close.push(journal._close.pop_all())
+            journal._close = close
+            journal._require_version()
+            # A table whose first page is cut off would be taken for an empty one.
+            journal.check()
+        except BaseException:
+            close.close()
+            raise
+        return journal
+
+    def _require_version(self) -> None:
+        with self._errors():
+            row = self._connection.execute(
+                "SELECT value FROM meta WHERE key = 'schema_version'"
+            ).fetchone()
+        version = None if row is None else row[0]
+        if version != str(SCHEMA_VERSION):
+            raise OutputError(
+                f"{self.path}: schema version {version}; this holdfast reads version "
+                f"{SCHEMA_VERSION}; go on with the holdfast that made it, or {_START_ANEW}"
             )
-        except sqlite3.Error as error:
-            raise OutputError(f"{path}: cannot be opened: {error}") from error
-        try:
-            # Two runs in one directory would spoil each other, so the lock is held until the end.
-            connection.execute("PRAGMA locking_mode = EXCLUSIVE")
-            connection.execute("PRAGMA journal_mode = TRUNCATE")
-            connection.execute("BEGIN IMMEDIATE")
-            connection.execute("COMMIT")
-        except sqlite3.Error as error:
-            connection.close()
-            if "locked" in str(error):
-                raise OutputError(f"{path}: another process is using this run") from error
-            raise OutputError(f"{path}: not a usable journal: {error}") from error
-        return connection
+
+    def _write_ahead(self) -> None:
+        with self._errors():
+            (mode,) = self._connection.execute("PRAGMA journal_mode = WAL").fetchone()
+            if mode != "wal":
+                raise OutputError(f"{self.path}: SQLite cannot write ahead here (mode {mode})")
+            self._connection.execute(f"PRAGMA wal_autocheckpoint = {_MAX_LOG_PAGES}")
+            self._set_synchronous(self.survives)
+
+    def _merge_log(self) -> None:
+        # It does no harm if this fails: the next one to open the journal does it.
+        with contextlib.suppress(sqlite3.Error):
+            self._connection.execute("PRAGMA journal_mode = DELETE")
+
+    def check(self) -> None:
+        """Find out whether the file is whole.
+
+        Raises
+        ------
+        OutputError
+            If it is damaged.
+        """
+        with self._errors():
+            (found,) = self._connection.execute("PRAGMA quick_check(1)").fetchone()
+        if found != "ok":
+            # SQLite's account begins with a line of stars that names the table.
+            raise self._damaged(str(found).strip().splitlines()[-1])
+
+    def require_unchanged(self) -> None:
+        """Make sure, after all was read from a journal of :meth:`read`, that it was one journal.
+
+        Raises
+        ------
+        OutputError
+            If somebody has begun to write to the file since it was opened.
+        """
+        if self._version_read is None:
+            return
+        with contextlib.suppress(OSError):
+            if self._version_read == _version_of_file(self.path):
+                return
+        raise OutputError(f"{self.path}: a run has written to it while it was read; try again")
+
+    def close(self) -> None:
+        """Close the file and leave it to others. May be repeated."""
+        self._close.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    # -----------------------------------------------------------------------------------------
+    # Errors and transactions
+    # -----------------------------------------------------------------------------------------
+
+    def _damaged(self, how: str) -> OutputError:
+        return _damaged(self.path, how)
 
     @contextlib.contextmanager
     def _errors(self) -> Iterator[None]:
         try:
             yield
-        except (sqlite3.Error, msgspec.DecodeError) as error:
+        except sqlite3.DatabaseError as error:
+            # The plain error is one in our SQL: then the tables are not those that we have made.
+            if getattr(error, "sqlite_errorname", "") == "SQLITE_ERROR" or _is_named(
+                error, "SQLITE_CORRUPT", "SQLITE_NOTADB"
+            ):
+                raise self._damaged(str(error)) from error
             raise OutputError(f"{self.path}: {error}") from error
+        except sqlite3.Error as error:
+            raise OutputError(f"{self.path}: {error}") from error
+        except (msgspec.DecodeError, UnicodeDecodeError) as error:
+            raise self._damaged(str(error)) from error
+
+    def _set_synchronous(self, survives: Survives) -> None:
+        self._connection.execute(
+            f"PRAGMA synchronous = {'FULL' if survives == 'power_cut' else 'NORMAL'}"
+        )
+
+    @contextlib.contextmanager
+    def _transaction(self, *, on_disk: bool = True) -> Iterator[None]:
+        """Do all of what is inside or nothing; with ``on_disk``, a power cut does not undo it."""
+        connection = self._connection
+        raised = on_disk and self.survives != "power_cut"
+        with self._errors():
+            if raised:
+                self._set_synchronous("power_cut")
+            try:
+                connection.execute("BEGIN IMMEDIATE")
+                yield
+                connection.execute("COMMIT")
+            except BaseException:
+                if connection.in_transaction:
+                    connection.execute("ROLLBACK")
+                raise
+            finally:
+                if raised:
+                    self._set_synchronous(self.survives)
+
+    # -----------------------------------------------------------------------------------------
+    # The run
+    # -----------------------------------------------------------------------------------------
 
     def meta(self) -> dict[str, str]:
         """Return what was noted about the run."""
+        meta = {}
         with self._errors():
-            return dict(self._connection.execute("SELECT key, value FROM meta"))
+            for key, value, checksum in self._connection.execute(
+                "SELECT key, value, checksum FROM meta"
+            ):
+                if _meta_checksum(key, value) != checksum:
+                    raise self._damaged(f"its note {key!r} has a wrong checksum")
+                meta[key] = value
+        return meta
 
     def set_meta(self, key: str, value: str) -> None:
         """Note something about the run."""
-        with self._errors():
-            self._connection.execute("INSERT OR REPLACE INTO meta VALUES (?, ?)", (key, value))
+        with self._transaction():
+            self._note({key: value})
+
+    def _note(self, rows: dict[str, str]) -> None:
+        self._connection.executemany(
+            "INSERT OR REPLACE INTO meta VALUES (?, ?, ?)",
+            [(key, value, _meta_checksum(key, value)) for key, value in rows.items()],
+        )
 
     def restart(self, meta: dict[str, str]) -> None:
-        """Forget what was noted about a run without a finished trial, and note ``meta`` instead.
+        """Forget what was noted about a run that has done nothing yet, and note ``meta`` instead.
 
         Raises
         ------
         OutputError
-            If a trial is finished.
+            If a trial is finished or begun.
         """
         if not self.is_empty():
-            raise OutputError(f"{self.path}: holds finished trials")
-        rows = {"schema_version": str(SCHEMA_VERSION)} | meta
-        with self._errors():
-            self._connection.execute("BEGIN IMMEDIATE")
+            raise OutputError(f"{self.path}: holds trials that are finished or begun")
+        with self._transaction():
             self._connection.execute("DELETE FROM meta")
-            self._connection.executemany("INSERT INTO meta VALUES (?, ?)", rows.items())
-            self._connection.execute("COMMIT")
+            self._note(_first_rows(meta))
+
+    def session(self) -> bytes:
+        """Return the 16 random bytes that were drawn for this run when it was made."""
+        text = self.meta().get("session", "")
+        try:
+            session = bytes.fromhex(text)
+        except ValueError:
+            session = b""
+        if len(session) != _SESSION_SIZE:
+            raise self._damaged(f"its session is {text!r}, not {_SESSION_SIZE} bytes")
+        return session
+
+    def raise_epoch(self) -> int:
+        """Count one more process of the run, and return how many these are now, from 1.
+
+        When this returns, the new count is on the disk: no two processes get the same, even if the
+        power is cut between them.
+        """
+        text = self.meta().get("epoch", "0")
+        if not text.isdecimal() or not 0 <= int(text) < _MAX_EPOCH:
+            raise self._damaged(f"its epoch is {text!r}, not from 0 to {_MAX_EPOCH - 1}")
+        epoch = int(text) + 1
+        self.set_meta("epoch", str(epoch))
+        return epoch
+
+    # -----------------------------------------------------------------------------------------
+    # Steps of the unfinished trial
+    # -----------------------------------------------------------------------------------------
+
+    def append(self, trial: int, records: Sequence[Record]) -> None:
+        """Keep records of a trial that is not finished: all of them, or none if this raises.
+
+        When this returns they outlive the death of the process; with ``survives="power_cut"`` they
+        are on the disk. The first records of a trial, and the first after each opening, always
+        are: so a trial that was begun is known to be, whatever happens.
+
+        Parameters
+        ----------
+        trial : int
+        records : sequence of Record
+
+        Raises
+        ------
+        OutputError
+            If they cannot be written.
+        InvalidValueError
+            If the trial is finished already, or another one is unfinished.
+        """
+        if not records:
+            return
+        steps = self._steps
+        first = steps is None or steps.trial != trial
+        if steps is None or first:
+            steps = self._begin(trial)
+        sequence = steps.next_sequence
+        rows = []
+        for record in records:
+            data = encode_record(record)
+            rows.append((sequence, trial, data, _step_checksum(sequence, trial, data)))
+            sequence += 1
+        # Until it is known that they are kept, nothing is known of what is in the file.
+        self._steps = None
+        with self._transaction(on_disk=first):
+            if first:
+                self._note(
+                    {
+                        "steps_boot": _boot_id() or "",
+                        "steps_on_disk": str(int(self.survives == "power_cut")),
+                    }
+                )
+            self._connection.executemany("INSERT INTO steps VALUES (?, ?, ?, ?)", rows)
+        self._steps = _Steps(trial, sequence)
+
+    def _begin(self, trial: int) -> _Steps:
+        with self._errors():
+            last, unfinished = self._connection.execute(
+                "SELECT MAX(sequence), trial FROM steps"
+            ).fetchone()
+            finished = self._connection.execute(
+                "SELECT 1 FROM trials WHERE trial = ?", (trial,)
+            ).fetchone()
+        if finished is not None:
+            raise InvalidValueError(f"trial {trial} is finished: no step can follow in {self.path}")
+        if last is not None and unfinished != trial:
+            raise InvalidValueError(
+                f"trial {unfinished} is not finished in {self.path}: trial {trial} cannot begin"
+            )
+        return _Steps(trial, 0 if last is None else last + 1)
+
+    def unfinished_trial(self) -> int | None:
+        """Return the number of the trial that is begun and not finished, None if there is none."""
+        with self._errors():
+            row = self._connection.execute(
+                "SELECT trial FROM steps ORDER BY sequence LIMIT 1"
+            ).fetchone()
+        return None if row is None else int(row[0])
+
+    def unfinished(self) -> UnfinishedTrial | None:
+        """Return the records of the trial that is not finished, None if there is none.
+
+        Raises
+        ------
+        OutputError
+            If one of them is damaged or missing.
+        """
+        records = []
+        trial: int | None = None
+        with self._errors():
+            rows = self._connection.execute(
+                "SELECT sequence, trial, record, checksum FROM steps ORDER BY sequence"
+            )
+            for expected, (sequence, number, data, checksum) in enumerate(rows):
+                trial = number if trial is None else trial
+                where = f"record {expected} of the unfinished trial {trial}"
+                if sequence != expected or number != trial:
+                    raise self._damaged(f"{where} is missing")
+                if not _is_intact(data, checksum, _step_checksum, sequence, number):
+                    raise self._damaged(f"{where} has a wrong checksum")
+                try:
+                    records.append(decode_record(data))
+                except RecordError as error:
+                    raise self._damaged(f"{where}: {error}") from error
+        if trial is None:
+            return None
+        meta = self.meta()
+        boot = _boot_id()
+        return UnfinishedTrial(
+            trial=trial,
+            records=records,
+            same_boot=boot is not None and meta.get("steps_boot") == boot,
+            on_disk=meta.get("steps_on_disk") == "1",
+        )
+
+    # -----------------------------------------------------------------------------------------
+    # Finished trials
+    # -----------------------------------------------------------------------------------------
 
     def add(self, result: TrialResult) -> None:
-        """Keep a finished trial; when this returns, it is on the disk.
+        """Keep a finished trial, and drop its steps; when this returns, it is on the disk.
 
         Parameters
         ----------
@@ -202,38 +566,73 @@ class Journal:
         """
         if result.decisions is None:
             raise OutputError(f"trial {result.trial}: the result comes without its decisions")
+        trial = result.trial
+        outcome = self._encode(msgspec.structs.replace(result, decisions=None))
+        decisions = self._encode(result.decisions)
         row = (
-            result.trial,
-            self._encode(msgspec.structs.replace(result, decisions=None)),
-            self._encode(result.decisions),
+            trial,
+            outcome,
+            _trial_checksum(trial, 0, outcome),
+            decisions,
+            _trial_checksum(trial, 1, decisions),
         )
-        with self._errors():
-            # Outside an explicit transaction, a statement is one of its own.
-            self._connection.execute("INSERT INTO trials VALUES (?, ?, ?)", row)
+        self._steps = None
+        with self._transaction():
+            self._connection.execute("INSERT INTO trials VALUES (?, ?, ?, ?, ?)", row)
+            dropped = self._connection.execute("DELETE FROM steps WHERE trial = ?", (trial,))
+        if dropped.rowcount:
+            # Now, while the robot has nothing to do, and not in the middle of its next trial. The
+            # trial is kept already, so trouble here is told by whatever is written next.
+            with contextlib.suppress(sqlite3.Error):
+                self._connection.execute("PRAGMA wal_checkpoint(PASSIVE)")
 
     def is_empty(self) -> bool:
-        """Tell whether no trial is kept."""
+        """Tell whether nothing has been done yet: no trial is finished, and none is begun."""
         with self._errors():
-            return self._connection.execute("SELECT 1 FROM trials LIMIT 1").fetchone() is None
+            return (
+                self._connection.execute("SELECT 1 FROM trials LIMIT 1").fetchone() is None
+                and self.unfinished_trial() is None
+            )
 
     def finished(self) -> set[int]:
-        """Return the numbers of the trials that are kept."""
+        """Return the numbers of the trials that are finished."""
         with self._errors():
             return {trial for (trial,) in self._connection.execute("SELECT trial FROM trials")}
 
     def tally(self) -> Tally:
-        """Count the trials that are kept."""
+        """Count the trials that are finished."""
         finished = successes = 0
         for result in self.results():
             finished += 1
             successes += result.success
         return Tally(finished, successes)
 
-    def results(self) -> Iterator[TrialResult]:
-        """Yield the results in the order of their trials, without their decisions."""
+    def results(self, *, with_decisions: bool = False) -> Iterator[TrialResult]:
+        """Yield the results in the order of their trials.
+
+        Parameters
+        ----------
+        with_decisions : bool
+            Whether to read the decisions as well; else they are None.
+
+        Raises
+        ------
+        OutputError
+            If one is damaged.
+        """
         with self._errors():
-            for (blob,) in self._connection.execute("SELECT result FROM trials ORDER BY trial"):
-                yield _RESULT_DECODER.decode(blob)
+            for trial, blob, checksum in self._connection.execute(
+                "SELECT trial, result, result_checksum FROM trials ORDER BY trial"
+            ):
+                if not _is_intact(blob, checksum, _trial_checksum, trial, 0):
+                    raise self._damaged(f"the result of trial {trial} has a wrong checksum")
+                result = _RESULT_DECODER.decode(blob)
+                if with_decisions:
+                    decisions = self.decisions(trial)
+                    if decisions.digest() != result.digest:
+                        raise self._damaged(f"trial {trial} has decisions with another digest")
+                    result = msgspec.structs.replace(result, decisions=decisions)
+                yield result
 
     def decisions(self, trial: int) -> Decisions:
         """Return the decisions of one trial.
@@ -241,30 +640,203 @@ class Journal:
         Raises
         ------
         OutputError
-            If the journal does not have that trial.
+            If the journal does not have that trial, or it is damaged.
         """
         with self._errors():
             row = self._connection.execute(
-                "SELECT decisions FROM trials WHERE trial = ?", (trial,)
+                "SELECT decisions, decisions_checksum FROM trials WHERE trial = ?", (trial,)
             ).fetchone()
             if row is None:
                 raise OutputError(f"{self.path}: trial {trial} is not in the journal")
+            if not _is_intact(row[0], row[1], _trial_checksum, trial, 1):
+                raise self._damaged(f"the decisions of trial {trial} have a wrong checksum")
             return _DECISIONS_DECODER.decode(row[0])
 
-    def close(self) -> None:
-        """Close the file and leave it to others."""
-        # An empty rollback file would stay behind otherwise; it does no harm if this fails.
-        with contextlib.suppress(sqlite3.Error):
-            self._connection.execute("PRAGMA journal_mode = DELETE")
-        self._connection.close()
 
-    def __enter__(self) -> Self:
-        return self
+class _Steps(NamedTuple):
+    """The unfinished trial, and the number of its next record."""
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
+    trial: int
+    next_sequence: int
+
+
+def _first_rows(meta: dict[str, str]) -> dict[str, str]:
+    return {
+        "schema_version": str(SCHEMA_VERSION),
+        "session": os.urandom(_SESSION_SIZE).hex(),
+        **meta,
+    }
+
+
+def _checksum(person: bytes, first: int, second: int, data: bytes) -> bytes:
+    # The numbers too, so that a row cannot pass for another.
+    hashed = hashlib.blake2b(
+        _NUMBERS.pack(first, second), digest_size=_CHECKSUM_SIZE, person=person
+    )
+    hashed.update(data)
+    return hashed.digest()
+
+
+def _meta_checksum(key: str, value: str) -> bytes:
+    data = f"{key}={value}".encode()
+    return _checksum(b"holdfast-meta", len(key), len(value), data)
+
+
+def _step_checksum(sequence: int, trial: int, data: bytes) -> bytes:
+    return _checksum(b"holdfast-step", sequence, trial, data)
+
+
+def _trial_checksum(trial: int, column: int, data: bytes) -> bytes:
+    return _checksum(b"holdfast-trial", trial, column, data)
+
+
+def _is_intact(
+    data: object,
+    checksum: object,
+    make: Callable[[int, int, bytes], bytes],
+    first: object,
+    second: object,
+) -> bool:
+    # SQLite's types belong to each value, so a damaged row may hold any.
+    return (
+        isinstance(data, bytes)
+        and isinstance(first, int)
+        and isinstance(second, int)
+        and make(first, second, data) == checksum
+    )
+
+
+def _boot_id() -> str | None:
+    """Return what tells this run of the kernel from every other, None if there is no such thing."""
+    try:
+        return _BOOT_ID.read_text(encoding="ascii").strip() or None
+    except (OSError, UnicodeDecodeError):
+        return None
+
+
+def _identity(path: Path) -> tuple[int, int]:
+    status = path.stat()
+    return status.st_dev, status.st_ino
+
+
+def _version_of_file(path: Path) -> tuple[int, ...]:
+    status = path.stat()
+    return status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns
+
+
+def _logs_of(path: Path) -> list[Path]:
+    """Return the files beside a database that hold a part of its content."""
+    logs = (path.with_name(path.name + suffix) for suffix in ("-wal", "-journal"))
+    return [log for log in logs if log.is_file() and log.stat().st_size]
+
+
+def _require_file(path: Path) -> None:
+    try:
+        size = path.stat().st_size if path.is_file() else None
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be read: {error.strerror}") from error
+    if size is None:
+        raise OutputError(f"{path}: there is no journal of a run")
+    if size == 0:
+        # SQLite would take it for a new database, and remove the log beside it.
+        raise OutputError(f"{path}: is empty, so no journal of a run; {_START_ANEW}")
+
+
+def _synchronize_directory(path: Path) -> None:
+    """Make a new name in a directory outlive a power cut."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _connect(path: Path, *, create: bool) -> sqlite3.Connection:
+    """Open a database for this process alone."""
+    try:
+        connection = sqlite3.connect(
+            f"{path.absolute().as_uri()}?mode={'rwc' if create else 'rw'}",
+            uri=True,
+            timeout=_BUSY_TIMEOUT_S,
+            isolation_level=None,
+        )
+    except sqlite3.Error as error:
+        raise OutputError(f"{path}: cannot be opened: {error}") from error
+    try:
+        # Two runs in one directory would spoil each other, so the lock is held until the end.
+        connection.execute("PRAGMA locking_mode = EXCLUSIVE")
+        connection.execute("BEGIN EXCLUSIVE")
+        connection.execute("COMMIT")
+    except sqlite3.Error as error:
+        connection.close()
+        if _is_named(error, "SQLITE_BUSY", "SQLITE_LOCKED"):
+            raise _in_use(path) from error
+        if _is_named(error, "SQLITE_READONLY", "SQLITE_CANTOPEN", "SQLITE_FULL"):
+            raise OutputError(f"{path}: cannot be written: {error}") from error
+        if _is_named(error, "SQLITE_CORRUPT"):
+            raise _damaged(path, str(error)) from error
+        raise OutputError(f"{path}: not a usable journal: {error}; {_START_ANEW}") from error
+    return connection
+
+
+def _is_named(error: sqlite3.Error, *names: str) -> bool:
+    """Tell whether SQLite calls an error by one of these names, or a finer one below them."""
+    # Those that Python's module raises by itself have no such name.
+    return str(getattr(error, "sqlite_errorname", "")).startswith(names)
+
+
+def _damaged(path: Path, how: str) -> OutputError:
+    return OutputError(
+        f"{path}: the journal is damaged ({how}), so the run cannot go on; restore the file, or "
+        f"{_START_ANEW}"
+    )
+
+
+def _in_use(path: Path) -> OutputError:
+    return OutputError(f"{path}: another process is using this run")
+
+
+def _connect_to_read(path: Path, close: contextlib.ExitStack) -> sqlite3.Connection:
+    """Open a database without a lock and without a trace.
+
+    SQLite reads a log only where it may write beside it. So if there is one, both are copied, and
+    the copy is read; a file without a log is read where it is.
+    """
+    if _identity(path) in _open_here:
+        raise OutputError(f"{path}: this process is using this run")
+    try:
+        with path.open("rb") as file:
+            try:
+                # Nobody can begin to write while it is copied; held no longer than that.
+                fcntl.lockf(
+                    file, fcntl.LOCK_SH | fcntl.LOCK_NB, _SHARED_LOCK_SIZE, _SHARED_LOCK_START
+                )
+            except (BlockingIOError, PermissionError) as error:
+                raise _in_use(path) from error
+            logs = _logs_of(path)
+            if logs:
+                folder = Path(
+                    close.enter_context(
+                        tempfile.TemporaryDirectory(
+                            prefix="holdfast-journal-", ignore_cleanup_errors=True
+                        )
+                    )
+                )
+                for source in (path, *logs):
+                    shutil.copyfile(source, folder / source.name)
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be read: {error.strerror}") from error
+    if logs:
+        try:
+            connection = _connect(folder / path.name, create=False)
+        except OutputError as error:
+            raise OutputError(str(error).replace(str(folder / path.name), str(path))) from error
+    else:
+        try:
+            connection = sqlite3.connect(
+                f"{path.absolute().as_uri()}?immutable=1", uri=True, isolation_level=None
+            )
+        except sqlite3.Error as error:
+            raise OutputError(f"{path}: cannot be opened: {error}") from error
+    connection.execute("PRAGMA query_only = ON")
+    return connection

@@ -3,7 +3,8 @@
 A run's directory is claimed before its first trial, so that a wrong path costs no computing. The
 journal is the truth; ``trials.csv`` and ``summary.json`` are made from it, and are made again when
 a run is resumed. Only the same configuration and the same code go on with a run, because a table
-of trials that were decided in two ways would say nothing about either.
+of trials that were decided in two ways would say nothing about either. Where decisions are made and
+what they act on may differ, though: that changes time, never a decision.
 """
 
 from __future__ import annotations
@@ -17,19 +18,37 @@ from typing import Any, Self
 
 from holdfast import __version__
 from holdfast.configuration import Configuration
+from holdfast.files import OutputError, write_atomically
 from holdfast.outcome import TrialResult
-from holdfast.recording.files import OutputError, write_atomically
 from holdfast.recording.fingerprint import difference, fingerprint
-from holdfast.recording.journal import Journal
+from holdfast.recording.journal import Journal, Survives
 from holdfast.recording.tables import RunSummary, SummaryBuilder, csv_lines
 
-__all__ = ["RunDirectory", "claim_default_directory", "latest_default_directory", "output_names"]
+__all__ = [
+    "CONFIGURATION_NAME",
+    "EVENTS_NAME",
+    "FIGURE_NAME",
+    "JOURNAL_NAME",
+    "SUMMARY_NAME",
+    "TIMINGS_NAME",
+    "TRIALS_NAME",
+    "RunDirectory",
+    "claim_default_directory",
+    "configuration_difference",
+    "latest_default_directory",
+    "output_names",
+]
 
 CONFIGURATION_NAME = "config.yaml"
+EVENTS_NAME = "events.jsonl"
 FIGURE_NAME = "trial.png"
 JOURNAL_NAME = "journal.sqlite"
 SUMMARY_NAME = "summary.json"
+TIMINGS_NAME = "timings.csv"
 TRIALS_NAME = "trials.csv"
+
+# Which service decides, how soon it is given up, and which world is acted on change no decision.
+_SECTIONS_WITHOUT_DECISIONS = ("offload", "recovery", "environment")
 
 _MAX_SUFFIX = 10_000
 
@@ -59,7 +78,7 @@ class RunDirectory:
     def create(cls, path: Path, configuration: Configuration) -> Self:
         """Claim a directory for a new run; it is made if it is not there.
 
-        A run of which no trial is finished does not keep its directory.
+        A run of which no trial is finished or begun does not keep its directory.
 
         Raises
         ------
@@ -75,7 +94,8 @@ class RunDirectory:
             raise OutputError(f"{path}: cannot be made: {error.strerror}") from error
         text = configuration.to_yaml()
         meta = {"configuration": text} | fingerprint(configuration)
-        journal = _journal_without_trials(path)
+        survives = configuration.recovery.journal_survives
+        journal = _unused_journal(path, survives)
         if taken and journal is None:
             raise OutputError(
                 f"{path}: holds {', '.join(taken)} already; go on with that run (--resume), or "
@@ -84,11 +104,11 @@ class RunDirectory:
         try:
             if journal is not None:
                 journal.restart(meta)
-                for name in (TRIALS_NAME, SUMMARY_NAME, FIGURE_NAME):
+                for name in (TRIALS_NAME, SUMMARY_NAME, FIGURE_NAME, EVENTS_NAME, TIMINGS_NAME):
                     (path / name).unlink(missing_ok=True)
             else:
                 _require_writable(path)
-                journal = Journal.create(path / JOURNAL_NAME, meta)
+                journal = Journal.create(path / JOURNAL_NAME, meta, survives=survives)
             # After the journal, which only one run can have: so both are the same run's.
             write_atomically(path / CONFIGURATION_NAME, text)
             return cls(path, configuration, journal)
@@ -101,23 +121,28 @@ class RunDirectory:
     def resume(cls, path: Path, configuration: Configuration) -> Self:
         """Open the directory of a run that shall go on, perhaps to more trials than it had.
 
+        If a trial was begun and not finished, the journal has its steps:
+        :meth:`holdfast.recording.journal.Journal.unfinished`.
+
         Raises
         ------
         OutputError
-            If it holds no run, one of other code or with another configuration, one with a finished
-            trial that the configuration does not ask for, or one that is in use.
+            If it holds no run, one of other code or with another configuration, one with a trial
+            that the configuration does not ask for, one that is damaged, or one that is in use.
         """
         if not path.is_dir():
             raise OutputError(f"{path}: there is no such directory, so no run to resume")
         if not (path / JOURNAL_NAME).is_file():
             raise OutputError(f"{path}: holds no {JOURNAL_NAME}, so no run to resume")
-        journal = Journal.open(path / JOURNAL_NAME)
+        journal = Journal.open(
+            path / JOURNAL_NAME, survives=configuration.recovery.journal_survives
+        )
         try:
             text = configuration.to_yaml()
             meta = journal.meta()
             _require_same_code(path, meta, fingerprint(configuration))
             _require_same_configuration(path, meta.get("configuration", ""), text)
-            _require_enough_trials(path, journal.finished(), configuration.simulator.num_trials)
+            _require_enough_trials(path, journal, configuration.simulator.num_trials)
             if meta.get("configuration") != text:
                 journal.set_meta("configuration", text)
                 write_atomically(path / CONFIGURATION_NAME, text)
@@ -180,8 +205,23 @@ class RunDirectory:
 
 
 def output_names() -> tuple[str, ...]:
-    """Return the names of the files that a run leaves in its directory."""
-    return (TRIALS_NAME, SUMMARY_NAME, CONFIGURATION_NAME, FIGURE_NAME, JOURNAL_NAME)
+    """Return the names of the files that a run leaves in its directory, the last two not always.
+
+    Returns
+    -------
+    tuple of str
+        ``events.jsonl`` (changes of status) and ``timings.csv`` (a row for each decision) are there
+        only if services decided.
+    """
+    return (
+        TRIALS_NAME,
+        SUMMARY_NAME,
+        CONFIGURATION_NAME,
+        FIGURE_NAME,
+        JOURNAL_NAME,
+        EVENTS_NAME,
+        TIMINGS_NAME,
+    )
 
 
 def claim_default_directory(configuration: Configuration, parent: Path) -> Path:
@@ -204,7 +244,7 @@ def claim_default_directory(configuration: Configuration, parent: Path) -> Path:
         If it cannot be made.
     """
     for path in _default_directories(configuration, parent):
-        free = _journal_without_trials(path)
+        free = _unused_journal(path, configuration.recovery.journal_survives)
         if free is not None:
             free.close()
             return path
@@ -248,13 +288,19 @@ def _default_directories(configuration: Configuration, parent: Path) -> Iterator
         yield parent / f"{name}-{number}"
 
 
-def _journal_without_trials(path: Path) -> Journal | None:
-    """Return the open journal of a run of which no trial is finished, None if there is no such."""
-    # Absent, in use or no journal of ours: then nothing there is free to be used.
+def _unused_journal(path: Path, survives: Survives) -> Journal | None:
+    """Return the open journal of a run that has done nothing yet, None if there is no such."""
+    # Absent, in use, damaged or no journal of ours: then nothing there is free to be used.
     with contextlib.suppress(OutputError):
-        journal = Journal.open(path / JOURNAL_NAME)
-        if journal.is_empty():
-            return journal
+        # Checked only if it is to be used, for then it is small.
+        journal = Journal.open(path / JOURNAL_NAME, survives=survives, check=False)
+        try:
+            if journal.is_empty():
+                journal.check()
+                return journal
+        except BaseException:
+            journal.close()
+            raise
         journal.close()
     return None
 
@@ -278,10 +324,7 @@ def _require_same_code(path: Path, there: Mapping[str, str], here: Mapping[str, 
 
 
 def _require_same_configuration(path: Path, there: str, here: str) -> None:
-    import yaml
-
-    # Both were written by us, so the same plain loader reads both in the same way.
-    found = _difference_in(_compared(yaml.safe_load(there)), _compared(yaml.safe_load(here)), "")
+    found = configuration_difference(there, here)
     if found is not None:
         key, old, new = found
         raise OutputError(
@@ -290,11 +333,31 @@ def _require_same_configuration(path: Path, there: str, here: str) -> None:
         )
 
 
+def configuration_difference(first: str, second: str) -> tuple[str, str, str] | None:
+    """Return the first key whose value changes a decision and differs, None if there is none.
+
+    Parameters
+    ----------
+    first, second : str
+        Two resolved configurations (:meth:`holdfast.configuration.Configuration.to_yaml`).
+
+    Returns
+    -------
+    tuple of str or None
+        Key and both values, for a person.
+    """
+    import yaml
+
+    # Both were written by us, so the same plain loader reads both in the same way.
+    return _difference_in(_compared(yaml.safe_load(first)), _compared(yaml.safe_load(second)), "")
+
+
 def _compared(configuration: Any) -> Any:
-    """Leave out what changes no trial: how many there are, and where the problem's file lies."""
+    """Leave out what changes no decision: the number of trials, who decides, where files lie."""
     if not isinstance(configuration, Mapping):
         return configuration
-    kept = {key: value for key, value in configuration.items() if key != "problem_directory"}
+    left_out = ("problem_directory", *_SECTIONS_WITHOUT_DECISIONS)
+    kept = {key: value for key, value in configuration.items() if key not in left_out}
     if isinstance(kept.get("simulator"), Mapping):
         kept["simulator"] = {
             key: value for key, value in kept["simulator"].items() if key != "num_trials"
@@ -302,11 +365,15 @@ def _compared(configuration: Any) -> Any:
     return kept
 
 
-def _require_enough_trials(path: Path, finished: set[int], num_trials: int) -> None:
-    last = max(finished, default=-1)
+def _require_enough_trials(path: Path, journal: Journal, num_trials: int) -> None:
+    last = max(journal.finished(), default=-1)
+    begun = journal.unfinished_trial()
+    state = "finished"
+    if begun is not None and begun > last:
+        last, state = begun, "begun"
     if last >= num_trials:
         raise OutputError(
-            f"{path}: trial {last} of that run is finished, so simulator.num_trials (--trials) is "
+            f"{path}: trial {last} of that run is {state}, so simulator.num_trials (--trials) is "
             f"at least {last + 1}, not {num_trials}; use another directory (--out) for fewer"
         )
 

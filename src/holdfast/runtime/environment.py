@@ -1,24 +1,50 @@
 """What the robot's loop acts on: a world that can be sensed and moved.
 
 The loop knows three methods. The simulated world is made from the problem and draws from streams
-of its own; a real robot is another object with the same three methods.
+of its own; a real robot is another object with the same three methods, of a class of the user's.
+
+One thing about a real robot no journal can tell: whether the last action that was to be performed
+before a crash was performed. An environment that counts its task actions answers that, with a
+fourth method.
 """
 
 from __future__ import annotations
 
-from typing import Protocol, runtime_checkable
+import copy
+import difflib
+import inspect
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol, Self, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
 
 from holdfast import contract
-from holdfast.errors import InvalidValueError
+from holdfast.errors import ConfigurationError, EnvironmentFailedError, InvalidValueError
 from holdfast.problems.problem import Problem
 from holdfast.randomness import Purpose, stream
+from holdfast.user_code import account_of_user_error, find_class
 
-__all__ = ["Environment", "SimulatedEnvironment"]
+if TYPE_CHECKING:
+    from holdfast.configuration import Configuration
+
+__all__ = [
+    "CountingEnvironment",
+    "Environment",
+    "EnvironmentMaker",
+    "SimulatedEnvironment",
+    "load_environment",
+]
 
 FloatArray = npt.NDArray[np.float64]
+
+GROUP = "holdfast.environments"
+"""Entry points by which packages register their environments."""
+
+_REQUIRED = ("perform_sensing", "perform", "is_done")
+
+_PROVIDED = ("problem", "seed", "trial", "resumed")
 
 
 @runtime_checkable
@@ -35,6 +61,19 @@ class Environment(Protocol):
 
     def is_done(self) -> bool:
         """Tell whether the task is done."""
+        ...
+
+
+@runtime_checkable
+class CountingEnvironment(Environment, Protocol):
+    """An environment that knows how far it is: after a crash of the robot's process it is asked."""
+
+    def steps_performed(self) -> int:
+        """Return how many task actions have been performed in this trial.
+
+        The count is the world's own and outlives the robot's process: whoever asks after that
+        process has died, in the middle of a task action even, is told the truth about that action.
+        """
         ...
 
 
@@ -67,6 +106,22 @@ class SimulatedEnvironment:
         drawn = problem.initial_states(initial, 1)
         shape = (1, problem.state_size)
         self.state: FloatArray = contract.states_of(problem, "initial_states", drawn, shape)[0]
+
+    @classmethod
+    def after(cls, problem: Problem, seed: int, trial: int, actions: Sequence[FloatArray]) -> Self:
+        """Return the world as it is after these task actions: they are performed again.
+
+        Parameters
+        ----------
+        problem : Problem
+        seed, trial : int
+        actions : sequence of array of shape (action_size,)
+            Executed task actions from the beginning of the trial on.
+        """
+        environment = cls(problem, seed, trial)
+        for action in actions:
+            environment.perform(action)
+        return environment
 
     def perform_sensing(self, sensing_action: int) -> FloatArray:
         """Draw an observation of the true state.
@@ -105,3 +160,201 @@ class SimulatedEnvironment:
         """Tell whether the true state is a goal."""
         problem = self._problem
         return bool(contract.scalar(problem, "is_goal", problem.is_goal(self.state)))
+
+    def steps_performed(self) -> int:
+        """Return the number of task actions performed, those of :meth:`after` included."""
+        return self.step
+
+
+class EnvironmentMaker:
+    """Makes the environment of each trial: a simulated one, or one of the user's.
+
+    An environment of the user's is made anew for each trial. Its constructor is given the
+    configuration's ``environment.arguments`` and, of the following, what it has named parameters
+    for:
+
+    - ``problem``: the :class:`~holdfast.problems.problem.Problem`;
+    - ``seed``, ``trial``: what the run is told by;
+    - ``resumed``: True if the robot's process has died in the middle of this trial. The robot is
+      where it was left then, and must not be brought back to its start.
+
+    Parameters
+    ----------
+    name : str
+        For messages.
+    problem : Problem
+    seed : int
+    timeout_ms : float
+        Longest time that one call of the environment may take.
+    environment_class : type, optional
+        The user's class; None for the simulated world.
+    arguments : mapping, optional
+        Keyword arguments for the class.
+
+    Attributes
+    ----------
+    name, problem, timeout_ms
+        As passed.
+    simulated : bool
+        Whether the world is simulated from the problem.
+
+    Raises
+    ------
+    ConfigurationError
+        If the class does not take the arguments.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        problem: Problem,
+        seed: int,
+        timeout_ms: float,
+        environment_class: type[Any] | None = None,
+        arguments: Mapping[str, Any] | None = None,
+    ) -> None:
+        self.name = name
+        self.problem = problem
+        self.timeout_ms = timeout_ms
+        self.simulated = environment_class is None
+        self._seed = seed
+        self._class = environment_class
+        self._arguments = dict(arguments or {})
+        self._provided = (
+            ()
+            if environment_class is None
+            else _provided_parameters(name, environment_class, self._arguments)
+        )
+
+    def __call__(
+        self, trial: int, *, resumed: bool = False, performed: Sequence[FloatArray] = ()
+    ) -> Environment:
+        """Make the environment of a trial.
+
+        Parameters
+        ----------
+        trial : int
+        resumed : bool, optional
+            Whether the robot's process has died in the middle of this trial.
+        performed : sequence of array, optional
+            Task actions that were performed in this trial before that. A simulated world has died
+            with the process and performs them again; a real one stands where they led to.
+
+        Returns
+        -------
+        Environment
+
+        Raises
+        ------
+        EnvironmentFailedError
+            If the object lacks one of the three methods. Whatever the user's constructor raises is
+            passed on.
+        """
+        if self._class is None:
+            return SimulatedEnvironment.after(self.problem, self._seed, trial, performed)
+        values = {
+            "problem": self.problem,
+            "seed": self._seed,
+            "trial": trial,
+            "resumed": resumed,
+        }
+        environment = self._class(
+            # A copy: what one trial does to its arguments must not reach the next one.
+            **copy.deepcopy(self._arguments),
+            **{name: values[name] for name in self._provided},
+        )
+        missing = [name for name in _REQUIRED if not callable(getattr(environment, name, None))]
+        if missing:
+            raise EnvironmentFailedError(
+                f"{self.name} is no environment: it lacks {' and '.join(missing)}; it needs "
+                "perform_sensing(sensing_action), perform(task_action) and is_done()"
+            )
+        made: Environment = environment
+        return made
+
+
+def load_environment(configuration: Configuration) -> EnvironmentMaker:
+    """Find the environment that a configuration names.
+
+    Parameters
+    ----------
+    configuration : Configuration
+
+    Returns
+    -------
+    EnvironmentMaker
+        Calling it with the number of a trial makes the trial's environment.
+
+    Raises
+    ------
+    ConfigurationError
+        If the class cannot be imported or does not take the arguments.
+    """
+    settings = configuration.environment
+    problem, seed = configuration.problem, configuration.simulator.seed
+    name = settings.object
+    if name is None:
+        return EnvironmentMaker(
+            f"the simulated {configuration.problem_name}", problem, seed, settings.timeout_ms
+        )
+    directory = None if settings.directory is None else Path(settings.directory)
+    try:
+        found = find_class(
+            name,
+            what="environment.object",
+            group=GROUP,
+            search_directory=directory,
+            error_type=ConfigurationError,
+        )
+    except ConfigurationError as error:
+        raise ConfigurationError(f"{configuration.path}: {error}") from error
+    except Exception as error:
+        # Its module was found, but does not come through its own import.
+        account = account_of_user_error(error, name)
+        if account is None:
+            raise
+        raise ConfigurationError(f"{configuration.path}: environment.object: {account}") from error
+    try:
+        return EnvironmentMaker(name, problem, seed, settings.timeout_ms, found, settings.arguments)
+    except ConfigurationError as error:
+        raise ConfigurationError(f"{configuration.path}: {error}") from error
+
+
+def _provided_parameters(
+    name: str, environment_class: type[Any], arguments: Mapping[str, Any]
+) -> tuple[str, ...]:
+    """Check that the class takes the arguments, and return what else of ours it takes."""
+    reserved = [key for key in arguments if key in _PROVIDED]
+    if reserved:
+        raise ConfigurationError(
+            f"environment.arguments.{reserved[0]} cannot be set: holdfast itself passes "
+            f"{', '.join(_PROVIDED)} to a class that has parameters of these names"
+        )
+    try:
+        signature = inspect.signature(environment_class)
+    except (TypeError, ValueError):
+        return ()  # compiled code does not always tell; then its constructor complains
+    parameters = signature.parameters.values()
+    named = [
+        parameter.name
+        for parameter in parameters
+        if parameter.kind in (parameter.POSITIONAL_OR_KEYWORD, parameter.KEYWORD_ONLY)
+    ]
+    if not any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
+        allowed = [key for key in named if key not in _PROVIDED]
+        for key in arguments:
+            if key not in allowed:
+                close = difflib.get_close_matches(key, allowed, n=1)
+                suggestion = f"; did you mean {close[0]}?" if close else ""
+                raise ConfigurationError(
+                    f"environment.arguments.{key} is no argument of {name}{suggestion}\n"
+                    f"allowed: {', '.join(allowed) or 'no keys'}"
+                )
+    provided = tuple(key for key in _PROVIDED if key in named)
+    try:
+        signature.bind(**arguments, **dict.fromkeys(provided))
+    except TypeError as error:
+        raise ConfigurationError(
+            f"environment.arguments do not suit {name}{signature}: {error}"
+        ) from None
+    return provided

@@ -75,6 +75,10 @@ __all__ = ["HeldError", "History", "Robot", "UnknownPerformanceError", "replay"]
 FloatArray = npt.NDArray[np.float64]
 
 
+_TICKS_INTERVAL_S = 1.0
+"""Missed ticks are reported at most this often; all of them are counted."""
+
+
 class HeldError(HoldfastError):
     """The robot holds still: its environment failed. The run can be resumed."""
 
@@ -264,6 +268,8 @@ class Robot:
         self._asleep_until: float | None = None
         self._sensing_ms: list[float] = []
         self._recoveries_before = 0
+        self._told_ticks = 0
+        self._tell_ticks_at = 0.0
         self.missed_ticks = 0
 
     @property
@@ -443,7 +449,7 @@ class Robot:
         )
         self._stop(
             HeldError(
-                f"the robot holds still in trial {self._trial}, step {event.step}: {event.what}: "
+                f"the robot holds still in trial {self._trial}, step {event.step}: "
                 f"{event.text}{unknown}"
             )
         )
@@ -468,7 +474,7 @@ class Robot:
             return
         state = history.state
         if self._done or state.step >= self._simulator.max_steps:
-            self._end_trial()
+            self._end_trial(now)
             return
         if needs_sensing(self._planning, state):
             self._next_sensing(state, now)
@@ -547,14 +553,24 @@ class Robot:
         missed = int((now - tick) / self._period_s)
         if missed:
             self.missed_ticks += missed
-            self._report("missed_ticks", missed=missed, total=self.missed_ticks)
+            if now >= self._tell_ticks_at:
+                self._tell_ticks(now)
         self._next_tick = tick + (missed + 1) * self._period_s
         return True
 
-    def _end_trial(self) -> None:
+    def _tell_ticks(self, now: float) -> None:
+        """Report ticks missed since the last time, if there are any."""
+        missed = self.missed_ticks - self._told_ticks
+        if missed:
+            self._told_ticks = self.missed_ticks
+            self._tell_ticks_at = now + _TICKS_INTERVAL_S
+            self._report("missed_ticks", missed=missed, total=self.missed_ticks)
+
+    def _end_trial(self, now: float) -> None:
         history = self._history
         assert history is not None
         state = history.state
+        self._tell_ticks(now)
         history.log.ended(state.step, digest(state))
         decisions = history.log.decisions()
         sensing_ms = tuple(self._sensing_ms)

@@ -1,0 +1,42 @@
+"""The command line: options in, a run, and what a person at a terminal wants to see of it.
+
+Nothing below this package prints or exits. Here an error that holdfast raises on purpose, or that a
+problem's own code raises, becomes one message and exit code 2; Ctrl-C, SIGTERM and a terminal that
+is closed end a run in order, with 128 and the signal's number; and anything else is a defect and
+keeps its traceback.
+
+There is one module for each command, and libraries that take long to import are imported where they
+are used, so that ``--help`` and a mistyped option answer at once. ``serve`` goes past all of it: a
+service that is started because another one died is waited for, and need not wait for a command
+line that is made for people.
+"""
+
+from __future__ import annotations
+
+import sys
+
+__all__ = ["main"]
+
+
+def main() -> None:
+    """Run the command line and exit."""
+    from holdfast.errors import HoldfastError
+
+    arguments = sys.argv[1:]
+    try:
+        if arguments[:1] == ["serve"]:
+            from holdfast.runtime.service_process import main as serve
+
+            sys.exit(serve(arguments[1:]))
+        from holdfast.cli.application import run_application
+
+        run_application(arguments)
+    except HoldfastError as error:
+        from holdfast.cli.endings import EXIT_ERROR
+
+        sys.stderr.write(f"holdfast: error: {error}\n")
+        sys.exit(EXIT_ERROR)
+    except KeyboardInterrupt as interruption:
+        from holdfast.cli.endings import EXIT_SIGNAL, signal_of
+
+        sys.exit(EXIT_SIGNAL + signal_of(interruption))

@@ -1,0 +1,92 @@
+"""All commands together, as ``holdfast --help`` lists them.
+
+A command is a function in a module of its own; this one gives it its name and nothing else.
+"""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from typing import Annotated
+
+import typer
+
+from holdfast import __version__
+from holdfast.cli.compare import compare
+from holdfast.cli.endings import EXIT_ERROR
+from holdfast.cli.keys import keys
+from holdfast.cli.run import run
+from holdfast.cli.serve import serve
+
+__all__ = ["app", "run_application"]
+
+app = typer.Typer(
+    name="holdfast",
+    help=(
+        "Action-entropy active sensing: choose what to sense by how much it decides what to do, "
+        "and decide the same, bit for bit, on every machine."
+    ),
+    epilog="Start with: holdfast run examples/peg_in_hole_2d.yaml",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,  # its tables give flags a value and take a third of the columns
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+app.command(no_args_is_help=True, short_help="Run the trials of a configuration.")(run)
+app.command(
+    short_help="Decide for robots, as a service.",
+    # It reads its own arguments, the one for help as well.
+    context_settings={
+        "allow_extra_args": True,
+        "ignore_unknown_options": True,
+        "help_option_names": [],
+    },
+)(serve)
+app.command(no_args_is_help=True, short_help="Tell whether two runs decided the same.")(compare)
+app.command(no_args_is_help=True, short_help="Make keys for robots and services.")(keys)
+
+
+def run_application(arguments: list[str]) -> None:
+    """Run one command and exit.
+
+    Parameters
+    ----------
+    arguments : list of str
+        What stands after ``holdfast``.
+
+    Raises
+    ------
+    HoldfastError
+        If the command fails in a way that is no defect.
+    SystemExit
+        Else, with the exit code.
+    """
+    first = arguments[0] if arguments else ""
+    if first.endswith((".yaml", ".yml")):
+        command = shlex.join(["holdfast", "run", *arguments])
+        sys.stderr.write(f"holdfast: error: {first} is no command; did you mean: {command}\n")
+        sys.exit(EXIT_ERROR)
+    app(args=arguments, prog_name="holdfast")
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"holdfast {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _common(
+    version: Annotated[
+        bool,
+        typer.Option(
+            "--version",
+            callback=_print_version,
+            is_eager=True,
+            help="Show the version and exit.",
+        ),
+    ] = False,
+) -> None:
+    del version

@@ -1,0 +1,101 @@
+"""``holdfast run`` as a robot does it: step by step, journalled, with services that may die."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from holdfast.configuration import Configuration
+    from holdfast.outcome import TrialResult
+    from holdfast.recording.run_directory import RunDirectory
+    from holdfast.runtime.logs import EventSink, LogFormat
+
+__all__ = ["is_robot_run", "run_as_robot"]
+
+RECOVERY_LOG_NAME = "recovery.log"
+
+
+def is_robot_run(configuration: Configuration, rate_hz: float | None) -> bool:
+    """Tell whether a run needs more than a batch of simulated trials does.
+
+    Parameters
+    ----------
+    configuration : Configuration
+    rate_hz : float or None
+        Task actions a second.
+    """
+    return (
+        bool(configuration.offload.services)
+        or configuration.environment.object is not None
+        or rate_hz is not None
+    )
+
+
+def run_as_robot(
+    configuration: Configuration,
+    directory: RunDirectory,
+    on_result: Callable[[TrialResult], None],
+    *,
+    rate_hz: float | None,
+    log_format: LogFormat,
+    quiet: bool,
+) -> int:
+    """Run the missing trials one after another, and return the number of missed ticks.
+
+    Parameters
+    ----------
+    configuration : Configuration
+    directory : RunDirectory
+        Its journal keeps each step.
+    on_result : callable
+        Gets each trial's result, and keeps it.
+    rate_hz : float or None
+    log_format : {"text", "json"}
+        Of the events on the standard error.
+    quiet : bool
+        Whether events go to the file alone.
+
+    Raises
+    ------
+    HoldfastError
+        If the robot holds still and cannot go on.
+    """
+    from holdfast.recording.run_directory import EVENTS_NAME, TIMINGS_NAME
+    from holdfast.recording.timings import TimingTable
+    from holdfast.runtime.environment import load_environment
+    from holdfast.runtime.links import make_links
+    from holdfast.runtime.logs import EventLog, TeeEventLog
+    from holdfast.runtime.robot_process import RobotProcess
+
+    maker = load_environment(configuration)
+    links = make_links(configuration, directory.path / RECOVERY_LOG_NAME)
+    with contextlib.ExitStack() as stack:
+        stack.callback(links.close)
+        # What is only for people on a terminal is kept in the file all the same.
+        sinks: list[EventSink] = [
+            EventLog(directory.path / EVENTS_NAME, format="json", component="robot")
+        ]
+        if not quiet:
+            sinks.append(EventLog(sys.stderr, format=log_format, component="robot"))
+        events = TeeEventLog(*sinks)
+        stack.callback(events.close)
+        timings = TimingTable(directory.path / TIMINGS_NAME)
+        stack.callback(timings.close)
+        robot = RobotProcess(
+            configuration,
+            links.services,
+            links.recovery,
+            links.transport,
+            directory.journal,
+            maker,
+            events,
+            on_result,
+            timings.add,
+            rate_hz,
+        )
+        launcher = None if links.launcher is None else links.launcher(robot.deliver)
+        robot.run(directory.journal.finished(), launcher)
+        return robot.missed_ticks

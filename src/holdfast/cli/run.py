@@ -1,0 +1,395 @@
+"""``holdfast run``: the trials of a configuration, and what they leave in a directory."""
+
+from __future__ import annotations
+
+import contextlib
+import shlex
+import signal
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from time import perf_counter
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from holdfast.cli.endings import ended_by_signals, signal_of
+from holdfast.cli.terminal import print_files, print_summary, run_display
+from holdfast.errors import HoldfastError, InvalidValueError
+
+if TYPE_CHECKING:
+    from holdfast.configuration import Configuration
+    from holdfast.outcome import TrialResult
+    from holdfast.recording.recorder import Recorder, TrialRecord
+    from holdfast.recording.run_directory import RunDirectory
+
+__all__ = ["run"]
+
+_RUNS = Path("runs")
+_MAX_RATE_HZ = 10_000.0
+
+
+def run(
+    configuration_path: Annotated[
+        Path,
+        typer.Argument(
+            metavar="CONFIG", show_default=False, help="Configuration file (YAML) of the run."
+        ),
+    ],
+    trials: Annotated[
+        int | None,
+        typer.Option(
+            "--trials", metavar="N", min=1, help="Number of trials, instead of the file's."
+        ),
+    ] = None,
+    seed: Annotated[
+        int | None,
+        typer.Option(
+            "--seed", metavar="S", min=0, help="Seed of all random draws, instead of the file's."
+        ),
+    ] = None,
+    problem: Annotated[
+        str | None,
+        typer.Option(
+            "--problem",
+            metavar="NAME",
+            help="Problem to run, instead of the file's: a registered name or module:Class.",
+        ),
+    ] = None,
+    jobs: Annotated[
+        int | None,
+        typer.Option(
+            "--jobs",
+            "-j",
+            metavar="N",
+            min=1,
+            max=1024,
+            help=(
+                "Largest number of processes (default: one for each core). It changes time only, "
+                "never a result."
+            ),
+            show_default=False,
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            "-o",
+            metavar="DIR",
+            help="Directory for the results (default: runs/CONFIG-seedS, numbered if taken).",
+            show_default=False,
+        ),
+    ] = None,
+    resume: Annotated[
+        bool,
+        typer.Option(
+            "--resume",
+            help=(
+                "Go on with the run in DIR (default: the latest) and run the missing trials; with "
+                "a larger --trials, more than it had."
+            ),
+        ),
+    ] = False,
+    quiet: Annotated[
+        bool,
+        typer.Option(
+            "--quiet",
+            "-q",
+            help="Show no progress and no summary: only errors. The files are the same.",
+        ),
+    ] = False,
+    service: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--service",
+            "-s",
+            metavar="ENDPOINT",
+            help=(
+                "Let the service at ENDPOINT decide (tcp/10.0.0.7:7447); more of them are tried in "
+                "this order."
+            ),
+            show_default=False,
+        ),
+    ] = None,
+    recovery: Annotated[
+        str | None,
+        typer.Option(
+            "--recovery",
+            metavar="WHEN",
+            help=("When to launch the local service: on_failure (the default), at_start or never."),
+            show_default=False,
+        ),
+    ] = None,
+    tls: Annotated[
+        Path | None,
+        typer.Option(
+            "--tls",
+            metavar="DIR",
+            help="This robot's credentials, as holdfast keys makes them.",
+            show_default=False,
+        ),
+    ] = None,
+    environment: Annotated[
+        str | None,
+        typer.Option(
+            "--environment",
+            "-e",
+            metavar="MODULE:CLASS",
+            help="Act on this environment instead of a simulated one.",
+            show_default=False,
+        ),
+    ] = None,
+    rate: Annotated[
+        float | None,
+        typer.Option(
+            "--rate",
+            metavar="HZ",
+            help="Task actions a second (default: as fast as it goes).",
+            show_default=False,
+        ),
+    ] = None,
+    log: Annotated[
+        str,
+        typer.Option("--log", metavar="FORMAT", help="Format of the events shown: text or json."),
+    ] = "text",
+) -> None:
+    """Run the trials of CONFIG and write what they come to into a directory.
+
+    DIR gets trials.csv (a row for each trial), summary.json, config.yaml
+    (with all defaults filled in; it can be run again), journal.sqlite (every
+    decision of every trial) and trial.png (a figure of trial 0).
+
+    With --service, --environment or --rate the trials are run one after
+    another, as a robot does: every step is in the journal before it is
+    performed, and DIR gets events.jsonl (what happened to the services) and
+    timings.csv (how long each decision took) as well.
+
+    Ctrl-C, a crash or a power cut loses no trial and no step: the same
+    command with --resume goes on.
+    """
+    if rate is not None and not 0.0 < rate <= _MAX_RATE_HZ:
+        raise InvalidValueError(
+            f"--rate is {rate:g}; allowed are more than 0 and at most {_MAX_RATE_HZ:g} (Hz)"
+        )
+    if log not in ("text", "json"):
+        raise InvalidValueError(f"--log is {log!r}; allowed are text and json")
+    options = _Options(
+        configuration_path=configuration_path,
+        trials=trials,
+        seed=seed,
+        problem=problem,
+        jobs=jobs,
+        out=out,
+        resume=resume,
+        quiet=quiet,
+        services=tuple(service or ()),
+        recovery=recovery,
+        tls=tls,
+        environment=environment,
+        rate=rate,
+        log=log,
+    )
+    with ended_by_signals():
+        _run(options)
+
+
+@dataclass(frozen=True)
+class _Options:
+    """The command line, as it was given."""
+
+    configuration_path: Path
+    trials: int | None
+    seed: int | None
+    problem: str | None
+    jobs: int | None
+    out: Path | None
+    resume: bool
+    quiet: bool
+    services: tuple[str, ...]
+    recovery: str | None
+    tls: Path | None
+    environment: str | None
+    rate: float | None
+    log: str
+
+    def resume_command(self, directory: Path) -> str:
+        """Return the command that goes on."""
+        words = ["holdfast", "run", str(self.configuration_path)]
+        options: list[tuple[str, object]] = [
+            ("--trials", self.trials),
+            ("--seed", self.seed),
+            ("--problem", self.problem),
+            ("--jobs", self.jobs),
+            *(("--service", service) for service in self.services),
+            ("--recovery", self.recovery),
+            ("--tls", self.tls),
+            ("--environment", self.environment),
+            ("--rate", self.rate),
+        ]
+        for option, value in options:
+            if value is not None:
+                words += [option, str(value)]
+        if self.log != "text":
+            words += ["--log", self.log]
+        return shlex.join([*words, "--out", str(directory), "--resume"])
+
+    def load(self) -> Configuration:
+        """Read the configuration, with what was said instead."""
+        from holdfast.configuration import load
+
+        return load(
+            self.configuration_path,
+            problem=self.problem,
+            num_trials=self.trials,
+            seed=self.seed,
+            overrides={
+                "offload.services": list(self.services) or None,
+                "offload.tls": None if self.tls is None else str(self.tls),
+                "recovery.launch": self.recovery,
+                "environment.object": self.environment,
+            },
+        )
+
+
+def _run(options: _Options) -> None:
+    from holdfast.cli.robot_run import is_robot_run, run_as_robot
+    from holdfast.recording.recorder import Recorder
+    from holdfast.recording.run_directory import (
+        RunDirectory,
+        claim_default_directory,
+        latest_default_directory,
+    )
+    from holdfast.runtime.trials import available_cores, run_trials
+
+    configuration = options.load()
+    quiet = options.quiet
+    if options.resume:
+        directory_path = options.out or latest_default_directory(configuration, _RUNS)
+        directory = RunDirectory.resume(directory_path, configuration)
+    else:
+        directory_path = options.out or claim_default_directory(configuration, _RUNS)
+        directory = RunDirectory.create(directory_path, configuration)
+    with directory:
+        earlier = directory.journal.tally()
+        display = run_display(configuration, quiet=quiet)
+        recorder = Recorder(trial=0)
+        missed_ticks = 0
+        started = perf_counter()
+
+        def on_result(result: TrialResult) -> None:
+            directory.add(result)
+            display.show(result)
+
+        try:
+            display.start(earlier.finished, earlier.successes, directory_path)
+            try:
+                if is_robot_run(configuration, options.rate):
+                    missed_ticks = run_as_robot(
+                        configuration,
+                        directory,
+                        on_result,
+                        rate_hz=options.rate,
+                        log_format="json" if options.log == "json" else "text",
+                        quiet=quiet,
+                    )
+                else:
+                    run_trials(
+                        configuration,
+                        options.jobs or available_cores(),
+                        directory.journal.finished(),
+                        on_result,
+                        recorder,
+                    )
+            except BaseException:
+                # After SIGHUP there is no terminal to write to.
+                with contextlib.suppress(OSError):
+                    display.stop()
+                # Tables of what is finished; if the disk is the trouble, the first error says so.
+                with contextlib.suppress(HoldfastError):
+                    directory.write_tables(perf_counter() - started)
+                raise
+            display.stop()
+            summary = directory.write_tables(perf_counter() - started)
+            if not quiet:
+                print_summary(summary)
+                if missed_ticks:
+                    sys.stderr.write(f"note: {missed_ticks} ticks of --rate were missed\n")
+            note = _draw_figure(configuration, directory, recorder)
+        except KeyboardInterrupt as interruption:
+            command = options.resume_command(directory_path)
+            finished = directory.journal.tally().finished
+            ended = signal_of(interruption)
+            how = "Interrupted" if ended == signal.SIGINT else f"Ended by {ended.name}"
+            with contextlib.suppress(OSError):
+                sys.stderr.write(
+                    f"\n{how}. {finished} of {configuration.simulator.num_trials} trials are "
+                    f"finished and kept in {directory_path}\nGo on with: {command}\n"
+                )
+            raise
+        except HoldfastError as error:
+            if directory.journal.unfinished_trial() is None:
+                raise
+            command = options.resume_command(directory_path)
+            raise HoldfastError(f"{error}\nGo on with: {command}") from error
+        if not quiet:
+            print_files(directory_path, note)
+
+
+def _draw_figure(
+    configuration: Configuration, directory: RunDirectory, recorder: Recorder
+) -> str | None:
+    """Draw trial 0 and return None, or what is to be said about it."""
+    if configuration.environment.object is not None:
+        return None  # its world is not ours to look into
+    try:
+        from holdfast.recording.figure import trial_figure
+    except ImportError as error:
+        if error.name is None or error.name.split(".")[0] != "matplotlib":
+            raise
+        return "no figure, because matplotlib is not installed: pip install matplotlib"
+
+    try:
+        note = _draw_trial(configuration, directory, recorder, trial_figure)
+    except HoldfastError:
+        raise
+    except Exception as error:
+        from holdfast.user_code import account_of_user_error
+
+        account = account_of_user_error(error, configuration.problem_name)
+        if account is None:
+            raise
+        raise HoldfastError(f"the figure of trial {recorder.trial}: {account}") from error
+    return note
+
+
+def _draw_trial(
+    configuration: Configuration,
+    directory: RunDirectory,
+    recorder: Recorder,
+    draw: Callable[[Configuration, TrialRecord, Path], None],
+) -> str | None:
+    from holdfast.recording.run_directory import FIGURE_NAME
+    from holdfast.runtime.trial import run_trial
+
+    if recorder.record.result is None:
+        # It ran in a worker or in an earlier part of the run; a trial can always be run again.
+        run_trial(
+            configuration.problem,
+            configuration.planning,
+            configuration.simulator,
+            recorder.trial,
+            observer=recorder,
+        )
+    record: TrialRecord = recorder.record
+    note = None
+    if record.result is not None and record.result.decisions is not None:
+        kept = directory.journal.decisions(recorder.trial)
+        if kept.log != record.result.decisions.log:
+            note = (
+                f"trial {recorder.trial} decided otherwise when it was run again for the figure, "
+                f"so the problem {configuration.problem_name} is not deterministic"
+            )
+    draw(configuration, record, directory.path / FIGURE_NAME)
+    return note

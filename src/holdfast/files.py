@@ -1,0 +1,108 @@
+"""Files that are there whole or not at all.
+
+A file is written beside its place and then renamed to it, because a rename happens at once: a
+reader, or a crash, meets the old file or the new one, never a part. Directories whose files belong
+together, a key and its certificate, appear the same way.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+from holdfast.errors import HoldfastError
+
+__all__ = ["NewFile", "OutputError", "create_directory_atomically", "write_atomically"]
+
+
+class OutputError(HoldfastError):
+    """The output of a run cannot be written or read, or does not belong to this run."""
+
+
+class NewFile(NamedTuple):
+    """A file of a new directory.
+
+    Attributes
+    ----------
+    content : bytes
+    mode : int
+        Its permissions; what the process's umask forbids is taken away from them.
+    """
+
+    content: bytes
+    mode: int
+
+
+def write_atomically(path: Path, content: bytes | Iterable[str]) -> None:
+    """Write a file so that no reader, and no crash, ever sees a part of it.
+
+    Parameters
+    ----------
+    path : Path
+        Where it shall be; what is there already is replaced.
+    content : bytes, str or iterable of str
+        Text is encoded as UTF-8, piece by piece.
+
+    Raises
+    ------
+    OutputError
+        If it cannot be written; then whatever was there is unchanged.
+    """
+    pieces: Iterable[bytes]
+    if isinstance(content, bytes):
+        pieces = (content,)
+    else:
+        pieces = (piece.encode() for piece in ((content,) if isinstance(content, str) else content))
+    # In the same folder, because a rename is atomic only within one file system.
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with temporary.open("wb") as file:
+            file.writelines(pieces)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    except BaseException as error:
+        with contextlib.suppress(OSError):
+            temporary.unlink()
+        if isinstance(error, OSError):
+            raise OutputError(f"{path}: cannot be written: {error.strerror}") from error
+        raise
+
+
+def create_directory_atomically(path: Path, files: Mapping[str, NewFile]) -> None:
+    """Create a directory that only its owner can enter, and all its files at once.
+
+    Parameters
+    ----------
+    path : Path
+        Where it shall be, in a directory that exists. An empty directory there is replaced.
+    files : mapping of str to NewFile
+        By name.
+
+    Raises
+    ------
+    OutputError
+        If something is there already, or it cannot be written; then nothing is changed.
+    """
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        temporary.mkdir(mode=0o700)
+        for name, new in files.items():
+            # With its mode from the start: a key is at no time open to others.
+            flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL
+            with os.fdopen(os.open(temporary / name, flags, new.mode), "wb") as file:
+                file.write(new.content)
+                file.flush()
+                os.fsync(file.fileno())
+        temporary.rename(path)
+    except BaseException as error:
+        shutil.rmtree(temporary, ignore_errors=True)
+        if isinstance(error, OSError):
+            # A rename onto a directory that has files fails with one of several reasons.
+            reason = "it exists already" if path.exists() else error.strerror
+            raise OutputError(f"{path}: cannot be created: {reason}") from error
+        raise

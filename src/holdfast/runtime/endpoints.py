@@ -1,0 +1,350 @@
+"""Where a service is, in Zenoh's form: what is allowed, and what would be unsafe.
+
+An endpoint is a protocol and a place: ``tcp/127.0.0.1:7447``, ``tls/planner.example:7447``,
+``unixsock-stream//run/holdfast/robot.sock``. Zenoh itself takes much more than holdfast can keep
+its promises with, and finds some mistakes only later, in the background, without a word. So every
+endpoint is read here first, and what cannot work is refused with the reason.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ipaddress
+import re
+import socket
+from pathlib import Path
+from typing import NamedTuple, Self
+
+import msgspec
+
+from holdfast.errors import TransportError
+
+__all__ = [
+    "ENCRYPTED_PROTOCOLS",
+    "MAX_SOCKET_PATH_BYTES",
+    "PROTOCOLS",
+    "Endpoint",
+    "PrivateSocket",
+    "ServiceAddress",
+    "TlsFiles",
+    "check_credentials",
+    "free_port",
+    "parse_endpoint",
+]
+
+PROTOCOLS = ("tcp", "tls", "quic", "unixsock-stream")
+"""What an endpoint may begin with."""
+
+ENCRYPTED_PROTOCOLS = frozenset({"tls", "quic"})
+"""Those in which both ends prove by a certificate who they are."""
+
+MAX_SOCKET_PATH_BYTES = 107
+"""Bound on the path of a local socket: the system's ``sockaddr_un`` has room for no more."""
+
+_UNIX = "unixsock-stream"
+
+_REFUSED = {
+    "udp": "it loses whatever is larger than one datagram and repeats nothing; "
+    "quic is the reliable protocol over UDP",
+    "ws": "holdfast is not tested over it",
+    "serial": "holdfast is not tested over it",
+    "vsock": "holdfast is not tested over it",
+    "unixpipe": "unixsock-stream is the local protocol that finds a dead peer at once",
+}
+
+_HOST_NAME = re.compile(
+    r"(?=.{1,253}\Z)[A-Za-z0-9_]([A-Za-z0-9_-]*[A-Za-z0-9_])?(\.[A-Za-z0-9_-]+)*"
+)
+_NUMBERS = re.compile(r"[0-9.]+")
+
+
+class TlsFiles(msgspec.Struct, frozen=True):
+    """The credentials of one end, as files in PEM.
+
+    Attributes
+    ----------
+    authority : Path
+        Certificate of the authority by which the other end must be certified.
+    certificate : Path
+        This end's own certificate.
+    key : Path
+        The private key of that certificate.
+    """
+
+    authority: Path
+    certificate: Path
+    key: Path
+
+
+class Endpoint(NamedTuple):
+    """A protocol and a place, checked. ``str`` gives it back in Zenoh's form.
+
+    Attributes
+    ----------
+    protocol : str
+        One of :data:`PROTOCOLS`.
+    host : str
+        Name or address, an IPv6 address without its brackets; for ``unixsock-stream`` the path.
+    port : int
+        0 means any free port, where something listens; for ``unixsock-stream`` always 0.
+    """
+
+    protocol: str
+    host: str
+    port: int
+
+    def __str__(self) -> str:
+        if self.protocol == _UNIX:
+            return f"{self.protocol}/{self.host}"
+        host = f"[{self.host}]" if ":" in self.host else self.host
+        return f"{self.protocol}/{host}:{self.port}"
+
+    @property
+    def is_encrypted(self) -> bool:
+        """Whether both ends prove who they are, and nobody between them can read or write."""
+        return self.protocol in ENCRYPTED_PROTOCOLS
+
+    @property
+    def is_local_socket(self) -> bool:
+        """Whether this is a file of this machine, not an address."""
+        return self.protocol == _UNIX
+
+    @property
+    def is_loopback(self) -> bool:
+        """Whether only this machine can reach it.
+
+        A host name other than ``localhost`` counts as reachable from outside, whatever it stands
+        for today: what a name stands for can change without anybody here noticing.
+        """
+        if self.is_local_socket:
+            return True
+        address = _address_of(self.host)
+        if address is not None:
+            return _is_loopback_address(address)
+        if self.host.lower().rstrip(".") != "localhost":
+            return False
+        try:
+            found = socket.getaddrinfo(self.host, None)
+        except OSError:
+            return False
+        addresses = [_address_of(str(entry[4][0])) for entry in found]
+        return all(each is not None and _is_loopback_address(each) for each in addresses)
+
+    def with_port(self, port: int) -> Endpoint:
+        """Return the same endpoint with another port."""
+        return self._replace(port=port)
+
+
+class ServiceAddress(NamedTuple):
+    """Where a robot finds a service, or where it lets a service find it.
+
+    Attributes
+    ----------
+    endpoint : str
+        In Zenoh's form.
+    listens : bool
+        False: the service listens there and the robot connects. True: the robot listens there and
+        the service connects, which a service that the robot itself launches does; it is then seen
+        as soon as it is there, without waiting for the robot's next attempt.
+    name : str or None
+        The name that the service must have; None takes whichever is there.
+    """
+
+    endpoint: str
+    listens: bool = False
+    name: str | None = None
+
+
+class PrivateSocket:
+    """A local socket in a directory that no other user can enter.
+
+    The permissions of the directory, not those of the socket, keep others out: a socket's own are
+    set only after it can be connected to. Use it as a context, or call :meth:`remove`.
+
+    Attributes
+    ----------
+    endpoint : str
+        ``unixsock-stream/PATH``.
+
+    Raises
+    ------
+    TransportError
+        If the directory for temporary files has too long a path for a socket.
+    """
+
+    def __init__(self) -> None:
+        import tempfile
+
+        self._directory = Path(tempfile.mkdtemp(prefix="holdfast-"))  # made with mode 0700
+        self.endpoint = f"{_UNIX}/{self._directory / 's'}"
+        try:
+            parse_endpoint(self.endpoint)
+        except TransportError as error:
+            self.remove()
+            raise TransportError(
+                f"{error}; set TMPDIR to a directory for temporary files with a shorter path"
+            ) from None
+
+    def remove(self) -> None:
+        """Remove the directory with what is left in it. May be repeated."""
+        with contextlib.suppress(OSError):
+            for file in self._directory.iterdir():
+                file.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            self._directory.rmdir()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.remove()
+
+
+def parse_endpoint(text: str) -> Endpoint:
+    """Read an endpoint in Zenoh's form.
+
+    Parameters
+    ----------
+    text : str
+        ``PROTOCOL/HOST:PORT``, with an IPv6 address in brackets, or ``unixsock-stream/PATH``.
+
+    Raises
+    ------
+    TransportError
+        If it is none, or its protocol is none of :data:`PROTOCOLS`.
+    """
+    protocol, slash, place = text.partition("/")
+    if not slash or not re.fullmatch(r"[a-z][a-z0-9_-]*", protocol):
+        raise TransportError(
+            f"endpoint {text!r} does not begin with a protocol: allowed are {_listed(PROTOCOLS)}, "
+            f"as in tcp/127.0.0.1:7447"
+        )
+    if protocol not in PROTOCOLS:
+        reason = _REFUSED.get(protocol)
+        raise TransportError(
+            f"endpoint {text!r}: protocol {protocol} is not allowed"
+            + (f" ({reason})" if reason else "")
+            + f"; allowed are {_listed(PROTOCOLS)}, as in tcp/127.0.0.1:7447"
+        )
+    if "?" in place or "#" in place:
+        raise TransportError(
+            f"endpoint {text!r}: options after '?' or '#' are not allowed; "
+            f"give the place alone, as in tcp/127.0.0.1:7447"
+        )
+    if protocol == _UNIX:
+        return _local_socket(text, place)
+    host, colon, port_text = place.rpartition(":")
+    if not colon or place.endswith("]"):
+        raise TransportError(
+            f"endpoint {text!r} has no port: write {protocol}/HOST:PORT, "
+            f"as in {protocol}/127.0.0.1:7447"
+        )
+    if not (port_text.isascii() and port_text.isdigit() and int(port_text) <= 65535):
+        raise TransportError(
+            f"endpoint {text!r}: port {port_text!r} is not a number from 0 to 65535, "
+            f"as in {protocol}/127.0.0.1:7447"
+        )
+    return Endpoint(protocol, _host(text, protocol, host), int(port_text))
+
+
+def check_credentials(endpoint: Endpoint, tls: TlsFiles | None) -> None:
+    """Check that an endpoint has the credentials that its protocol needs, and no others.
+
+    Raises
+    ------
+    TransportError
+        If an encrypted endpoint has none, a plain one has some that would not be used, or one of
+        the files cannot be read.
+    """
+    if endpoint.is_encrypted and tls is None:
+        raise TransportError(
+            f"endpoint {endpoint}: {endpoint.protocol} needs credentials (--tls DIR; "
+            f"'holdfast keys DIR' makes them)"
+        )
+    if tls is None:
+        return
+    if not endpoint.is_encrypted and not endpoint.is_local_socket:
+        raise TransportError(
+            f"endpoint {endpoint}: {endpoint.protocol} does not use the credentials that were "
+            f"given (--tls); write tls/... or quic/..., or leave them out"
+        )
+    if endpoint.is_encrypted:
+        for file in (tls.authority, tls.certificate, tls.key):
+            try:
+                with file.open("rb") as opened:
+                    opened.read(1)
+            except OSError as error:
+                raise TransportError(
+                    f"endpoint {endpoint}: credentials {file} cannot be read: {error.strerror}"
+                ) from error
+
+
+def free_port(endpoint: Endpoint) -> int:
+    """Return a port that nobody listens on now, at the host of an endpoint.
+
+    Raises
+    ------
+    TransportError
+        If this machine has no such address.
+    """
+    kind = socket.SOCK_DGRAM if endpoint.protocol == "quic" else socket.SOCK_STREAM
+    try:
+        family, _, _, _, address = socket.getaddrinfo(
+            endpoint.host, 0, type=kind, flags=socket.AI_PASSIVE
+        )[0]
+        with socket.socket(family, kind) as probe:
+            probe.bind(address)
+            return int(probe.getsockname()[1])
+    except OSError as error:
+        raise TransportError(f"cannot listen on {endpoint}: {error.strerror}") from error
+
+
+def _local_socket(text: str, path: str) -> Endpoint:
+    if not path.strip("/"):
+        raise TransportError(
+            f"endpoint {text!r} has no path: write {_UNIX}/PATH, as in {_UNIX}//run/holdfast/s"
+        )
+    size = len(path.encode("utf-8", "surrogateescape"))
+    if size > MAX_SOCKET_PATH_BYTES:
+        raise TransportError(
+            f"endpoint {text!r}: a path of {size} bytes; a local socket's has at most "
+            f"{MAX_SOCKET_PATH_BYTES}"
+        )
+    return Endpoint(_UNIX, path, 0)
+
+
+def _host(text: str, protocol: str, host: str) -> str:
+    if host.startswith("[") and host.endswith("]"):
+        inner = host[1:-1]
+        if isinstance(_address_of(inner), ipaddress.IPv6Address):
+            return inner
+        raise TransportError(
+            f"endpoint {text!r}: {inner!r} is no IPv6 address, as in {protocol}/[::1]:7447"
+        )
+    if ":" in host:
+        raise TransportError(
+            f"endpoint {text!r}: an IPv6 address stands in brackets, as in {protocol}/[::1]:7447"
+        )
+    numeric = _NUMBERS.fullmatch(host) is not None
+    if (numeric and _address_of(host) is None) or not _HOST_NAME.fullmatch(host):
+        raise TransportError(
+            f"endpoint {text!r}: {host!r} is no host name or address, "
+            f"as in {protocol}/127.0.0.1:7447"
+        )
+    return host
+
+
+def _address_of(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
+    try:
+        return ipaddress.ip_address(host)
+    except ValueError:
+        return None
+
+
+def _is_loopback_address(address: ipaddress.IPv4Address | ipaddress.IPv6Address) -> bool:
+    mapped = address.ipv4_mapped if isinstance(address, ipaddress.IPv6Address) else None
+    return (mapped or address).is_loopback
+
+
+def _listed(names: tuple[str, ...]) -> str:
+    return f"{', '.join(names[:-1])} and {names[-1]}"

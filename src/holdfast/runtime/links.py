@@ -1,0 +1,128 @@
+"""From the configuration to a robot's links: whom it can ask, and over what.
+
+With services named it is one link to each, and one over which the local service, once it is
+launched, finds the robot. With none named the planner is in the robot's own process.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+from holdfast.configuration import Configuration
+from holdfast.runtime.own_planner import OWN_PLANNER, OwnPlanner
+from holdfast.runtime.recovery_launcher import RecoveryExited, RecoveryLauncher
+from holdfast.runtime.transport.contract import RobotTransport
+
+__all__ = ["RECOVERY_SERVICE", "Links", "make_links"]
+
+RECOVERY_SERVICE = "cloud_active_sensing_recovery"
+"""The name of the local service (the thesis's)."""
+
+
+class Links(NamedTuple):
+    """Whom a robot can ask.
+
+    Attributes
+    ----------
+    transport : RobotTransport
+        Not started yet.
+    services : tuple of str
+        In order of preference.
+    recovery : str or None
+        The local service; None if there is none.
+    launcher : callable or None
+        Makes what launches it, given where to tell of its end.
+    close : callable
+        Releases what was made here; after the transport is closed.
+    """
+
+    transport: RobotTransport
+    services: tuple[str, ...]
+    recovery: str | None
+    launcher: Callable[[Callable[[RecoveryExited], None]], RecoveryLauncher] | None
+    close: Callable[[], None]
+
+
+def make_links(configuration: Configuration, log_path: Path | None) -> Links:
+    """Make the links that a configuration asks for.
+
+    Parameters
+    ----------
+    configuration : Configuration
+    log_path : Path or None
+        Gets what the local service writes.
+
+    Raises
+    ------
+    TransportError
+        If an endpoint is malformed, or does not go with the credentials.
+    HoldfastError
+        If the credentials cannot be used.
+    """
+    offload = configuration.offload
+    if not offload.services:
+        return Links(OwnPlanner(configuration.problem), (OWN_PLANNER,), None, None, lambda: None)
+    return _zenoh_links(configuration, log_path)
+
+
+def _zenoh_links(configuration: Configuration, log_path: Path | None) -> Links:
+    # Only a robot that has services needs these.
+    from holdfast.runtime.credentials import load_credentials
+    from holdfast.runtime.endpoints import (
+        PrivateSocket,
+        ServiceAddress,
+        check_credentials,
+        parse_endpoint,
+    )
+    from holdfast.runtime.transport.zenoh_transport import ZenohRobotTransport
+
+    offload = configuration.offload
+    tls = None if offload.tls is None else load_credentials(Path(offload.tls), "robot")
+    for service in offload.services:
+        check_credentials(parse_endpoint(service), tls)
+    addresses = {service: ServiceAddress(service) for service in offload.services}
+    recovery = None
+    launcher = None
+    close: Callable[[], None] = _nothing
+    if configuration.recovery.launch != "never":
+        recovery = RECOVERY_SERVICE
+        local = PrivateSocket()
+        close = local.remove
+        addresses[recovery] = ServiceAddress(local.endpoint, listens=True, name=recovery)
+        arguments = [
+            "--name",
+            recovery,
+            "--connect",
+            local.endpoint,
+            "--lease-ms",
+            f"{offload.lease_ms:g}",
+            "--until-stdin-closes",
+            *_problem_arguments(configuration),
+        ]
+
+        def launcher(deliver: Callable[[RecoveryExited], None]) -> RecoveryLauncher:
+            return RecoveryLauncher(arguments, deliver, log_path)
+
+    transport = ZenohRobotTransport(
+        addresses,
+        lease_ms=offload.lease_ms,
+        tls=tls,
+        decision_timeout_ms=offload.decision_timeout_ms,
+    )
+    return Links(transport, offload.services, recovery, launcher, close)
+
+
+def _problem_arguments(configuration: Configuration) -> list[str]:
+    """Return what lets the local service build a problem that is not registered."""
+    if ":" not in configuration.problem_name:
+        return []
+    arguments = ["--problem", configuration.problem_name]
+    if configuration.problem_directory is not None:
+        arguments += ["--problem-directory", str(configuration.problem_directory)]
+    return arguments
+
+
+def _nothing() -> None:
+    pass

@@ -1,0 +1,360 @@
+"""What happened, one line each: for a person to read, or for a program.
+
+A run that survives a dead service has a story: when the loss was seen, what was launched, how long
+each part took. Every chapter of it is an *event*: a name and a few fields. The one who reports it
+does not know where it goes. JSON lines keep every field for whoever evaluates a run; the text form
+arranges the same fields so that the eye finds them, by rules that hold for events not thought of
+yet: what changed and who it is about come first, then why, then the rest, and units follow their
+numbers.
+
+A log must never hurt what it watches. A terminal that was closed, a full disk, a value that is not
+a number, a text of a megabyte or with control characters in it cost at most the line.
+
+Names of events in use. By the robot: status, launch, launched, launch_failed, recovery_exited,
+retry, hedge, restore, service_appeared, service_vanished, service_suspected, holding, resumed,
+refused, disagreement, trial, missed_ticks. By a service: ready, session_opened,
+session_taken_over, restored, refused, busy, evicted, stopping. Fields with a place of their own in
+the text form: ``from`` and ``to`` (of a change), ``service``, ``reason``, ``duration_ms``.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Literal, Protocol, Self, TextIO, TypeAlias
+
+import msgspec
+
+from holdfast.files import OutputError
+
+__all__ = [
+    "MAX_LINE_BYTES",
+    "EventLog",
+    "EventSink",
+    "LogFormat",
+    "NullEventLog",
+    "TeeEventLog",
+]
+
+LogFormat: TypeAlias = Literal["text", "json"]
+
+MAX_LINE_BYTES = 4096
+"""Bound on a line; fields that do not fit are left out, and the line says so."""
+
+MAX_VALUE_CHARACTERS = 800
+"""Bound on a text within a line, and on a list or mapping once it is written out."""
+
+_COMPONENT_WIDTH = 8
+_EVENT_WIDTH = 18
+
+# Units that a field's name ends in, and how they are written.
+_UNITS = {"_ms": "ms", "_us": "µs", "_s": "s", "_hz": "Hz", "_bytes": "bytes"}
+
+
+class EventSink(Protocol):
+    """Whatever takes events."""
+
+    def event(self, name: str, /, **fields: object) -> None:
+        """Take an event; never raises."""
+        ...
+
+    def close(self) -> None:
+        """Take no more; may be repeated."""
+        ...
+
+
+class NullEventLog:
+    """Forgets every event: for those who do not want any."""
+
+    def event(self, name: str, /, **fields: object) -> None:
+        """Forget an event."""
+
+    def close(self) -> None:
+        """Do nothing."""
+
+
+class TeeEventLog:
+    """Hands every event to several others.
+
+    Parameters
+    ----------
+    *sinks : EventSink
+        In the order in which they get it.
+    """
+
+    def __init__(self, *sinks: EventSink) -> None:
+        self._sinks = sinks
+
+    def event(self, name: str, /, **fields: object) -> None:
+        """Hand an event on."""
+        for sink in self._sinks:
+            sink.event(name, **fields)
+
+    def close(self) -> None:
+        """Close all of them."""
+        for sink in self._sinks:
+            sink.close()
+
+
+class EventLog:
+    """Writes events as lines; any thread may report one.
+
+    Parameters
+    ----------
+    target : text stream or path
+        A stream stays open when the log is closed. A file is appended to, each line in one piece,
+        so that several processes can write to the same one.
+    format : {"text", "json"}
+    component : str
+        Who reports: ``robot``, or a service's name.
+    clock : callable
+        Returns nanoseconds since the epoch.
+
+    Attributes
+    ----------
+    lost : int
+        Lines that could not be written.
+
+    Raises
+    ------
+    OutputError
+        If the file cannot be opened.
+    """
+
+    def __init__(
+        self,
+        target: TextIO | Path | str,
+        *,
+        format: LogFormat = "text",  # noqa: A002 (nothing else says it as well)
+        component: str,
+        clock: Callable[[], int] = time.time_ns,
+    ) -> None:
+        self._compose = _compose_json if format == "json" else _compose_text
+        self._component = component
+        self._clock = clock
+        self._stream: TextIO | None = None
+        self._descriptor: int | None = None
+        # Taken again by the same thread if a signal's handler reports an event in mid-write.
+        self._lock = threading.RLock()
+        self.lost = 0
+        if isinstance(target, (str, Path)):
+            self._descriptor = _open_for_lines(Path(target))
+        else:
+            self._stream = target
+
+    def event(self, name: str, /, **fields: object) -> None:
+        """Write an event.
+
+        Parameters
+        ----------
+        name : str
+            What happened.
+        **fields : object
+            Numbers, texts, None, lists and mappings of them; bytes are written as hexadecimal.
+            Names end in their unit; those in ``_ms`` are rounded to three digits.
+        """
+        now_ns = self._clock()
+        try:
+            line = self._compose(now_ns, self._component, name, fields)
+        except Exception as error:  # noqa: BLE001
+            # Whatever a field's own methods do must not end a robot's run.
+            unwritable = {"unwritable_fields": type(error).__name__}
+            line = self._compose(now_ns, self._component, name, unwritable)
+        with self._lock:
+            try:
+                if self._descriptor is not None:
+                    os.write(self._descriptor, line.encode())
+                elif self._stream is not None:
+                    self._write(self._stream, line)
+            # ValueError: it is closed. RuntimeError: a signal's handler came in mid-write.
+            except (OSError, ValueError, RuntimeError):
+                self.lost += 1
+
+    @staticmethod
+    def _write(stream: TextIO, line: str) -> None:
+        try:
+            stream.write(line)
+        except UnicodeEncodeError:
+            stream.write(line.encode("ascii", "backslashreplace").decode())
+        stream.flush()
+
+    def close(self) -> None:
+        """Write no more; may be repeated."""
+        with self._lock:
+            self._stream = None
+            if self._descriptor is not None:
+                os.close(self._descriptor)
+                self._descriptor = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+
+def _open_for_lines(path: Path) -> int:
+    try:
+        descriptor = os.open(path, os.O_RDWR | os.O_APPEND | os.O_CREAT, 0o666)
+        size = os.fstat(descriptor).st_size
+        # A power cut may have left half a line; what comes now is not to be appended to that.
+        if size and os.pread(descriptor, 1, size - 1) != b"\n":
+            os.write(descriptor, b"\n")
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written: {error.strerror}") from error
+    return descriptor
+
+
+# JSON
+
+
+def _compose_json(now_ns: int, component: str, name: str, fields: Mapping[str, object]) -> str:
+    seconds, rest_ns = divmod(now_ns, 1_000_000_000)
+    moment = time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime(seconds))
+    head = {
+        "time": f"{moment}.{rest_ns // 1000:06d}Z",
+        "component": _bounded(component, 100),
+        "event": _bounded(name, 100),
+    }
+    line = _json(head)[:-1]
+    truncated = ',"truncated":true}\n'
+    room = MAX_LINE_BYTES - len(line.encode()) - len(truncated)
+    for key, value in fields.items():
+        # What every line has keeps its meaning.
+        own = f"{key}_" if key in head or key == "truncated" else _bounded(key, 100)
+        piece = f",{_json(own)}:{_json(_plain(key, value))}"
+        room -= len(piece.encode())
+        if room < 0:
+            return line + truncated
+        line += piece
+    return line + "}\n"
+
+
+def _json(value: object) -> str:
+    """Encode plain data; what is not finite becomes null."""
+    return msgspec.json.encode(value).decode()
+
+
+def _plain(key: str, value: object) -> object:
+    """Return a field's value as bounded plain data."""
+    match value:
+        case None | bool():
+            return value
+        case int():
+            # Beyond 64 bits many readers, and the encoder, give up.
+            return int(value) if -(2**63) <= value < 2**63 else _bounded(str(value))
+        case float():
+            return round(float(value), 3) if key.endswith("_ms") else float(value)
+        case str():
+            return _bounded(value)
+        case bytes():
+            return _bounded(value.hex())
+        case BaseException():
+            return _bounded(f"{type(value).__name__}: {value}")
+        case list() | tuple():
+            short = [_plain(key, item) for item in value[:100]]
+            return short if _fits(short) and len(value) <= 100 else _bounded(_json(short))
+        case dict():
+            pairs = list(value.items())[:100]
+            named = {_bounded(str(inner), 100): _plain(str(inner), item) for inner, item in pairs}
+            return named if _fits(named) and len(value) <= 100 else _bounded(_json(named))
+    item = getattr(value, "item", None)
+    if callable(item) and getattr(value, "size", None) == 1:
+        return _plain(key, item())  # a number of NumPy's
+    return _bounded(str(value))
+
+
+def _fits(value: object) -> bool:
+    return len(_json(value)) <= MAX_VALUE_CHARACTERS
+
+
+def _bounded(text: str, limit: int = MAX_VALUE_CHARACTERS) -> str:
+    """Cut a text, and write what no encoding has as an escape."""
+    if len(text) > limit:
+        text = f"{text[: limit - 1]}…"
+    return text.encode("utf-8", "backslashreplace").decode()
+
+
+# Text
+
+
+def _compose_text(now_ns: int, component: str, name: str, fields: Mapping[str, object]) -> str:
+    seconds, rest_ns = divmod(now_ns, 1_000_000_000)
+    moment = time.strftime("%H:%M:%S", time.localtime(seconds))
+    who = _readable(component, 100).ljust(_COMPONENT_WIDTH)
+    what = _readable(name.replace("_", " "), 100).ljust(_EVENT_WIDTH)
+    line = f"{moment}.{rest_ns // 1_000_000:03d} {who} {what} {_sentence(fields)}".rstrip()
+    data = line.encode()
+    if len(data) >= MAX_LINE_BYTES:
+        line = data[: MAX_LINE_BYTES - 4].decode("utf-8", "ignore") + "…"
+    return line + "\n"
+
+
+def _sentence(fields: Mapping[str, object]) -> str:
+    """Arrange fields: what changed and who (why), the rest, how long it took."""
+    rest = {key: value for key, value in fields.items() if value is not None}
+    head = []
+    if "from" in rest and "to" in rest:
+        head.append(f"{_value(rest.pop('from'))} -> {_value(rest.pop('to'))}")
+    if "service" in rest:
+        head.append(_value(rest.pop("service")))
+    parts = [", ".join(head)] if head else []
+    if "reason" in rest:
+        why = _value(rest.pop("reason"))
+        parts = [f"{parts[0]} ({why})"] if parts else [why]
+    duration = rest.pop("duration_ms", None)
+    parts.extend(_phrase(key, value) for key, value in rest.items())
+    if duration is not None:
+        parts.append(f"{_value(duration, milliseconds=True)} ms")
+    return ", ".join(parts)
+
+
+def _phrase(key: str, value: object) -> str:
+    """Return ``retry_in_ms=12.3`` as ``retry in 12.3 ms``, ``warm=False`` as ``not warm``."""
+    label, unit = key, ""
+    if isinstance(value, (int, float)) and not isinstance(value, bool):
+        for ending, symbol in _UNITS.items():
+            if key.endswith(ending):
+                label, unit = key.removesuffix(ending), f" {symbol}"
+                break
+    label = _readable(label.replace("_", " "), 100)
+    if isinstance(value, bool):
+        return label if value else f"not {label}"
+    return f"{label} {_value(value, milliseconds=unit == ' ms')}{unit}"
+
+
+def _value(value: object, *, milliseconds: bool = False) -> str:
+    if isinstance(value, bytes) and len(value) > 4:
+        return f"{value[:4].hex()}…"  # enough to tell sessions apart
+    plain = _plain("", value)
+    if isinstance(plain, float):
+        if milliseconds and abs(plain) < 1e9:
+            return f"{plain:.{2 if abs(plain) < 10 else 1 if abs(plain) < 100 else 0}f}"
+        return f"{plain:.6g}"
+    if isinstance(plain, (list, dict)):
+        return _readable(_json(plain))
+    return _readable(str(plain))
+
+
+def _readable(text: str, limit: int = MAX_VALUE_CHARACTERS) -> str:
+    """Return a text without what would move a terminal's cursor or begin a line of its own."""
+    text = _bounded(text, limit)
+    if text.isprintable():
+        return text
+    return "".join(
+        letter
+        if letter.isprintable()
+        else " "
+        if letter in "\n\t"
+        else letter.encode("unicode_escape").decode()
+        for letter in text
+    )

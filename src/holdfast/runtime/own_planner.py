@@ -1,0 +1,95 @@
+"""The planner in the robot's own process, behind the same wire as any other service.
+
+A robot that offloads nothing runs the same loop, with the same journal, as one that does; its only
+service is this one. It computes on a thread of its own, so that the next sensing action is computed
+while the robot moves here too. It cannot be lost, for its process is the robot's.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from queue import SimpleQueue
+from time import monotonic
+from typing import NamedTuple
+
+from holdfast.problems.problem import Problem
+from holdfast.session.events import Appeared, Ended, Replied, TransportEvent
+from holdfast.session.messages import Opening
+from holdfast.session.service import Answer, Effect, End, Run, Service, ServiceLimits
+
+__all__ = ["OWN_PLANNER", "OwnPlanner"]
+
+OWN_PLANNER = "in_process"
+"""The name of the service."""
+
+# A robot is never too large for itself.
+_NO_LIMITS = ServiceLimits(max_particles=2**62, max_work=2**62, max_state_bytes=2**62)
+
+
+class _Request(NamedTuple):
+    call: int
+    payload: bytes
+
+
+class OwnPlanner:
+    """A :class:`~holdfast.runtime.transport.contract.RobotTransport` that leads nowhere else.
+
+    Parameters
+    ----------
+    problem : Problem
+        The robot's own; it answers for this one only.
+    """
+
+    def __init__(self, problem: Problem) -> None:
+        def make_problem(opening: Opening) -> Problem:
+            del opening
+            return problem
+
+        self._service = Service(make_problem, 1, _NO_LIMITS)
+        self._requests: SimpleQueue[_Request | None] = SimpleQueue()
+        self._abandoned: set[int] = set()
+        self._deliver: Callable[[TransportEvent], None] | None = None
+        self._thread = threading.Thread(target=self._work, name="holdfast-planner", daemon=True)
+
+    def start(self, deliver: Callable[[TransportEvent], None]) -> None:
+        """Begin to answer."""
+        self._deliver = deliver
+        self._thread.start()
+        deliver(Appeared(OWN_PLANNER, "own"))
+
+    def call(self, service: str, call: int, payload: bytes) -> None:
+        """Take a request."""
+        del service
+        self._requests.put(_Request(call, payload))
+
+    def abandon(self, call: int) -> None:
+        """Deliver nothing more of a call."""
+        self._abandoned.add(call)
+
+    def close(self, timeout_s: float = 1.0) -> None:
+        """Answer no more."""
+        self._deliver = None
+        if self._thread.is_alive():
+            self._requests.put(None)
+            self._thread.join(timeout_s)
+
+    def _work(self) -> None:
+        service = self._service
+        while (request := self._requests.get()) is not None:
+            effects = service.receive(request.call, request.payload, monotonic())
+            while effects:
+                effects += self._carry_out(effects.pop(0))
+
+    def _carry_out(self, effect: Effect) -> list[Effect]:
+        deliver = self._deliver
+        if isinstance(effect, Run) and deliver is not None:
+            return self._service.finished(effect.job, effect.job.run(), monotonic())
+        if isinstance(effect, Answer):
+            if deliver is not None and effect.call not in self._abandoned:
+                deliver(Replied(effect.call, effect.payload))
+        elif isinstance(effect, End):
+            if deliver is not None and effect.call not in self._abandoned:
+                deliver(Ended(effect.call))
+            self._abandoned.discard(effect.call)
+        return []

@@ -1,0 +1,370 @@
+"""The robot's process: one queue of events, one machine, and effects carried out in order.
+
+Everything that happens, on the wire, in the environment, to the local service, on the keyboard,
+comes as an event through one queue to one thread. That thread tells the machine
+(:class:`holdfast.session.robot.Robot`) and carries out what it asks for. It waits for nothing but
+the queue, so a robot that moves slowly still hears at once that a service has died.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import sys
+import threading
+from collections.abc import Callable, Collection, Iterator, Sequence
+from queue import Empty, SimpleQueue
+from time import monotonic
+from typing import NamedTuple, Protocol, TypeAlias
+
+from holdfast.configuration import Configuration
+from holdfast.outcome import TrialResult
+from holdfast.runtime.environment import EnvironmentMaker
+from holdfast.runtime.logs import EventSink
+from holdfast.runtime.performer import Performer, make_performer
+from holdfast.runtime.recovery_launcher import RecoveryExited
+from holdfast.runtime.transport.contract import RobotTransport
+from holdfast.session.dispatcher import Dispatcher
+from holdfast.session.effects import (
+    Abandon,
+    Act,
+    Effect,
+    EndTrial,
+    Journal,
+    Launch,
+    Paused,
+    Report,
+    Send,
+    Sense,
+    Stop,
+    Timing,
+)
+from holdfast.session.events import Begun, EnvironmentEvent, EnvironmentFailed, TransportEvent
+from holdfast.session.messages import Opening
+from holdfast.session.records import Record
+from holdfast.session.robot import HeldError, History, Robot, replay
+
+__all__ = ["Launcher", "RobotProcess", "StepJournal"]
+
+_SWITCH_INTERVAL_S = 0.0005
+"""How long a thread may hold the interpreter while the one that has the answer waits for it."""
+
+
+class UnfinishedTrial(Protocol):
+    """What a journal holds of a trial that has not ended."""
+
+    @property
+    def trial(self) -> int:
+        """Its number."""
+        ...
+
+    @property
+    def records(self) -> Sequence[Record]:
+        """What was written down, in order."""
+        ...
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether these are surely all records that were ever written."""
+        ...
+
+
+class StepJournal(Protocol):
+    """Keeps the records of the unfinished trial."""
+
+    def session(self) -> bytes:
+        """Return the 16 bytes that name the run."""
+        ...
+
+    def raise_epoch(self) -> int:
+        """Return a number above all that were returned before; it is on the disk."""
+        ...
+
+    def append(self, trial: int, records: Sequence[Record]) -> None:
+        """Keep records; when this returns they are safe."""
+        ...
+
+    def unfinished(self) -> UnfinishedTrial | None:
+        """Return what there is of a trial that has not ended."""
+        ...
+
+
+class Launcher(Protocol):
+    """Starts the local service."""
+
+    def launch(self, number: int) -> None:
+        """Start it, and end the one that was started before."""
+        ...
+
+    def close(self) -> None:
+        """End it."""
+        ...
+
+
+class _Interrupted(NamedTuple):
+    number: int
+
+
+_Happening: TypeAlias = TransportEvent | EnvironmentEvent | RecoveryExited | _Interrupted
+
+
+class RobotProcess:
+    """Runs the trials of a configuration, one after another.
+
+    Parameters
+    ----------
+    configuration : Configuration
+    services : sequence of str
+        Names of the services in order of preference, as the transport knows them.
+    recovery : str or None
+        Name of the local service; None if there is none.
+    transport : RobotTransport
+        Not started yet; it is closed at the end.
+    journal : StepJournal
+    maker : EnvironmentMaker
+    events : EventSink
+        Is told what happens.
+    on_result : callable
+        Gets the result of each trial, and keeps it.
+    on_timing : callable
+        Gets the times of each decision.
+    rate_hz : float or None
+        Task actions a second; None acts as soon as possible.
+    """
+
+    def __init__(
+        self,
+        configuration: Configuration,
+        services: Sequence[str],
+        recovery: str | None,
+        transport: RobotTransport,
+        journal: StepJournal,
+        maker: EnvironmentMaker,
+        events: EventSink,
+        on_result: Callable[[TrialResult], None],
+        on_timing: Callable[[Timing], None],
+        rate_hz: float | None = None,
+    ) -> None:
+        self._configuration = configuration
+        self._transport = transport
+        self._journal = journal
+        self._maker = maker
+        self._events = events
+        self._on_result = on_result
+        self._on_timing = on_timing
+        self._queue: SimpleQueue[_Happening] = SimpleQueue()
+        self._launcher: Launcher | None = None
+        self._performer: Performer | None = None
+        self._starting: tuple[int, History, bool] | None = None
+        self._finished: set[int] = set()
+        self._numbers = iter(range(configuration.simulator.num_trials))
+        self._paused = False
+        self._ended = False
+        self._interrupted: int | None = None
+        problem = configuration.problem
+        simulator = configuration.simulator
+        dispatcher = Dispatcher(
+            services,
+            recovery,
+            configuration.offload,
+            configuration.recovery,
+            journal.session(),
+            journal.raise_epoch(),
+            Opening(
+                configuration.problem_name,
+                dict(configuration.model),
+                dict(configuration.state_space_planner),
+                configuration.planning,
+                simulator.seed,
+            ),
+            problem.action_size,
+            len(problem.sensing_actions),
+        )
+        self._robot = Robot(problem, configuration.planning, simulator, dispatcher, rate_hz)
+
+    @property
+    def missed_ticks(self) -> int:
+        """Ticks of the rate that passed while the robot was not ready."""
+        return self._robot.missed_ticks
+
+    def deliver(self, event: TransportEvent | EnvironmentEvent | RecoveryExited) -> None:
+        """Take an event from any thread."""
+        self._queue.put(event)
+
+    def run(self, finished: Collection[int], launcher: Launcher | None = None) -> None:
+        """Run all trials that are not finished.
+
+        Parameters
+        ----------
+        finished : collection of int
+        launcher : Launcher or None
+            Starts the local service; None if there is none.
+
+        Raises
+        ------
+        HoldfastError
+            If the robot holds still and cannot go on; the journal has everything to resume.
+        KeyboardInterrupt
+            After Ctrl-C or another signal that ends a process, once everything is written down.
+            (As whoever calls handles these signals.)
+        """
+        self._finished = set(finished)
+        self._launcher = launcher
+        before = sys.getswitchinterval()
+        sys.setswitchinterval(_SWITCH_INTERVAL_S)
+        try:
+            with self._signals_as_events():
+                self._transport.start(self.deliver)
+                self._carry_out(self._robot.start(monotonic()))
+                self._begin_next()
+                self._loop()
+        finally:
+            sys.setswitchinterval(before)
+            if self._performer is not None:
+                self._performer.close()
+            self._transport.close()
+            if launcher is not None:
+                launcher.close()
+        if self._interrupted is not None:
+            signal.raise_signal(self._interrupted)
+
+    def _loop(self) -> None:
+        robot = self._robot
+        while not self._ended:
+            wake_at = robot.next_wakeup()
+            try:
+                if wake_at is None:
+                    event = self._queue.get()
+                else:
+                    event = self._queue.get(timeout=max(0.0, wake_at - monotonic()))
+            except Empty:
+                self._carry_out(robot.wake(monotonic()))
+                continue
+            self._handle(event)
+
+    def _handle(self, event: _Happening) -> None:
+        robot = self._robot
+        now = monotonic()
+        if isinstance(event, _Interrupted):
+            self._interrupted = event.number
+            self._carry_out(robot.pause(now))
+        elif isinstance(event, RecoveryExited):
+            self._carry_out(robot.recovery_exited(event.launch, event.reason, now))
+        elif self._starting is not None and isinstance(event, Begun | EnvironmentFailed):
+            trial, history, tail_is_certain = self._starting
+            self._starting = None
+            if isinstance(event, EnvironmentFailed):
+                raise HeldError(f"trial {trial} cannot go on at step {event.step}: {event.text}")
+            self._carry_out(
+                robot.begin_trial(trial, history, event, now, tail_is_certain=tail_is_certain)
+            )
+        elif not isinstance(event, Begun):
+            self._carry_out(robot.handle(event, now))
+
+    def _carry_out(self, effects: list[Effect]) -> None:
+        for effect in effects:
+            if isinstance(effect, Send):
+                self._transport.call(effect.service, effect.call, effect.payload)
+            elif isinstance(effect, Journal):
+                self._journal.append(effect.trial, effect.records)
+            elif isinstance(effect, Act):
+                assert self._performer is not None
+                self._performer.perform(effect.step, effect.action)
+            elif isinstance(effect, Sense):
+                assert self._performer is not None
+                self._performer.sense(effect.step, effect.sensing_action)
+            elif isinstance(effect, Timing):
+                self._on_timing(effect)
+            elif isinstance(effect, Abandon):
+                self._transport.abandon(effect.call)
+            elif isinstance(effect, Report):
+                self._events.event(effect.name, **effect.fields)
+            elif isinstance(effect, Launch):
+                self._launch(effect)
+            elif isinstance(effect, EndTrial):
+                self._end_trial(effect.result)
+            elif isinstance(effect, Paused):
+                self._ended = True
+            elif isinstance(effect, Stop):
+                raise effect.error
+
+    def _launch(self, effect: Launch) -> None:
+        if self._launcher is None:
+            self.deliver(RecoveryExited(effect.number, "there is none to be launched"))
+        else:
+            self._launcher.launch(effect.number)
+
+    def _end_trial(self, result: TrialResult) -> None:
+        if self._performer is not None:
+            self._performer.close()
+            self._performer = None
+        self._on_result(result)
+        self._finished.add(result.trial)
+        self._events.event(
+            "trial",
+            trial=result.trial,
+            success=result.success,
+            steps=result.steps,
+            recoveries=result.recoveries,
+            digest=result.digest[:16],
+        )
+        self._begin_next()
+
+    def _begin_next(self) -> None:
+        """Make the environment of the next trial; the trial begins when it is there."""
+        if self._interrupted is not None:
+            self._ended = True
+            return
+        unfinished = self._journal.unfinished()
+        if unfinished is not None:
+            trial, records = unfinished.trial, unfinished.records
+            tail_is_certain = unfinished.is_complete
+        else:
+            following = next((n for n in self._numbers if n not in self._finished), None)
+            if following is None:
+                self._ended = True
+                return
+            trial, records, tail_is_certain = following, (), True
+        configuration = self._configuration
+        history = replay(
+            configuration.problem,
+            configuration.planning,
+            configuration.simulator.seed,
+            trial,
+            records,
+        )
+        self._starting = (trial, history, tail_is_certain)
+        self._performer = make_performer(
+            self._maker,
+            trial,
+            self.deliver,
+            resumed=history.begun,
+            performed=history.actions,
+        )
+        self._performer.begin(history.state.step)
+
+    @contextlib.contextmanager
+    def _signals_as_events(self) -> Iterator[None]:
+        """Let the first signal that ends a process end it in order; the second one ends it."""
+        if threading.current_thread() is not threading.main_thread():
+            yield
+            return
+        saved = {
+            number: before
+            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+            if (before := signal.getsignal(number)) is not signal.SIG_IGN
+        }
+
+        def note(number: int, frame: object) -> None:
+            del frame
+            for handled, before in saved.items():
+                signal.signal(handled, before)
+            self._queue.put(_Interrupted(number))
+
+        try:
+            for number in saved:
+                signal.signal(number, note)
+            yield
+        finally:
+            for number, before in saved.items():
+                signal.signal(number, before)

@@ -1,0 +1,619 @@
+"""The wire between machines: Zenoh, with one session for each service.
+
+Zenoh offers one network in which everybody meets; a robot that must know *which* replica answered,
+and that *this* one is gone, needs the opposite. So the robot opens a session of its own to every
+endpoint, and sessions never learn of each other. Each incarnation of a service has keys of its own,
+``holdfast/1/NAME/BOOT/alive`` (a liveliness token, which says that it is there) and
+``holdfast/1/NAME/BOOT/decide`` (a queryable, which answers), so that a process that was killed and
+its successor are never taken for one.
+
+What holds here was measured, not read:
+
+- Callbacks run on Zenoh's own threads (``indirect=False``). Zenoh's other way starts a Python
+  thread for each call; it is slower, and such a thread keeps the process from ending.
+- A send to a peer that has stopped reading blocks, and Zenoh's lease does not end that;
+  ``wait_before_close`` does. Shorter than the lease it makes Zenoh hang, so it is a little longer.
+  Large requests are sent from a thread of their own, so that ``call`` never blocks.
+- ``connect/timeout_ms`` stays at its default: 0 would mean one attempt and no other.
+- ``close`` can take ten seconds when a peer has vanished, so it runs aside and is not waited for.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import threading
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
+from time import monotonic
+
+import zenoh
+
+from holdfast.errors import InvalidValueError, TransportError
+from holdfast.runtime.endpoints import (
+    Endpoint,
+    ServiceAddress,
+    TlsFiles,
+    check_credentials,
+    free_port,
+    parse_endpoint,
+)
+from holdfast.runtime.transport.calls import (
+    DEFAULT_MAX_MESSAGE_BYTES,
+    CallTable,
+    Courier,
+    PendingCall,
+    too_large,
+)
+from holdfast.runtime.transport.contract import IncomingCall
+from holdfast.session.events import TransportEvent
+
+__all__ = ["KEY_VERSION", "ZenohRobotTransport", "ZenohServiceTransport"]
+
+KEY_VERSION = 1
+"""Of the keys. The messages have a version of their own, which can be told to the other end."""
+
+_RETRY_FIRST_MS = 50
+_RETRY_MAX_MS = 100
+"""A restarted service is reached again within about this time, however long it was away."""
+
+_OPEN_TIMEOUT_MS = 1000
+"""For the handshake of a link; without a bound, a QUIC peer takes 4 s to be reached again."""
+
+_BLOCKED_SEND_LEASES = 1.25
+"""A send that blocks so many leases long breaks the link. Below 1, Zenoh 1.10 hangs instead."""
+
+_SENT_AT_ONCE_BYTES = 32 * 1024
+"""Larger requests may fill the buffers of a link, and so block: they are sent from a thread."""
+
+_FREE_PORT_ATTEMPTS = 8
+
+_MAX_BOOTS = 64
+"""Incarnations of one service that a robot takes note of at the same time."""
+
+_MAX_ROBOTS = 4096
+"""Links that a service accepts at the same time."""
+
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
+
+
+class _Boot:
+    """One incarnation of a service, as a robot sees it."""
+
+    __slots__ = ("boot", "key")
+
+    def __init__(self, boot: str, key: zenoh.KeyExpr) -> None:
+        self.boot = boot
+        self.key = key
+
+
+class _Link:
+    """A session to one endpoint, and the incarnations that are seen there, the newest last."""
+
+    def __init__(self, service: str, address: ServiceAddress, endpoint: Endpoint) -> None:
+        self.service = service
+        self.address = address
+        self.endpoint = endpoint
+        self.session: zenoh.Session | None = None
+        self.boots: dict[str, _Boot] = {}
+        self.newest: _Boot | None = None
+        self.sender = Courier(f"holdfast-send-{service}")
+
+
+class _ZenohCall(PendingCall):
+    """A call in flight, and what is needed to break it off."""
+
+    __slots__ = ("cancellation", "sending_thread")
+
+    def __init__(self, number: int, peer: _Boot | None) -> None:
+        super().__init__(number, peer)
+        self.cancellation = zenoh.CancellationToken()
+        self.sending_thread = 0
+
+
+class ZenohRobotTransport:
+    """The robot's end: see :class:`~holdfast.runtime.transport.contract.RobotTransport`.
+
+    The callable that events are delivered to must not call the transport.
+
+    Parameters
+    ----------
+    services : mapping of str to ServiceAddress
+        Where each service is, by the robot's name for it.
+    lease_ms : float
+        A link over which nothing comes for this long is given up.
+    decision_timeout_ms : float
+        A call that takes longer than this is ended.
+    max_message_bytes : int
+        A larger request is refused here, a larger reply is dropped.
+    tls : TlsFiles or None
+        The robot's credentials, for ``tls`` and ``quic``.
+
+    Raises
+    ------
+    TransportError
+        If an endpoint cannot be used.
+    """
+
+    def __init__(
+        self,
+        services: Mapping[str, ServiceAddress],
+        *,
+        lease_ms: float = 400.0,
+        decision_timeout_ms: float = 60_000.0,
+        max_message_bytes: int = DEFAULT_MAX_MESSAGE_BYTES,
+        tls: TlsFiles | None = None,
+    ) -> None:
+        self._links: dict[str, _Link] = {}
+        for service, address in services.items():
+            endpoint = _checked(address.endpoint, tls, listens=address.listens)
+            if address.name is not None:
+                _check_name("name of a service", address.name)
+            if address.listens and endpoint.port == 0 and not endpoint.is_local_socket:
+                # Chosen now, so that a service can be told before it is launched.
+                endpoint = endpoint.with_port(free_port(endpoint))
+            self._links[service] = _Link(service, address, endpoint)
+        self._lease_ms = lease_ms
+        self._decision_timeout_s = decision_timeout_ms / 1e3
+        self._max_message_bytes = max_message_bytes
+        self._tls = tls
+        self._calls = CallTable()
+        self._courier = Courier("holdfast-robot-end")
+        self._closing: list[threading.Thread] = []
+
+    def endpoint_of(self, service: str) -> str:
+        """Return the endpoint of a service: for one that the robot listens for, where to connect.
+
+        Port 0 has been replaced by a free one.
+        """
+        return str(self._link(service).endpoint)
+
+    def start(self, deliver: Callable[[TransportEvent], None]) -> None:
+        """Begin to connect, and to deliver events; returns at once, connected or not.
+
+        Raises
+        ------
+        TransportError
+            If the robot cannot listen where it should.
+        """
+        self._calls.open(deliver)
+        try:
+            for link in self._links.values():
+                self._open(link)
+        except TransportError:
+            self.close()
+            raise
+
+    def call(self, service: str, call: int, payload: bytes) -> None:
+        """Send a request; never blocks."""
+        link = self._link(service)
+        with self._calls.lock:  # so that an incarnation does not vanish between these two lines
+            boot = link.newest
+            pending = _ZenohCall(call, boot)
+            if not self._calls.begin(pending):
+                return
+        if len(payload) > self._max_message_bytes:
+            self._courier.post(partial(self._refuse, pending, len(payload)))
+        elif boot is None:
+            self._courier.post(partial(self._calls.ended, pending))
+        elif len(payload) > _SENT_AT_ONCE_BYTES or not link.sender.is_idle:
+            link.sender.post(partial(self._send, link, boot, pending, payload))
+        else:
+            self._send(link, boot, pending, payload)
+
+    def abandon(self, call: int) -> None:
+        """Give a call up: nothing more of it is delivered, not even its end."""
+        pending = self._calls.abandon(call)
+        if isinstance(pending, _ZenohCall):
+            pending.cancellation.cancel()
+
+    def close(self, timeout_s: float = 1.0) -> None:
+        """Close all links, within about this time whatever the other ends do. May be repeated."""
+        deadline_s = monotonic() + timeout_s
+        self._calls.close()
+        with self._calls.lock:
+            sessions = [link.session for link in self._links.values() if link.session is not None]
+            for link in self._links.values():
+                link.session = None
+                link.newest = None
+                link.boots.clear()
+        self._closing += [_closed_aside(session) for session in sessions]
+        for courier in [self._courier, *(link.sender for link in self._links.values())]:
+            courier.stop(max(0.0, deadline_s - monotonic()))
+        for thread in self._closing:
+            thread.join(max(0.0, deadline_s - monotonic()))
+
+    def _link(self, service: str) -> _Link:
+        try:
+            return self._links[service]
+        except KeyError:
+            raise InvalidValueError(
+                f"service {service!r}: known are {sorted(self._links)}"
+            ) from None
+
+    def _open(self, link: _Link) -> None:
+        listens = link.address.listens
+        link.session, _ = _opened(
+            listen=[link.endpoint] if listens else [],
+            connect=[] if listens else [link.endpoint],
+            lease_ms=self._lease_ms,
+            max_message_bytes=self._max_message_bytes,
+            tls=self._tls,
+        )
+        name = link.address.name or "*"
+        link.session.liveliness().declare_subscriber(
+            f"holdfast/{KEY_VERSION}/{name}/*/alive",
+            zenoh.handlers.Callback(partial(self._token_changed, link), indirect=False),
+            history=True,
+        )
+
+    def _token_changed(self, link: _Link, sample: zenoh.Sample) -> None:
+        key = str(sample.key_expr)
+        boot = key.split("/")[3]
+        with self._calls.lock:
+            if sample.kind == zenoh.SampleKind.PUT:
+                if boot in link.boots or len(link.boots) >= _MAX_BOOTS:
+                    return
+                link.boots[boot] = link.newest = _Boot(
+                    boot, zenoh.KeyExpr(f"{key.removesuffix('/alive')}/decide")
+                )
+                self._calls.appeared(link.service, boot)
+                return
+            gone = link.boots.pop(boot, None)
+            if gone is None:
+                return
+            link.newest = next(reversed(link.boots.values()), None)
+            # Zenoh ends these calls too, but only when it gives up the link.
+            self._calls.vanished(link.service, boot, gone)
+
+    def _send(self, link: _Link, boot: _Boot, pending: _ZenohCall, payload: bytes) -> None:
+        session = link.session
+        if session is None or not self._calls.is_pending(pending):
+            return
+        pending.sending_thread = threading.get_ident()
+        try:
+            session.get(
+                boot.key,
+                zenoh.handlers.Callback(
+                    partial(self._replied, pending), partial(self._dropped, pending), indirect=False
+                ),
+                payload=payload,
+                consolidation=zenoh.ConsolidationMode.NONE,
+                timeout=self._decision_timeout_s,
+                express=True,
+                cancellation_token=pending.cancellation,
+            )
+        except zenoh.ZError:
+            self._courier.post(partial(self._calls.ended, pending))
+        finally:
+            pending.sending_thread = 0
+
+    def _replied(self, pending: _ZenohCall, reply: zenoh.Reply) -> None:
+        sample = reply.ok
+        if sample is None:
+            return  # Zenoh's own word that the time is up; the end follows.
+        payload = sample.payload
+        if len(payload) <= self._max_message_bytes:
+            self._calls.replied(pending, payload.to_bytes())
+
+    def _dropped(self, pending: _ZenohCall) -> None:
+        if pending.sending_thread == threading.get_ident():
+            # Nobody is there: Zenoh says so from inside get, where our caller may hold a lock.
+            self._courier.post(partial(self._calls.ended, pending))
+        else:
+            self._calls.ended(pending)
+
+    def _refuse(self, pending: _ZenohCall, size_bytes: int) -> None:
+        self._calls.replied(pending, too_large(size_bytes, self._max_message_bytes))
+        self._calls.ended(pending)
+
+
+class _ReceivedCall:
+    """A request as the service sees it."""
+
+    __slots__ = ("_ended", "_key", "_lock", "_payload", "_query", "_received")
+
+    def __init__(
+        self,
+        query: zenoh.Query,
+        received: zenoh.ZBytes | None,
+        key: zenoh.KeyExpr,
+        ended: Callable[[_ReceivedCall], None],
+    ) -> None:
+        self._query = query
+        self._received = received
+        self._key = key
+        self._ended = ended
+        self._lock = threading.Lock()
+        self._payload: bytes | None = None
+
+    @property
+    def payload(self) -> bytes:
+        """The request; copied when it is first asked for, which is not on Zenoh's thread."""
+        if self._payload is None:
+            self._payload = b"" if self._received is None else self._received.to_bytes()
+            self._received = None
+        return self._payload
+
+    def reply(self, payload: bytes) -> None:
+        """Send a reply. A robot that is gone is no error."""
+        with self._lock:
+            try:
+                self._query.reply(self._key, payload)
+            except zenoh.ZError:
+                return  # The call has ended, or the session is closed.
+
+    def end(self) -> None:
+        """End the call. May be repeated."""
+        with self._lock:
+            self._query.drop()
+        self._ended(self)
+
+
+class ZenohServiceTransport:
+    """The service's end: see :class:`~holdfast.runtime.transport.contract.ServiceTransport`.
+
+    Parameters
+    ----------
+    name : str
+        Under which robots know the service.
+    boot : str
+        Of this process; no other one may ever have had it.
+    listen, connect : sequence of str
+        Endpoints at which robots connect, and of robots that listen.
+    lease_ms : float
+        A link over which nothing comes for this long is given up.
+    max_message_bytes : int
+        A larger request is refused before it is copied. From twice that on it is dropped.
+    tls : TlsFiles or None
+        The service's credentials, for ``tls`` and ``quic``.
+
+    Raises
+    ------
+    TransportError
+        If an endpoint, the name or the boot cannot be used.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        *,
+        boot: str,
+        listen: Sequence[str] = (),
+        connect: Sequence[str] = (),
+        lease_ms: float = 400.0,
+        max_message_bytes: int = DEFAULT_MAX_MESSAGE_BYTES,
+        tls: TlsFiles | None = None,
+    ) -> None:
+        _check_name("name of a service", name)
+        _check_name("boot of a service", boot)
+        if not listen and not connect:
+            raise TransportError(
+                f"service {name} has no endpoint: give one, as in tcp/127.0.0.1:7447"
+            )
+        self._listen = [_checked(endpoint, tls, listens=True) for endpoint in listen]
+        self._connect = [_checked(endpoint, tls, listens=False) for endpoint in connect]
+        self._prefix = f"holdfast/{KEY_VERSION}/{name}/{boot}"
+        self._key = zenoh.KeyExpr(f"{self._prefix}/decide")
+        self._lease_ms = lease_ms
+        self._max_message_bytes = max_message_bytes
+        self._tls = tls
+        self._deliver: Callable[[IncomingCall], None] | None = None
+        self._calls: set[_ReceivedCall] = set()
+        self._state = threading.Condition()
+        self._deliveries = 0
+        self._session: zenoh.Session | None = None
+        self._token: zenoh.LivelinessToken | None = None
+        self._closing: threading.Thread | None = None
+        self._closed = False
+
+    @property
+    def endpoints(self) -> tuple[str, ...]:
+        """Where robots can connect; once started, with the ports that were free instead of 0."""
+        return tuple(str(endpoint) for endpoint in self._listen)
+
+    def start(self, deliver: Callable[[IncomingCall], None]) -> None:
+        """Listen, be seen, and deliver calls; returns when robots can connect.
+
+        Raises
+        ------
+        TransportError
+            If it cannot listen there; the message names the endpoint.
+        """
+        if self._closed or self._session is not None:
+            raise TransportError(f"service {self._prefix} was started before")
+        self._deliver = deliver
+        self._session, self._listen = _opened(
+            listen=self._listen,
+            connect=self._connect,
+            lease_ms=self._lease_ms,
+            max_message_bytes=self._max_message_bytes,
+            tls=self._tls,
+        )
+        # In this order: who sees the token must find the queryable.
+        self._session.declare_queryable(
+            self._key, zenoh.handlers.Callback(self._received, indirect=False)
+        )
+        self._token = self._session.liveliness().declare_token(f"{self._prefix}/alive")
+
+    def close(self, timeout_s: float = 1.0) -> None:
+        """Be seen no more, end all calls, and close all links. May be repeated."""
+        deadline_s = monotonic() + timeout_s
+        with self._state:
+            self._closed = True
+            self._deliver = None
+            self._state.wait_for(lambda: self._deliveries == 0, timeout_s)
+            calls = list(self._calls)
+            session, self._session = self._session, None
+            token, self._token = self._token, None
+        if session is not None:
+            self._closing = _closed_aside(session, partial(_take_leave, token, calls))
+        if self._closing is not None:
+            self._closing.join(max(0.0, deadline_s - monotonic()))
+
+    def _received(self, query: zenoh.Query) -> None:
+        payload = query.payload
+        if payload is not None and len(payload) > self._max_message_bytes:
+            with query:
+                query.reply(self._key, too_large(len(payload), self._max_message_bytes))
+            return
+        call = _ReceivedCall(query, payload, self._key, self._ended)
+        with self._state:
+            deliver = self._deliver
+            if deliver is not None:
+                self._calls.add(call)
+                self._deliveries += 1
+        if deliver is None:
+            call.end()
+            return
+        try:
+            # Not under the lock: a reply from in there can block while a robot does not read, and
+            # the other robots' calls are to come in meanwhile.
+            deliver(call)
+        finally:
+            with self._state:
+                self._deliveries -= 1
+                self._state.notify_all()
+
+    def _ended(self, call: _ReceivedCall) -> None:
+        with self._state:
+            self._calls.discard(call)
+
+
+def _take_leave(token: zenoh.LivelinessToken | None, calls: Iterable[_ReceivedCall]) -> None:
+    if token is not None:
+        token.undeclare()
+    for call in calls:
+        call.end()
+
+
+def _closed_aside(
+    session: zenoh.Session, before: Callable[[], object] | None = None
+) -> threading.Thread:
+    """Close a session on a thread that does not keep the process alive."""
+
+    def close() -> None:
+        try:
+            if before is not None:
+                before()
+            session.close()
+        except zenoh.ZError:
+            return  # It gave up after ten seconds; there is nothing that we could do better.
+
+    thread = threading.Thread(target=close, name="holdfast-close", daemon=True)
+    thread.start()
+    return thread
+
+
+def _checked(text: str, tls: TlsFiles | None, *, listens: bool) -> Endpoint:
+    endpoint = parse_endpoint(text)
+    check_credentials(endpoint, tls)
+    if not listens and endpoint.port == 0 and not endpoint.is_local_socket:
+        raise TransportError(
+            f"endpoint {endpoint}: port 0 is for listening; to connect, give the port, "
+            f"as in {endpoint.with_port(7447)}"
+        )
+    return endpoint
+
+
+def _check_name(what: str, name: str) -> None:
+    if not _NAME.fullmatch(name):
+        raise TransportError(
+            f"{what} {name!r}: allowed are 1 to 100 letters, digits, '_', '-' and '.', "
+            f"beginning with a letter or digit"
+        )
+
+
+def _opened(
+    *,
+    listen: list[Endpoint],
+    connect: list[Endpoint],
+    lease_ms: float,
+    max_message_bytes: int,
+    tls: TlsFiles | None,
+) -> tuple[zenoh.Session, list[Endpoint]]:
+    """Open a session; return it and where it listens."""
+    any_port = any(each.port == 0 and not each.is_local_socket for each in listen)
+    for attempt in range(_FREE_PORT_ATTEMPTS):
+        places = [
+            each if each.port or each.is_local_socket else each.with_port(free_port(each))
+            for each in listen
+        ]
+        configuration = _configuration(places, connect, lease_ms, max_message_bytes, tls)
+        try:
+            return zenoh.open(configuration), places
+        except zenoh.ZError as error:
+            # Somebody else may have taken the free port since.
+            if any_port and "os error 98" in str(error) and attempt < _FREE_PORT_ATTEMPTS - 1:
+                continue
+            where = ", ".join(map(str, places or connect))
+            verb = "listen on" if places else "connect to"
+            raise TransportError(f"cannot {verb} {where}: {_reason(error)}") from error
+    raise AssertionError  # not reached
+
+
+def _reason(error: zenoh.ZError) -> str:
+    """Return what a person can use of Zenoh's message, which names places in its source."""
+    text = str(error)
+    if "SocketStream" in text and "EAGAIN" in text:
+        return "another process listens there"
+    found = re.search(r"([^:\[\]]+) \(os error \d+\)", text)
+    return found[1].strip() if found else re.sub(r" at /\S+", "", text)
+
+
+def _configuration(
+    listen: list[Endpoint],
+    connect: list[Endpoint],
+    lease_ms: float,
+    max_message_bytes: int,
+    tls: TlsFiles | None,
+) -> zenoh.Config:
+    link: dict[str, object] = {
+        "protocols": sorted({endpoint.protocol for endpoint in [*listen, *connect]}),
+        "tx": {
+            "lease": round(lease_ms),
+            "queue": {
+                "congestion_control": {
+                    "block": {"wait_before_close": round(lease_ms * 1e3 * _BLOCKED_SEND_LEASES)}
+                }
+            },
+        },
+        # Twice, so that what is a little too large is answered with the reason.
+        "rx": {"max_message_size": 2 * max_message_bytes + 64 * 1024},
+    }
+    if tls is not None:
+        link["tls"] = {
+            "root_ca_certificate": str(tls.authority),
+            "listen_private_key": str(tls.key),
+            "listen_certificate": str(tls.certificate),
+            "connect_private_key": str(tls.key),
+            "connect_certificate": str(tls.certificate),
+            "enable_mtls": True,
+            "verify_name_on_connect": True,
+        }
+    retry = {
+        "period_init_ms": _RETRY_FIRST_MS,
+        "period_max_ms": _RETRY_MAX_MS,
+        "period_increase_factor": 2,
+    }
+    settings = {
+        "mode": "peer",
+        "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
+        "listen": {"endpoints": [str(endpoint) for endpoint in listen], "exit_on_failure": True},
+        "connect": {
+            "endpoints": [str(endpoint) for endpoint in connect],
+            "exit_on_failure": False,
+            "retry": retry,
+        },
+        "open": {"return_conditions": {"connect_scouted": False}},
+        "transport": {
+            "unicast": {
+                "open_timeout": _OPEN_TIMEOUT_MS,
+                "accept_timeout": _OPEN_TIMEOUT_MS,
+                "max_sessions": _MAX_ROBOTS,
+            },
+            "shared_memory": {"enabled": False},
+            "link": link,
+        },
+    }
+    return zenoh.Config.from_json5(json.dumps(settings))

@@ -1,0 +1,985 @@
+"""What every wire must do, over all of them; and what only processes and certificates can show.
+
+Waits are bounded by ``PATIENCE_S``, which is long: a test fails when something does not happen, not
+when a busy machine makes it happen late.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import datetime
+import ipaddress
+import json
+import os
+import queue
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Protocol
+
+import pytest
+
+from holdfast.errors import InvalidValueError, TransportError
+from holdfast.runtime.endpoints import PrivateSocket, ServiceAddress, TlsFiles
+from holdfast.runtime.transport.contract import IncomingCall, RobotTransport, ServiceTransport
+from holdfast.runtime.transport.in_process import InProcessNetwork
+from holdfast.runtime.transport.zenoh_transport import ZenohRobotTransport, ZenohServiceTransport
+from holdfast.session.events import Appeared, Ended, Replied, TransportEvent, Vanished
+from holdfast.session.messages import Refused, decode_reply
+
+PATIENCE_S = 30.0
+LEASE_MS = 400.0
+MAX_BYTES = 4_000_000
+TWO_MEGABYTES = 2_000_000
+
+
+class Inbox:
+    """Takes events, and lets a test wait for some."""
+
+    def __init__(self) -> None:
+        self.events: list[TransportEvent] = []
+        self.threads: list[int] = []
+        self._changed = threading.Condition()
+
+    def __call__(self, event: TransportEvent) -> None:
+        with self._changed:
+            self.events.append(event)
+            self.threads.append(threading.get_ident())
+            self._changed.notify_all()
+
+    def wait(self, condition: Callable[[list[TransportEvent]], bool]) -> list[TransportEvent]:
+        with self._changed:
+            if not self._changed.wait_for(lambda: condition(self.events), PATIENCE_S):
+                raise AssertionError(f"not in {PATIENCE_S} s; there were {self.events}")
+            return list(self.events)
+
+    def wait_for(self, *events: TransportEvent) -> None:
+        self.wait(lambda all_events: all(event in all_events for event in events))
+
+    def of_call(self, call: int) -> list[TransportEvent]:
+        """Wait for the end of a call and return what came of it."""
+        events = self.wait(lambda all_events: Ended(call) in all_events)
+        return [e for e in events if isinstance(e, Replied | Ended) and e.call == call]
+
+
+class Wire(Protocol):
+    """Makes ends that belong together; the fixture closes them."""
+
+    def robot(self, *services: str, max_message_bytes: int = MAX_BYTES) -> RobotTransport: ...
+
+    def service(self, name: str, boot: str) -> ServiceTransport: ...
+
+
+class InProcessWire:
+    def __init__(self) -> None:
+        self._network = InProcessNetwork(max_message_bytes=MAX_BYTES)
+        self.ends: list[RobotTransport | ServiceTransport] = []
+
+    def robot(self, *services: str, max_message_bytes: int = MAX_BYTES) -> RobotTransport:
+        robot = self._network.robot(services)
+        self.ends.append(robot)
+        return robot
+
+    def service(self, name: str, boot: str) -> ServiceTransport:
+        service = self._network.service(name, boot)
+        self.ends.append(service)
+        return service
+
+
+class ZenohWire:
+    """One endpoint for each name; either the services listen at it or the robot does."""
+
+    def __init__(
+        self,
+        protocol: str,
+        directory: Path,
+        *,
+        robot_tls: TlsFiles | None = None,
+        service_tls: TlsFiles | None = None,
+        robot_listens: bool = False,
+    ) -> None:
+        self._protocol = protocol
+        self._directory = directory
+        self._robot_tls = robot_tls
+        self._service_tls = service_tls
+        self._robot_listens = robot_listens
+        self._endpoints: dict[str, str] = {}
+        self.ends: list[RobotTransport | ServiceTransport] = []
+
+    def endpoint(self, name: str) -> str:
+        if name not in self._endpoints:
+            self._endpoints[name] = unused_endpoint(self._protocol, self._directory)
+        return self._endpoints[name]
+
+    def robot(self, *services: str, max_message_bytes: int = MAX_BYTES) -> ZenohRobotTransport:
+        robot = ZenohRobotTransport(
+            {name: ServiceAddress(self.endpoint(name), self._robot_listens) for name in services},
+            lease_ms=LEASE_MS,
+            decision_timeout_ms=PATIENCE_S * 1e3,
+            max_message_bytes=max_message_bytes,
+            tls=self._robot_tls,
+        )
+        self.ends.append(robot)
+        return robot
+
+    def service(self, name: str, boot: str) -> ZenohServiceTransport:
+        endpoints = [self.endpoint(name)]
+        service = ZenohServiceTransport(
+            name,
+            boot=boot,
+            listen=[] if self._robot_listens else endpoints,
+            connect=endpoints if self._robot_listens else [],
+            lease_ms=LEASE_MS,
+            max_message_bytes=MAX_BYTES,
+            tls=self._service_tls,
+        )
+        self.ends.append(service)
+        return service
+
+
+def unused_endpoint(protocol: str, directory: Path) -> str:
+    if protocol == "unixsock-stream":
+        return f"{protocol}/{directory}/{len(list(directory.iterdir()))}-{os.urandom(4).hex()}"
+    kind = socket.SOCK_DGRAM if protocol == "quic" else socket.SOCK_STREAM
+    with socket.socket(socket.AF_INET, kind) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"{protocol}/127.0.0.1:{probe.getsockname()[1]}"
+
+
+class Authority:
+    """Certifies, with keys that are made for the test."""
+
+    def __init__(self, directory: Path) -> None:
+        from cryptography import x509
+        from cryptography.hazmat.primitives.asymmetric import ec
+
+        self.directory = directory
+        directory.mkdir()
+        self._key = ec.generate_private_key(ec.SECP256R1())
+        self._name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, directory.name)])
+        self._certificate = self._certify(self._name, self._key.public_key(), is_authority=True)
+
+    def issue(self, name: str) -> TlsFiles:
+        from cryptography import x509
+        from cryptography.hazmat.primitives import serialization
+        from cryptography.hazmat.primitives.asymmetric import ec
+
+        key = ec.generate_private_key(ec.SECP256R1())
+        subject = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, name)])
+        certificate = self._certify(subject, key.public_key(), is_authority=False)
+        place = self.directory / name
+        place.mkdir()
+        files = TlsFiles(
+            place / "authority.pem",
+            place / "certificate.pem",
+            place / "key.pem",
+        )
+        pem = serialization.Encoding.PEM
+        files.authority.write_bytes(self._certificate.public_bytes(pem))
+        files.certificate.write_bytes(certificate.public_bytes(pem))
+        files.key.write_bytes(
+            key.private_bytes(pem, serialization.PrivateFormat.PKCS8, serialization.NoEncryption())
+        )
+        return files
+
+    def _certify(self, subject: object, public_key: object, *, is_authority: bool):  # type: ignore[no-untyped-def]
+        from cryptography import x509
+        from cryptography.hazmat.primitives import hashes
+
+        now = datetime.datetime.now(datetime.UTC)
+        usages = [x509.ExtendedKeyUsageOID.SERVER_AUTH, x509.ExtendedKeyUsageOID.CLIENT_AUTH]
+        names = [x509.DNSName("localhost"), x509.IPAddress(ipaddress.ip_address("127.0.0.1"))]
+        builder = (
+            x509.CertificateBuilder()
+            .subject_name(subject)  # type: ignore[arg-type]
+            .issuer_name(self._name)
+            .public_key(public_key)  # type: ignore[arg-type]
+            .serial_number(x509.random_serial_number())
+            .not_valid_before(now - datetime.timedelta(hours=1))
+            .not_valid_after(now + datetime.timedelta(days=1))
+            .add_extension(x509.BasicConstraints(ca=is_authority, path_length=None), critical=True)
+        )
+        if not is_authority:
+            builder = builder.add_extension(x509.ExtendedKeyUsage(usages), critical=False)
+            builder = builder.add_extension(x509.SubjectAlternativeName(names), critical=False)
+        return builder.sign(self._key, hashes.SHA256())
+
+
+@pytest.fixture(scope="session")
+def authority(tmp_path_factory: pytest.TempPathFactory) -> Authority:
+    return Authority(tmp_path_factory.mktemp("tls") / "authority")
+
+
+@pytest.fixture(scope="session")
+def robot_tls(authority: Authority) -> TlsFiles:
+    return authority.issue("robot")
+
+
+@pytest.fixture(scope="session")
+def service_tls(authority: Authority) -> TlsFiles:
+    return authority.issue("service")
+
+
+@pytest.fixture
+def socket_directory() -> Iterator[Path]:
+    """Pytest's own directories have paths too long for a socket."""
+    with PrivateSocket() as place:
+        yield Path(place.endpoint.removeprefix("unixsock-stream/")).parent
+
+
+WIRES = ["in_process", "tcp", "tls", "quic", "unixsock-stream", "robot_listens"]
+
+
+@pytest.fixture(params=WIRES)
+def wire(request: pytest.FixtureRequest, socket_directory: Path) -> Iterator[Wire]:
+    made: InProcessWire | ZenohWire
+    if request.param == "in_process":
+        made = InProcessWire()
+    elif request.param == "robot_listens":
+        made = ZenohWire("unixsock-stream", socket_directory, robot_listens=True)
+    elif request.param in ("tls", "quic"):
+        made = ZenohWire(
+            request.param,
+            socket_directory,
+            robot_tls=request.getfixturevalue("robot_tls"),
+            service_tls=request.getfixturevalue("service_tls"),
+        )
+    else:
+        made = ZenohWire(request.param, socket_directory)
+    yield made
+    for end in made.ends:
+        end.close()
+
+
+@pytest.fixture
+def tcp(socket_directory: Path) -> Iterator[ZenohWire]:
+    made = ZenohWire("tcp", socket_directory)
+    yield made
+    for end in made.ends:
+        end.close()
+
+
+def echo(call: IncomingCall) -> None:
+    call.reply(call.payload)
+    call.end()
+
+
+def silent(call: IncomingCall) -> None:
+    """Take a call and leave it open."""
+
+
+def connected(
+    wire: Wire, service: Callable[[IncomingCall], None] = echo, boot: str = "b1"
+) -> tuple[RobotTransport, Inbox, ServiceTransport]:
+    """Return both ends of one service, once the robot sees it."""
+    serving = wire.service("cloud", boot)
+    serving.start(service)
+    robot = wire.robot("cloud")
+    inbox = Inbox()
+    robot.start(inbox)
+    inbox.wait_for(Appeared("cloud", boot))
+    return robot, inbox, serving
+
+
+def restarted(wire: Wire, boot: str, reply: bytes) -> ServiceTransport:
+    """Start a service where one was closed in this very process; over QUIC its port lingers."""
+    until_s = time.monotonic() + PATIENCE_S
+    while True:
+        service = wire.service("cloud", boot)
+        try:
+            service.start(lambda call: (call.reply(reply), call.end())[0])
+        except TransportError:
+            if time.monotonic() > until_s:
+                raise
+            time.sleep(0.02)
+        else:
+            return service
+
+
+class TestEveryWire:
+    def test_a_call_brings_the_reply_and_one_end(self, wire: Wire) -> None:
+        robot, inbox, _ = connected(wire)
+        robot.call("cloud", 7, b"question")
+        assert inbox.of_call(7) == [Replied(7, b"question"), Ended(7)]
+
+    def test_several_replies_come_in_order(self, wire: Wire) -> None:
+        def count(call: IncomingCall) -> None:
+            for i in range(50):
+                call.reply(b"%d" % i)
+            call.end()
+
+        robot, inbox, _ = connected(wire, count)
+        robot.call("cloud", 1, b"")
+        expected: list[TransportEvent] = [Replied(1, b"%d" % i) for i in range(50)]
+        assert inbox.of_call(1) == [*expected, Ended(1)]
+
+    def test_replies_come_while_the_call_is_open(self, wire: Wire) -> None:
+        calls: queue.SimpleQueue[IncomingCall] = queue.SimpleQueue()
+        robot, inbox, _ = connected(wire, calls.put)
+        robot.call("cloud", 1, b"question")
+        call = calls.get(timeout=PATIENCE_S)
+        call.reply(b"first")
+        inbox.wait_for(Replied(1, b"first"))
+        assert Ended(1) not in inbox.events
+        call.reply(b"second")
+        call.end()
+        assert inbox.of_call(1) == [Replied(1, b"first"), Replied(1, b"second"), Ended(1)]
+
+    def test_what_comes_after_the_end_is_no_error_and_goes_nowhere(self, wire: Wire) -> None:
+        calls: queue.SimpleQueue[IncomingCall] = queue.SimpleQueue()
+        robot, inbox, _ = connected(wire, calls.put)
+        robot.call("cloud", 1, b"")
+        call = calls.get(timeout=PATIENCE_S)
+        call.end()
+        call.end()
+        call.reply(b"late")
+        robot.call("cloud", 2, b"")
+        echo(calls.get(timeout=PATIENCE_S))
+        assert inbox.of_call(2) == [Replied(2, b""), Ended(2)]
+        assert inbox.of_call(1) == [Ended(1)]
+
+    def test_an_absent_service_ends_a_call_from_another_thread(self, wire: Wire) -> None:
+        robot, inbox = wire.robot("cloud"), Inbox()
+        robot.start(inbox)
+        robot.call("cloud", 1, b"question")
+        assert inbox.of_call(1) == [Ended(1)]
+        assert threading.get_ident() not in inbox.threads
+
+    def test_a_service_that_starts_after_the_robot_appears(self, wire: Wire) -> None:
+        robot, inbox = wire.robot("cloud"), Inbox()
+        robot.start(inbox)
+        service = wire.service("cloud", "later")
+        service.start(echo)
+        inbox.wait_for(Appeared("cloud", "later"))
+        robot.call("cloud", 1, b"question")
+        assert inbox.of_call(1) == [Replied(1, b"question"), Ended(1)]
+
+    def test_a_service_that_has_appeared_can_be_called_at_once(self, wire: Wire) -> None:
+        service = wire.service("cloud", "b1")
+        robot = wire.robot("cloud")
+        appeared: queue.SimpleQueue[TransportEvent] = queue.SimpleQueue()
+        inbox = Inbox()
+
+        def deliver(event: TransportEvent) -> None:
+            appeared.put(event)
+            inbox(event)
+
+        robot.start(deliver)
+        service.start(echo)
+        assert appeared.get(timeout=PATIENCE_S) == Appeared("cloud", "b1")
+        robot.call("cloud", 1, b"question")
+        assert inbox.of_call(1) == [Replied(1, b"question"), Ended(1)]
+
+    def test_large_messages_both_ways(self, wire: Wire) -> None:
+        robot, inbox, _ = connected(wire)
+        payload = bytes(range(256)) * (TWO_MEGABYTES // 256)
+        robot.call("cloud", 1, payload)
+        robot.call("cloud", 2, b"small, while the large one is on its way")
+        assert inbox.of_call(1) == [Replied(1, payload), Ended(1)]
+        assert len(inbox.of_call(2)) == 2
+
+    def test_an_empty_message_is_a_message(self, wire: Wire) -> None:
+        robot, inbox, _ = connected(wire)
+        robot.call("cloud", 1, b"")
+        assert inbox.of_call(1) == [Replied(1, b""), Ended(1)]
+
+    def test_many_calls_at_once_from_several_threads(self, wire: Wire) -> None:
+        with ThreadPoolExecutor(4) as workers:
+
+            def work(call: IncomingCall) -> None:
+                workers.submit(lambda: (call.reply(b"first"), call.reply(call.payload), call.end()))
+
+            robot, inbox, _ = connected(wire, work)
+            threads = [
+                threading.Thread(
+                    target=lambda k=k: [  # type: ignore[misc]
+                        robot.call("cloud", number, b"%d" % number) for number in range(k, 200, 8)
+                    ]
+                )
+                for k in range(8)
+            ]
+            for thread in threads:
+                thread.start()
+            for thread in threads:
+                thread.join(PATIENCE_S)
+            for number in range(200):
+                assert inbox.of_call(number) == [
+                    Replied(number, b"first"),
+                    Replied(number, b"%d" % number),
+                    Ended(number),
+                ]
+
+    def test_nothing_comes_of_an_abandoned_call(self, wire: Wire) -> None:
+        calls: queue.SimpleQueue[IncomingCall] = queue.SimpleQueue()
+        robot, inbox, service = connected(wire, calls.put)
+        robot.call("cloud", 1, b"abandoned")
+        call = calls.get(timeout=PATIENCE_S)
+        robot.abandon(1)
+        robot.abandon(1)
+        robot.abandon(99)
+        echo(call)
+        robot.call("cloud", 2, b"other")
+        echo(calls.get(timeout=PATIENCE_S))
+        assert inbox.of_call(2) == [Replied(2, b"other"), Ended(2)]
+        service.close()
+        inbox.wait_for(Vanished("cloud", "b1"))
+        assert [e for e in inbox.events if isinstance(e, Replied | Ended) and e.call == 1] == []
+
+    def test_an_abandoned_number_can_be_used_again(self, wire: Wire) -> None:
+        calls: queue.SimpleQueue[IncomingCall] = queue.SimpleQueue()
+        robot, inbox, _ = connected(wire, calls.put)
+        robot.call("cloud", 1, b"old")
+        old = calls.get(timeout=PATIENCE_S)
+        robot.abandon(1)
+        robot.call("cloud", 1, b"new")
+        new = calls.get(timeout=PATIENCE_S)
+        echo(old)
+        echo(new)
+        assert inbox.of_call(1) == [Replied(1, b"new"), Ended(1)]
+
+    def test_a_service_that_closes_ends_the_calls_that_it_has(self, wire: Wire) -> None:
+        calls: queue.SimpleQueue[IncomingCall] = queue.SimpleQueue()
+        robot, inbox, service = connected(wire, calls.put)
+        for number in range(3):
+            robot.call("cloud", number, b"")
+        for _ in range(3):
+            calls.get(timeout=PATIENCE_S)
+        service.close()
+        inbox.wait_for(Vanished("cloud", "b1"))
+        for number in range(3):
+            assert inbox.of_call(number) == [Ended(number)]
+
+    def test_a_call_after_the_service_has_gone_ends(self, wire: Wire) -> None:
+        robot, inbox, service = connected(wire)
+        service.close()
+        inbox.wait_for(Vanished("cloud", "b1"))
+        robot.call("cloud", 1, b"question")
+        assert inbox.of_call(1) == [Ended(1)]
+
+    def test_a_restarted_service_is_another_one(self, wire: Wire) -> None:
+        robot, inbox, service = connected(wire)
+        for k in range(2, 5):
+            service.close()
+            inbox.wait_for(Vanished("cloud", f"b{k - 1}"))
+            service = restarted(wire, f"b{k}", b"%d" % k)
+            inbox.wait_for(Appeared("cloud", f"b{k}"))
+            robot.call("cloud", k, b"who?")
+            assert inbox.of_call(k) == [Replied(k, b"%d" % k), Ended(k)]
+        seen = [event for event in inbox.events if isinstance(event, Appeared | Vanished)]
+        boots = ["b1", "b2", "b3"]
+        there_and_gone = [event("cloud", boot) for boot in boots for event in (Appeared, Vanished)]
+        assert seen == [*there_and_gone, Appeared("cloud", "b4")]
+
+    def test_two_services_are_never_mixed(self, wire: Wire) -> None:
+        for name in ("east", "west"):
+            wire.service(name, "b1").start(
+                lambda call, name=name: (call.reply(name.encode()), call.end())  # type: ignore[misc]
+            )
+        robot, inbox = wire.robot("east", "west"), Inbox()
+        robot.start(inbox)
+        inbox.wait_for(Appeared("east", "b1"), Appeared("west", "b1"))
+        for number in range(40):
+            robot.call(("east", "west")[number % 2], number, b"who?")
+        for number in range(40):
+            name = ("east", "west")[number % 2].encode()
+            assert inbox.of_call(number) == [Replied(number, name), Ended(number)]
+
+    def test_one_of_two_services_vanishes_alone(self, wire: Wire) -> None:
+        services = {name: wire.service(name, "b1") for name in ("east", "west")}
+        for service in services.values():
+            service.start(silent)
+        robot, inbox = wire.robot("east", "west"), Inbox()
+        robot.start(inbox)
+        inbox.wait_for(Appeared("east", "b1"), Appeared("west", "b1"))
+        robot.call("east", 1, b"")
+        robot.call("west", 2, b"")
+        services["east"].close()
+        inbox.wait_for(Vanished("east", "b1"), Ended(1))
+        assert Vanished("west", "b1") not in inbox.events
+        assert Ended(2) not in inbox.events
+
+    def test_a_request_that_is_too_large_is_refused(self, wire: Wire) -> None:
+        robot, inbox, _ = connected(wire)
+        robot.call("cloud", 1, bytes(MAX_BYTES + 1))
+        replied, ended = inbox.of_call(1)
+        assert ended == Ended(1)
+        assert isinstance(replied, Replied)
+        refused = decode_reply(replied.payload)
+        assert isinstance(refused, Refused)
+        assert refused.code == "too_large"
+        assert str(MAX_BYTES) in refused.text
+        robot.call("cloud", 2, bytes(MAX_BYTES))
+        assert inbox.of_call(2) == [Replied(2, bytes(MAX_BYTES)), Ended(2)]
+
+    def test_a_reply_that_is_too_large_is_dropped(self, wire: Wire) -> None:
+        def answer(call: IncomingCall) -> None:
+            call.reply(bytes(MAX_BYTES + 1))
+            call.reply(b"small")
+            call.end()
+
+        robot, inbox, _ = connected(wire, answer)
+        robot.call("cloud", 1, b"")
+        assert inbox.of_call(1) == [Replied(1, b"small"), Ended(1)]
+
+    def test_a_robot_that_goes_hinders_nobody(self, wire: Wire) -> None:
+        if isinstance(wire, ZenohWire) and wire._robot_listens:
+            pytest.skip("only one robot can listen at an endpoint")
+        calls: queue.SimpleQueue[IncomingCall] = queue.SimpleQueue()
+        robot, _, _ = connected(wire, calls.put)
+        other, inbox = wire.robot("cloud"), Inbox()
+        other.start(inbox)
+        inbox.wait_for(Appeared("cloud", "b1"))
+        robot.call("cloud", 1, b"")
+        orphan = calls.get(timeout=PATIENCE_S)
+        robot.close()
+        orphan.reply(b"to nobody")
+        orphan.end()
+        other.call("cloud", 1, b"question")
+        echo(calls.get(timeout=PATIENCE_S))
+        assert inbox.of_call(1) == [Replied(1, b"question"), Ended(1)]
+
+    def test_a_robot_that_returns_sees_the_service(self, wire: Wire) -> None:
+        robot, _, _ = connected(wire)
+        robot.close()
+        again, inbox = wire.robot("cloud"), Inbox()
+        again.start(inbox)
+        inbox.wait_for(Appeared("cloud", "b1"))
+        again.call("cloud", 1, b"question")
+        assert inbox.of_call(1) == [Replied(1, b"question"), Ended(1)]
+
+    def test_a_closed_robot_delivers_nothing_more(self, wire: Wire) -> None:
+        calls: queue.SimpleQueue[IncomingCall] = queue.SimpleQueue()
+        robot, inbox, service = connected(wire, calls.put)
+        robot.call("cloud", 1, b"")
+        call = calls.get(timeout=PATIENCE_S)
+        robot.close()
+        robot.close()
+        before = list(inbox.events)
+        robot.call("cloud", 2, b"")
+        robot.abandon(1)
+        echo(call)
+        service.close()
+        service.close()
+        assert inbox.events == before == [Appeared("cloud", "b1")]
+
+    def test_a_closed_service_delivers_nothing_more(self, wire: Wire) -> None:
+        received = []
+        robot, inbox, service = connected(wire, lambda call: (received.append(1), echo(call))[0])
+        numbers = iter(range(1_000_000))
+        stop = threading.Event()
+
+        def flood() -> None:
+            while not stop.is_set():
+                robot.call("cloud", number := next(numbers), b"")
+                inbox.of_call(number)
+
+        thread = threading.Thread(target=flood)
+        thread.start()
+        try:
+            inbox.wait(lambda events: sum(isinstance(e, Replied) for e in events) > 20)
+            service.close()
+            at_close = len(received)
+            inbox.wait_for(Vanished("cloud", "b1"))
+        finally:
+            stop.set()
+            thread.join(PATIENCE_S)
+        assert len(received) == at_close
+
+    def test_ends_that_were_never_started_can_be_closed(self, wire: Wire) -> None:
+        robot, service = wire.robot("cloud"), wire.service("cloud", "b1")
+        for end in (robot, service):
+            end.close()
+            end.close()
+
+    def test_mistakes_of_the_caller_are_told(self, wire: Wire) -> None:
+        robot, inbox, _ = connected(wire, silent)
+        with pytest.raises(InvalidValueError, match=r"'elsewhere'.*cloud"):
+            robot.call("elsewhere", 1, b"")
+        robot.call("cloud", 1, b"")
+        with pytest.raises(InvalidValueError, match="call 1 is in flight"):
+            robot.call("cloud", 1, b"")
+        assert [e for e in inbox.events if isinstance(e, Ended)] == []
+
+
+class TestZenoh:
+    def test_port_0_becomes_a_port(self) -> None:
+        service = ZenohServiceTransport("cloud", boot="b1", listen=["tcp/127.0.0.1:0"])
+        service.start(echo)
+        robot, inbox = ZenohRobotTransport({"cloud": ServiceAddress(service.endpoints[0])}), Inbox()
+        with contextlib.closing(service), contextlib.closing(robot):
+            robot.start(inbox)
+            inbox.wait_for(Appeared("cloud", "b1"))
+        assert not service.endpoints[0].endswith(":0")
+
+    def test_a_listening_robot_knows_its_port_before_it_starts(self) -> None:
+        robot = ZenohRobotTransport({"local": ServiceAddress("tcp/127.0.0.1:0", listens=True)})
+        inbox = Inbox()
+        robot.start(inbox)
+        service = ZenohServiceTransport("r", boot="b1", connect=[robot.endpoint_of("local")])
+        with contextlib.closing(service), contextlib.closing(robot):
+            service.start(echo)
+            inbox.wait_for(Appeared("local", "b1"))
+
+    def test_a_name_that_was_asked_for_must_be_the_service_s(self, tcp: ZenohWire) -> None:
+        tcp.service("cloud", "b1").start(echo)
+        endpoint = tcp.endpoint("cloud")
+        robot = ZenohRobotTransport(
+            {
+                "right": ServiceAddress(endpoint, name="cloud"),
+                "wrong": ServiceAddress(endpoint, name="other"),
+            }
+        )
+        tcp.ends.append(robot)
+        inbox = Inbox()
+        robot.start(inbox)
+        inbox.wait_for(Appeared("right", "b1"))
+        robot.call("wrong", 1, b"")
+        assert inbox.of_call(1) == [Ended(1)]
+
+    def test_the_service_refuses_what_is_too_large_for_it(self, tcp: ZenohWire) -> None:
+        received: list[IncomingCall] = []
+        tcp.service("cloud", "b1").start(received.append)
+        robot, inbox = tcp.robot("cloud", max_message_bytes=2 * MAX_BYTES), Inbox()
+        robot.start(inbox)
+        inbox.wait_for(Appeared("cloud", "b1"))
+        robot.call("cloud", 1, bytes(MAX_BYTES + 1))
+        replied, _ = inbox.of_call(1)
+        assert isinstance(replied, Replied)
+        refused = decode_reply(replied.payload)
+        assert isinstance(refused, Refused)
+        assert refused.code == "too_large"
+        assert received == []
+
+    def test_a_call_that_takes_too_long_ends(self, tcp: ZenohWire) -> None:
+        tcp.service("cloud", "b1").start(silent)
+        address = ServiceAddress(tcp.endpoint("cloud"))
+        robot = ZenohRobotTransport({"cloud": address}, decision_timeout_ms=100.0)
+        tcp.ends.append(robot)
+        inbox = Inbox()
+        robot.start(inbox)
+        inbox.wait_for(Appeared("cloud", "b1"))
+        robot.call("cloud", 1, b"")
+        assert inbox.of_call(1) == [Ended(1)]
+        assert not any(isinstance(event, Vanished) for event in inbox.events)
+
+    def test_a_taken_port_is_an_error_that_names_it(self, tcp: ZenohWire) -> None:
+        tcp.service("cloud", "b1").start(echo)
+        endpoint = tcp.endpoint("cloud")
+        with pytest.raises(TransportError, match=f"cannot listen on {endpoint}: Address already"):
+            tcp.service("cloud", "b2").start(echo)
+
+    def test_one_bad_endpoint_of_two_is_an_error(self, tcp: ZenohWire) -> None:
+        taken, free = tcp.endpoint("taken"), tcp.endpoint("free")
+        tcp.service("taken", "b1").start(echo)
+        both = ZenohServiceTransport("both", boot="b1", listen=[free, taken])
+        tcp.ends.append(both)
+        with pytest.raises(TransportError, match="cannot listen on"):
+            both.start(echo)
+        tcp.service("free", "b1").start(echo)  # the first one was given back
+
+    def test_a_taken_socket_is_an_error_that_names_it(self, socket_directory: Path) -> None:
+        wire = ZenohWire("unixsock-stream", socket_directory)
+        wire.service("cloud", "b1").start(echo)
+        try:
+            with pytest.raises(TransportError, match=r"unixsock-stream/.*: another process"):
+                wire.service("cloud", "b2").start(echo)
+        finally:
+            for end in wire.ends:
+                end.close()
+
+    @pytest.mark.parametrize("bad", ["", "a/b", "a*", "a b", "x" * 101, "$x", "@x"])
+    def test_names_that_are_no_part_of_a_key_are_refused(self, bad: str) -> None:
+        with pytest.raises(TransportError, match="name of a service"):
+            ZenohServiceTransport(bad, boot="b1", listen=["tcp/127.0.0.1:0"])
+        with pytest.raises(TransportError, match="boot of a service"):
+            ZenohServiceTransport("cloud", boot=bad, listen=["tcp/127.0.0.1:0"])
+
+    def test_the_right_credentials_or_none(self, robot_tls: TlsFiles, tmp_path: Path) -> None:
+        with pytest.raises(TransportError, match=r"tls needs credentials.*--tls"):
+            ZenohRobotTransport({"cloud": ServiceAddress("tls/localhost:7447")})
+        with pytest.raises(TransportError, match=r"tcp does not use the credentials"):
+            ZenohRobotTransport({"cloud": ServiceAddress("tcp/localhost:7447")}, tls=robot_tls)
+        missing = TlsFiles(robot_tls.authority, tmp_path / "missing.pem", robot_tls.key)
+        with pytest.raises(TransportError, match=r"missing\.pem cannot be read: No such file"):
+            ZenohRobotTransport({"cloud": ServiceAddress("tls/localhost:7447")}, tls=missing)
+
+    def test_a_robot_connects_to_a_port_and_a_service_has_an_endpoint(self) -> None:
+        with pytest.raises(TransportError, match="port 0 is for listening"):
+            ZenohRobotTransport({"cloud": ServiceAddress("tcp/127.0.0.1:0")})
+        with pytest.raises(TransportError, match="has no endpoint"):
+            ZenohServiceTransport("cloud", boot="b1")
+
+    def test_robots_do_not_see_each_other(self, tcp: ZenohWire) -> None:
+        """A robot that plays the service's part fools only itself."""
+        import zenoh
+
+        tcp.service("cloud", "b1").start(echo)
+        settings = {
+            "mode": "peer",
+            "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
+            "listen": {"endpoints": []},
+            "connect": {"endpoints": [tcp.endpoint("cloud")]},
+        }
+        with zenoh.open(zenoh.Config.from_json5(json.dumps(settings))) as rogue:
+            answered = []
+            rogue.declare_queryable("holdfast/**", lambda query: answered.append(query))
+            rogue.liveliness().declare_token("holdfast/1/cloud/rogue/alive")
+            robot, inbox = tcp.robot("cloud"), Inbox()
+            robot.start(inbox)
+            inbox.wait_for(Appeared("cloud", "b1"))
+            for number in range(20):
+                robot.call("cloud", number, b"question")
+                assert inbox.of_call(number) == [Replied(number, b"question"), Ended(number)]
+            assert inbox.events[0] == Appeared("cloud", "b1")
+            assert Appeared("cloud", "rogue") not in inbox.events
+            assert answered == []
+
+
+@pytest.mark.parametrize("protocol", ["tls", "quic"])
+class TestCertificates:
+    def test_strangers_see_nothing(
+        self,
+        protocol: str,
+        robot_tls: TlsFiles,
+        service_tls: TlsFiles,
+        tmp_path: Path,
+        socket_directory: Path,
+    ) -> None:
+        foreign = Authority(tmp_path / "foreign").issue("robot")
+        # A stranger's certificate, but the right authority: it believes the service.
+        stranger = TlsFiles(robot_tls.authority, foreign.certificate, foreign.key)
+        wire = ZenohWire(protocol, socket_directory, robot_tls=robot_tls, service_tls=service_tls)
+        received: list[bytes] = []
+
+        def serve(call: IncomingCall) -> None:
+            received.append(call.payload)
+            echo(call)
+
+        wire.service("cloud", "b1").start(serve)
+        address = ServiceAddress(wire.endpoint("cloud"))
+        outsiders = [
+            ZenohRobotTransport({"cloud": address}, tls=files) for files in (foreign, stranger)
+        ]
+        inboxes = [Inbox() for _ in outsiders]
+        for outsider, inbox in zip(outsiders, inboxes, strict=True):
+            outsider.start(inbox)
+        bare = bare_session(protocol, address.endpoint, robot_tls.authority)
+        tokens: list[object] = []
+        bare.liveliness().declare_subscriber("**", tokens.append, history=True)
+        robot, inbox = wire.robot("cloud"), Inbox()
+        robot.start(inbox)
+        inbox.wait_for(Appeared("cloud", "b1"))
+        time.sleep(0.5)  # the others have had as many attempts as they like
+        for number, outsider in enumerate(outsiders):
+            outsider.call("cloud", number, b"stranger")
+            assert inboxes[number].of_call(number) == [Ended(number)]
+            assert inboxes[number].events == [Ended(number)]
+        assert list(bare.get("**", payload=b"bare", timeout=1.0)) == []
+        assert tokens == []
+        robot.call("cloud", 1, b"friend")
+        assert inbox.of_call(1) == [Replied(1, b"friend"), Ended(1)]
+        assert received == [b"friend"]
+        bare.close()
+        for end in (*outsiders, *wire.ends):
+            end.close()
+
+    def test_a_robot_does_not_believe_a_service_of_another_authority(
+        self, protocol: str, robot_tls: TlsFiles, tmp_path: Path, socket_directory: Path
+    ) -> None:
+        foreign = Authority(tmp_path / "foreign").issue("service")
+        wire = ZenohWire(protocol, socket_directory, robot_tls=robot_tls, service_tls=foreign)
+        wire.service("cloud", "b1").start(echo)
+        robot, inbox = wire.robot("cloud"), Inbox()
+        robot.start(inbox)
+        time.sleep(0.5)
+        assert inbox.events == []
+        for end in wire.ends:
+            end.close()
+
+
+def bare_session(protocol: str, endpoint: str, authority: Path):  # type: ignore[no-untyped-def]
+    """A client that knows the authority and has no certificate."""
+    import zenoh
+
+    settings = {
+        "mode": "client",
+        "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
+        "connect": {"endpoints": [endpoint], "timeout_ms": -1, "exit_on_failure": False},
+        "transport": {"link": {"tls": {"root_ca_certificate": str(authority)}}},
+    }
+    return zenoh.open(zenoh.Config.from_json5(json.dumps(settings)))
+
+
+SERVICE = """
+import sys
+from holdfast.runtime.transport.zenoh_transport import ZenohServiceTransport
+
+def serve(call):
+    if call.payload.startswith(b"echo"):
+        call.reply(call.payload)
+        call.end()
+    else:
+        call.reply(b"begun")  # and is never heard of again
+
+endpoint, boot, direction = sys.argv[1:]
+service = ZenohServiceTransport("cloud", boot=boot, **{direction: [endpoint]})
+service.start(serve)
+print("ready", flush=True)
+sys.stdin.read()
+service.close()
+"""
+
+
+@contextlib.contextmanager
+def service_process(
+    endpoint: str, boot: str, direction: str = "listen"
+) -> Iterator[subprocess.Popen[bytes]]:
+    process = subprocess.Popen(
+        [sys.executable, "-c", SERVICE, endpoint, boot, direction],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+    )
+    try:
+        assert process.stdout is not None
+        assert process.stdout.readline() == b"ready\n"
+        yield process
+    finally:
+        process.send_signal(signal.SIGCONT)
+        process.kill()
+        process.communicate()
+
+
+@pytest.mark.parametrize("kind", ["tcp", "unixsock-stream", "robot_listens"])
+class TestProcesses:
+    @pytest.fixture
+    def ends(self, kind: str, socket_directory: Path) -> Iterator[tuple[ZenohWire, str]]:
+        listens = kind == "robot_listens"
+        protocol = "unixsock-stream" if listens else kind
+        wire = ZenohWire(protocol, socket_directory, robot_listens=listens)
+        yield wire, "connect" if listens else "listen"
+        for end in wire.ends:
+            end.close()
+
+    def test_kill_in_mid_call_ends_the_call_and_the_next_process_is_seen(
+        self, ends: tuple[ZenohWire, str]
+    ) -> None:
+        wire, direction = ends
+        endpoint = wire.endpoint("cloud")
+        robot, inbox = wire.robot("cloud"), Inbox()
+        robot.start(inbox)
+        for k in range(3):
+            boot = f"b{k}"
+            with service_process(endpoint, boot, direction) as process:
+                inbox.wait_for(Appeared("cloud", boot))
+                robot.call("cloud", 2 * k, b"wait")
+                inbox.wait_for(Replied(2 * k, b"begun"))
+                process.kill()
+                inbox.wait_for(Vanished("cloud", boot))
+                assert inbox.of_call(2 * k) == [Replied(2 * k, b"begun"), Ended(2 * k)]
+                robot.call("cloud", 2 * k + 1, b"echo")
+                assert inbox.of_call(2 * k + 1) == [Ended(2 * k + 1)]
+
+    def test_a_stopped_process_is_lost_after_the_lease_and_found_again(
+        self, ends: tuple[ZenohWire, str]
+    ) -> None:
+        wire, direction = ends
+        endpoint = wire.endpoint("cloud")
+        robot, inbox = wire.robot("cloud"), Inbox()
+        robot.start(inbox)
+        with service_process(endpoint, "b1", direction) as process:
+            inbox.wait_for(Appeared("cloud", "b1"))
+            robot.call("cloud", 1, b"wait")
+            inbox.wait_for(Replied(1, b"begun"))
+            process.send_signal(signal.SIGSTOP)
+            inbox.wait_for(Vanished("cloud", "b1"), Ended(1))
+            robot.call("cloud", 2, b"echo")
+            assert inbox.of_call(2) == [Ended(2)]
+            process.send_signal(signal.SIGCONT)
+            inbox.wait(lambda events: events.count(Appeared("cloud", "b1")) == 2)
+            robot.call("cloud", 3, b"echo")
+            assert inbox.of_call(3) == [Replied(3, b"echo"), Ended(3)]
+
+    def test_a_large_request_to_a_stopped_process_ends_and_holds_nobody_up(
+        self, ends: tuple[ZenohWire, str]
+    ) -> None:
+        wire, direction = ends
+        endpoint = wire.endpoint("cloud")
+        robot, inbox = wire.robot("cloud", "idle"), Inbox()
+        wire.service("idle", "b1").start(echo)
+        robot.start(inbox)
+        with service_process(endpoint, "b1", direction) as process:
+            inbox.wait_for(Appeared("cloud", "b1"), Appeared("idle", "b1"))
+            process.send_signal(signal.SIGSTOP)
+            robot.call("cloud", 1, bytes(MAX_BYTES))  # more than the buffers of any link
+            robot.call("cloud", 2, b"echo")
+            robot.call("idle", 3, b"meanwhile")
+            assert inbox.of_call(3) == [Replied(3, b"meanwhile"), Ended(3)]
+            assert inbox.of_call(1) == [Ended(1)]
+            assert inbox.of_call(2) == [Ended(2)]
+            robot.call("cloud", 4, b"echo")
+            assert inbox.of_call(4) == [Ended(4)]
+            process.send_signal(signal.SIGCONT)
+            inbox.wait(lambda events: events.count(Appeared("cloud", "b1")) == 2)
+            robot.call("cloud", 5, b"echo")
+            assert inbox.of_call(5) == [Replied(5, b"echo"), Ended(5)]
+
+
+ROBOT_THAT_ENDS = """
+import sys, threading
+from holdfast.runtime.endpoints import ServiceAddress
+from holdfast.runtime.transport.zenoh_transport import ZenohRobotTransport
+from holdfast.session.events import Appeared, Ended
+
+seen = threading.Event()
+robot = ZenohRobotTransport({"cloud": ServiceAddress(sys.argv[1])})
+numbers = iter(range(10**9))
+
+def deliver(event):
+    if isinstance(event, Appeared):
+        seen.set()
+
+robot.start(deliver)
+assert seen.wait(30)
+
+def flood():
+    while True:
+        robot.call("cloud", next(numbers), b"echo")
+
+threading.Thread(target=flood, daemon=True).start()
+seen.clear()
+seen.wait(0.2)
+print("leaving", flush=True)
+if sys.argv[2] == "close":
+    robot.close(0.2)
+"""
+
+
+@pytest.mark.parametrize("manner", ["close", "leave"])
+@pytest.mark.parametrize("stopped", [False, True])
+def test_a_process_ends_quietly_whatever_its_links_do(
+    tcp: ZenohWire, manner: str, stopped: bool
+) -> None:
+    """With calls in flight, with or without ``close``, and with a peer that does not answer."""
+    endpoint = tcp.endpoint("cloud")
+    with service_process(endpoint, "b1") as service:
+        robot = subprocess.Popen(
+            [sys.executable, "-c", ROBOT_THAT_ENDS, endpoint, manner],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+        )
+        try:
+            assert robot.stdout is not None
+            if stopped:
+                time.sleep(0.1)
+                service.send_signal(signal.SIGSTOP)
+            _, errors = robot.communicate(timeout=PATIENCE_S)
+        finally:
+            robot.kill()
+            robot.communicate()
+        assert (robot.returncode, errors) == (0, b"")
