@@ -6,6 +6,7 @@ import contextlib
 import csv
 import json
 import sqlite3
+from dataclasses import replace
 from pathlib import Path
 
 import msgspec
@@ -34,6 +35,7 @@ from holdfast.recording.tables import (
 )
 from holdfast.runtime.trial import run_trial
 from holdfast.session.records import PausedRecord
+from holdfast.settings import EnvironmentSettings
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
@@ -391,6 +393,14 @@ class TestRunDirectory:
         assert load(out / "config.yaml").offload.services == ("tcp/127.0.0.1:1",)
         with RunDirectory.resume(out, configuration) as directory:
             assert directory.journal.survives == "process_crash"
+
+    def test_another_world_does_not_go_on_with_a_run(self, tmp_path: Path) -> None:
+        out = tmp_path / "out"
+        configuration = configuration_of(tmp_path)
+        RunDirectory.create(out, configuration).close()
+        robot = replace(configuration, environment=EnvironmentSettings(object="arm:Arm"))
+        with pytest.raises(OutputError, match=r"environment.* is not given there .*arm:Arm"):
+            RunDirectory.resume(out, robot)
 
     def test_a_damaged_journal_is_neither_resumed_nor_taken_over(self, tmp_path: Path) -> None:
         configuration = configuration_of(tmp_path)

@@ -47,8 +47,8 @@ SUMMARY_NAME = "summary.json"
 TIMINGS_NAME = "timings.csv"
 TRIALS_NAME = "trials.csv"
 
-# Which service decides, how soon it is given up, and which world is acted on change no decision.
-_SECTIONS_WITHOUT_DECISIONS = ("offload", "recovery", "environment")
+# Which service decides, and how soon it is given up, changes no decision.
+_SECTIONS_WITHOUT_DECISIONS = ("offload", "recovery")
 
 _MAX_SUFFIX = 10_000
 
@@ -353,7 +353,7 @@ def configuration_difference(first: str, second: str) -> tuple[str, str, str] | 
 
 
 def _compared(configuration: Any) -> Any:
-    """Leave out what changes no decision: the number of trials, who decides, where files lie."""
+    """Leave out what changes no decision: how many trials, who decides, where files lie."""
     if not isinstance(configuration, Mapping):
         return configuration
     left_out = ("problem_directory", *_SECTIONS_WITHOUT_DECISIONS)
@@ -362,6 +362,10 @@ def _compared(configuration: Any) -> Any:
         kept["simulator"] = {
             key: value for key, value in kept["simulator"].items() if key != "num_trials"
         }
+    # How a world is reached may change between two parts of a run; which one it is may not.
+    environment = kept.pop("environment", None)
+    if isinstance(environment, Mapping) and environment.get("object") is not None:
+        kept["environment"] = {"object": environment["object"]}
     return kept
 
 

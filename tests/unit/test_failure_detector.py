@@ -1,0 +1,72 @@
+"""What the failure detector believes, and what changes its mind."""
+
+from __future__ import annotations
+
+from holdfast.session.failure_detector import FailureDetector
+
+
+def present() -> FailureDetector:
+    detector = FailureDetector(0.25)
+    assert detector.appeared("a")
+    return detector
+
+
+def test_absent_until_its_token_is_seen() -> None:
+    detector = FailureDetector(0.25)
+    assert (detector.present, detector.trusted, detector.seen) == (False, False, False)
+    detector.appeared("a")
+    assert (detector.present, detector.trusted, detector.seen) == (True, True, True)
+
+
+def test_a_token_that_goes_takes_only_its_own_process() -> None:
+    detector = present()
+    assert not detector.vanished("b")
+    assert (detector.present, detector.seen) == (True, True)
+    assert detector.vanished("a")
+    assert (detector.present, detector.seen) == (False, True)
+
+
+def test_the_same_token_again_is_no_news() -> None:
+    detector = present()
+    detector.suspect("slow")
+    assert not detector.appeared("a")
+    assert detector.suspicion == "slow"
+    assert detector.appeared("b")
+    assert detector.suspicion is None
+
+
+def test_silence_counts_only_while_something_is_awaited() -> None:
+    detector = present()
+    assert detector.deadline() is None
+    assert not detector.fell_silent(1e9)
+    detector.asked(10.0)
+    assert detector.deadline() == 10.25
+    assert not detector.fell_silent(10.2)
+    assert detector.fell_silent(10.25)
+    assert detector.suspicion == "no sign of progress for 250 ms"
+    assert not detector.fell_silent(11.0), "suspected only once"
+    assert detector.deadline() is None
+
+
+def test_any_sign_moves_the_deadline_and_clears_a_suspicion() -> None:
+    detector = present()
+    detector.asked(0.0)
+    detector.heard(0.2)
+    assert not detector.fell_silent(0.4)
+    assert detector.fell_silent(0.45)
+    detector.heard(5.0)
+    assert detector.trusted
+    assert detector.deadline() == 5.25
+
+
+def test_several_awaited_things_are_one_silence() -> None:
+    detector = present()
+    detector.asked(0.0)
+    detector.asked(0.2)
+    assert detector.deadline() == 0.25
+    detector.settled()
+    assert detector.deadline() == 0.25
+    detector.settled()
+    assert detector.deadline() is None
+    detector.asked(9.0)
+    assert detector.deadline() == 9.25

@@ -1,0 +1,148 @@
+"""The codec: what goes in comes out, and what is no message is said to be none."""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from holdfast.session import messages
+from holdfast.session.messages import (
+    DIGEST_SIZE,
+    MAX_OBSERVATIONS,
+    MAX_TASK_ACTIONS,
+    PROTOCOL_VERSION,
+    Busy,
+    MessageError,
+    NeedState,
+    Observed,
+    Opening,
+    Progress,
+    Refused,
+    Reply,
+    Request,
+    SensingAnswer,
+    TaskAnswer,
+    decode_reply,
+    decode_request,
+    encode,
+    numbers_from,
+    numbers_to,
+)
+from holdfast.settings import PlanningSettings
+
+REQUEST = Request(
+    PROTOCOL_VERSION,
+    b"s" * 16,
+    3,
+    17,
+    2,
+    40,
+    True,
+    b"d" * DIGEST_SIZE,
+    (Observed(36, 1, numbers_to([1.0, 2.0])),),
+    Opening("peg_in_hole_2d", {"peg_width": 1.0}, {}, PlanningSettings(), 9),
+)
+REPLIES: list[Reply] = [
+    TaskAnswer(17, 2, numbers_to(np.arange(6.0)), 250),
+    SensingAnswer(17, 44, 2, b"e" * DIGEST_SIZE, 80),
+    Progress(17, True),
+    NeedState(17, False),
+    Busy(17, 30),
+    Refused(17, "stale_epoch", "epoch 1: epoch 2 was seen"),
+]
+
+
+def test_a_request_survives_the_wire() -> None:
+    assert decode_request(encode(REQUEST)) == REQUEST
+
+
+@pytest.mark.parametrize("reply", REPLIES, ids=lambda reply: type(reply).__name__)
+def test_a_reply_survives_the_wire(reply: Reply) -> None:
+    assert decode_reply(encode(reply)) == reply
+
+
+def test_another_version_is_named_even_if_its_fields_are_unknown() -> None:
+    other = msgspec.structs.replace(REQUEST, version=PROTOCOL_VERSION + 1)
+    for payload in (encode(other), msgspec.msgpack.encode([PROTOCOL_VERSION + 1, {"new": 1}])):
+        with pytest.raises(MessageError, match=f"version {PROTOCOL_VERSION + 1}") as raised:
+            decode_request(payload)
+        assert raised.value.code == "version"
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"session": b"short"},
+        {"epoch": -1},
+        {"step": 2**32},
+        {"digest": b"d" * 32},
+        {"observations": (Observed(1, 0, b""),) * (MAX_OBSERVATIONS + 1)},
+        {"checkpoint": b"a checkpoint and observations"},
+    ],
+)
+def test_a_request_out_of_bounds_is_malformed(change: dict[str, object]) -> None:
+    payload = encode(msgspec.structs.replace(REQUEST, **change))
+    with pytest.raises(MessageError) as raised:
+        decode_request(payload)
+    assert raised.value.code == "malformed"
+
+
+def test_hostile_settings_are_malformed() -> None:
+    fields = msgspec.msgpack.decode(encode(REQUEST))
+    fields[9][3]["particle_filter"]["num_particles"] = 10**12
+    with pytest.raises(MessageError):
+        decode_request(msgspec.msgpack.encode(fields))
+
+
+def test_a_task_answer_has_a_bounded_number_of_actions() -> None:
+    with pytest.raises(MessageError):
+        decode_reply(encode(TaskAnswer(1, MAX_TASK_ACTIONS + 1, b"", 1)))
+    with pytest.raises(MessageError):
+        decode_reply(encode(TaskAnswer(1, 0, b"", 1)))
+
+
+@given(st.binary(max_size=300))
+def test_any_bytes_decode_or_are_malformed(payload: bytes) -> None:
+    for decode in (decode_request, decode_reply):
+        try:
+            decode(payload)
+        except MessageError as error:
+            assert error.code in ("malformed", "version")
+
+
+@given(st.integers(0, len(encode(REQUEST)) - 1), st.integers(1, 255))
+def test_a_damaged_request_decodes_or_is_refused(position: int, flip: int) -> None:
+    payload = bytearray(encode(REQUEST))
+    payload[position] ^= flip
+    try:
+        decoded = decode_request(bytes(payload))
+    except MessageError:
+        return
+    assert decoded != REQUEST
+
+
+def test_deep_nesting_is_malformed() -> None:
+    for payload in (b"\x91" * 100_000, b"\x81\xa1a" * 100_000):
+        with pytest.raises(MessageError):
+            decode_request(payload)
+
+
+@given(st.lists(st.floats(allow_nan=False, allow_infinity=False), max_size=20))
+def test_numbers_keep_their_bits(numbers: list[float]) -> None:
+    data = numbers_to(numbers)
+    assert numbers_to(numbers_from(data, len(numbers))) == data
+
+
+@pytest.mark.parametrize("number", [np.nan, np.inf, -np.inf])
+def test_numbers_that_are_not_finite_are_refused(number: float) -> None:
+    with pytest.raises(MessageError):
+        numbers_from(numbers_to([0.0, number]), 2)
+    with pytest.raises(MessageError):
+        numbers_from(numbers_to([0.0]), 2)
+
+
+def test_every_message_is_listed() -> None:
+    assert {type(reply).__name__ for reply in REPLIES} < set(messages.__all__)
