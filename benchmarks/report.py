@@ -33,6 +33,9 @@ class Bar(NamedTuple):
     unit : str
     at_least : bool
         Whether the value must reach the limit; else it must not be above it.
+    percentile_99 : float or None
+        Where the value is a median and was taken often. The verdict is the median's; it says so if
+        the 99th percentile would have another.
     """
 
     what: str
@@ -40,20 +43,29 @@ class Bar(NamedTuple):
     limit: float
     unit: str
     at_least: bool = False
+    percentile_99: float | None = None
 
     @property
     def met(self) -> bool:
         """Whether the value is on the right side of the limit."""
         return self.value >= self.limit if self.at_least else self.value <= self.limit
 
-    def cells(self) -> list[str]:
-        """Return the bar as a row of a table."""
+    def _verdict(self) -> str:
+        if not self.met:
+            return "**miss**"
+        rare = self.percentile_99
+        return "pass" if rare is None or rare <= self.limit else "median passes"
+
+    def cells(self, command: str) -> list[str]:
+        """Return the bar as a row of a table, with the name of what measures it."""
         bound = "at least" if self.at_least else "at most"
         return [
             self.what,
             f"{self.value:.3g} {self.unit}".rstrip(),
+            "" if self.percentile_99 is None else f"{self.percentile_99:.3g} {self.unit}".rstrip(),
             f"{bound} {self.limit:g} {self.unit}".rstrip(),
-            "pass" if self.met else "**miss**",
+            self._verdict(),
+            command,
         ]
 
 
@@ -71,7 +83,7 @@ class Result(NamedTuple):
     bars: Sequence[Bar] = ()
 
 
-BARS_HEADER = ("what", "measured", "bar", "verdict")
+BARS_HEADER = ("what", "measured", "99 %", "bar", "verdict", "case")
 
 
 def milliseconds(seconds: float) -> str:

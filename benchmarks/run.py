@@ -24,7 +24,6 @@ from benchmarks.machine import describe, kernel_hash
 from benchmarks.measure import OtherLoad
 from benchmarks.report import (
     BARS_HEADER,
-    Bar,
     Result,
     Table,
     markdown_of,
@@ -93,7 +92,7 @@ def load_in_words(cores: float | None) -> str:
 def report(
     machine: dict[str, str],
     results: list[tuple[Case, Result, str]],
-    bars: list[Bar],
+    bars: list[list[str]],
     notes: list[str],
 ) -> str:
     """Return the report in Markdown."""
@@ -103,7 +102,8 @@ def report(
         "Timings are no tests: a miss here fails nothing.",
         *notes,
         "## Bars",
-        markdown_of(Table(BARS_HEADER, [bar.cells() for bar in bars])) if bars else "None here.",
+        "One of them alone: `python benchmarks/run.py --only CASE`.",
+        markdown_of(Table(BARS_HEADER, bars)) if bars else "None here.",
         "## Machine",
         markdown_of(Table(("", ""), [[name, value] for name, value in machine.items()])),
     ]
@@ -151,7 +151,7 @@ def main() -> None:
         console.rule(case.title)
         show(console, [*result.content, f"Meanwhile, {load}."])
 
-    bars = [bar for _, result, _ in results for bar in result.bars]
+    bars = [bar.cells(case.name) for case, result, _ in results for bar in result.bars]
     notes = []
     if options.quick:
         notes.append("**A quick run: few repetitions, rough numbers.**")
@@ -165,7 +165,7 @@ def main() -> None:
     show(console, notes)
     if bars:
         console.rule("Bars")
-        show(console, [Table(BARS_HEADER, [bar.cells() for bar in bars])])
+        show(console, [Table(BARS_HEADER, bars)])
     if output is not None:
         write_atomically(output, report(machine, results, bars, notes))
         console.print(f"written to {output}", highlight=False)

@@ -58,6 +58,7 @@ class Robot:
     def __init__(self, options):
         self.options, self.silent_at = options, options.silent_at
         self.trial, self.performed, self.reward, self.pose = 0, 0, 0.0, START
+        options.directory.mkdir(parents=True, exist_ok=True)
         self.log = options.directory / "performed.log"
         if self.log.exists() and (lines := self.log.read_text().splitlines()):
             self.__dict__.update(json.loads(lines[-1])["after"])

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import shlex
 import subprocess
 import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -32,27 +34,55 @@ def clone(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return directory
 
 
+ENVIRONMENT = {**os.environ, "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
+
+
 def run(command: list[str], directory: Path) -> subprocess.CompletedProcess[str]:
-    environment = {**os.environ, "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
     return subprocess.run(
-        command, cwd=directory, env=environment, capture_output=True, text=True, timeout=240
+        command, cwd=directory, env=ENVIRONMENT, capture_output=True, text=True, timeout=240
     )
+
+
+@contextlib.contextmanager
+def in_background() -> Iterator[Callable[[list[str], Path], None]]:
+    """Start what a command line ends in ``&`` for, wait until it has said something, and end it."""
+    started: list[subprocess.Popen[str]] = []
+
+    def start(command: list[str], directory: Path) -> None:
+        process = subprocess.Popen(
+            command, cwd=directory, env=ENVIRONMENT, stdout=subprocess.PIPE, text=True
+        )
+        started.append(process)
+        assert process.stdout is not None
+        assert process.stdout.readline(), f"{command} ended without a word"
+
+    try:
+        yield start
+    finally:
+        for process in started:
+            process.terminate()
+            process.communicate(timeout=30)
 
 
 def test_every_command_is_known() -> None:
     """So that a command of another kind gets a test of its own."""
     for command in COMMANDS:
-        assert command.startswith(("holdfast ", "make ", "git clone ")), command
+        assert command.startswith(("holdfast ", "make ", "git clone ", "python ")), command
     assert sum(command.startswith("holdfast ") for command in COMMANDS) >= 3
     assert len(PROGRAMS) >= 2
 
 
 def test_holdfast_commands(clone: Path) -> None:
-    for command in COMMANDS:
-        if not command.startswith("holdfast "):
-            continue
-        done = run(shlex.split(command), clone)
-        assert done.returncode == 0, f"{command}\n{done.stdout}{done.stderr}"
+    with in_background() as start:
+        for command in COMMANDS:
+            if not command.startswith(("holdfast ", "python ")):
+                continue
+            words = shlex.split(command)
+            if words[-1] == "&":
+                start(words[:-1], clone)
+                continue
+            done = run(words, clone)
+            assert done.returncode == 0, f"{command}\n{done.stdout}{done.stderr}"
     for name in ("trials.csv", "summary.json", "config.yaml", "journal.sqlite", "trial.png"):
         assert (clone / "runs" / "first" / name).stat().st_size > 0
 

@@ -13,6 +13,7 @@ import typer
 
 from holdfast import __version__
 from holdfast.cli.compare import compare
+from holdfast.cli.demo import demo
 from holdfast.cli.endings import EXIT_ERROR
 from holdfast.cli.keys import keys
 from holdfast.cli.run import run
@@ -44,6 +45,7 @@ app.command(
         "help_option_names": [],
     },
 )(serve)
+app.command(short_help="See a cloud and a robot killed, and no decision change.")(demo)
 app.command(no_args_is_help=True, short_help="Tell whether two runs decided the same.")(compare)
 app.command(no_args_is_help=True, short_help="Make keys for robots and services.")(keys)
 

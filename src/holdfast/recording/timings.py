@@ -7,6 +7,8 @@ when the run goes on.
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 from holdfast.files import OutputError
@@ -23,16 +25,21 @@ TIMING_COLUMNS = (
     "waited_ms",
     "round_trip_ms",
     "computed_ms",
+    "time",
 )
 
 
 class TimingTable:
     """The file ``timings.csv`` of a run, open for more rows.
 
+    The last column says when the decision was carried out, as ``events.jsonl`` writes times.
+
     Parameters
     ----------
     path : Path
         Appended to if it is there.
+    clock : callable
+        Returns nanoseconds since the epoch.
 
     Raises
     ------
@@ -40,8 +47,9 @@ class TimingTable:
         If it cannot be written.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, clock: Callable[[], int] = time.time_ns) -> None:
         self._path = path
+        self._clock = clock
         try:
             if path.exists():
                 _cut_off_unfinished_line(path)
@@ -62,10 +70,13 @@ class TimingTable:
         service = timing.service.replace('"', '""')
         if any(character in service for character in ',"\n'):
             service = f'"{service}"'
+        seconds, rest_ns = divmod(self._clock(), 1_000_000_000)
+        moment = time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime(seconds))
         try:
             self._file.write(
                 f"{timing.trial},{timing.step},{timing.kind},{service},{timing.status},"
-                f"{timing.waited_ms:.3f},{timing.round_trip_ms:.3f},{timing.computed_ms:.3f}\n"
+                f"{timing.waited_ms:.3f},{timing.round_trip_ms:.3f},{timing.computed_ms:.3f},"
+                f"{moment}.{rest_ns // 1000:06d}Z\n"
             )
         except OSError as error:
             raise OutputError(f"{self._path}: cannot be written: {error.strerror}") from error

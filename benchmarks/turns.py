@@ -1,0 +1,268 @@
+"""A robot's questions and their right answers, made before anything is asked.
+
+A *turn* is what a robot asks at a time: from a state on, the task actions up to the next sensing
+step and the sensing action there. Trials are run in process, with the same planning functions that
+a service uses but none of its code; so whatever a service answers can be held against it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from queue import SimpleQueue
+from time import perf_counter
+from typing import NamedTuple
+
+from benchmarks.beliefs import MAX_STEPS, SEED
+from holdfast.configuration import Configuration
+from holdfast.planning import (
+    PlanningState,
+    advance,
+    choose_sensing_action,
+    choose_task_action,
+    digest,
+    encode_checkpoint,
+    initial_state,
+    needs_sensing,
+    observe,
+)
+from holdfast.problems.problem import Problem
+from holdfast.runtime.endpoints import ServiceAddress
+from holdfast.runtime.environment import SimulatedEnvironment
+from holdfast.runtime.transport.zenoh_transport import ZenohRobotTransport
+from holdfast.session.events import Appeared, Ended, Replied, TransportEvent
+from holdfast.session.messages import (
+    DIGEST_SIZE,
+    PROTOCOL_VERSION,
+    Observed,
+    Opening,
+    Reply,
+    Request,
+    SensingAnswer,
+    TaskAnswer,
+    decode_reply,
+    encode,
+    numbers_to,
+)
+from holdfast.settings import PlanningSettings
+
+__all__ = ["Asked", "Asker", "Turn", "decided_in_process", "opening_of", "recorded_turns"]
+
+_PATIENCE_S = 30.0
+
+
+class Turn(NamedTuple):
+    """A question and its answer.
+
+    Attributes
+    ----------
+    state : PlanningState
+        In which it is asked: before the first sensing action of a trial, else after one.
+    digest : bytes
+        Of the state, as it is sent.
+    checkpoint : bytes
+    observations : tuple of Observed
+        All of the trial that led to the state.
+    before : PlanningState or None
+        Before the last of them.
+    actions : bytes
+        The task actions up to the next sensing step.
+    sensing_step : int
+    sensing_state : PlanningState
+        At that step.
+    sensing_digest : bytes
+        Of that state.
+    sensing_action : int
+    """
+
+    state: PlanningState
+    digest: bytes
+    checkpoint: bytes
+    observations: tuple[Observed, ...]
+    before: PlanningState | None
+    actions: bytes
+    sensing_step: int
+    sensing_state: PlanningState
+    sensing_digest: bytes
+    sensing_action: int
+
+    def is_right(self, reply: TaskAnswer | SensingAnswer) -> bool:
+        """Tell whether a part of an answer is the one that was made in process."""
+        if isinstance(reply, TaskAnswer):
+            return reply.actions == self.actions
+        return (reply.step, reply.sensing_action, reply.digest) == (
+            self.sensing_step,
+            self.sensing_action,
+            self.sensing_digest,
+        )
+
+
+def recorded_turns(problem: Problem, settings: PlanningSettings, trial: int) -> list[Turn]:
+    """Run a trial in process and return all questions that its robot would ask."""
+    environment = SimulatedEnvironment(problem, SEED, trial)
+    state = initial_state(problem, settings, SEED, trial)
+    observations: tuple[Observed, ...] = ()
+    turns = [_turn(problem, settings, state, observations, None)]
+    while not environment.is_done() and state.step < MAX_STEPS:
+        if needs_sensing(settings, state):
+            before, sensing_action = state, turns[-1].sensing_action
+            observation = environment.perform_sensing(sensing_action)
+            state, _ = observe(problem, settings, state, sensing_action, observation)
+            last = Observed(state.step, sensing_action, numbers_to(observation))
+            observations = (*observations, last)
+            turns.append(_turn(problem, settings, state, observations, before))
+        action, _ = choose_task_action(problem, settings, state)
+        environment.perform(action)
+        state = advance(problem, settings, state, action)
+    return turns
+
+
+def _turn(
+    problem: Problem,
+    settings: PlanningSettings,
+    state: PlanningState,
+    observations: tuple[Observed, ...],
+    before: PlanningState | None,
+) -> Turn:
+    ahead, actions = _rolled(problem, settings, state)
+    sensing_action, _ = choose_sensing_action(problem, settings, ahead)
+    return Turn(
+        state,
+        digest(state)[:DIGEST_SIZE],
+        encode_checkpoint(state),
+        observations,
+        before,
+        b"".join(actions),
+        ahead.step,
+        ahead,
+        digest(ahead)[:DIGEST_SIZE],
+        sensing_action,
+    )
+
+
+def _rolled(
+    problem: Problem, settings: PlanningSettings, state: PlanningState
+) -> tuple[PlanningState, list[bytes]]:
+    """Return the state at the next sensing step, and the task actions that lead there."""
+    actions = []
+    while not needs_sensing(settings, state):
+        action, _ = choose_task_action(problem, settings, state)
+        state = advance(problem, settings, state, action)
+        actions.append(numbers_to(action))
+    return state, actions
+
+
+def decided_in_process(
+    problem: Problem, settings: PlanningSettings, turn: Turn
+) -> Callable[[], object]:
+    """Return a call that computes what a service computes for a turn, and nothing else."""
+
+    def decide() -> object:
+        state = turn.state
+        if turn.before is not None:
+            last = turn.observations[-1]
+            seen = _numbers(last.observation)
+            state, _ = observe(problem, settings, turn.before, last.sensing_action, seen)
+        ahead, actions = _rolled(problem, settings, state)
+        return actions, choose_sensing_action(problem, settings, ahead)
+
+    return decide
+
+
+def _numbers(data: bytes) -> Sequence[float]:
+    return memoryview(data).cast("d").tolist()
+
+
+def opening_of(configuration: Configuration) -> Opening:
+    """Return what a service is told of a robot's run."""
+    return Opening(
+        configuration.problem_name,
+        dict(configuration.model),
+        dict(configuration.state_space_planner),
+        configuration.planning,
+        configuration.simulator.seed,
+    )
+
+
+class Asked(NamedTuple):
+    """An answer, and the seconds from before its question was encoded until it was decoded.
+
+    Attributes
+    ----------
+    task, sensing : TaskAnswer, SensingAnswer or None
+    task_s, sensing_s : float
+        Until that part was there; 0 if it was none.
+    """
+
+    task: TaskAnswer | None
+    sensing: SensingAnswer | None
+    task_s: float
+    sensing_s: float
+
+
+class Asker:
+    """Asks one service one question at a time, over the robot's own end of the wire.
+
+    Parameters
+    ----------
+    endpoint : str
+    opening : Opening
+    session : bytes
+        Of 16 bytes.
+    """
+
+    def __init__(self, endpoint: str, opening: Opening, session: bytes) -> None:
+        self._events: SimpleQueue[TransportEvent] = SimpleQueue()
+        self._transport = ZenohRobotTransport({endpoint: ServiceAddress(endpoint)})
+        self._endpoint = endpoint
+        self._opening: Opening | None = opening
+        self._session = session
+        self._number = 0
+
+    def __enter__(self) -> Asker:
+        self._transport.start(self._events.put)
+        while not isinstance(self._events.get(timeout=_PATIENCE_S), Appeared):
+            pass
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._transport.close()
+
+    def ask(
+        self,
+        state: PlanningState,
+        state_digest: bytes,
+        observations: tuple[Observed, ...] = (),
+        checkpoint: bytes | None = None,
+    ) -> Asked:
+        """Ask, and wait for the end of the call."""
+        self._number += 1
+        task: TaskAnswer | None = None
+        sensing: SensingAnswer | None = None
+        task_s = sensing_s = 0.0
+        start = perf_counter()
+        request = Request(
+            PROTOCOL_VERSION,
+            self._session,
+            1,
+            self._number,
+            state.trial,
+            state.step,
+            state.sensed,
+            state_digest,
+            observations,
+            self._opening,
+            checkpoint,
+        )
+        self._transport.call(self._endpoint, self._number, encode(request))
+        while True:
+            event = self._events.get(timeout=_PATIENCE_S)
+            if isinstance(event, Replied):
+                reply: Reply = decode_reply(event.payload)
+                if isinstance(reply, TaskAnswer):
+                    task, task_s = reply, perf_counter() - start
+                elif isinstance(reply, SensingAnswer):
+                    sensing, sensing_s = reply, perf_counter() - start
+            elif isinstance(event, Ended):
+                break
+        self._opening = None
+        return Asked(task, sensing, task_s, sensing_s)

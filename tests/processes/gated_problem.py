@@ -1,0 +1,42 @@
+"""A problem whose computing can be watched, and held, from outside the process that computes.
+
+With the variable ``HOLDFAST_TEST_GATE`` (a port) in its environment, a process says so before each
+of the problem's longer computations and goes on when it is told to. Without it, it is the peg.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+
+import numpy as np
+import numpy.typing as npt
+
+from holdfast.problems.peg_in_hole_2d import PegInHole2D
+
+FloatArray = npt.NDArray[np.float64]
+
+VARIABLE = "HOLDFAST_TEST_GATE"
+
+
+class GatedPeg(PegInHole2D):
+    """The peg in the plane, with a gate before whatever is computed on many particles."""
+
+    name = "gated_peg"
+
+    def policy(self, states: FloatArray, stage: int) -> FloatArray:
+        if len(states) > 1:
+            _pass("policy")
+        return super().policy(states, stage)
+
+    def observation_mean(self, states: FloatArray, sensing_action: int) -> FloatArray:
+        _pass("observation_mean")
+        return super().observation_mean(states, sensing_action)
+
+
+def _pass(what: str) -> None:
+    port = os.environ.get(VARIABLE)
+    if port is not None:
+        with socket.create_connection(("127.0.0.1", int(port))) as gate:
+            gate.sendall(f"{what} {os.getpid()}\n".encode())
+            gate.recv(1)

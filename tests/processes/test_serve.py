@@ -1,0 +1,508 @@
+"""``holdfast serve`` as a robot and an operator meet it: real processes, sockets and signals."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+from queue import SimpleQueue
+from typing import Any
+
+import msgspec
+import pytest
+from tests.unit.test_session_service import Robot, content, planning_of
+
+from holdfast.runtime.endpoints import PrivateSocket, ServiceAddress, TlsFiles
+from holdfast.runtime.transport.zenoh_transport import ZenohRobotTransport
+from holdfast.session.events import Appeared, Ended, Replied, TransportEvent, Vanished
+from holdfast.session.messages import (
+    NeedState,
+    Progress,
+    Refused,
+    Reply,
+    SensingAnswer,
+    decode_reply,
+    encode,
+)
+
+PATIENCE_S = 30.0
+COMMAND = [sys.executable, "-m", "holdfast", "serve"]
+ANYWHERE = ["--listen", "tcp/127.0.0.1:0"]
+
+# Computes in Python until a file appears, and never sleeps: nothing but the interpreter's own
+# switching lets other threads run meanwhile.
+BUSY = """
+from pathlib import Path
+
+from holdfast.problems.capsule_robot import CapsuleRobot
+
+
+class Busy(CapsuleRobot):
+    name = "busy"
+
+    def policy(self, states, stage):
+        Path("begun").touch()
+        while not Path("let_go").exists():
+            pass
+        return super().policy(states, stage)
+"""
+
+
+class Served:
+    """A running service, ready."""
+
+    def __init__(
+        self, *arguments: str, directory: Path | None = None, ready: bool = True, **popen: Any
+    ) -> None:
+        self.process = subprocess.Popen(
+            [*COMMAND, *arguments],
+            cwd=directory,
+            stdin=popen.pop("stdin", subprocess.DEVNULL),
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            **popen,
+        )
+        self.ready_line = ""
+        if ready:
+            assert self.process.stdout is not None
+            self.ready_line = self.process.stdout.readline()
+            assert self.ready_line, self.process.communicate(timeout=PATIENCE_S)[1]
+
+    @property
+    def endpoint(self) -> str:
+        return self.ready_line.split()[-1]
+
+    def end(self, number: int = signal.SIGTERM) -> tuple[int, str]:
+        """Send a signal; return the exit code and the log."""
+        self.process.send_signal(number)
+        _, log = self.process.communicate(timeout=PATIENCE_S)
+        return self.process.returncode, log
+
+
+@contextlib.contextmanager
+def served(*arguments: str, **options: Any) -> Iterator[Served]:
+    service = Served(*arguments, **options)
+    try:
+        yield service
+    finally:
+        service.process.kill()
+        service.process.wait(PATIENCE_S)
+        for stream in (service.process.stdin, service.process.stdout, service.process.stderr):
+            if stream is not None:
+                stream.close()
+
+
+class End:
+    """A robot's end of the wire."""
+
+    def __init__(
+        self,
+        endpoint: str,
+        *,
+        listens: bool = False,
+        tls: TlsFiles | None = None,
+        name: str | None = None,
+    ) -> None:
+        self.events: SimpleQueue[TransportEvent] = SimpleQueue()
+        address = ServiceAddress(endpoint, listens=listens, name=name)
+        self.transport = ZenohRobotTransport({"service": address}, tls=tls)
+        self.transport.start(self.events.put)
+        self.calls = 0
+
+    def appeared(self) -> str:
+        event = self.events.get(timeout=PATIENCE_S)
+        assert isinstance(event, Appeared), event
+        return event.boot
+
+    def send(self, payload: bytes) -> int:
+        self.calls += 1
+        self.transport.call("service", self.calls, payload)
+        return self.calls
+
+    def ask(self, payload: bytes) -> list[Reply]:
+        self.send(payload)
+        return self.collect()
+
+    def collect(self) -> list[Reply]:
+        replies = []
+        while not isinstance(event := self.events.get(timeout=PATIENCE_S), Ended):
+            assert isinstance(event, Replied), event
+            replies.append(decode_reply(event.payload))
+        return replies
+
+
+@contextlib.contextmanager
+def robots_end(endpoint: str, **options: Any) -> Iterator[End]:
+    end = End(endpoint, **options)
+    try:
+        yield end
+    finally:
+        end.transport.close()
+
+
+def run_turns(end: End, robot: Robot, turns: int) -> None:
+    for _ in range(turns):
+        request = robot.request(since=max(0, len(robot.observed) - 1))
+        assert content(end.ask(encode(request))) == robot.right_answer()
+        robot.act_until_sensing()
+        robot.sense()
+
+
+def refused_to_start(*arguments: str) -> str:
+    done = subprocess.run(
+        [*COMMAND, *arguments], capture_output=True, text=True, timeout=PATIENCE_S
+    )
+    assert done.returncode == 2, done
+    assert done.stdout == ""
+    assert "Traceback" not in done.stderr
+    return done.stderr
+
+
+class TestServing:
+    def test_decides_as_the_planner_does(self) -> None:
+        with served(*ANYWHERE) as service:
+            assert service.ready_line.startswith(
+                "cloud_active_sensing is listening on tcp/127.0.0.1:"
+            )
+            with robots_end(service.endpoint, name="cloud_active_sensing") as end:
+                end.appeared()
+                run_turns(end, Robot("peg_in_hole_2d"), 4)
+                assert isinstance(end.ask(b"rubbish")[0], Refused)
+                run_turns(end, Robot("peg_in_hole_3d", key=2), 3)
+            code, log = service.end()
+        assert code == 0
+        assert "stopping" in log
+        assert "Traceback" not in log
+
+    def test_restarted_after_a_kill_on_the_same_port(self) -> None:
+        robot = Robot()
+        with served(*ANYWHERE) as service, robots_end(service.endpoint) as end:
+            boot = end.appeared()
+            run_turns(end, robot, 2)
+            service.end(signal.SIGKILL)
+            assert end.events.get(timeout=PATIENCE_S) == Vanished("service", boot)
+            with served("--listen", service.endpoint):
+                assert end.appeared() != boot
+                request = robot.request(opening=False)
+                assert end.ask(encode(request)) == [NeedState(request.number, differs=False)]
+                assert content(end.ask(encode(robot.restore()))) == robot.right_answer()
+
+    def test_killed_while_it_computes(self, tmp_path: Path) -> None:
+        (tmp_path / "busy_problem.py").write_text(BUSY)
+        robot = Robot()
+        robot.opening = msgspec.structs.replace(robot.opening, problem="busy_problem:Busy")
+        with (
+            served(*ANYWHERE, "--problem", "busy_problem:Busy", directory=tmp_path) as service,
+            robots_end(service.endpoint) as end,
+        ):
+            end.appeared()
+            end.send(encode(robot.request()))
+            # Signs of progress come, although the problem keeps the interpreter to itself.
+            for _ in range(3):
+                event = end.events.get(timeout=PATIENCE_S)
+                assert isinstance(event, Replied)
+                assert isinstance(decode_reply(event.payload), Progress)
+            service.end(signal.SIGKILL)
+            ended = [end.events.get(timeout=PATIENCE_S) for _ in range(2)]
+            while isinstance(ended[0], Replied):
+                ended = [ended[1], end.events.get(timeout=PATIENCE_S)]
+            assert {type(event) for event in ended} == {Vanished, Ended}
+
+    def test_stops_in_order_while_it_computes(self, tmp_path: Path) -> None:
+        (tmp_path / "busy_problem.py").write_text(BUSY)
+        robot = Robot()
+        robot.opening = msgspec.structs.replace(robot.opening, problem="busy_problem:Busy")
+        arguments = ["--problem", "busy_problem:Busy", "--problem-directory", str(tmp_path)]
+        directory = tmp_path / "elsewhere"
+        directory.mkdir()
+        with (
+            served(*ANYWHERE, *arguments, directory=directory) as service,
+            robots_end(service.endpoint) as end,
+        ):
+            end.appeared()
+            end.send(encode(robot.request()))
+            event = end.events.get(timeout=PATIENCE_S)  # a sign: it is in work
+            code, log = service.end()
+            assert code == 0, log
+            assert "Fatal" not in log
+            while isinstance(event, Replied):
+                event = end.events.get(timeout=PATIENCE_S)
+            assert isinstance(event, Ended | Vanished)
+
+    def test_own_problem_that_was_not_named(self) -> None:
+        robot = Robot()
+        robot.opening = msgspec.structs.replace(robot.opening, problem="os:PathLike")
+        with served(*ANYWHERE) as service, robots_end(service.endpoint) as end:
+            end.appeared()
+            (reply,) = end.ask(encode(robot.request()))
+            assert isinstance(reply, Refused)
+            assert reply.code == "unknown_problem"
+            assert "--problem" in reply.text
+            run_turns(end, Robot(key=2), 2)
+
+    def test_many_robots_at_once(self) -> None:
+        with served(*ANYWHERE, "--workers", "3") as service, contextlib.ExitStack() as stack:
+            ends = [stack.enter_context(robots_end(service.endpoint)) for _ in range(6)]
+            robots = [Robot(key=key, seed=key) for key in range(1, 7)]
+            for end in ends:
+                end.appeared()
+            for _ in range(4):
+                for end, robot in zip(ends, robots, strict=True):
+                    end.send(encode(robot.request()))
+                for end, robot in zip(ends, robots, strict=True):
+                    assert content(end.collect()) == robot.right_answer()
+                    robot.act_until_sensing()
+                    robot.sense()
+
+    def test_state_of_many_particles(self) -> None:
+        robot = Robot(planning=planning_of(particles=20_000))
+        with served(*ANYWHERE) as service, robots_end(service.endpoint) as end:
+            end.appeared()
+            replies = end.ask(encode(robot.restore()))
+            assert content(replies) == robot.right_answer()
+
+    def test_two_names_on_two_endpoints(self) -> None:
+        with served(
+            *ANYWHERE, "--listen", "tcp/127.0.0.1:0", "--name", "cloud_active_sensing_recovery"
+        ) as service:
+            words = service.ready_line.split()
+            assert words[0] == "cloud_active_sensing_recovery"
+            endpoints = [word for word in words if word.startswith("tcp/")]
+            assert len(set(endpoints)) == 2
+            for key, endpoint in enumerate(endpoints, 1):
+                with robots_end(endpoint) as end:
+                    end.appeared()
+                    run_turns(end, Robot(key=key), 2)
+
+
+class TestConnecting:
+    def test_to_a_robot_that_listens_until_that_dies(self) -> None:
+        with PrivateSocket() as local, robots_end(local.endpoint, listens=True) as end:
+            arguments = ["--connect", local.endpoint, "--until-stdin-closes"]
+            with served(*arguments, stdin=subprocess.PIPE) as service:
+                assert service.ready_line.split()[1:] == ["is", "connecting", "to", local.endpoint]
+                end.appeared()
+                run_turns(end, Robot(), 2)
+                assert service.process.stdin is not None
+                service.process.stdin.write("this is not the end\n")
+                service.process.stdin.flush()
+                run_turns(end, Robot(key=2), 2)
+                _, log = service.process.communicate(timeout=PATIENCE_S)  # closes its input
+                assert service.process.returncode == 0
+                assert "standard input has ended" in log
+
+
+class TestEnding:
+    @pytest.mark.parametrize(
+        ("number", "code"),
+        [(signal.SIGTERM, 0), (signal.SIGINT, 130), (signal.SIGHUP, 129)],
+    )
+    def test_exit_code(self, number: int, code: int) -> None:
+        with served(*ANYWHERE) as service:
+            assert service.end(number)[0] == code
+
+    def test_hangup_that_is_ignored(self) -> None:
+        def ignore() -> None:
+            signal.signal(signal.SIGHUP, signal.SIG_IGN)
+
+        with served(*ANYWHERE, preexec_fn=ignore) as service:
+            service.process.send_signal(signal.SIGHUP)
+            with robots_end(service.endpoint) as end:
+                end.appeared()
+                run_turns(end, Robot(), 1)
+            assert service.end()[0] == 0
+
+    def test_nobody_reads_what_it_says(self) -> None:
+        """A closed terminal is no reason to stop deciding."""
+        with PrivateSocket() as local, robots_end(local.endpoint, listens=True) as end:
+            reading, writing = os.pipe()
+            os.close(reading)
+            process = subprocess.Popen(
+                [*COMMAND, "--connect", local.endpoint],
+                stdin=subprocess.DEVNULL,
+                stdout=writing,
+                stderr=writing,
+            )
+            os.close(writing)
+            try:
+                end.appeared()
+                run_turns(end, Robot(), 2)
+                process.terminate()
+                assert process.wait(PATIENCE_S) in (0, 120)  # 120: Python could not flush
+            finally:
+                process.kill()
+                process.wait()
+
+
+class TestRefusing:
+    @pytest.mark.parametrize("address", ["0.0.0.0:0", "[::]:0", "192.0.2.1:7447", "robot.test:1"])
+    def test_address_that_others_can_reach(self, address: str) -> None:
+        text = refused_to_start("--listen", f"tcp/{address}")
+        assert f"tcp/{address}" in text
+        assert "--tls" in text
+        assert "--insecure" in text
+
+    def test_robot_that_others_can_reach(self) -> None:
+        assert "--insecure" in refused_to_start("--connect", "tcp/192.0.2.1:7447")
+
+    def test_unless_it_is_said(self) -> None:
+        with served("--listen", "tcp/0.0.0.0:0", "--insecure") as service:
+            port = service.endpoint.rpartition(":")[2]
+            with robots_end(f"tcp/127.0.0.1:{port}") as end:
+                end.appeared()
+                run_turns(end, Robot(), 1)
+
+    def test_encryption_without_credentials(self) -> None:
+        assert "--tls DIR" in refused_to_start("--listen", "tls/127.0.0.1:0")
+
+    def test_port_that_is_taken(self) -> None:
+        with socket.socket() as taken:
+            taken.bind(("127.0.0.1", 0))
+            taken.listen()
+            endpoint = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
+            assert endpoint in refused_to_start("--listen", endpoint)
+
+    @pytest.mark.parametrize(
+        ("arguments", "text"),
+        [
+            (["--listen", "udp/127.0.0.1:0"], "udp"),
+            (["--listen", "tcp/127.0.0.1"], "no port"),
+            (["--lease-ms", "1"], "from 50 to 60000"),
+            (["--lease-ms", "nan"], "from 50 to 60000"),
+            (["--workers", "0"], "from 1 to 256"),
+            (["--max-sessions", "many"], "from 1 to"),
+            (["--metrics", "65536"], "from 0 to 65535"),
+            (["--name", "a b"], "a b"),
+            (["--problem", "nix"], "nix"),
+            (["--tls", "/nowhere"], "/nowhere"),
+            (["--lis", "tcp/127.0.0.1:0"], "--lis"),
+        ],
+    )
+    def test_option_that_cannot_be_used(self, arguments: list[str], text: str) -> None:
+        assert text in refused_to_start(*arguments)
+
+
+class TestTls:
+    @pytest.mark.parametrize("protocol", ["tls", "quic"])
+    def test_robot_with_and_without_credentials(self, tmp_path: Path, protocol: str) -> None:
+        credentials = pytest.importorskip("holdfast.runtime.credentials")
+        pytest.importorskip("cryptography")
+        credentials.make_credentials(tmp_path)
+        tls = credentials.load_credentials(tmp_path / "robot", "robot")
+        with served(
+            "--listen", f"{protocol}/127.0.0.1:0", "--tls", str(tmp_path / "service")
+        ) as service:
+            with robots_end(service.endpoint, tls=tls) as end:
+                end.appeared()
+                run_turns(end, Robot(), 2)
+            assert service.end()[0] == 0
+
+    def test_default_endpoint_is_encrypted(self, tmp_path: Path) -> None:
+        credentials = pytest.importorskip("holdfast.runtime.credentials")
+        pytest.importorskip("cryptography")
+        credentials.make_credentials(tmp_path)
+        text = refused_to_start("--listen", "tcp/127.0.0.1:0", "--tls", str(tmp_path / "service"))
+        assert "tcp does not use the credentials" in text
+
+
+class TestTelling:
+    def test_json(self) -> None:
+        with served(*ANYWHERE, "--log", "json", "--max-sessions", "1") as service:
+            ready = json.loads(service.ready_line)
+            assert ready["event"] == "ready"
+            assert ready["service"] == "cloud_active_sensing"
+            assert ready["pid"] == service.process.pid
+            (endpoint,) = ready["listen"]
+            with robots_end(endpoint) as end:
+                end.appeared()
+                run_turns(end, Robot(), 1)
+                end.ask(encode(Robot(key=2).restore()))
+                end.ask(b"rubbish")
+            _, log = service.end()
+        events = {record["event"]: record for record in map(json.loads, log.splitlines())}
+        assert set(events) >= {"session_opened", "restored", "refused", "evicted", "stopping"}
+        assert events["refused"]["code"] == "malformed"
+        assert events["stopping"]["reason"] == "SIGTERM"
+
+    def test_metrics(self) -> None:
+        pytest.importorskip("prometheus_client")
+        with served(*ANYWHERE, "--log", "json", "--metrics", "0") as service:
+            ready = json.loads(service.ready_line)
+            with robots_end(ready["listen"][0]) as end:
+                end.appeared()
+                run_turns(end, Robot(), 3)
+                end.ask(b"rubbish")
+            url = f"http://127.0.0.1:{ready['metrics_port']}/metrics"
+            with urllib.request.urlopen(url, timeout=PATIENCE_S) as response:
+                lines = response.read().decode().splitlines()
+            assert service.end()[0] == 0
+        assert 'holdfast_decisions_total{kind="task"} 2.0' in lines
+        assert 'holdfast_decisions_total{kind="sensing"} 3.0' in lines
+        assert 'holdfast_refusals_total{code="malformed"} 1.0' in lines
+        assert "holdfast_sessions 1.0" in lines
+
+    def test_metrics_port_that_is_taken(self) -> None:
+        pytest.importorskip("prometheus_client")
+        with socket.socket() as taken:
+            taken.bind(("127.0.0.1", 0))
+            taken.listen()
+            port = str(taken.getsockname()[1])
+            assert port in refused_to_start(*ANYWHERE, "--metrics", port)
+
+    def test_help(self) -> None:
+        done = subprocess.run(
+            [*COMMAND, "--help"], capture_output=True, text=True, timeout=PATIENCE_S
+        )
+        assert done.returncode == 0
+        for option in ("--listen", "--connect", "--tls", "--insecure", "--until-stdin-closes"):
+            assert option in done.stdout
+
+
+def test_a_service_is_ready_without_what_it_does_not_need() -> None:
+    """Start-up time is recovery time: nothing heavy but NumPy is loaded."""
+    program = """
+import json, sys, threading
+from holdfast.runtime import service_process
+ready = service_process._say_ready
+def tell(*arguments):
+    ready(*arguments)
+    print(json.dumps(sorted(sys.modules)), flush=True)
+service_process._say_ready = tell
+sys.exit(service_process.main(["--listen", "tcp/127.0.0.1:0", "--until-stdin-closes"]))
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", program],
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+    )
+    assert done.returncode == 0, done.stderr
+    modules = set(json.loads(done.stdout.splitlines()[1]))
+    assert "numpy" in modules
+    for heavy in (
+        "asyncio", "cryptography", "holdfast.configuration", "holdfast.user_code",
+        "importlib.metadata", "matplotlib", "multiprocessing", "prometheus_client", "rich",
+        "scipy", "sqlite3", "ssl", "typer", "yaml",
+    ):  # fmt: skip
+        assert heavy not in modules
+
+
+def test_whoever_sees_the_service_can_use_it() -> None:
+    with (
+        PrivateSocket() as local,
+        robots_end(local.endpoint, listens=True) as end,
+        served("--connect", local.endpoint, ready=False) as service,
+    ):
+        end.appeared()
+        (reply,) = end.ask(encode(Robot().request()))
+        assert isinstance(reply, SensingAnswer)
+        assert service.process.poll() is None

@@ -1,0 +1,335 @@
+"""The threads around a service's machine, over the wire inside one process."""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from queue import SimpleQueue
+from typing import Any
+
+import msgspec
+import pytest
+from tests.unit.test_session_service import Robot, content, planning_of
+
+from holdfast.errors import ConfigurationError, UnknownProblemError
+from holdfast.problems import registry
+from holdfast.problems.capsule_robot import CapsuleRobot
+from holdfast.problems.problem import Problem
+from holdfast.runtime.service_shell import KnownProblems, ServiceBrokenError, ServiceShell
+from holdfast.runtime.transport.contract import IncomingCall
+from holdfast.runtime.transport.in_process import InProcessNetwork
+from holdfast.session.events import Appeared, Ended, Replied, TransportEvent
+from holdfast.session.messages import (
+    Busy,
+    Opening,
+    Progress,
+    Refused,
+    Reply,
+    SensingAnswer,
+    decode_reply,
+    encode,
+)
+from holdfast.session.service import Service, ServiceLimits
+
+PATIENCE_S = 20.0
+
+
+class Patient:
+    """A robot's end that collects the replies of each call."""
+
+    def __init__(self, network: InProcessNetwork) -> None:
+        self.events: SimpleQueue[TransportEvent] = SimpleQueue()
+        self.transport = network.robot(["service"])
+        self.transport.start(self.events.put)
+        assert isinstance(self.events.get(timeout=PATIENCE_S), Appeared)
+        self.calls = 0
+
+    def send(self, payload: bytes) -> int:
+        self.calls += 1
+        self.transport.call("service", self.calls, payload)
+        return self.calls
+
+    def ask(self, payload: bytes) -> list[Reply]:
+        call = self.send(payload)
+        return self.collect({call})[call]
+
+    def collect(self, calls: set[int]) -> dict[int, list[Reply]]:
+        replies: dict[int, list[Reply]] = {call: [] for call in calls}
+        open_calls = set(calls)
+        while open_calls:
+            event = self.events.get(timeout=PATIENCE_S)
+            if isinstance(event, Replied):
+                assert event.call in open_calls
+                replies[event.call].append(decode_reply(event.payload))
+            elif isinstance(event, Ended):
+                open_calls.remove(event.call)
+        return replies
+
+
+class Held(CapsuleRobot):
+    """Stands still in its policy until it is let go."""
+
+    name = "held"
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.begun = threading.Event()
+        self.let_go = threading.Event()
+
+    def policy(self, states: Any, stage: Any) -> Any:
+        self.begun.set()
+        assert self.let_go.wait(PATIENCE_S)
+        return super().policy(states, stage)
+
+
+HELD_OPENING = Opening("held", {}, {}, planning_of(), 5)
+
+
+class Joined:
+    """A shell on a network, with a thread that keeps its time."""
+
+    def __init__(self, workers: int = 2, **limits: Any) -> None:
+        self.held = Held()
+        known = KnownProblems()
+
+        def make_problem(opening: Opening) -> Problem:
+            return self.held if opening.problem == "held" else known(opening)
+
+        self.network = InProcessNetwork()
+        self.service = Service(make_problem, workers, ServiceLimits(**limits))
+        self.timed: list[tuple[str, float, float]] = []
+        self.shell = ServiceShell(
+            self.service,
+            self.network.service("service", "boot"),
+            workers,
+            on_decision=lambda *times: self.timed.append(times),
+        )
+        self.shell.start()
+        self.reasons: SimpleQueue[int | Exception] = SimpleQueue()
+        self.thread = threading.Thread(target=self._wait)
+        self.thread.start()
+
+    def _wait(self) -> None:
+        try:
+            self.reasons.put(self.shell.wait())
+        except ServiceBrokenError as error:
+            self.reasons.put(error)
+
+    def close(self) -> None:
+        self.held.let_go.set()
+        self.shell.stop()
+        self.thread.join(PATIENCE_S)
+        assert not self.thread.is_alive()
+        self.shell.close()
+
+    def robot_in_work(self, patient: Patient, key: int) -> tuple[int, Robot]:
+        """Let a robot's request hold a worker."""
+        robot = Robot(key=key)
+        robot.opening = HELD_OPENING
+        call = patient.send(encode(robot.request()))
+        assert self.held.begun.wait(PATIENCE_S)
+        return call, robot
+
+
+@pytest.fixture
+def joined() -> Iterator[Joined]:
+    joined = Joined()
+    yield joined
+    joined.close()
+
+
+def test_trials_of_many_robots_at_once(joined: Joined) -> None:
+    failures: list[BaseException] = []
+
+    def run(key: int) -> None:
+        try:
+            patient, robot = Patient(joined.network), Robot(key=key, seed=key)
+            for _ in range(8):
+                request = robot.request(since=max(0, len(robot.observed) - 1))
+                assert content(patient.ask(encode(request))) == robot.right_answer()
+                robot.act_until_sensing()
+                robot.sense()
+            patient.transport.close()
+        except BaseException as error:
+            failures.append(error)
+            raise
+
+    threads = [threading.Thread(target=run, args=(key,)) for key in range(1, 9)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(PATIENCE_S)
+    assert not failures
+    statistics = joined.shell.statistics()
+    assert (statistics.task_parts, statistics.sensing_parts) == (8 * 7, 8 * 8)
+    assert (statistics.calls, statistics.running, statistics.waiting) == (0, 0, 0)
+    assert len(joined.timed) == 8 * 15
+    assert {kind for kind, _, _ in joined.timed} == {"task", "sensing"}
+    assert all(computed >= 0.0 and waited >= 0.0 for _, computed, waited in joined.timed)
+
+
+def test_signs_of_progress_while_a_worker_computes(joined: Joined) -> None:
+    patient = Patient(joined.network)
+    call, _ = joined.robot_in_work(patient, 1)
+    for _ in range(3):
+        event = patient.events.get(timeout=PATIENCE_S)
+        assert isinstance(event, Replied)
+        assert isinstance(decode_reply(event.payload), Progress)
+    joined.held.let_go.set()
+    replies = patient.collect({call})[call]
+    assert any(isinstance(reply, SensingAnswer) for reply in replies)
+
+
+def test_calls_are_heard_while_all_workers_compute() -> None:
+    joined = Joined(workers=1, max_waiting=1)
+    try:
+        patient = Patient(joined.network)
+        first, _ = joined.robot_in_work(patient, 1)
+        second = patient.send(encode(Robot(key=2).request()))
+        other = Patient(joined.network)
+        assert [type(reply) for reply in other.ask(encode(Robot(key=3).request()))] == [Busy]
+        assert [type(reply) for reply in other.ask(b"rubbish")] == [Refused]
+        joined.held.let_go.set()
+        for replies in patient.collect({first, second}).values():
+            assert isinstance(replies[-1], SensingAnswer)
+    finally:
+        joined.close()
+
+
+class Silent:
+    """A transport over which nothing comes but what the test delivers."""
+
+    def start(self, deliver: Any) -> None:
+        self.deliver = deliver
+
+    def close(self, timeout_s: float = 1.0) -> None:
+        pass
+
+
+class Call:
+    def __init__(self, payload: bytes) -> None:
+        self._payload = payload
+        self.replies: SimpleQueue[bytes | None] = SimpleQueue()
+
+    @property
+    def payload(self) -> bytes:
+        return self._payload
+
+    def reply(self, payload: bytes) -> None:
+        self.replies.put(payload)
+
+    def end(self) -> None:
+        self.replies.put(None)
+
+
+class Unreadable(Call):
+    @property
+    def payload(self) -> bytes:
+        raise RuntimeError("no payload")
+
+
+class Stuck(Call):
+    """Keeps whoever reads it until it is let go."""
+
+    let_go = threading.Event()
+
+    @property
+    def payload(self) -> bytes:
+        assert self.let_go.wait(PATIENCE_S)
+        return self._payload
+
+
+def test_calls_beyond_the_queue_are_turned_away_unread() -> None:
+    shell = ServiceShell(Service(KnownProblems(), 1), Silent(), 1, max_incoming=2)
+    shell.start()
+    calls: list[Call] = [Stuck(b"") for _ in range(30)]
+    accepted: list[IncomingCall] = []
+    for call in calls:
+        shell.deliver(call)
+        if call.replies.empty():
+            accepted.append(call)
+    assert 2 <= len(accepted) <= 4  # two in the queue, one with each thread
+    busy = decode_reply(calls[-1].replies.get(timeout=PATIENCE_S) or b"")
+    assert isinstance(busy, Busy)
+    assert busy.number == 0
+    assert calls[-1].replies.get(timeout=PATIENCE_S) is None
+    assert shell.statistics().busy == 30 - len(accepted)
+    Stuck.let_go.set()
+    shell.close()
+
+
+def test_a_failing_worker_ends_the_service() -> None:
+    shell = ServiceShell(Service(KnownProblems(), 1), Silent(), 1)
+    shell.start()
+    shell.deliver(Unreadable(b""))
+    with pytest.raises(ServiceBrokenError, match="no payload"):
+        shell.wait()
+    shell.close()
+
+
+def test_close_does_not_wait_for_a_computation() -> None:
+    joined = Joined(workers=1)
+    patient = Patient(joined.network)
+    call, _ = joined.robot_in_work(patient, 1)
+    joined.shell.stop()
+    assert joined.reasons.get(timeout=PATIENCE_S) == 0
+    begun = time.monotonic()
+    joined.shell.close()
+    assert time.monotonic() - begun < PATIENCE_S / 2  # the computation would take all of it
+    joined.held.let_go.set()
+    joined.thread.join(PATIENCE_S)
+    assert call == 1
+
+
+class TestKnownProblems:
+    def test_built_in_problems(self) -> None:
+        for name in registry.BUILT_IN:
+            assert KnownProblems()(Opening(name, {}, {}, planning_of(), 0)).name == name
+
+    def test_settings_are_those_of_the_opening(self) -> None:
+        opening = Opening("peg_in_hole_2d", {"peg_width": 2.0}, {}, planning_of(), 0)
+        built: Any = KnownProblems()(opening)
+        assert built.model.peg_width == 2.0
+
+    def test_settings_that_do_not_fit_are_explained(self) -> None:
+        opening = Opening("peg_in_hole_2d", {"peg_width": -2.0}, {}, planning_of(), 0)
+        with pytest.raises(ConfigurationError, match=r"model\.peg_width is -2\.0; expected"):
+            KnownProblems()(opening)
+
+    def test_unknown_keys_are_explained(self) -> None:
+        opening = Opening("peg_in_hole_2d", {"peg_with": 2.0}, {}, planning_of(), 0)
+        with pytest.raises(ConfigurationError, match=r"model\.peg_with.*did you mean peg_width"):
+            KnownProblems()(opening)
+
+    def test_unknown_name(self) -> None:
+        with pytest.raises(UnknownProblemError, match=r"problem nix: .*capsule_robot"):
+            KnownProblems()(Opening("nix", {}, {}, planning_of(), 0))
+
+    def test_code_of_the_robots_choice_is_not_run(self, tmp_path: Path) -> None:
+        opening = Opening("holdfast.problems.capsule_robot:CapsuleRobot", {}, {}, planning_of(), 0)
+        with pytest.raises(UnknownProblemError, match="--problem"):
+            KnownProblems()(opening)
+
+    def test_own_problem_that_was_named(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(sys, "path", sys.path.copy())
+        (tmp_path / "a_robot_of_ones_own.py").write_text(
+            "from holdfast.problems.capsule_robot import CapsuleRobot\n"
+            "class Mine(CapsuleRobot):\n    name = 'mine'\n"
+        )
+        known = KnownProblems(["a_robot_of_ones_own:Mine"], tmp_path)
+        opening = Opening("a_robot_of_ones_own:Mine", {}, {}, planning_of(), 0)
+        assert known(opening).name == "mine"
+
+    def test_unknown_name_at_the_start(self) -> None:
+        with pytest.raises(UnknownProblemError, match="nix"):
+            KnownProblems(["nix"])
+
+    def test_a_problem_is_built_anew_for_other_settings(self) -> None:
+        opening = Opening("capsule_robot", {}, {}, planning_of(), 0)
+        known = KnownProblems()
+        assert known(opening) is not known(msgspec.structs.replace(opening, seed=1))
