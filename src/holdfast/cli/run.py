@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from holdfast.cli.endings import ended_by_signals, signal_of
-from holdfast.cli.terminal import print_files, print_summary, run_display
+from holdfast.cli.terminal import duration, print_files, print_summary, run_display
 from holdfast.errors import HoldfastError, InvalidValueError
 
 if TYPE_CHECKING:
@@ -28,6 +28,8 @@ __all__ = ["run"]
 
 _RUNS = Path("runs")
 _MAX_RATE_HZ = 10_000.0
+_LONGEST_REPETITION_S = 30.0
+"""A trial that took longer is not run again for its figure."""
 
 
 def run(
@@ -166,8 +168,8 @@ def run(
     performed, and DIR gets events.jsonl (what happened to the services) and
     timings.csv (how long each decision took) as well.
 
-    Ctrl-C, a crash or a power cut loses no trial and no step: the same
-    command with --resume goes on.
+    Ctrl-C or a crash loses no trial and no step: the same command with
+    --resume goes on.
     """
     if rate is not None and not 0.0 < rate <= _MAX_RATE_HZ:
         raise InvalidValueError(
@@ -265,6 +267,8 @@ def _run(options: _Options) -> None:
 
     configuration = options.load()
     quiet = options.quiet
+    as_robot = is_robot_run(configuration, options.rate)
+    _require_effect(options, configuration, as_robot=as_robot)
     if options.resume:
         directory_path = options.out or latest_default_directory(configuration, _RUNS)
         directory = RunDirectory.resume(directory_path, configuration)
@@ -285,7 +289,7 @@ def _run(options: _Options) -> None:
         try:
             display.start(earlier.finished, earlier.successes, directory_path)
             try:
-                if is_robot_run(configuration, options.rate):
+                if as_robot:
                     missed_ticks = run_as_robot(
                         configuration,
                         directory,
@@ -337,12 +341,41 @@ def _run(options: _Options) -> None:
             print_files(directory_path, note)
 
 
+def _require_effect(options: _Options, configuration: Configuration, *, as_robot: bool) -> None:
+    """Refuse options that would do nothing, rather than let somebody believe that they do."""
+    if options.jobs is not None and as_robot:
+        raise InvalidValueError(
+            f"--jobs is {options.jobs}, but a robot runs its trials one after another: leave it "
+            "out, or leave out --service, --environment and --rate (and offload.services and "
+            "environment.object)"
+        )
+    if configuration.offload.services:
+        # Before a directory is claimed: a mistyped one shall leave nothing behind.
+        from holdfast.runtime.endpoints import parse_endpoint
+
+        for service in configuration.offload.services:
+            parse_endpoint(service)
+    for option, value in (("--recovery", options.recovery), ("--tls", options.tls)):
+        if value is not None and not configuration.offload.services:
+            raise InvalidValueError(
+                f"{option} is {value}, but no service is named, so there is nothing to recover "
+                "from or to be known to: give --service"
+            )
+
+
 def _draw_figure(
     configuration: Configuration, directory: RunDirectory, recorder: Recorder
 ) -> str | None:
     """Draw trial 0 and return None, or what is to be said about it."""
     if configuration.environment.object is not None:
         return None  # its world is not ours to look into
+    if recorder.record.result is None:
+        again_s = _time_of_sensing(directory, recorder.trial)
+        if again_s > _LONGEST_REPETITION_S:
+            return (
+                f"no figure, because trial {recorder.trial} would have to be run again for it, "
+                f"with {duration(again_s)} of sensing decisions"
+            )
     try:
         from holdfast.recording.figure import trial_figure
     except ImportError as error:
@@ -362,6 +395,13 @@ def _draw_figure(
             raise
         raise HoldfastError(f"the figure of trial {recorder.trial}: {account}") from error
     return note
+
+
+def _time_of_sensing(directory: RunDirectory, trial: int) -> float:
+    for result in directory.journal.results():
+        if result.trial == trial:
+            return 1e-3 * result.mean_sensing_ms * result.sensing_decisions
+    return 0.0
 
 
 def _draw_trial(
