@@ -18,9 +18,9 @@ CPP_FILES := $(shell find cpp -name '*.hpp' -o -name '*.cpp')
 help: ## what there is to make
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
-demo: $(INSTALLED_FIGURES) ## ten trials of peg-in-hole, with their tables and a figure, in demo-run
+demo: $(INSTALLED_FIGURES) ## a cloud and a robot are killed, and no decision changes; see demo-run
 	rm -rf demo-run
-	$(BIN)/holdfast run examples/peg_in_hole_2d.yaml --out demo-run
+	$(BIN)/holdfast demo --out demo-run
 
 test: $(INSTALLED_DEV) ## the quick tests
 	$(BIN)/pytest -q

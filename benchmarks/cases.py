@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from benchmarks import command, decisions, scale
+from benchmarks import command, decisions, faults, scale, service
 from benchmarks.common import Case
 
 __all__ = ["CASES"]
@@ -18,4 +18,11 @@ CASES = (
     Case("busy", "On a busy machine", decisions.busy_machine, 30.0, 8.0),
     Case("startup", "Start-up", command.startup, 20.0, 3.0),
     Case("estimators", "Estimators and methods", decisions.estimators, 20.0, 1.0),
+    Case("offload", "A question to a service", service.offload, 5.0, 2.0),
+    Case("robot", "A robot's loop, with and without a service", service.robot_loop, 20.0, 4.0),
+    Case("paced", "A robot at its own pace", service.paced, 60.0, 7.0),
+    Case("wire", "Bytes on the wire", service.wire, 20.0, 4.0),
+    Case("kills", "A killed cloud, and a new one", faults.kills, 90.0, 12.0),
+    Case("capacity", "Many robots", service.capacity, 220.0, 50.0),
+    Case("serve", "The service's process", service.serve, 50.0, 14.0),
 )

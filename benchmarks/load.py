@@ -58,7 +58,7 @@ class _Fleet:
         self.counting = False
         self.task_s: list[float] = []
         self.sensing_s: list[float] = []
-        self.sent = self.complete = self.busy = self.need_state = self.refused = 0
+        self.sent = self.complete = self.busy = self.need_state = 0
         self.lost = self.wrong = self.skipped = 0
 
 
@@ -75,6 +75,7 @@ class _Robot:
         self._opened = self._hand_over = False
         self._acknowledged = 0
         self._sent_at = 0.0
+        self._call = -1
         self._parts_missing = 0
 
     @property
@@ -110,11 +111,14 @@ class _Robot:
         self._parts_missing = 1 if fresh else 2
         fleet.sent += fleet.counting
         payload = encode(request)
+        self._call = self._link.next_call(self)
         self._sent_at = time.perf_counter()
-        self._link.call(self, payload)
+        self._link.send(self._call, payload)
 
-    def replied(self, payload: bytes) -> None:
+    def replied(self, call: int, payload: bytes) -> None:
         """Take a reply; on a thread of the transport."""
+        if call != self._call:
+            return
         took_s = time.perf_counter() - self._sent_at
         fleet = self._fleet
         reply = decode_reply(payload)
@@ -136,12 +140,12 @@ class _Robot:
             fleet.need_state += 1
             self._opened, self._hand_over = False, True
             self._parts_missing = 0
-        elif isinstance(reply, Refused):
-            raise RuntimeError(f"refused: {reply.text}")
+        else:
+            fleet.wrong += isinstance(reply, Refused)
 
-    def ended(self) -> None:
-        """Take note that nothing more comes."""
-        if self._parts_missing:
+    def ended(self, call: int) -> None:
+        """Take note that nothing more comes of a call; of the one before it may be told late."""
+        if call == self._call and self._parts_missing:
             self._fleet.lost += 1
             self._parts_missing = 0
             self._opened, self._hand_over = False, True
@@ -165,19 +169,22 @@ class _Link:
         self.appeared = threading.Event()
         self._transport.start(self._deliver)
 
-    def call(self, robot: _Robot, payload: bytes) -> None:
+    def next_call(self, robot: _Robot) -> int:
         self._number += 1
         self._asked[self._number] = robot
-        self._transport.call(_SERVICE, self._number, payload)
+        return self._number
+
+    def send(self, call: int, payload: bytes) -> None:
+        self._transport.call(_SERVICE, call, payload)
 
     def close(self) -> None:
         self._transport.close()
 
     def _deliver(self, event: TransportEvent) -> None:
         if isinstance(event, Replied):
-            self._asked[event.call].replied(event.payload)
+            self._asked[event.call].replied(event.call, event.payload)
         elif isinstance(event, Ended):
-            self._asked.pop(event.call).ended()
+            self._asked.pop(event.call).ended(event.call)
         elif isinstance(event, Appeared):
             self.appeared.set()
 
@@ -197,6 +204,7 @@ def load(
     num_robots: int,
     num_links: int,
     rate_hz: float,
+    sensing_interval: int,
     warm_up_s: float,
     seconds: float,
 ) -> dict[str, Any]:
@@ -209,13 +217,16 @@ def load(
         Of the service, to see what it uses.
     num_robots, num_links : int
         Robots, and links that they share.
+    sensing_interval : int
     rate_hz : float
         Turns of each robot a second, evenly spaced, the robots one after another.
     warm_up_s, seconds : float
         Before anything is counted, and then.
     """
     with tempfile.TemporaryDirectory() as directory:
-        configuration = configuration_for(Path(directory), num_trials=1)
+        configuration = configuration_for(
+            Path(directory), num_trials=1, sensing_interval=sensing_interval
+        )
     problem, settings = configuration.problem, configuration.planning
     trials = [recorded_turns(problem, settings, trial) for trial in range(_NUM_TRIALS)]
     fleet = _Fleet(trials, opening_of(configuration))

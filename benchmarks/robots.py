@@ -29,7 +29,11 @@ __all__ = ["Notebook", "configuration_for", "robot_in_thread", "run_robot"]
 _CONFIGURATION = """\
 problem: peg_in_hole_2d
 particle_filter: {{num_particles: {num_particles}}}
-simulator: {{num_trials: {num_trials}, max_steps: 500, sensing_intervals: 8, seed: 0}}
+simulator:
+  num_trials: {num_trials}
+  max_steps: 500
+  sensing_intervals: {sensing_interval}
+  seed: 0
 recovery: {{launch: {launch}}}
 offload: {{services: {services}}}
 """
@@ -44,12 +48,14 @@ def configuration_for(
     services: tuple[str, ...] = (),
     launch: str = "never",
     num_particles: int = 100,
+    sensing_interval: int = 8,
 ) -> Configuration:
     """Return the published settings (M = 10, k = 5, H = 1, interval 8), with services."""
     path = directory / "robot.yaml"
     path.write_text(
         _CONFIGURATION.format(
             num_particles=num_particles,
+            sensing_interval=sensing_interval,
             num_trials=num_trials,
             launch=launch,
             services=list(services),

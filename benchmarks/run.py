@@ -37,6 +37,9 @@ RESULTS = Path(__file__).with_name("RESULTS.md")
 # Cores that others may use before the report says so.
 LOUD = 0.15
 
+# How long others must have been quiet when --patience waits for it.
+QUIET_S = 3.0
+
 
 class Progress:
     """One line with what runs and the time left; nothing of it runs while something is timed.
@@ -79,6 +82,16 @@ class Progress:
             print(f"\r\033[K{text}", end="", file=sys.stderr, flush=True)
         elif fraction == 0.0:
             print(text, file=sys.stderr, flush=True)
+
+
+def wait_for_quiet(until: float) -> None:
+    """Wait until others let the machine alone, but not longer than to a time of the clock."""
+    while time.monotonic() < until:
+        other = OtherLoad()
+        time.sleep(QUIET_S)
+        cores = other.cores()
+        if cores is None or cores <= LOUD:
+            return
 
 
 def load_in_words(cores: float | None) -> str:
@@ -130,6 +143,13 @@ def main() -> None:
     parser.add_argument(
         "--output", type=Path, help="where to write (default: RESULTS.md after a full run)"
     )
+    parser.add_argument(
+        "--patience",
+        type=float,
+        default=0.0,
+        metavar="MINUTES",
+        help="wait before each case until others let the machine alone, but no longer than this",
+    )
     options = parser.parse_args()
     cases = [case for case in CASES if not options.only or case.name in options.only]
     complete = not options.quick and len(cases) == len(CASES)
@@ -141,6 +161,7 @@ def main() -> None:
     results = []
     loads = []
     for case in cases:
+        wait_for_quiet(time.monotonic() + 60.0 * options.patience)
         other = OtherLoad()
         result = case.run(Context(options.quick, progress.of(case.name)))
         progress.finish(case.name)

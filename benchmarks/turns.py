@@ -7,7 +7,6 @@ a service uses but none of its code; so whatever a service answers can be held a
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from queue import SimpleQueue
 from time import perf_counter
 from typing import NamedTuple
@@ -41,6 +40,7 @@ from holdfast.session.messages import (
     TaskAnswer,
     decode_reply,
     encode,
+    numbers_from,
     numbers_to,
 )
 from holdfast.settings import PlanningSettings
@@ -151,25 +151,15 @@ def _rolled(
     return state, actions
 
 
-def decided_in_process(
-    problem: Problem, settings: PlanningSettings, turn: Turn
-) -> Callable[[], object]:
-    """Return a call that computes what a service computes for a turn, and nothing else."""
-
-    def decide() -> object:
-        state = turn.state
-        if turn.before is not None:
-            last = turn.observations[-1]
-            seen = _numbers(last.observation)
-            state, _ = observe(problem, settings, turn.before, last.sensing_action, seen)
-        ahead, actions = _rolled(problem, settings, state)
-        return actions, choose_sensing_action(problem, settings, ahead)
-
-    return decide
-
-
-def _numbers(data: bytes) -> Sequence[float]:
-    return memoryview(data).cast("d").tolist()
+def decided_in_process(problem: Problem, settings: PlanningSettings, turn: Turn) -> int:
+    """Compute what a service computes for a turn, and nothing else; return the sensing action."""
+    state = turn.state
+    if turn.before is not None:
+        last = turn.observations[-1]
+        observation = numbers_from(last.observation, len(last.observation) // 8)
+        state, _ = observe(problem, settings, turn.before, last.sensing_action, observation)
+    ahead, _ = _rolled(problem, settings, state)
+    return choose_sensing_action(problem, settings, ahead)[0]
 
 
 def opening_of(configuration: Configuration) -> Opening:

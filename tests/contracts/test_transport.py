@@ -60,11 +60,18 @@ class Inbox:
             return list(self.events)
 
     def wait_for(self, *events: TransportEvent) -> None:
-        self.wait(lambda all_events: all(event in all_events for event in events))
+        self.wait(lambda _: all(event in self for event in events))
+
+    def __contains__(self, event: TransportEvent) -> bool:
+        return self.count(event) > 0
+
+    def count(self, event: TransportEvent) -> int:
+        # By type as well: named tuples are equal if their fields are.
+        return sum(type(each) is type(event) and each == event for each in self.events)
 
     def of_call(self, call: int) -> list[TransportEvent]:
         """Wait for the end of a call and return what came of it."""
-        events = self.wait(lambda all_events: Ended(call) in all_events)
+        events = self.wait(lambda _: Ended(call) in self)
         return [e for e in events if isinstance(e, Replied | Ended) and e.call == call]
 
 
@@ -326,7 +333,7 @@ class TestEveryWire:
         call = calls.get(timeout=PATIENCE_S)
         call.reply(b"first")
         inbox.wait_for(Replied(1, b"first"))
-        assert Ended(1) not in inbox.events
+        assert Ended(1) not in inbox
         call.reply(b"second")
         call.end()
         assert inbox.of_call(1) == [Replied(1, b"first"), Replied(1, b"second"), Ended(1)]
@@ -474,7 +481,7 @@ class TestEveryWire:
         seen = [event for event in inbox.events if isinstance(event, Appeared | Vanished)]
         boots = ["b1", "b2", "b3"]
         there_and_gone = [event("cloud", boot) for boot in boots for event in (Appeared, Vanished)]
-        assert seen == [*there_and_gone, Appeared("cloud", "b4")]
+        assert list(map(repr, seen)) == list(map(repr, [*there_and_gone, Appeared("cloud", "b4")]))
 
     def test_two_services_are_never_mixed(self, wire: Wire) -> None:
         for name in ("east", "west"):
@@ -501,8 +508,8 @@ class TestEveryWire:
         robot.call("west", 2, b"")
         services["east"].close()
         inbox.wait_for(Vanished("east", "b1"), Ended(1))
-        assert Vanished("west", "b1") not in inbox.events
-        assert Ended(2) not in inbox.events
+        assert Vanished("west", "b1") not in inbox
+        assert Ended(2) not in inbox
 
     def test_a_request_that_is_too_large_is_refused(self, wire: Wire) -> None:
         robot, inbox, _ = connected(wire)
@@ -736,8 +743,7 @@ class TestZenoh:
             for number in range(20):
                 robot.call("cloud", number, b"question")
                 assert inbox.of_call(number) == [Replied(number, b"question"), Ended(number)]
-            assert inbox.events[0] == Appeared("cloud", "b1")
-            assert Appeared("cloud", "rogue") not in inbox.events
+            assert Appeared("cloud", "rogue") not in inbox
             assert answered == []
 
 
@@ -808,9 +814,10 @@ def bare_session(protocol: str, endpoint: str, authority: Path):  # type: ignore
     import zenoh
 
     settings = {
-        "mode": "client",
+        "mode": "peer",
         "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
-        "connect": {"endpoints": [endpoint], "timeout_ms": -1, "exit_on_failure": False},
+        "listen": {"endpoints": []},
+        "connect": {"endpoints": [endpoint]},
         "transport": {"link": {"tls": {"root_ca_certificate": str(authority)}}},
     }
     return zenoh.open(zenoh.Config.from_json5(json.dumps(settings)))
@@ -901,7 +908,7 @@ class TestProcesses:
             robot.call("cloud", 2, b"echo")
             assert inbox.of_call(2) == [Ended(2)]
             process.send_signal(signal.SIGCONT)
-            inbox.wait(lambda events: events.count(Appeared("cloud", "b1")) == 2)
+            inbox.wait(lambda _: inbox.count(Appeared("cloud", "b1")) == 2)
             robot.call("cloud", 3, b"echo")
             assert inbox.of_call(3) == [Replied(3, b"echo"), Ended(3)]
 
@@ -925,7 +932,7 @@ class TestProcesses:
             robot.call("cloud", 4, b"echo")
             assert inbox.of_call(4) == [Ended(4)]
             process.send_signal(signal.SIGCONT)
-            inbox.wait(lambda events: events.count(Appeared("cloud", "b1")) == 2)
+            inbox.wait(lambda _: inbox.count(Appeared("cloud", "b1")) == 2)
             robot.call("cloud", 5, b"echo")
             assert inbox.of_call(5) == [Replied(5, b"echo"), Ended(5)]
 

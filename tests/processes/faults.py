@@ -289,6 +289,8 @@ class World:
     ----------
     performed : dict of int to list of bytes
         Of each trial, the task actions that were carried out, in order, bit for bit.
+    moments_s : list of float
+        When each of them was carried out.
     wrongs : list of str
         What should never have been asked.
     """
@@ -305,6 +307,7 @@ class World:
         self._connections: list[socket.socket] = []
         self._failures: list[BaseException] = []
         self.performed: dict[int, list[bytes]] = {}
+        self.moments_s: list[float] = []
         self.wrongs: list[str] = []
         self._listener = socket.create_server(("127.0.0.1", 0))
         self.port: int = self._listener.getsockname()[1]
@@ -319,6 +322,20 @@ class World:
         robot has died by then, what it asked for is not carried out any more.
         """
         self._hooks[trial, what, step, afterwards] = hook
+
+    @property
+    def step(self) -> int:
+        """How many task actions were carried out in this trial."""
+        return 0 if self._environment is None else self._environment.step
+
+    def become(self, other: World) -> None:
+        """Take on the state of another world, as it is now."""
+        self._trial = other._trial
+        self.performed = {trial: actions.copy() for trial, actions in other.performed.items()}
+        actions = [np.frombuffer(action) for action in self.performed[self._trial]]
+        self._environment = SimulatedEnvironment.after(
+            self._problem, self._seed, self._trial, actions
+        )
 
     def close(self) -> None:
         """Hang up, and raise what a hook has raised."""
@@ -405,6 +422,7 @@ class World:
             action = np.array(command["task_action"])
             answer = {"reward": environment.perform(action)}
             self.performed[self._trial].append(action.tobytes())
+            self.moments_s.append(time.monotonic())
         self._call_hook(what, afterwards=True, step=step)
         return {key: np.asarray(value).tolist() for key, value in answer.items()}
 
@@ -478,6 +496,7 @@ class Gate:
                 passing, _ = self._listener.accept()
             except OSError:
                 return
+            passing.recv(100)  # what is closed with unread data is reset
             if self._arrivals >= self._holds_at and not self._opened.is_set():
                 self._held.append(passing)
                 self._reached.set()
@@ -607,7 +626,9 @@ class Site:
         path.write_text(yaml.safe_dump(merged))
         return path
 
-    def world(self, document: Mapping[str, Any], **sections: Any) -> tuple[World, Path]:
+    def world(
+        self, document: Mapping[str, Any], name: str = "configuration", **sections: Any
+    ) -> tuple[World, Path]:
         """Return a world, and the file of a run in it."""
         world = World(load(self.configure(document, "of_world")))
         self._open.append(world)
@@ -615,14 +636,77 @@ class Site:
             "object": "world_client:WorldClient",
             "directory": str(HERE),
             "arguments": {"port": world.port},
-            "timeout_ms": 1e3 * 5.0 * PATIENCE_S,
+            "timeout_ms": 5e3 * PATIENCE_S,
+            **sections.pop("environment", {}),
         }
-        return world, self.configure(document, environment=environment, **sections)
+        return world, self.configure(document, name, environment=environment, **sections)
 
     def gate(self, holds_at: int) -> Gate:
         gate = Gate(holds_at)
         self._open.append(gate)
         return gate
+
+
+class Story:
+    """A robot in its world, and services to which things happen."""
+
+    def __init__(
+        self, site: Site, references: References, document: dict[str, Any], **sections: Any
+    ) -> None:
+        self.site = site
+        self.reference = references(document)
+        self.world, self.file = site.world(document, **sections)
+
+    def at(
+        self, what: str, step: int, *hooks: Hook, trial: int = 0, afterwards: bool = False
+    ) -> None:
+        """Let things happen, in order, while the robot senses or performs: see :meth:`World.on`."""
+
+        def all_of_them() -> None:
+            for hook in hooks:
+                hook()
+
+        self.world.on(what, step, all_of_them, trial=trial, afterwards=afterwards)
+
+    def status(self, to: str, count: int = 1) -> Hook:
+        """Return what waits until the robot has come to a status so many times."""
+        return lambda: self.running.wait_for("status", count, to=to)
+
+    @property
+    def running(self) -> Robot:
+        assert self.site.robot is not None
+        return self.site.robot
+
+    def run(self, *services: Service | str, options: Sequence[str] = ()) -> Robot:
+        """Run to the end, and find out whether all is as it should be."""
+        robot = self.site.run(self.file, *options, services=services)
+        self.finish(robot)
+        return robot
+
+    def run_and_resume(self, *services: Service | str) -> int:
+        """Run to the end, with a new process each time the robot has been killed; count these."""
+        robot = self.site.run(self.file, services=services)
+        kills = 0
+        while robot.wait() == -signal.SIGKILL:
+            kills += 1
+            self.check_unfinished(robot.out)
+            robot = self.site.run(self.file, services=services, resume=True)
+        self.finish(robot)
+        return kills
+
+    def check_unfinished(self, run: Path) -> None:
+        """Assert that the journal of a killed run has what was done, and at most one step more."""
+        steps = unfinished_steps(run)
+        assert steps == list(range(len(steps)))
+        assert len(steps) in (self.world.step, self.world.step + 1)
+
+    def finish(self, robot: Robot) -> None:
+        """Wait for the end, and find out whether all is as it should be."""
+        robot.wait()
+        self.world.check()
+        robot.finish()
+        assert_identical(robot.out, self.reference)
+        self.world.assert_each_once(self.reference)
 
 
 class References:

@@ -132,10 +132,13 @@ class End:
         return self.collect()
 
     def collect(self) -> list[Reply]:
-        replies = []
+        """Return the replies to the one open call, without signs of progress."""
+        replies: list[Reply] = []
         while not isinstance(event := self.events.get(timeout=PATIENCE_S), Ended):
             assert isinstance(event, Replied), event
-            replies.append(decode_reply(event.payload))
+            reply = decode_reply(event.payload)
+            if not isinstance(reply, Progress):
+                replies.append(reply)
         return replies
 
 
@@ -389,6 +392,17 @@ class TestRefusing:
     def test_option_that_cannot_be_used(self, arguments: list[str], text: str) -> None:
         assert text in refused_to_start(*arguments)
 
+    def test_no_standard_input_to_wait_for(self) -> None:
+        command = [*COMMAND, *ANYWHERE, "--until-stdin-closes"]
+        done = subprocess.run(
+            ["/bin/sh", "-c", 'exec "$@" <&-', "sh", *command],
+            capture_output=True,
+            text=True,
+            timeout=PATIENCE_S,
+        )
+        assert done.returncode == 2
+        assert "standard input" in done.stderr
+
 
 class TestTls:
     @pytest.mark.parametrize("protocol", ["tls", "quic"])
@@ -405,7 +419,7 @@ class TestTls:
                 run_turns(end, Robot(), 2)
             assert service.end()[0] == 0
 
-    def test_default_endpoint_is_encrypted(self, tmp_path: Path) -> None:
+    def test_credentials_that_would_not_be_used(self, tmp_path: Path) -> None:
         credentials = pytest.importorskip("holdfast.runtime.credentials")
         pytest.importorskip("cryptography")
         credentials.make_credentials(tmp_path)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import sys
 from pathlib import Path
 from typing import Any
@@ -373,6 +374,11 @@ class TestRegistry:
             "peg_in_hole_2d",
             "peg_in_hole_3d",
         }
+
+    def test_the_built_in_ones_are_registered_as_the_same(self) -> None:
+        found = importlib.metadata.entry_points(group=registry.GROUP)
+        values = {entry_point.name: entry_point.value for entry_point in found}
+        assert registry.BUILT_IN.items() <= values.items()
 
     def test_finds_a_registered_class(self) -> None:
         assert registry.problem_class("peg_in_hole_2d") is PegInHole2D

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import subprocess
 import sys
 import threading
 import time
@@ -63,7 +64,9 @@ class Patient:
             event = self.events.get(timeout=PATIENCE_S)
             if isinstance(event, Replied):
                 assert event.call in open_calls
-                replies[event.call].append(decode_reply(event.payload))
+                reply = decode_reply(event.payload)
+                if not isinstance(reply, Progress):
+                    replies[event.call].append(reply)
             elif isinstance(event, Ended):
                 open_calls.remove(event.call)
         return replies
@@ -333,3 +336,33 @@ class TestKnownProblems:
         opening = Opening("capsule_robot", {}, {}, planning_of(), 0)
         known = KnownProblems()
         assert known(opening) is not known(msgspec.structs.replace(opening, seed=1))
+
+    def test_several_workers_build_their_first_problem_at_once(self) -> None:
+        program = """
+import sys, threading
+from holdfast.problems import registry
+from holdfast.runtime.service_shell import KnownProblems
+from holdfast.session.messages import Opening
+from holdfast.settings import PlanningSettings
+
+sys.setswitchinterval(1e-6)
+known = KnownProblems()
+barrier = threading.Barrier(4)
+built = []
+
+def build():
+    for name in registry.BUILT_IN:
+        barrier.wait()
+        built.append(known(Opening(name, {}, {}, PlanningSettings(), 0)).name)
+
+threads = [threading.Thread(target=build) for _ in range(4)]
+for thread in threads:
+    thread.start()
+for thread in threads:
+    thread.join()
+assert len(built) == 16
+"""
+        done = subprocess.run(
+            [sys.executable, "-c", program], capture_output=True, text=True, timeout=60
+        )
+        assert done.returncode == 0, done.stderr

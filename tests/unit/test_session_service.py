@@ -911,6 +911,17 @@ class TestCapacity:
         assert isinstance(busy, Busy)
         assert 60 <= busy.retry_after_ms <= 250
 
+    def test_one_job_that_was_held_up_turns_nobody_away(self) -> None:
+        bench = Bench(max_wait_ms=100.0)
+        first = Robot(key=1)
+        bench.ask(first.request())
+        first.sense()
+        bench.send(first.request())
+        bench.now += 60.0  # the process was stopped
+        bench.run_all()
+        calls = [bench.send(Robot(key=key).request()) for key in range(2, 8)]
+        assert all(not bench.replies[call] for call in calls)
+
     def test_one_more_robot_than_workers_is_never_too_many(self) -> None:
         bench = Bench(max_wait_ms=1.0, max_waiting=1)
         first = Robot(key=1)

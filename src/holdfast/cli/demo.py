@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import contextlib
+import signal
 import sys
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from holdfast.cli.endings import EXIT_DIFFERENT, ended_by_signals
+from holdfast.cli.endings import EXIT_DIFFERENT, ended_by_signals, signal_of
+from holdfast.errors import HoldfastError
 
 if TYPE_CHECKING:
     from holdfast.cli.story import Findings
@@ -20,9 +21,10 @@ __all__ = ["demo"]
 _RUNS = Path("runs")
 
 _INTRODUCTION = """\
-A robot puts a peg into a hole that it can hardly see. A service, in the cloud, decides what it
-measures and how it moves. Here the service is killed, twice, and then the robot's own process.
-Only time may be lost: the decisions must be those of a run that nothing disturbs, bit for bit.
+A robot puts a peg into a hole that it can hardly see. A service in the cloud
+decides what it measures and how it moves. Here that service is killed, twice,
+and then the robot's own process. Time may be lost, but nothing else: what is
+decided must be, bit for bit, what a run without kills decides.
 
 """
 
@@ -42,7 +44,7 @@ def demo(
         int, typer.Option("--seed", metavar="S", min=0, help="Seed of all random draws.")
     ] = 0,
     quick: Annotated[
-        bool, typer.Option("--quick", help="A shorter run at a faster pace: half the time.")
+        bool, typer.Option("--quick", help="A shorter run: about half the time.")
     ] = False,
 ) -> None:
     """Kill the cloud, twice, and the robot, and show that no decision changes.
@@ -70,8 +72,7 @@ def _tell(out: Path | None, seed: int, *, quick: bool) -> Findings:
     show = make_show()
     sys.stderr.write(_INTRODUCTION)
     sys.stderr.flush()
-    began = time.time()
-    plan = Plan(min_steps=240, duration_s=7.0) if quick else Plan()
+    plan = Plan(min_steps=240, duration_s=9.0) if quick else Plan()
     try:
         with Story(directory, seed, plan, show) as story:
             try:
@@ -80,11 +81,16 @@ def _tell(out: Path | None, seed: int, *, quick: bool) -> Findings:
                 # First of all the terminal; after SIGHUP there is none to write to.
                 with contextlib.suppress(OSError):
                     show.stop()
-    except KeyboardInterrupt:
-        with contextlib.suppress(OSError):
-            sys.stderr.write(f"\nInterrupted; all processes are ended. Logs are in {directory}\n")
+    except HoldfastError:
+        show.conclude(story.chronicle)
         raise
-    show.conclude(story.chronicle, time.time() - began)
+    except KeyboardInterrupt as interruption:
+        ended = signal_of(interruption)
+        how = "Interrupted" if ended == signal.SIGINT else f"Ended by {ended.name}"
+        with contextlib.suppress(OSError):
+            sys.stderr.write(f"\n{how}; all processes are ended. The logs are in {directory}\n")
+        raise
+    show.conclude(story.chronicle)
     sys.stdout.write(account(findings, directory))
     sys.stdout.flush()
     return findings
@@ -103,19 +109,19 @@ def account(findings: Findings, directory: Path) -> str:
 
     def row(label: str, *values: float | None) -> str:
         texts = ["-" if value is None else f"{value:.0f} ms" for value in values]
-        return f"  {label:<44}" + "".join(f"{text:>12}" for text in texts)
+        return f"  {label:<42}" + "".join(f"{text:>12}" for text in texts)
 
     outages = findings.outages
-    passed = "; after its restart: ".join(" -> ".join(each) for each in findings.statuses)
+    passed = [" -> ".join(each) for each in findings.statuses]
     comparison = findings.comparison
     runs = [directory / name for name in (UNDISTURBED_RUN_NAME, KILLED_RUN_NAME)]
     if comparison.identical:
-        verdict = "The decisions are those of the undisturbed run:"
+        verdict = "The decisions are those of the run without kills:"
     else:
-        verdict = "The decisions are NOT those of the undisturbed run:"
+        verdict = "The decisions are NOT those of the run without kills:"
     lines = [
         "",
-        f"{'What the kills cost':<46}{'1st kill':>12}{'2nd kill':>12}",
+        f"{'What the kills cost':<44}{'1st kill':>12}{'2nd kill':>12}",
         row("cloud killed -> found", *(each.found_ms for each in outages)),
         row("found -> first local decision", *(each.first_local_decision_ms for each in outages)),
         row("longest wait for a decision", *(each.longest_wait_ms for each in outages)),
@@ -123,13 +129,17 @@ def account(findings: Findings, directory: Path) -> str:
         row("cloud: spawned -> listening", *(each.listening_ms for each in outages)),
         row("cloud: listening -> used again", *(each.used_again_ms for each in outages)),
         row("robot killed -> acting again", findings.robot_acting_again_ms),
-        f"Until a decision is needed the robot goes on with the actions it has; without a kill it "
-        f"waits\n{findings.usual_wait_ms:.1f} ms for one (median).",
+        "After a kill the robot first uses up the actions that it has; the wait is how",
+        f"long it stood still. Without a kill that is {findings.usual_wait_ms:.1f} ms (median).",
         "",
-        f"statuses: {passed}",
+        "Statuses that the robot passed",
+        f"  {passed[0]}",
+        *(f"  after its restart: {each}" for each in passed[1:]),
+        "",
         verdict,
         comparison.describe(),
         "",
-        f"Look for yourself: holdfast compare {runs[0]} {runs[1]}",
+        "Look for yourself:",
+        f"  holdfast compare {runs[0]} {runs[1]}",
     ]
     return "".join(f"{line}\n" for line in lines)

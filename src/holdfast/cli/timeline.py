@@ -85,6 +85,12 @@ def _characters(start: str, deciding: str, ready: str) -> Characters:
 UNICODE = _characters("▲", "█", "░")
 ASCII = _characters("^", "#", "-")
 
+_MEANINGS = {
+    "standard": "the cloud decides, the local service was never needed",
+    "local_recovery": "the local service decides, the cloud is tried again",
+    "keep_alive": "the cloud decides, the local service stays ready",
+}
+
 _ROW_COLOURS: Mapping[Row, str] = {"cloud": "green", "local": "yellow", "robot": ""}
 
 
@@ -144,9 +150,8 @@ def _cells_of(
     following = 0
     state: State = "off"
     for index in range(reached):
-        end_s = min((index + 1) * cell_s, now_s)
         held = state == "held"
-        while following < len(changes) and changes[following].at_s <= end_s:
+        while following < len(changes) and int(changes[following].at_s / cell_s) <= index:
             state = changes[following].state
             held = held or state == "held"
             following += 1
@@ -185,18 +190,17 @@ def legend(characters: Characters) -> list[Piece]:
     """Return the line that says what the characters mean."""
     deciding, ready = characters.cells["deciding"].text, characters.cells["ready"].text
     return [
-        Piece(" " * _LABEL_WIDTH, ""),
         Piece(f"{deciding} decides  {ready} ready  ", "dim"),
         Piece(characters.start, "bold cyan"),
         Piece(" started  ", "dim"),
         Piece(characters.kill, "bold white on red"),
         Piece(" killed   ", "dim"),
         Piece("C", _COLOURS["by_cloud"]),
-        Piece(" the cloud, ", "dim"),
+        Piece(" cloud decides  ", "dim"),
         Piece("L", _COLOURS["by_local"]),
-        Piece(" local decides, ", "dim"),
+        Piece(" local  ", "dim"),
         Piece("!", _COLOURS["held"]),
-        Piece(" held", "dim"),
+        Piece(" nobody", "dim"),
     ]
 
 
@@ -220,7 +224,7 @@ class Show(Protocol):
         """End, and leave the terminal as it was; may be repeated."""
         ...
 
-    def conclude(self, chronicle: Chronicle, now_s: float) -> None:
+    def conclude(self, chronicle: Chronicle) -> None:
         """Leave behind what a person may want to look at afterwards."""
         ...
 
@@ -250,10 +254,11 @@ class PlainShow:
     def stop(self) -> None:
         """Do nothing."""
 
-    def conclude(self, chronicle: Chronicle, now_s: float) -> None:
+    def conclude(self, chronicle: Chronicle) -> None:
         """Draw the bars, in plain characters."""
         lines = [
-            "".join(piece.text for piece in line) for line in bars(chronicle, now_s, 79, ASCII)
+            "".join(piece.text for piece in line)
+            for line in bars(chronicle, _end_of(chronicle), 79, ASCII)
         ]
         lines.append("".join(piece.text for piece in legend(ASCII)))
         sys.stderr.write("\n" + "".join(f"{line.rstrip()}\n" for line in lines))
@@ -302,12 +307,12 @@ class LiveShow:
             self._live.stop()
             self._live = None
 
-    def conclude(self, chronicle: Chronicle, now_s: float) -> None:
+    def conclude(self, chronicle: Chronicle) -> None:
         """Leave all lines, and the picture as it was in the end."""
         for line in sorted(chronicle.lines):
             self._console.print(self._text([_styled(line)]), soft_wrap=True)
         self._console.print()
-        for pieces in self._picture(chronicle, now_s):
+        for pieces in self._picture(chronicle, _end_of(chronicle)):
             self._console.print(self._text(pieces))
 
     def _frame(self, chronicle: Chronicle, now_s: float) -> Text:
@@ -320,7 +325,7 @@ class LiveShow:
         title.append(Piece(passed.rjust(max(len(passed) + 1, width - 1 - used)), "dim"))
         lines = [title, [], *self._picture(chronicle, now_s), []]
         for label, value, style in (
-            ("status", chronicle.status, "bold"),
+            ("status", f"{chronicle.status}: {_MEANINGS.get(chronicle.status, '')}", "bold"),
             ("robot", chronicle.progress, ""),
         ):
             lines.append([Piece(label.ljust(_LABEL_WIDTH), "dim"), Piece(value, style)])
@@ -347,3 +352,7 @@ class LiveShow:
 def _styled(line: Line) -> Piece:
     style = {"demo": "bold", "cloud": "green", "local": "yellow"}.get(line.who, "")
     return Piece(plain_line(line), style)
+
+
+def _end_of(chronicle: Chronicle) -> float:
+    return max((line.at_s for line in chronicle.lines), default=0.0)

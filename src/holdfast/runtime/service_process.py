@@ -17,7 +17,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from holdfast.errors import TransportError
+from holdfast.errors import InvalidValueError, TransportError
 
 if TYPE_CHECKING:
     from holdfast.runtime.endpoints import Endpoint, TlsFiles
@@ -177,6 +177,8 @@ def _port(text: str) -> int:
 
 
 def _serve(options: argparse.Namespace) -> int:
+    if options.until_stdin_closes and sys.stdin is None:
+        raise InvalidValueError("--until-stdin-closes: this process has no standard input")
     # In the order in which they are needed, so that a mistake in the options is told at once.
     from holdfast.runtime.endpoints import parse_endpoint
 

@@ -88,6 +88,9 @@ class KnownProblems:
         self._classes = {
             name: registry.problem_class(name, search_directory=directory) for name in names
         }
+        # msgspec (0.22) finds out about a struct's fields when the first one is made, and crashes
+        # if a second thread makes one meanwhile.
+        self._lock = threading.Lock()
 
     def __call__(self, opening: Opening) -> Problem:
         """Build the problem that an opening names.
@@ -99,6 +102,10 @@ class KnownProblems:
         ConfigurationError
             If its settings do not fit.
         """
+        with self._lock:
+            return self._build(opening)
+
+    def _build(self, opening: Opening) -> Problem:
         name = opening.problem
         found = self._classes.get(name) or self._registered(name)
         if name in registry.BUILT_IN:

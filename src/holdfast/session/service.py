@@ -628,6 +628,14 @@ def _key_of(data: object) -> bytes:
     return hashlib.blake2b(msgspec.msgpack.encode(data), digest_size=16).digest()
 
 
+def _moved(mean_s: float, sample_s: float, divisor: float) -> float:
+    """Return a running mean; one sample out of all proportion (a stopped process) moves it little.
+
+    Else robots would be turned away for what happened once.
+    """
+    return mean_s + (min(sample_s, 4.0 * mean_s + 0.01) - mean_s) / divisor
+
+
 def _size_of(state: PlanningState | None) -> int:
     return 0 if state is None else state.belief.states.nbytes + state.belief.weights.nbytes
 
@@ -1125,11 +1133,11 @@ class Service:
     def _learn(self, session: _Session, computed_s: float, *, task: bool) -> None:
         """Let a job's time count in what the next ones are expected to take."""
         if task:
-            self._task_s += (computed_s - self._task_s) / 8.0
-            session.task_s += (computed_s - session.task_s) / 4.0
+            self._task_s = _moved(self._task_s, computed_s, 8.0)
+            session.task_s = _moved(session.task_s, computed_s, 4.0)
         else:
-            self._sensing_s += (computed_s - self._sensing_s) / 8.0
-            session.sensing_s += (computed_s - session.sensing_s) / 4.0
+            self._sensing_s = _moved(self._sensing_s, computed_s, 8.0)
+            session.sensing_s = _moved(session.sensing_s, computed_s, 4.0)
 
     def _succeeded(self, work: _Work, outcome: Outcome, now: float) -> None:
         session, statistics = work.session, self._statistics

@@ -1,0 +1,387 @@
+"""The robot's own process dies, at any moment and by any signal, and a new one goes on.
+
+Whatever was performed is performed once: the world, which outlives the robot, has counted it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import pty
+import shlex
+import shutil
+import signal
+import subprocess
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tests.processes.faults import (
+    COMMAND,
+    KEEP_ALIVE,
+    LOCAL_RECOVERY,
+    PROBLEMS,
+    References,
+    Robot,
+    Site,
+    Story,
+    assert_identical,
+    document_of,
+    events_of,
+    sensing_steps,
+    unfinished_steps,
+    wait_for_end,
+    wait_until,
+)
+
+PEG = "peg_in_hole_2d"
+PEG_AND_SLOWLY_ALL = [
+    PEG,
+    *(pytest.param(name, marks=pytest.mark.slow) for name in PROBLEMS if name != PEG),
+]
+
+
+def rows_of(run: Path) -> list[str]:
+    """Return the decisions that a run has told the times of so far."""
+    path = run / "timings.csv"
+    return path.read_text().splitlines()[1:] if path.exists() else []
+
+
+class TestKilled:
+    @pytest.mark.parametrize("problem", PROBLEMS)
+    def test_and_resumed_again_and_again(
+        self, problem: str, site: Site, references: References
+    ) -> None:
+        document = document_of(problem)
+        steps = sensing_steps(document)
+        cloud = site.service().start()
+        story = Story(site, references, document)
+        # With an action in the journal that was not performed, with one that was, and with an
+        # observation that nobody has seen.
+        story.at("perform", steps[1] + 2, site.kill_robot)
+        story.at("perform", steps[3] - 1, site.kill_robot, afterwards=True)
+        story.at("sense", steps[4], site.kill_robot, afterwards=True)
+        assert story.run_and_resume(cloud) == 3
+        # Each robot came with a higher epoch, so the cloud has taken the session over.
+        assert len(cloud.process.matching("session_taken_over")) >= 1
+
+    @pytest.mark.parametrize("problem", PEG_AND_SLOWLY_ALL)
+    def test_where_trials_begin_and_end(
+        self, problem: str, site: Site, references: References
+    ) -> None:
+        document = document_of(problem, max_steps=30, trials=3)
+        cloud = site.service().start()
+        story = Story(site, references, document)
+        story.at("begin", 0, site.kill_robot)
+        story.at("sense", 0, site.kill_robot)
+        story.at("perform", 0, site.kill_robot)
+        story.at("perform", 29, site.kill_robot, afterwards=True)
+        story.at("begin", 0, site.kill_robot, trial=1)
+        story.at("perform", 0, site.kill_robot, trial=1, afterwards=True)
+        story.at("perform", 29, site.kill_robot, trial=2)
+        assert story.run_and_resume(cloud) == 7
+
+    @pytest.mark.parametrize("problem", PEG_AND_SLOWLY_ALL)
+    def test_together_with_the_cloud(
+        self, problem: str, site: Site, references: References
+    ) -> None:
+        document = document_of(problem)
+        steps = sensing_steps(document)
+        cloud = site.service().start()
+        story = Story(site, references, document)
+        # Up again before the next robot is there; not up, and the local service decides; and both
+        # at once while that one does.
+        story.at("sense", steps[1], cloud.kill, site.kill_robot, cloud.start)
+        story.at("perform", steps[2], cloud.kill, site.kill_robot)
+        story.at("perform", steps[4], cloud.start, story.status(KEEP_ALIVE))
+        story.at("perform", steps[4] + 2, site.kill_robot, cloud.kill)
+        assert story.run_and_resume(cloud) == 3
+
+    def test_its_local_service_ends_with_it(self, site: Site, references: References) -> None:
+        document = document_of(PEG)
+        cloud = site.service()
+        story = Story(
+            site, references, document, offload={"startup_timeout_ms": 100.0}, recovery={}
+        )
+        ended: list[int] = []
+
+        def kill_and_wait() -> None:
+            ended.append(story.running.recovery_pid())
+            site.kill_robot()
+            wait_for_end(ended[-1])
+
+        story.at("perform", 20, kill_and_wait)
+        assert story.run_and_resume(cloud) == 1
+        assert ended
+        site.wait_for_nobody()
+
+    @pytest.mark.parametrize("problem", PEG_AND_SLOWLY_ALL)
+    def test_with_the_planner_in_its_own_process(
+        self, problem: str, site: Site, references: References
+    ) -> None:
+        document = document_of(problem)
+        story = Story(site, references, document)
+        for step in (1, 20, 21, 40):
+            story.at("perform", step, site.kill_robot, afterwards=step % 2 == 0)
+        assert story.run_and_resume() == 4
+
+    @pytest.mark.parametrize("problem", PEG_AND_SLOWLY_ALL)
+    def test_in_a_simulated_world(self, problem: str, site: Site, references: References) -> None:
+        """That world dies with the robot, and is made again from the journal."""
+        document = document_of(problem, trials=2)
+        reference = references(document)
+        file = site.configure(document)
+        cloud = site.service().start()
+        random = np.random.default_rng(5)
+        robot = site.run(file, "--rate", "400", services=[cloud])
+        for rows in np.cumsum(random.integers(3, 9, 4)).tolist():
+            # These moments are nobody's choice: between two steps, or within one.
+            out = robot.out
+            wait_until(lambda: len(rows_of(out)) >= rows, f"{rows} decisions")  # noqa: B023
+            time.sleep(random.uniform(0.0, 0.02))
+            robot.kill()
+            steps = unfinished_steps(robot.out)
+            assert steps == list(range(len(steps)))
+            robot = site.run(file, "--rate", "400", services=[cloud], resume=True)
+        robot.finish()
+        assert_identical(robot.out, reference)
+        assert len([each for each in events_of(robot.out) if each["event"] == "resumed_trial"]) > 0
+
+    @pytest.mark.slow
+    @pytest.mark.parametrize("problem", PROBLEMS)
+    @pytest.mark.parametrize("seed", range(3))
+    def test_at_random_with_and_without_the_cloud(
+        self, problem: str, seed: int, site: Site, references: References
+    ) -> None:
+        document = document_of(problem, max_steps=60, trials=2)
+        random = np.random.default_rng([7, seed, PROBLEMS.index(problem)])
+        cloud = site.service().start()
+        story = Story(site, references, document)
+        for trial in range(2):
+            for step in random.choice(np.arange(60), 6, replace=False).tolist():
+                hooks = [
+                    [site.kill_robot],
+                    [cloud.kill, site.kill_robot, cloud.start],
+                    [cloud.kill, cloud.start],
+                ][random.integers(3)]
+                story.at("perform", step, *hooks, trial=trial, afterwards=bool(random.integers(2)))
+        story.run_and_resume(cloud)
+
+
+class TestStopped:
+    def test_for_a_while(self, site: Site, references: References) -> None:
+        """A robot that stood still finds its links given up, and goes on."""
+        cloud = site.service().start()
+        story = Story(site, references, document_of(PEG))
+
+        def stop_for_longer_than_a_lease() -> None:
+            story.running.stop()
+            time.sleep(1.0)
+            story.running.resume()
+
+        story.at("sense", 27, stop_for_longer_than_a_lease)
+        story.run(cloud)
+
+
+class TestEndedInOrder:
+    @pytest.mark.parametrize(
+        ("number", "said"),
+        [
+            (signal.SIGINT, "Interrupted"),
+            (signal.SIGTERM, "Ended by SIGTERM"),
+            (signal.SIGHUP, "Ended by SIGHUP"),
+        ],
+    )
+    def test_by_a_signal(
+        self, number: signal.Signals, said: str, site: Site, references: References
+    ) -> None:
+        document = document_of(PEG)
+        cloud = site.service().start()
+        story = Story(site, references, document)
+        story.at("perform", 12, cloud.kill, story.status(LOCAL_RECOVERY))
+        story.at("perform", 30, lambda: story.running.signal(number))
+        robot = site.run(story.file, services=[cloud])
+        assert robot.wait() == 128 + number
+        # What was being performed was still written down, and nothing after it was begun.
+        assert f"{said}. 0 of 1 trials are finished" in robot.output
+        assert story.world.step == 31
+        assert unfinished_steps(robot.out) == list(range(31))
+        # No local service is left behind, and nothing else.
+        site.wait_for_nobody()
+        # The command that it names goes on.
+        command = robot.output.split("Go on with: ")[1].splitlines()[0]
+        words = shlex.split(command)
+        assert words[:2] == ["holdfast", "run"]
+        resumed = site.process(*COMMAND, *words[1:])
+        assert resumed.wait() == 0, resumed.account()
+        assert_identical(robot.out, story.reference)
+        story.world.assert_each_once(story.reference)
+
+    def test_by_a_second_signal_while_the_robot_does_not_answer(
+        self, site: Site, references: References
+    ) -> None:
+        document = document_of(PEG)
+        cloud = site.service().start()
+        story = Story(site, references, document)
+
+        def press_until_it_ends() -> None:
+            deadline = time.monotonic() + 30.0
+            while story.running.process.poll() is None:
+                assert time.monotonic() < deadline
+                story.running.signal(signal.SIGINT)
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    story.running.process.wait(1.5)
+
+        story.at("perform", 30, press_until_it_ends)
+        robot = site.run(story.file, services=[cloud])
+        assert robot.wait() == 128 + signal.SIGINT
+        assert "Go on with: " in robot.output
+        assert story.world.step == 30
+        story.finish(site.run(story.file, services=[cloud], resume=True))
+
+    def test_by_a_terminal_that_is_closed(self, site: Site, references: References) -> None:
+        document = document_of(PEG)
+        story = Story(site, references, document, offload={"startup_timeout_ms": 100.0})
+        cloud = site.service()
+        ours, theirs = pty.openpty()
+        # The first terminal that the leader of a session opens is the one that controls it.
+        opens_terminal = f"import os; os.open({os.ttyname(theirs)!r}, os.O_RDWR); "
+        story.at("perform", 20, lambda: os.close(ours))
+        robot = site.run(
+            story.file,
+            services=[cloud],
+            command=[*COMMAND[:2], opens_terminal + COMMAND[2]],
+        )
+        os.close(theirs)
+        assert robot.wait() == 128 + signal.SIGHUP
+        site.wait_for_nobody()
+        story.finish(site.run(story.file, services=[cloud], resume=True))
+
+
+class TestWorld:
+    @pytest.mark.parametrize("performed", [False, True])
+    def test_a_robot_that_stalls_holds_and_is_resumed(
+        self, performed: bool, site: Site, references: References
+    ) -> None:
+        document = document_of(PEG)
+        cloud = site.service().start()
+        story = Story(site, references, document, environment={"timeout_ms": 1500.0})
+        story.at("perform", 22, lambda: story.running.wait(), afterwards=performed)
+        robot = site.run(story.file, services=[cloud])
+        assert robot.wait() == 2
+        assert "the robot holds still in trial 0, step 22" in robot.output
+        assert "perform has not returned within 1500 ms" in robot.output
+        assert "whether that task action was performed is not known" in robot.output
+        assert "Go on with: holdfast run" in robot.output
+        story.finish(site.run(story.file, services=[cloud], resume=True))
+
+    def test_two_that_do_not_belong_together(self, site: Site, references: References) -> None:
+        """The world has done more than the journal knows: nothing is performed."""
+        document = document_of(PEG)
+        story = Story(site, references, document)
+        early: list[Path] = []
+
+        def copy() -> None:
+            early.append(Path(shutil.copytree(story.running.out, site.directory / "early")))
+
+        story.at("perform", 10, copy)
+        story.at("perform", 20, site.kill_robot)
+        site.run(story.file).wait()
+        robot = site.run(story.file, out="early", resume=True)
+        assert robot.wait() == 2
+        assert "20 task actions were performed in this trial, the journal has 10" in robot.output
+        assert story.world.step == 20
+
+
+class TestEpoch:
+    def test_the_older_of_two_robots_is_refused(self, site: Site, references: References) -> None:
+        document = document_of(PEG)
+        reference = references(document)
+        steps = sensing_steps(document)
+        cloud = site.service().start()
+        world, file = site.world(document, "older")
+        other, other_file = site.world(document, "newer")
+
+        def be_overtaken() -> None:
+            older = site.robot
+            assert older is not None
+            # Its journal is copied as it is, and somebody goes on with the copy.
+            shutil.copytree(older.out, site.directory / "newer")
+            other.become(world)
+            newer = site.run(other_file, services=[cloud], out="newer", resume=True)
+            newer.finish()
+            assert_identical(newer.out, reference)
+
+        world.on("perform", steps[2], be_overtaken)
+        older = site.run(file, services=[cloud], out="older")
+        assert older.wait() == 2
+        assert "another process has resumed this run, so this one stops" in older.output
+        assert cloud.process.matching("session_taken_over")
+        assert cloud.process.matching("refused", code="stale_epoch")
+        # It still performed what it had been told before, and nothing after that.
+        assert world.step <= steps[3] + 1
+        world.check()
+        other.assert_each_once(reference)
+
+
+class TestRate:
+    def test_it_paces_the_steps(self, site: Site, references: References) -> None:
+        story = Story(site, references, document_of(PEG, max_steps=40))
+        robot = story.run(options=("--rate", "100"))
+        moments_s = story.world.moments_s
+        # A tick late is a tick less to wait for the next one, but never does one come early.
+        missed = sum(event["missed"] for event in robot.matching("missed_ticks"))
+        assert moments_s[-1] - moments_s[0] >= (39 + missed) * 0.01 - 0.05
+
+    def test_missed_ticks_are_counted_and_told(self, site: Site, references: References) -> None:
+        story = Story(site, references, document_of(PEG, max_steps=20))
+        story.at("perform", 10, lambda: time.sleep(0.5))
+        robot = story.run(options=("--rate", "50"))
+        missed = sum(event["missed"] for event in robot.matching("missed_ticks"))
+        assert missed >= 23
+        assert robot.matching("missed_ticks")[-1]["total"] == missed
+        assert f"note: {missed} ticks of --rate were missed" in robot.output
+
+
+class TestDamagedJournal:
+    @pytest.fixture(scope="class")
+    def killed(
+        self, tmp_path_factory: pytest.TempPathFactory, references: References
+    ) -> tuple[Path, Path]:
+        """Return a run killed in its second trial, and the one without faults."""
+        document = document_of(PEG, trials=2, max_steps=40)
+        with Site(tmp_path_factory.mktemp("killed")) as site:
+            file = site.configure(document)
+            robot = site.run(file, "--rate", "300")
+            robot.wait_for("trial")
+            wait_until(lambda: len(rows_of(robot.out)) > 14, "decisions of the second trial")
+            robot.kill()
+            assert unfinished_steps(robot.out)
+            return robot.out, references(document)
+
+    @staticmethod
+    def resume(site: Site, document: dict[str, object]) -> Robot:
+        return site.run(site.configure(document), "--rate", "10000", resume=True)
+
+    @pytest.mark.parametrize("name", ["journal.sqlite", "journal.sqlite-wal"])
+    @pytest.mark.parametrize(
+        "part",
+        [
+            pytest.param(part, marks=[pytest.mark.slow] if number % 6 else [])
+            for number, part in enumerate(np.linspace(0.0, 0.998, 25).tolist())
+        ],
+    )
+    def test_cut_off(self, name: str, part: float, killed: tuple[Path, Path], site: Site) -> None:
+        directory, reference = killed
+        shutil.copytree(directory, site.directory / "out")
+        path = site.directory / "out" / name
+        os.truncate(path, int(part * path.stat().st_size))
+        robot = self.resume(site, document_of(PEG, trials=2, max_steps=40))
+        if robot.wait() == 0:
+            assert_identical(robot.out, reference)
+        else:
+            assert robot.process.returncode == 2, robot.account()
+            assert f"{site.directory / 'out' / 'journal.sqlite'}: " in robot.output
+            assert "--out" in robot.output
+            assert "Traceback" not in robot.output
