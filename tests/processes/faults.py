@@ -61,6 +61,16 @@ FloatArray = npt.NDArray[np.float64]
 Hook = Callable[[], object]
 
 
+def in_order(*hooks: Hook) -> Hook:
+    """Return what calls all of them."""
+
+    def call() -> None:
+        for hook in hooks:
+            hook()
+
+    return call
+
+
 def free_port() -> int:
     """Return a port that nobody uses."""
     with socket.socket() as sock:
@@ -351,8 +361,10 @@ class World:
 
     def check(self) -> None:
         """Raise what a hook has raised."""
-        if self._failures:
-            raise self._failures[0]
+        failures = self._failures.copy()
+        self._failures.clear()
+        if failures:
+            raise failures[0]
 
     def assert_each_once(self, reference: Path) -> None:
         """Compare with a run without faults: every action was performed once, in its order."""
@@ -416,15 +428,17 @@ class World:
         self._call_hook(what, afterwards=False, step=step)
         if _has_hung_up(connection):
             return None
+        answer: dict[str, Any]
         if what == "sense":
-            answer = {"observation": environment.perform_sensing(command["sensing_action"])}
+            shown = environment.perform_sensing(command["sensing_action"])
+            answer = {"observation": shown.tolist()}
         else:
             action = np.array(command["task_action"])
-            answer = {"reward": environment.perform(action)}
+            answer = {"reward": float(environment.perform(action))}
             self.performed[self._trial].append(action.tobytes())
             self.moments_s.append(time.monotonic())
         self._call_hook(what, afterwards=True, step=step)
-        return {key: np.asarray(value).tolist() for key, value in answer.items()}
+        return answer
 
     def _begin(self, trial: int, *, resumed: bool) -> None:
         if resumed and trial != self._trial:
@@ -662,11 +676,7 @@ class Story:
     ) -> None:
         """Let things happen, in order, while the robot senses or performs: see :meth:`World.on`."""
 
-        def all_of_them() -> None:
-            for hook in hooks:
-                hook()
-
-        self.world.on(what, step, all_of_them, trial=trial, afterwards=afterwards)
+        self.world.on(what, step, in_order(*hooks), trial=trial, afterwards=afterwards)
 
     def status(self, to: str, count: int = 1) -> Hook:
         """Return what waits until the robot has come to a status so many times."""

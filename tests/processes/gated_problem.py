@@ -24,7 +24,7 @@ class GatedPeg(PegInHole2D):
 
     name = "gated_peg"
 
-    def policy(self, states: FloatArray, stage: int) -> FloatArray:
+    def policy(self, states: FloatArray, stage: int | npt.NDArray[np.int64]) -> FloatArray:
         if len(states) > 1:
             _pass("policy")
         return super().policy(states, stage)

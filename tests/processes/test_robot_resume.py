@@ -22,8 +22,8 @@ from tests.processes.faults import (
     KEEP_ALIVE,
     LOCAL_RECOVERY,
     PROBLEMS,
+    Hook,
     References,
-    Robot,
     Site,
     Story,
     assert_identical,
@@ -160,11 +160,12 @@ class TestKilled:
         story = Story(site, references, document)
         for trial in range(2):
             for step in random.choice(np.arange(60), 6, replace=False).tolist():
-                hooks = [
+                faults: list[list[Hook]] = [
                     [site.kill_robot],
                     [cloud.kill, site.kill_robot, cloud.start],
                     [cloud.kill, cloud.start],
-                ][random.integers(3)]
+                ]
+                hooks = faults[random.integers(3)]
                 story.at("perform", step, *hooks, trial=trial, afterwards=bool(random.integers(2)))
         story.run_and_resume(cloud)
 
@@ -240,22 +241,35 @@ class TestEndedInOrder:
         assert story.world.step == 30
         story.finish(site.run(story.file, services=[cloud], resume=True))
 
-    def test_by_a_terminal_that_is_closed(self, site: Site, references: References) -> None:
+    @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP], ids=["ctrl_c", "closed"])
+    def test_by_its_terminal(
+        self, number: signal.Signals, site: Site, references: References
+    ) -> None:
         document = document_of(PEG)
         story = Story(site, references, document, offload={"startup_timeout_ms": 100.0})
         cloud = site.service()
         ours, theirs = pty.openpty()
         # The first terminal that the leader of a session opens is the one that controls it.
         opens_terminal = f"import os; os.open({os.ttyname(theirs)!r}, os.O_RDWR); "
-        story.at("perform", 20, lambda: os.close(ours))
+
+        def end() -> None:
+            if number == signal.SIGINT:
+                os.write(ours, b"\x03")
+            else:
+                os.close(ours)
+
+        story.at("perform", 20, story.status(LOCAL_RECOVERY), end)
         robot = site.run(
             story.file,
             services=[cloud],
             command=[*COMMAND[:2], opens_terminal + COMMAND[2]],
         )
         os.close(theirs)
-        assert robot.wait() == 128 + signal.SIGHUP
+        assert robot.wait() == 128 + number
+        assert story.world.step == 21
         site.wait_for_nobody()
+        if number == signal.SIGINT:
+            os.close(ours)
         story.finish(site.run(story.file, services=[cloud], resume=True))
 
 
@@ -344,44 +358,57 @@ class TestRate:
         assert f"note: {missed} ticks of --rate were missed" in robot.output
 
 
+SHORT = document_of(PEG, trials=2, max_steps=40)
+
+
+@pytest.fixture(scope="module")
+def killed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the directory of a run that was killed in its second trial."""
+    with Site(tmp_path_factory.mktemp("killed")) as site:
+        robot = site.run(site.configure(SHORT), "--rate", "300")
+        robot.wait_for("trial")
+        wait_until(lambda: len(rows_of(robot.out)) > 14, "decisions of the second trial")
+        robot.kill()
+        assert unfinished_steps(robot.out)
+        return robot.out
+
+
 class TestDamagedJournal:
-    @pytest.fixture(scope="class")
-    def killed(
-        self, tmp_path_factory: pytest.TempPathFactory, references: References
-    ) -> tuple[Path, Path]:
-        """Return a run killed in its second trial, and the one without faults."""
-        document = document_of(PEG, trials=2, max_steps=40)
-        with Site(tmp_path_factory.mktemp("killed")) as site:
-            file = site.configure(document)
-            robot = site.run(file, "--rate", "300")
-            robot.wait_for("trial")
-            wait_until(lambda: len(rows_of(robot.out)) > 14, "decisions of the second trial")
-            robot.kill()
-            assert unfinished_steps(robot.out)
-            return robot.out, references(document)
-
-    @staticmethod
-    def resume(site: Site, document: dict[str, object]) -> Robot:
-        return site.run(site.configure(document), "--rate", "10000", resume=True)
-
     @pytest.mark.parametrize("name", ["journal.sqlite", "journal.sqlite-wal"])
     @pytest.mark.parametrize(
-        "part",
+        "permille",
         [
-            pytest.param(part, marks=[pytest.mark.slow] if number % 6 else [])
-            for number, part in enumerate(np.linspace(0.0, 0.998, 25).tolist())
+            pytest.param(permille, marks=[pytest.mark.slow] if number % 6 else [])
+            for number, permille in enumerate(range(0, 1000, 41))
         ],
     )
-    def test_cut_off(self, name: str, part: float, killed: tuple[Path, Path], site: Site) -> None:
-        directory, reference = killed
-        shutil.copytree(directory, site.directory / "out")
+    def test_cut_off(
+        self, name: str, permille: int, killed: Path, site: Site, references: References
+    ) -> None:
+        shutil.copytree(killed, site.directory / "out")
         path = site.directory / "out" / name
-        os.truncate(path, int(part * path.stat().st_size))
-        robot = self.resume(site, document_of(PEG, trials=2, max_steps=40))
+        os.truncate(path, permille * path.stat().st_size // 1000)
+        # Without --rate the trials would be run as a batch, anew from where each began.
+        robot = site.run(site.configure(SHORT), "--rate", "10000", resume=True)
         if robot.wait() == 0:
-            assert_identical(robot.out, reference)
+            assert_identical(robot.out, references(SHORT))
         else:
             assert robot.process.returncode == 2, robot.account()
             assert f"{site.directory / 'out' / 'journal.sqlite'}: " in robot.output
             assert "--out" in robot.output
             assert "Traceback" not in robot.output
+
+    def test_as_it_was_left(self, killed: Path, site: Site, references: References) -> None:
+        shutil.copytree(killed, site.directory / "out")
+        robot = site.run(site.configure(SHORT), "--rate", "10000", resume=True)
+        robot.finish()
+        assert robot.matching("resumed_trial", trial=1)
+        assert_identical(robot.out, references(SHORT))
+
+    def test_as_it_was_left_and_finished_as_a_batch(
+        self, killed: Path, site: Site, references: References
+    ) -> None:
+        shutil.copytree(killed, site.directory / "out")
+        robot = site.run(site.configure(SHORT), resume=True)
+        robot.finish()
+        assert_identical(robot.out, references(SHORT))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import shlex
 import signal
 import sys
 from pathlib import Path
@@ -140,6 +141,6 @@ def account(findings: Findings, directory: Path) -> str:
         comparison.describe(),
         "",
         "Look for yourself:",
-        f"  holdfast compare {runs[0]} {runs[1]}",
+        f"  {shlex.join(['holdfast', 'compare', *map(str, runs)])}",
     ]
     return "".join(f"{line}\n" for line in lines)

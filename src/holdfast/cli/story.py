@@ -629,6 +629,8 @@ class Story:
         text = self._in_words(name, event, at)
         if text:
             self._say("robot", text, at)
+        if self._robot_is_done and name == "trial":
+            self._say("robot", "has done all trials; writes its tables and draws one of them", at)
 
     def _in_words(self, name: str, event: dict[str, Any], at: float) -> str:
         """Return what an event says to somebody who sees the first of them; empty for nothing."""

@@ -276,8 +276,8 @@ class LiveShow:
 
     def __init__(self, console: Console) -> None:
         self._console = console
-        unicode = (console.encoding or "").lower().startswith("utf")
-        self._characters = UNICODE if unicode else ASCII
+        self._unicode = (console.encoding or "").lower().startswith("utf")
+        self._characters = UNICODE if self._unicode else ASCII
         self._live: Live | None = None
         self._drawn_at = 0.0
         self._fresh = True
@@ -309,7 +309,7 @@ class LiveShow:
 
     def conclude(self, chronicle: Chronicle) -> None:
         """Leave all lines, and the picture as it was in the end."""
-        for line in sorted(chronicle.lines):
+        for line in sorted(chronicle.lines, key=_moment_of):
             self._console.print(self._text([_styled(line)]), soft_wrap=True)
         self._console.print()
         for pieces in self._picture(chronicle, _end_of(chronicle)):
@@ -331,10 +331,10 @@ class LiveShow:
             lines.append([Piece(label.ljust(_LABEL_WIDTH), "dim"), Piece(value, style)])
         lines.append([])
         room = max(1, height - _AROUND_LINES - 1)
-        lines += [[_styled(line)] for line in sorted(chronicle.lines)[-room:]]
+        lines += [[_styled(line)] for line in sorted(chronicle.lines, key=_moment_of)[-room:]]
         texts = [self._text(pieces) for pieces in lines]
         for text in texts:
-            text.truncate(width - 1, overflow="ellipsis")
+            text.truncate(width - 1, overflow="ellipsis" if self._unicode else "crop")
         return Text("\n").join(texts)
 
     def _picture(self, chronicle: Chronicle, now_s: float) -> list[list[Piece]]:
@@ -356,3 +356,8 @@ def _styled(line: Line) -> Piece:
 
 def _end_of(chronicle: Chronicle) -> float:
     return max((line.at_s for line in chronicle.lines), default=0.0)
+
+
+def _moment_of(line: Line) -> float:
+    """Return by what lines are ordered; those of the same moment stay as they were told."""
+    return line.at_s

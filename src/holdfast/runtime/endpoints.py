@@ -9,7 +9,9 @@ endpoint is read here first, and what cannot work is refused with the reason.
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import ipaddress
+import os
 import re
 import socket
 from pathlib import Path
@@ -52,6 +54,7 @@ _REFUSED = {
     "unixpipe": "unixsock-stream is the local protocol that finds a dead peer at once",
 }
 
+_LOCK = "lock"
 _HOST_NAME = re.compile(
     r"(?=.{1,253}\Z)[A-Za-z0-9_]([A-Za-z0-9_-]*[A-Za-z0-9_])?(\.[A-Za-z0-9_-]+)*"
 )
@@ -159,7 +162,8 @@ class PrivateSocket:
     """A local socket in a directory that no other user can enter.
 
     The permissions of the directory, not those of the socket, keep others out: a socket's own are
-    set only after it can be connected to. Use it as a context, or call :meth:`remove`.
+    set only after it can be connected to. Use it as a context, or call :meth:`remove`. What a
+    process leaves that is killed before it can do that, the next one removes.
 
     Attributes
     ----------
@@ -173,9 +177,14 @@ class PrivateSocket:
     """
 
     def __init__(self) -> None:
-        import tempfile
+        import tempfile  # only robots that launch services need it
 
-        self._directory = Path(tempfile.mkdtemp(prefix="holdfast-"))  # made with mode 0700
+        prefix = f"holdfast-{os.getuid()}-"
+        _remove_abandoned(Path(tempfile.gettempdir()), prefix)
+        self._lock = -1
+        while self._lock < 0:
+            self._directory = Path(tempfile.mkdtemp(prefix=prefix))  # made with mode 0700
+            self._lock = _locked(self._directory)
         self.endpoint = f"{_UNIX}/{self._directory / 's'}"
         try:
             parse_endpoint(self.endpoint)
@@ -187,17 +196,50 @@ class PrivateSocket:
 
     def remove(self) -> None:
         """Remove the directory with what is left in it. May be repeated."""
-        with contextlib.suppress(OSError):
-            for file in self._directory.iterdir():
-                file.unlink(missing_ok=True)
-        with contextlib.suppress(OSError):
-            self._directory.rmdir()
+        _remove_directory(self._directory)
+        if self._lock >= 0:
+            os.close(self._lock)
+            self._lock = -1
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
         self.remove()
+
+
+def _locked(directory: Path) -> int:
+    """Show that a directory is in use until this process ends, however it does.
+
+    Returns -1 if it was taken for an abandoned one before it could be locked.
+    """
+    lock = os.open(directory / _LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+    fcntl.flock(lock, fcntl.LOCK_EX)
+    if (directory / _LOCK).exists():
+        return lock
+    os.close(lock)
+    return -1
+
+
+def _remove_abandoned(parent: Path, prefix: str) -> None:
+    """Remove the directories of sockets whose processes are gone."""
+    for directory in parent.glob(f"{prefix}*"):
+        # Of somebody else, just being made, or gone meanwhile: then it is not ours to remove.
+        with contextlib.suppress(OSError):
+            lock = os.open(directory / _LOCK, os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW)
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                _remove_directory(directory)
+            finally:
+                os.close(lock)
+
+
+def _remove_directory(directory: Path) -> None:
+    with contextlib.suppress(OSError):
+        for file in directory.iterdir():
+            file.unlink(missing_ok=True)
+    with contextlib.suppress(OSError):
+        directory.rmdir()
 
 
 def parse_endpoint(text: str) -> Endpoint:

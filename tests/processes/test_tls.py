@@ -1,0 +1,147 @@
+"""Services behind mutual TLS: their faults change no decision, and strangers stay outside."""
+
+from __future__ import annotations
+
+import socket
+import ssl
+from pathlib import Path
+
+import pytest
+from tests.processes.faults import (
+    KEEP_ALIVE,
+    LOCAL_RECOVERY,
+    LOST,
+    LOST_AGAIN,
+    RESTORED,
+    References,
+    Service,
+    Site,
+    Story,
+    document_of,
+    events_of,
+    free_port,
+    sensing_steps,
+)
+
+PEG = "peg_in_hole_2d"
+
+
+@pytest.fixture(scope="module")
+def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a directory with the keys of a robot and a service, and of strangers."""
+    directory = tmp_path_factory.mktemp("keys")
+    with Site(directory) as site:
+        for name in ("ours", "theirs"):
+            made = site.holdfast("keys", directory / name)
+            assert made.process.returncode == 0, made.account()
+    return directory
+
+
+def secure(site: Site, keys: Path, protocol: str, authority: str = "ours") -> Service:
+    directory = keys / authority / "service"
+    return site.service(*("--tls", str(directory)), endpoint=f"{protocol}/127.0.0.1:{free_port()}")
+
+
+@pytest.mark.parametrize("protocol", ["tls", "quic"])
+def test_killed_stopped_and_started_again(
+    protocol: str, keys: Path, site: Site, references: References
+) -> None:
+    document = document_of(PEG)
+    steps = sensing_steps(document)
+    cloud = secure(site, keys, protocol).start()
+    story = Story(site, references, document)
+    story.at("sense", steps[1], cloud.kill)
+    story.at("perform", steps[3], cloud.start, story.status(KEEP_ALIVE))
+    story.at("sense", steps[4], cloud.stop)
+    story.at("perform", steps[6], cloud.resume, story.status(KEEP_ALIVE, 2))
+    robot = story.run(cloud, options=("--tls", str(keys / "ours" / "robot")))
+    assert robot.statuses() == [LOST, RESTORED, LOST_AGAIN, RESTORED]
+
+
+@pytest.mark.parametrize("protocol", ["tls", "quic"])
+def test_a_robot_of_another_authority_stays_outside(
+    protocol: str, keys: Path, site: Site, references: References
+) -> None:
+    cloud = secure(site, keys, protocol).start()
+    offload = {"startup_timeout_ms": 1000.0}
+    story = Story(site, references, document_of(PEG), offload=offload)
+    # It cannot use the cloud and does not believe it either; its own service decides.
+    robot = story.run(cloud, options=("--tls", str(keys / "theirs" / "robot")))
+    assert robot.statuses() == [LOST]
+    assert not robot.matching("service_appeared", service=cloud.endpoint)
+    assert not cloud.process.matching("session_opened")
+
+
+def test_a_service_of_another_authority_is_not_believed(
+    keys: Path, site: Site, references: References
+) -> None:
+    cloud = secure(site, keys, "tls", authority="theirs").start()
+    story = Story(site, references, document_of(PEG))
+    robot = story.run(cloud, options=("--tls", str(keys / "ours" / "robot")))
+    assert robot.statuses() == [LOST]
+    assert not robot.matching("service_appeared", service=cloud.endpoint)
+
+
+def test_a_robot_without_credentials_is_told_so(keys: Path, site: Site) -> None:
+    cloud = secure(site, keys, "tls").start()
+    robot = site.run(site.configure(document_of(PEG)), services=[cloud])
+    assert robot.wait() == 2
+    assert cloud.endpoint in robot.output
+    assert "--tls" in robot.output
+    assert "Traceback" not in robot.output
+
+
+def test_a_stranger_is_cut_off(keys: Path, site: Site, references: References) -> None:
+    """Seen from outside, by TLS itself; and the robot at work notices nothing."""
+    cloud = secure(site, keys, "tls").start()
+    story = Story(site, references, document_of(PEG))
+
+    def knock() -> None:
+        port = int(cloud.endpoint.rpartition(":")[2])
+        for certificate in (None, keys / "theirs" / "robot"):
+            context = ssl.create_default_context(
+                cafile=str(keys / "ours" / "robot" / "authority.pem")
+            )
+            if certificate is not None:
+                context.load_cert_chain(certificate / "certificate.pem", certificate / "key.pem")
+            # The alert may come with the handshake, or with the first word after it.
+            with (
+                socket.create_connection(("127.0.0.1", port), 30.0) as plain,
+                pytest.raises((ssl.SSLError, ConnectionError)),
+                context.wrap_socket(plain, server_hostname="127.0.0.1") as secured,
+            ):
+                secured.sendall(b"hello")
+                if not secured.recv(1):
+                    raise ConnectionError("closed")
+
+    story.at("perform", 20, knock)
+    robot = story.run(cloud, options=("--tls", str(keys / "ours" / "robot")))
+    assert robot.statuses() == []
+
+
+class TestServeOnAddressesThatOthersReach:
+    def test_refused_without_credentials(self, site: Site) -> None:
+        for address in ("0.0.0.0", "[::]"):
+            ended = site.holdfast("serve", "--listen", f"tcp/{address}:{free_port()}")
+            assert ended.process.returncode == 2
+            assert "--tls" in ended.output
+            assert "--insecure" in ended.output
+
+    def test_allowed_if_it_is_said(self, site: Site, references: References) -> None:
+        port = free_port()
+        cloud = site.service("--insecure", endpoint=f"tcp/0.0.0.0:{port}").start()
+        story = Story(site, references, document_of(PEG))
+        robot = story.run(f"tcp/127.0.0.1:{port}")
+        assert robot.statuses() == []
+        assert cloud.process.matching("session_opened")
+
+    def test_allowed_with_credentials(self, keys: Path, site: Site, references: References) -> None:
+        port = free_port()
+        cloud = site.service(
+            "--tls", str(keys / "ours" / "service"), endpoint=f"tls/0.0.0.0:{port}"
+        ).start()
+        story = Story(site, references, document_of(PEG))
+        story.at("perform", 30, cloud.kill, story.status(LOCAL_RECOVERY))
+        robot = story.run(f"tls/127.0.0.1:{port}", options=("--tls", str(keys / "ours" / "robot")))
+        assert robot.statuses() == [LOST]
+        assert events_of(robot.out)
