@@ -23,6 +23,6 @@ CASES = (
     Case("paced", "A robot at its own pace", service.paced, 60.0, 7.0),
     Case("wire", "Bytes on the wire", service.wire, 20.0, 4.0),
     Case("kills", "A killed cloud, and a new one", faults.kills, 90.0, 12.0),
-    Case("capacity", "Many robots", service.capacity, 220.0, 50.0),
+    Case("capacity", "Many robots", service.capacity, 290.0, 60.0),
     Case("serve", "The service's process", service.serve, 50.0, 14.0),
 )

@@ -28,7 +28,7 @@ from benchmarks.robots import configuration_for
 from benchmarks.turns import Turn, opening_of, recorded_turns
 from holdfast.runtime.endpoints import ServiceAddress
 from holdfast.runtime.transport.zenoh_transport import ZenohRobotTransport
-from holdfast.session.events import Appeared, Ended, Replied, TransportEvent
+from holdfast.session.events import Appeared, Ended, Replied, TransportEvent, Vanished
 from holdfast.session.messages import (
     PROTOCOL_VERSION,
     Busy,
@@ -45,7 +45,6 @@ from holdfast.session.messages import (
 _SERVICE = "cloud"
 _NUM_TRIALS = 12
 _PATIENCE_S = 30.0
-_MAX_OBSERVATIONS = 64
 _DRAIN_S = 1.0
 
 
@@ -59,7 +58,7 @@ class _Fleet:
         self.task_s: list[float] = []
         self.sensing_s: list[float] = []
         self.sent = self.complete = self.busy = self.need_state = 0
-        self.lost = self.wrong = self.skipped = 0
+        self.lost = self.wrong = self.skipped = self.links_lost = 0
 
 
 class _Robot:
@@ -89,10 +88,8 @@ class _Robot:
         turn = fleet.trials[self._trial][self._position]
         state = turn.state
         fresh = turn.before is None
-        hand_over = self._hand_over or not (self._opened or fresh)
         missing = turn.observations[self._acknowledged :]
-        if len(missing) > _MAX_OBSERVATIONS:
-            hand_over = True
+        hand_over = self._hand_over or len(missing) > 1 or not (self._opened or fresh)
         self._number += 1
         request = Request(
             PROTOCOL_VERSION,
@@ -162,7 +159,8 @@ class _Robot:
 class _Link:
     """A robot's end of the wire, for one robot or for several."""
 
-    def __init__(self, endpoint: str) -> None:
+    def __init__(self, fleet: _Fleet, endpoint: str) -> None:
+        self._fleet = fleet
         self._transport = ZenohRobotTransport({_SERVICE: ServiceAddress(endpoint)})
         self._asked: dict[int, _Robot] = {}
         self._number = 0
@@ -187,6 +185,8 @@ class _Link:
             self._asked.pop(event.call).ended(event.call)
         elif isinstance(event, Appeared):
             self.appeared.set()
+        elif isinstance(event, Vanished):
+            self._fleet.links_lost += 1
 
 
 def _percentiles(seconds: list[float]) -> dict[str, float]:
@@ -230,7 +230,7 @@ def load(
     problem, settings = configuration.problem, configuration.planning
     trials = [recorded_turns(problem, settings, trial) for trial in range(_NUM_TRIALS)]
     fleet = _Fleet(trials, opening_of(configuration))
-    links = [_Link(endpoint) for _ in range(num_links)]
+    links = [_Link(fleet, endpoint) for _ in range(num_links)]
     for link in links:
         if not link.appeared.wait(_PATIENCE_S):
             raise RuntimeError(f"no service at {endpoint}")
@@ -283,7 +283,16 @@ def load(
         "unanswered": unanswered,
         **{
             name: getattr(fleet, name)
-            for name in ("sent", "complete", "busy", "need_state", "lost", "wrong", "skipped")
+            for name in (
+                "sent",
+                "complete",
+                "busy",
+                "need_state",
+                "lost",
+                "links_lost",
+                "wrong",
+                "skipped",
+            )
         },
     }
 

@@ -14,8 +14,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-__all__ = ["CountingProxy", "ServiceProcess", "Usage", "free_tcp_port", "usage_of"]
+__all__ = ["CountingProxy", "EchoProcess", "ServiceProcess", "Usage", "free_tcp_port", "usage_of"]
 
+_ECHO = Path(__file__).with_name("echo.py")
 _READY_TIMEOUT_S = 30.0
 _TICK_S = 1.0 / os.sysconf("SC_CLK_TCK")
 
@@ -143,6 +144,32 @@ class ServiceProcess:
         at = time.monotonic()
         self.ready_at = at if line and json.loads(line)["event"] == "ready" else 0.0
         self._ready.set()
+
+
+class EchoProcess:
+    """The wire alone: see echo.py.
+
+    Attributes
+    ----------
+    endpoint : str
+    """
+
+    def __init__(self) -> None:
+        self.endpoint = f"tcp/127.0.0.1:{free_tcp_port()}"
+        self._process = subprocess.Popen(
+            [sys.executable, str(_ECHO), self.endpoint],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+        )
+        assert self._process.stdout is not None
+        self._process.stdout.readline()
+
+    def __enter__(self) -> EchoProcess:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._process.kill()
+        self._process.communicate()
 
 
 class CountingProxy:

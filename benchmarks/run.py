@@ -11,8 +11,9 @@ import argparse
 import os
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
@@ -94,6 +95,21 @@ def wait_for_quiet(until: float) -> None:
             return
 
 
+def measure(
+    case: Case, quick: bool, progress: Progress, patience_s: float
+) -> tuple[Result, float | None]:
+    """Run a case, again if others were loud meanwhile and there is time; return the last."""
+    until = time.monotonic() + patience_s
+    while True:
+        wait_for_quiet(until)
+        other = OtherLoad()
+        result = case.run(Context(quick, progress.of(case.name)))
+        cores = other.cores()
+        if not cores or cores <= LOUD or time.monotonic() >= until:
+            progress.finish(case.name)
+            return result, cores
+
+
 def load_in_words(cores: float | None) -> str:
     """Return what else the machine had to do, of a mean number of cores."""
     average = f"load average {os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else ""
@@ -102,28 +118,65 @@ def load_in_words(cores: float | None) -> str:
     return f"others kept {cores:.2f} cores busy" + (f", {average}" if average else "")
 
 
-def report(
-    machine: dict[str, str],
-    results: list[tuple[Case, Result, str]],
-    bars: list[list[str]],
-    notes: list[str],
-) -> str:
+class Section(NamedTuple):
+    """What the report says of one case.
+
+    Attributes
+    ----------
+    title : str
+    body : str
+        In Markdown.
+    bars : list of list of str
+        Rows of the table of bars.
+    """
+
+    title: str
+    body: str
+    bars: list[list[str]]
+
+
+def section(case: Case, result: Result, meanwhile: str) -> Section:
+    """Return the section of a case that was measured."""
+    parts = [part if isinstance(part, str) else markdown_of(part) for part in result.content]
+    bars = [bar.cells(case.name) for bar in result.bars]
+    return Section(case.title, "\n\n".join([*parts, meanwhile]), bars)
+
+
+def sections_of(text: str) -> dict[str, Section]:
+    """Return the sections of a report that was written before, by the names of their cases."""
+    bodies = dict(part.split("\n\n", 1) for part in text.split("\n## ")[1:])
+    rows = [
+        [cell.strip() for cell in line.strip("|").split("|")]
+        for line in bodies.get("Bars", "").splitlines()
+        if line.startswith("| ")
+    ]
+    return {
+        case.name: Section(
+            case.title,
+            bodies[case.title].rstrip("\n"),
+            [row for row in rows if row[-1] == case.name],
+        )
+        for case in CASES
+        if case.title in bodies
+    }
+
+
+def report(machine: dict[str, str], sections: Sequence[Section], notes: Sequence[str]) -> str:
     """Return the report in Markdown."""
+    bars = [row for each in sections for row in each.bars]
     parts = [
         "# Benchmarks",
         "Written by `make bench`. What is compared ran in turns within one run; times are medians. "
-        "Timings are no tests: a miss here fails nothing.",
+        "Timings are no tests: a miss here fails nothing. One case alone: "
+        "`python benchmarks/run.py --only CASE`.",
         *notes,
         "## Bars",
-        "One of them alone: `python benchmarks/run.py --only CASE`.",
         markdown_of(Table(BARS_HEADER, bars)) if bars else "None here.",
         "## Machine",
         markdown_of(Table(("", ""), [[name, value] for name, value in machine.items()])),
     ]
-    for case, result, load in results:
-        parts.append(f"## {case.title}")
-        parts += [part if isinstance(part, str) else markdown_of(part) for part in result.content]
-        parts.append(f"Meanwhile, {load}.")
+    for each in sections:
+        parts += [f"## {each.title}", each.body]
     return "\n\n".join(parts) + "\n"
 
 
@@ -144,35 +197,36 @@ def main() -> None:
         "--output", type=Path, help="where to write (default: RESULTS.md after a full run)"
     )
     parser.add_argument(
+        "--update",
+        action="store_true",
+        help="put what is measured into the report in the place of what it says of these cases",
+    )
+    parser.add_argument(
         "--patience",
         type=float,
         default=0.0,
         metavar="MINUTES",
-        help="wait before each case until others let the machine alone, but no longer than this",
+        help="wait before each case until others let the machine alone, and measure again if they "
+        "did not while it ran, for no longer than this",
     )
     options = parser.parse_args()
     cases = [case for case in CASES if not options.only or case.name in options.only]
     complete = not options.quick and len(cases) == len(CASES)
-    output = options.output or (RESULTS if complete else None)
+    output = options.output or (RESULTS if complete or options.update else None)
 
     console = Console()
     progress = Progress(cases, options.quick)
     machine, kernel = describe(), kernel_hash()
-    results = []
+    sections = {}
     loads = []
     for case in cases:
-        wait_for_quiet(time.monotonic() + 60.0 * options.patience)
-        other = OtherLoad()
-        result = case.run(Context(options.quick, progress.of(case.name)))
-        progress.finish(case.name)
-        cores = other.cores()
+        result, cores = measure(case, options.quick, progress, 60.0 * options.patience)
         loads.append(cores or 0.0)
-        load = load_in_words(cores)
-        results.append((case, result, load))
+        meanwhile = f"Meanwhile, {load_in_words(cores)} ({machine['holdfast']}, {machine['date']})."
+        sections[case.name] = section(case, result, meanwhile)
         console.rule(case.title)
-        show(console, [*result.content, f"Meanwhile, {load}."])
+        show(console, [*result.content, meanwhile])
 
-    bars = [bar.cells(case.name) for case, result, _ in results for bar in result.bars]
     notes = []
     if options.quick:
         notes.append("**A quick run: few repetitions, rough numbers.**")
@@ -184,11 +238,16 @@ def main() -> None:
     if kernel_hash() != kernel:
         notes.append("**The kernel was built again during this run: the sections differ in it.**")
     show(console, notes)
+    bars = [row for each in sections.values() for row in each.bars]
     if bars:
         console.rule("Bars")
         show(console, [Table(BARS_HEADER, bars)])
     if output is not None:
-        write_atomically(output, report(machine, results, bars, notes))
+        if options.update and output.exists():
+            sections = sections_of(output.read_text()) | sections
+            notes = []  # they would seem to be about all sections; each says its own
+        ordered = [sections[case.name] for case in CASES if case.name in sections]
+        write_atomically(output, report(machine, ordered, notes))
         console.print(f"written to {output}", highlight=False)
 
 

@@ -7,9 +7,10 @@ a service uses but none of its code; so whatever a service answers can be held a
 
 from __future__ import annotations
 
+import sys
 from queue import SimpleQueue
 from time import perf_counter
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 from benchmarks.beliefs import MAX_STEPS, SEED
 from holdfast.configuration import Configuration
@@ -45,9 +46,10 @@ from holdfast.session.messages import (
 )
 from holdfast.settings import PlanningSettings
 
-__all__ = ["Asked", "Asker", "Turn", "decided_in_process", "opening_of", "recorded_turns"]
+__all__ = ["Asked", "Asker", "Caller", "Turn", "decided_in_process", "opening_of", "recorded_turns"]
 
 _PATIENCE_S = 30.0
+_SWITCH_INTERVAL_S = 0.0005
 
 
 class Turn(NamedTuple):
@@ -189,8 +191,46 @@ class Asked(NamedTuple):
     sensing_s: float
 
 
-class Asker:
-    """Asks one service one question at a time, over the robot's own end of the wire.
+class Caller:
+    """The robot's own end of the wire to one service, for one call at a time.
+
+    Parameters
+    ----------
+    endpoint : str
+    """
+
+    def __init__(self, endpoint: str) -> None:
+        self._events: SimpleQueue[TransportEvent] = SimpleQueue()
+        self._transport = ZenohRobotTransport({endpoint: ServiceAddress(endpoint)})
+        self._endpoint = endpoint
+        self._number = 0
+        self._switch_interval_s = sys.getswitchinterval()
+
+    def __enter__(self) -> Self:
+        sys.setswitchinterval(_SWITCH_INTERVAL_S)  # as a robot's process does
+        self._transport.start(self._events.put)
+        while not isinstance(self._events.get(timeout=_PATIENCE_S), Appeared):
+            pass
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._transport.close()
+        sys.setswitchinterval(self._switch_interval_s)
+
+    def call(self, payload: bytes) -> list[tuple[float, Reply]]:
+        """Send a request; return its replies and when each was decoded, once the call has ended."""
+        self._number += 1
+        self._transport.call(self._endpoint, self._number, payload)
+        replies = []
+        while not isinstance(event := self._events.get(timeout=_PATIENCE_S), Ended):
+            if isinstance(event, Replied):
+                reply = decode_reply(event.payload)
+                replies.append((perf_counter(), reply))
+        return replies
+
+
+class Asker(Caller):
+    """Asks one service one question at a time, as one robot.
 
     Parameters
     ----------
@@ -201,21 +241,9 @@ class Asker:
     """
 
     def __init__(self, endpoint: str, opening: Opening, session: bytes) -> None:
-        self._events: SimpleQueue[TransportEvent] = SimpleQueue()
-        self._transport = ZenohRobotTransport({endpoint: ServiceAddress(endpoint)})
-        self._endpoint = endpoint
+        super().__init__(endpoint)
         self._opening: Opening | None = opening
         self._session = session
-        self._number = 0
-
-    def __enter__(self) -> Asker:
-        self._transport.start(self._events.put)
-        while not isinstance(self._events.get(timeout=_PATIENCE_S), Appeared):
-            pass
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._transport.close()
 
     def ask(
         self,
@@ -225,16 +253,12 @@ class Asker:
         checkpoint: bytes | None = None,
     ) -> Asked:
         """Ask, and wait for the end of the call."""
-        self._number += 1
-        task: TaskAnswer | None = None
-        sensing: SensingAnswer | None = None
-        task_s = sensing_s = 0.0
         start = perf_counter()
         request = Request(
             PROTOCOL_VERSION,
             self._session,
             1,
-            self._number,
+            self._number + 1,
             state.trial,
             state.step,
             state.sensed,
@@ -243,16 +267,11 @@ class Asker:
             self._opening,
             checkpoint,
         )
-        self._transport.call(self._endpoint, self._number, encode(request))
-        while True:
-            event = self._events.get(timeout=_PATIENCE_S)
-            if isinstance(event, Replied):
-                reply: Reply = decode_reply(event.payload)
-                if isinstance(reply, TaskAnswer):
-                    task, task_s = reply, perf_counter() - start
-                elif isinstance(reply, SensingAnswer):
-                    sensing, sensing_s = reply, perf_counter() - start
-            elif isinstance(event, Ended):
-                break
+        asked = Asked(None, None, 0.0, 0.0)
+        for at, reply in self.call(encode(request)):
+            if isinstance(reply, TaskAnswer):
+                asked = asked._replace(task=reply, task_s=at - start)
+            elif isinstance(reply, SensingAnswer):
+                asked = asked._replace(sensing=reply, sensing_s=at - start)
         self._opening = None
-        return Asked(task, sensing, task_s, sensing_s)
+        return asked

@@ -15,6 +15,7 @@ __all__ = [
     "InvalidValueError",
     "ProblemError",
     "TransportError",
+    "TrialError",
     "UnknownProblemError",
 ]
 
@@ -49,3 +50,7 @@ class CheckpointError(HoldfastError):
 
 class TransportError(HoldfastError):
     """An endpoint cannot be used: it is malformed, taken, or lacks its credentials."""
+
+
+class TrialError(HoldfastError):
+    """What holdfast refused, or the problem's own code raised, with the trial where it happened."""

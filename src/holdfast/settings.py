@@ -150,7 +150,9 @@ class OffloadSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
     startup_timeout_ms : float
         At the start of a run, how long to wait for a service that has never been seen yet.
     lease_ms : float
-        A link over which nothing comes for this long is given up.
+        Services give up the link to this robot when nothing comes over it for this long; the robot
+        gives up the local service's after the same time, and any other's after what that one says
+        itself (``holdfast serve --lease-ms``).
     decision_deadline_ms : float or None
         A decision that is not there this long after it was needed is asked of the local service
         as well, if that is running; the first answer wins.

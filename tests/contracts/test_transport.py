@@ -7,8 +7,9 @@ when a busy machine makes it happen late.
 from __future__ import annotations
 
 import contextlib
-import datetime
+import datetime as dt
 import ipaddress
+import itertools
 import json
 import os
 import queue
@@ -18,12 +19,17 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Protocol
 
 import pytest
+import zenoh
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.x509 import oid
 
 from holdfast.errors import InvalidValueError, TransportError
 from holdfast.runtime.endpoints import PrivateSocket, ServiceAddress, TlsFiles
@@ -111,22 +117,22 @@ class ZenohWire:
         service_tls: TlsFiles | None = None,
         robot_listens: bool = False,
     ) -> None:
-        self._protocol = protocol
+        self.protocol = protocol
         self._directory = directory
         self._robot_tls = robot_tls
-        self._service_tls = service_tls
-        self._robot_listens = robot_listens
+        self.service_tls = service_tls
+        self.robot_listens = robot_listens
         self._endpoints: dict[str, str] = {}
         self.ends: list[RobotTransport | ServiceTransport] = []
 
     def endpoint(self, name: str) -> str:
         if name not in self._endpoints:
-            self._endpoints[name] = unused_endpoint(self._protocol, self._directory)
+            self._endpoints[name] = unused_endpoint(self.protocol, self._directory)
         return self._endpoints[name]
 
     def robot(self, *services: str, max_message_bytes: int = MAX_BYTES) -> ZenohRobotTransport:
         robot = ZenohRobotTransport(
-            {name: ServiceAddress(self.endpoint(name), self._robot_listens) for name in services},
+            {name: ServiceAddress(self.endpoint(name), self.robot_listens) for name in services},
             lease_ms=LEASE_MS,
             decision_timeout_ms=PATIENCE_S * 1e3,
             max_message_bytes=max_message_bytes,
@@ -140,11 +146,11 @@ class ZenohWire:
         service = ZenohServiceTransport(
             name,
             boot=boot,
-            listen=[] if self._robot_listens else endpoints,
-            connect=endpoints if self._robot_listens else [],
+            listen=[] if self.robot_listens else endpoints,
+            connect=endpoints if self.robot_listens else [],
             lease_ms=LEASE_MS,
             max_message_bytes=MAX_BYTES,
-            tls=self._service_tls,
+            tls=self.service_tls,
         )
         self.ends.append(service)
         return service
@@ -159,12 +165,16 @@ def unused_endpoint(protocol: str, directory: Path) -> str:
         return f"{protocol}/127.0.0.1:{probe.getsockname()[1]}"
 
 
+def close_all(ends: Sequence[RobotTransport | ServiceTransport]) -> None:
+    # Robots first: over QUIC, one that looks for a lost service takes a second to close.
+    for end in sorted(ends, key=lambda end: hasattr(end, "endpoints")):
+        end.close()
+
+
 class Authority:
     """Certifies, with keys that are made for the test."""
 
     def __init__(self, directory: Path) -> None:
-        from cryptography import x509
-        from cryptography.hazmat.primitives.asymmetric import ec
 
         self.directory = directory
         directory.mkdir()
@@ -173,9 +183,6 @@ class Authority:
         self._certificate = self._certify(self._name, self._key.public_key(), is_authority=True)
 
     def issue(self, name: str) -> TlsFiles:
-        from cryptography import x509
-        from cryptography.hazmat.primitives import serialization
-        from cryptography.hazmat.primitives.asymmetric import ec
 
         key = ec.generate_private_key(ec.SECP256R1())
         subject = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, name)])
@@ -195,21 +202,21 @@ class Authority:
         )
         return files
 
-    def _certify(self, subject: object, public_key: object, *, is_authority: bool):  # type: ignore[no-untyped-def]
-        from cryptography import x509
-        from cryptography.hazmat.primitives import hashes
+    def _certify(
+        self, subject: x509.Name, public_key: ec.EllipticCurvePublicKey, *, is_authority: bool
+    ) -> x509.Certificate:
 
-        now = datetime.datetime.now(datetime.UTC)
-        usages = [x509.ExtendedKeyUsageOID.SERVER_AUTH, x509.ExtendedKeyUsageOID.CLIENT_AUTH]
+        now = dt.datetime.now(dt.UTC)
+        usages = [oid.ExtendedKeyUsageOID.SERVER_AUTH, oid.ExtendedKeyUsageOID.CLIENT_AUTH]
         names = [x509.DNSName("localhost"), x509.IPAddress(ipaddress.ip_address("127.0.0.1"))]
         builder = (
             x509.CertificateBuilder()
-            .subject_name(subject)  # type: ignore[arg-type]
+            .subject_name(subject)
             .issuer_name(self._name)
-            .public_key(public_key)  # type: ignore[arg-type]
+            .public_key(public_key)
             .serial_number(x509.random_serial_number())
-            .not_valid_before(now - datetime.timedelta(hours=1))
-            .not_valid_after(now + datetime.timedelta(days=1))
+            .not_valid_before(now - dt.timedelta(hours=1))
+            .not_valid_after(now + dt.timedelta(days=1))
             .add_extension(x509.BasicConstraints(ca=is_authority, path_length=None), critical=True)
         )
         if not is_authority:
@@ -260,21 +267,29 @@ def wire(request: pytest.FixtureRequest, socket_directory: Path) -> Iterator[Wir
     else:
         made = ZenohWire(request.param, socket_directory)
     yield made
-    for end in made.ends:
-        end.close()
+    close_all(made.ends)
 
 
 @pytest.fixture
 def tcp(socket_directory: Path) -> Iterator[ZenohWire]:
     made = ZenohWire("tcp", socket_directory)
     yield made
-    for end in made.ends:
-        end.close()
+    close_all(made.ends)
 
 
 def echo(call: IncomingCall) -> None:
     call.reply(call.payload)
     call.end()
+
+
+def saying(text: bytes) -> Callable[[IncomingCall], None]:
+    """Return a service that always says the same."""
+
+    def answer(call: IncomingCall) -> None:
+        call.reply(text)
+        call.end()
+
+    return answer
 
 
 def silent(call: IncomingCall) -> None:
@@ -292,21 +307,6 @@ def connected(
     robot.start(inbox)
     inbox.wait_for(Appeared("cloud", boot))
     return robot, inbox, serving
-
-
-def restarted(wire: Wire, boot: str, reply: bytes) -> ServiceTransport:
-    """Start a service where one was closed in this very process; over QUIC its port lingers."""
-    until_s = time.monotonic() + PATIENCE_S
-    while True:
-        service = wire.service("cloud", boot)
-        try:
-            service.start(lambda call: (call.reply(reply), call.end())[0])
-        except TransportError:
-            if time.monotonic() > until_s:
-                raise
-            time.sleep(0.02)
-        else:
-            return service
 
 
 class TestEveryWire:
@@ -400,17 +400,18 @@ class TestEveryWire:
         with ThreadPoolExecutor(4) as workers:
 
             def work(call: IncomingCall) -> None:
-                workers.submit(lambda: (call.reply(b"first"), call.reply(call.payload), call.end()))
+                call.reply(b"first")
+                echo(call)
 
-            robot, inbox, _ = connected(wire, work)
-            threads = [
-                threading.Thread(
-                    target=lambda k=k: [  # type: ignore[misc]
-                        robot.call("cloud", number, b"%d" % number) for number in range(k, 200, 8)
-                    ]
-                )
-                for k in range(8)
-            ]
+            def ask(first: int) -> None:
+                for number in range(first, 200, 8):
+                    robot.call("cloud", number, b"%d" % number)
+
+            def hand_over(call: IncomingCall) -> None:
+                workers.submit(work, call)
+
+            robot, inbox, _ = connected(wire, hand_over)
+            threads = [threading.Thread(target=ask, args=(first,)) for first in range(8)]
             for thread in threads:
                 thread.start()
             for thread in threads:
@@ -470,11 +471,14 @@ class TestEveryWire:
         assert inbox.of_call(1) == [Ended(1)]
 
     def test_a_restarted_service_is_another_one(self, wire: Wire) -> None:
+        if isinstance(wire, ZenohWire) and wire.protocol == "quic":
+            pytest.skip("a process keeps a QUIC port for a while: see TestProcesses")
         robot, inbox, service = connected(wire)
         for k in range(2, 5):
             service.close()
             inbox.wait_for(Vanished("cloud", f"b{k - 1}"))
-            service = restarted(wire, f"b{k}", b"%d" % k)
+            service = wire.service("cloud", f"b{k}")
+            service.start(saying(b"%d" % k))
             inbox.wait_for(Appeared("cloud", f"b{k}"))
             robot.call("cloud", k, b"who?")
             assert inbox.of_call(k) == [Replied(k, b"%d" % k), Ended(k)]
@@ -485,17 +489,15 @@ class TestEveryWire:
 
     def test_two_services_are_never_mixed(self, wire: Wire) -> None:
         for name in ("east", "west"):
-            wire.service(name, "b1").start(
-                lambda call, name=name: (call.reply(name.encode()), call.end())  # type: ignore[misc]
-            )
+            wire.service(name, "b1").start(saying(name.encode()))
         robot, inbox = wire.robot("east", "west"), Inbox()
         robot.start(inbox)
         inbox.wait_for(Appeared("east", "b1"), Appeared("west", "b1"))
         for number in range(40):
             robot.call(("east", "west")[number % 2], number, b"who?")
         for number in range(40):
-            name = ("east", "west")[number % 2].encode()
-            assert inbox.of_call(number) == [Replied(number, name), Ended(number)]
+            name = ("east", "west")[number % 2]
+            assert inbox.of_call(number) == [Replied(number, name.encode()), Ended(number)]
 
     def test_one_of_two_services_vanishes_alone(self, wire: Wire) -> None:
         services = {name: wire.service(name, "b1") for name in ("east", "west")}
@@ -535,7 +537,7 @@ class TestEveryWire:
         assert inbox.of_call(1) == [Replied(1, b"small"), Ended(1)]
 
     def test_a_robot_that_goes_hinders_nobody(self, wire: Wire) -> None:
-        if isinstance(wire, ZenohWire) and wire._robot_listens:
+        if isinstance(wire, ZenohWire) and wire.robot_listens:
             pytest.skip("only one robot can listen at an endpoint")
         calls: queue.SimpleQueue[IncomingCall] = queue.SimpleQueue()
         robot, _, _ = connected(wire, calls.put)
@@ -576,8 +578,13 @@ class TestEveryWire:
         assert inbox.events == before == [Appeared("cloud", "b1")]
 
     def test_a_closed_service_delivers_nothing_more(self, wire: Wire) -> None:
-        received = []
-        robot, inbox, service = connected(wire, lambda call: (received.append(1), echo(call))[0])
+        received: list[IncomingCall] = []
+
+        def serve(call: IncomingCall) -> None:
+            received.append(call)
+            echo(call)
+
+        robot, inbox, service = connected(wire, serve)
         numbers = iter(range(1_000_000))
         stop = threading.Event()
 
@@ -697,8 +704,7 @@ class TestZenoh:
             with pytest.raises(TransportError, match=r"unixsock-stream/.*: another process"):
                 wire.service("cloud", "b2").start(echo)
         finally:
-            for end in wire.ends:
-                end.close()
+            close_all(wire.ends)
 
     @pytest.mark.parametrize("bad", ["", "a/b", "a*", "a b", "x" * 101, "$x", "@x"])
     def test_names_that_are_no_part_of_a_key_are_refused(self, bad: str) -> None:
@@ -724,8 +730,6 @@ class TestZenoh:
 
     def test_robots_do_not_see_each_other(self, tcp: ZenohWire) -> None:
         """A robot that plays the service's part fools only itself."""
-        import zenoh
-
         tcp.service("cloud", "b1").start(echo)
         settings = {
             "mode": "peer",
@@ -775,7 +779,7 @@ class TestCertificates:
         inboxes = [Inbox() for _ in outsiders]
         for outsider, inbox in zip(outsiders, inboxes, strict=True):
             outsider.start(inbox)
-        bare = bare_session(protocol, address.endpoint, robot_tls.authority)
+        bare = bare_session(address.endpoint, robot_tls.authority)
         tokens: list[object] = []
         bare.liveliness().declare_subscriber("**", tokens.append, history=True)
         robot, inbox = wire.robot("cloud"), Inbox()
@@ -792,8 +796,7 @@ class TestCertificates:
         assert inbox.of_call(1) == [Replied(1, b"friend"), Ended(1)]
         assert received == [b"friend"]
         bare.close()
-        for end in (*outsiders, *wire.ends):
-            end.close()
+        close_all([*wire.ends, *outsiders])
 
     def test_a_robot_does_not_believe_a_service_of_another_authority(
         self, protocol: str, robot_tls: TlsFiles, tmp_path: Path, socket_directory: Path
@@ -805,14 +808,11 @@ class TestCertificates:
         robot.start(inbox)
         time.sleep(0.5)
         assert inbox.events == []
-        for end in wire.ends:
-            end.close()
+        close_all(wire.ends)
 
 
-def bare_session(protocol: str, endpoint: str, authority: Path):  # type: ignore[no-untyped-def]
+def bare_session(endpoint: str, authority: Path) -> zenoh.Session:
     """A client that knows the authority and has no certificate."""
-    import zenoh
-
     settings = {
         "mode": "peer",
         "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
@@ -824,18 +824,28 @@ def bare_session(protocol: str, endpoint: str, authority: Path):  # type: ignore
 
 
 SERVICE = """
-import sys
+import sys, threading, time
+from pathlib import Path
+from holdfast.runtime.endpoints import TlsFiles
 from holdfast.runtime.transport.zenoh_transport import ZenohServiceTransport
+
+def stream(call):
+    while True:
+        call.reply(b"more")
+        time.sleep(0.0002)
 
 def serve(call):
     if call.payload.startswith(b"echo"):
         call.reply(call.payload)
         call.end()
+    elif call.payload == b"stream":
+        threading.Thread(target=stream, args=[call], daemon=True).start()
     else:
         call.reply(b"begun")  # and is never heard of again
 
-endpoint, boot, direction = sys.argv[1:]
-service = ZenohServiceTransport("cloud", boot=boot, **{direction: [endpoint]})
+endpoint, boot, direction, *files = sys.argv[1:]
+tls = TlsFiles(*map(Path, files)) if files else None
+service = ZenohServiceTransport("cloud", boot=boot, tls=tls, **{direction: [endpoint]})
 service.start(serve)
 print("ready", flush=True)
 sys.stdin.read()
@@ -845,10 +855,11 @@ service.close()
 
 @contextlib.contextmanager
 def service_process(
-    endpoint: str, boot: str, direction: str = "listen"
+    endpoint: str, boot: str, direction: str = "listen", tls: TlsFiles | None = None
 ) -> Iterator[subprocess.Popen[bytes]]:
+    files = [] if tls is None else [str(tls.authority), str(tls.certificate), str(tls.key)]
     process = subprocess.Popen(
-        [sys.executable, "-c", SERVICE, endpoint, boot, direction],
+        [sys.executable, "-c", SERVICE, endpoint, boot, direction, *files],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
     )
@@ -862,27 +873,40 @@ def service_process(
         process.communicate()
 
 
-@pytest.mark.parametrize("kind", ["tcp", "unixsock-stream", "robot_listens"])
+@pytest.mark.parametrize("kind", ["tcp", "tls", "quic", "unixsock-stream", "robot_listens"])
 class TestProcesses:
     @pytest.fixture
-    def ends(self, kind: str, socket_directory: Path) -> Iterator[tuple[ZenohWire, str]]:
-        listens = kind == "robot_listens"
-        protocol = "unixsock-stream" if listens else kind
-        wire = ZenohWire(protocol, socket_directory, robot_listens=listens)
-        yield wire, "connect" if listens else "listen"
-        for end in wire.ends:
-            end.close()
+    def wire(
+        self, kind: str, socket_directory: Path, robot_tls: TlsFiles, service_tls: TlsFiles
+    ) -> Iterator[ZenohWire]:
+        if kind in ("tls", "quic"):
+            wire = ZenohWire(kind, socket_directory, robot_tls=robot_tls, service_tls=service_tls)
+        elif kind == "robot_listens":
+            wire = ZenohWire("unixsock-stream", socket_directory, robot_listens=True)
+        else:
+            wire = ZenohWire(kind, socket_directory)
+        yield wire
+        close_all(wire.ends)
+
+    @pytest.fixture
+    def start(
+        self, wire: ZenohWire
+    ) -> Callable[[str], contextlib.AbstractContextManager[subprocess.Popen[bytes]]]:
+        direction = "connect" if wire.robot_listens else "listen"
+        return lambda boot: service_process(
+            wire.endpoint("cloud"), boot, direction, wire.service_tls
+        )
 
     def test_kill_in_mid_call_ends_the_call_and_the_next_process_is_seen(
-        self, ends: tuple[ZenohWire, str]
+        self,
+        wire: ZenohWire,
+        start: Callable[[str], contextlib.AbstractContextManager[subprocess.Popen[bytes]]],
     ) -> None:
-        wire, direction = ends
-        endpoint = wire.endpoint("cloud")
         robot, inbox = wire.robot("cloud"), Inbox()
         robot.start(inbox)
         for k in range(3):
             boot = f"b{k}"
-            with service_process(endpoint, boot, direction) as process:
+            with start(boot) as process:
                 inbox.wait_for(Appeared("cloud", boot))
                 robot.call("cloud", 2 * k, b"wait")
                 inbox.wait_for(Replied(2 * k, b"begun"))
@@ -893,13 +917,13 @@ class TestProcesses:
                 assert inbox.of_call(2 * k + 1) == [Ended(2 * k + 1)]
 
     def test_a_stopped_process_is_lost_after_the_lease_and_found_again(
-        self, ends: tuple[ZenohWire, str]
+        self,
+        wire: ZenohWire,
+        start: Callable[[str], contextlib.AbstractContextManager[subprocess.Popen[bytes]]],
     ) -> None:
-        wire, direction = ends
-        endpoint = wire.endpoint("cloud")
         robot, inbox = wire.robot("cloud"), Inbox()
         robot.start(inbox)
-        with service_process(endpoint, "b1", direction) as process:
+        with start("b1") as process:
             inbox.wait_for(Appeared("cloud", "b1"))
             robot.call("cloud", 1, b"wait")
             inbox.wait_for(Replied(1, b"begun"))
@@ -909,32 +933,59 @@ class TestProcesses:
             assert inbox.of_call(2) == [Ended(2)]
             process.send_signal(signal.SIGCONT)
             inbox.wait(lambda _: inbox.count(Appeared("cloud", "b1")) == 2)
-            robot.call("cloud", 3, b"echo")
-            assert inbox.of_call(3) == [Replied(3, b"echo"), Ended(3)]
+            assert answered(robot, inbox, itertools.count(3))
 
     def test_a_large_request_to_a_stopped_process_ends_and_holds_nobody_up(
-        self, ends: tuple[ZenohWire, str]
+        self,
+        wire: ZenohWire,
+        start: Callable[[str], contextlib.AbstractContextManager[subprocess.Popen[bytes]]],
     ) -> None:
-        wire, direction = ends
-        endpoint = wire.endpoint("cloud")
-        robot, inbox = wire.robot("cloud", "idle"), Inbox()
         wire.service("idle", "b1").start(echo)
+        robot, inbox = wire.robot("cloud", "idle"), Inbox()
         robot.start(inbox)
-        with service_process(endpoint, "b1", direction) as process:
-            inbox.wait_for(Appeared("cloud", "b1"), Appeared("idle", "b1"))
-            process.send_signal(signal.SIGSTOP)
-            robot.call("cloud", 1, bytes(MAX_BYTES))  # more than the buffers of any link
-            robot.call("cloud", 2, b"echo")
-            robot.call("idle", 3, b"meanwhile")
-            assert inbox.of_call(3) == [Replied(3, b"meanwhile"), Ended(3)]
-            assert inbox.of_call(1) == [Ended(1)]
-            assert inbox.of_call(2) == [Ended(2)]
-            robot.call("cloud", 4, b"echo")
-            assert inbox.of_call(4) == [Ended(4)]
-            process.send_signal(signal.SIGCONT)
-            inbox.wait(lambda _: inbox.count(Appeared("cloud", "b1")) == 2)
-            robot.call("cloud", 5, b"echo")
-            assert inbox.of_call(5) == [Replied(5, b"echo"), Ended(5)]
+        numbers = itertools.count()
+        for boot in ("b1", "b2"):
+            with start(boot) as process:
+                inbox.wait_for(Appeared("cloud", boot), Appeared("idle", "b1"))
+                process.send_signal(signal.SIGSTOP)
+                large, small, other, late = itertools.islice(numbers, 4)
+                robot.call("cloud", large, bytes(MAX_BYTES))  # more than buffers take
+                robot.call("cloud", small, b"echo")
+                robot.call("idle", other, b"meanwhile")
+                assert inbox.of_call(other) == [Replied(other, b"meanwhile"), Ended(other)]
+                inbox.wait_for(Vanished("cloud", boot))
+                assert inbox.of_call(large) == [Ended(large)]
+                assert inbox.of_call(small) == [Ended(small)]
+                robot.call("cloud", late, b"echo")
+                assert inbox.of_call(late) == [Ended(late)]
+
+    def test_a_service_that_goes_on_just_when_it_was_given_up_answers_again(
+        self,
+        wire: ZenohWire,
+        start: Callable[[str], contextlib.AbstractContextManager[subprocess.Popen[bytes]]],
+    ) -> None:
+        robot, inbox = wire.robot("cloud"), Inbox()
+        robot.start(inbox)
+        numbers = itertools.count()
+        with start("b1") as process:
+            for k in range(1, 4):
+                inbox.wait(lambda _, k=k: inbox.count(Appeared("cloud", "b1")) >= k)  # type: ignore[misc]
+                process.send_signal(signal.SIGSTOP)
+                robot.call("cloud", next(numbers), bytes(0 if wire.robot_listens else MAX_BYTES))
+                inbox.wait(lambda _, k=k: inbox.count(Vanished("cloud", "b1")) >= k)  # type: ignore[misc]
+                process.send_signal(signal.SIGCONT)
+                inbox.wait(lambda _, k=k: inbox.count(Appeared("cloud", "b1")) > k)  # type: ignore[misc]
+                assert answered(robot, inbox, numbers)
+
+
+def answered(robot: RobotTransport, inbox: Inbox, numbers: Iterator[int]) -> bool:
+    """Whether a service answers after at most a few calls that it loses while it comes back."""
+    for number in itertools.islice(numbers, 20):
+        robot.call("cloud", number, b"echo")
+        if inbox.of_call(number) == [Replied(number, b"echo"), Ended(number)]:
+            return True
+        time.sleep(0.05)
+    return False
 
 
 ROBOT_THAT_ENDS = """
@@ -945,7 +996,6 @@ from holdfast.session.events import Appeared, Ended
 
 seen = threading.Event()
 robot = ZenohRobotTransport({"cloud": ServiceAddress(sys.argv[1])})
-numbers = iter(range(10**9))
 
 def deliver(event):
     if isinstance(event, Appeared):
@@ -954,36 +1004,34 @@ def deliver(event):
 robot.start(deliver)
 assert seen.wait(30)
 
-def flood():
-    while True:
-        robot.call("cloud", next(numbers), b"echo")
-
-threading.Thread(target=flood, daemon=True).start()
+for number in range(20):
+    robot.call("cloud", number, b"stream")
+robot.call("cloud", 20, bytes(4_000_000))
 seen.clear()
-seen.wait(0.2)
-print("leaving", flush=True)
+print("calling", flush=True)
+seen.wait(float(sys.argv[3]))
 if sys.argv[2] == "close":
     robot.close(0.2)
 """
 
 
 @pytest.mark.parametrize("manner", ["close", "leave"])
-@pytest.mark.parametrize("stopped", [False, True])
+@pytest.mark.parametrize(("stopped", "after_s"), [(False, 0.1), (True, 0.1), (True, 0.7)])
 def test_a_process_ends_quietly_whatever_its_links_do(
-    tcp: ZenohWire, manner: str, stopped: bool
+    tcp: ZenohWire, manner: str, stopped: bool, after_s: float
 ) -> None:
-    """With calls in flight, with or without ``close``, and with a peer that does not answer."""
+    """With replies coming in, with or without ``close``, with a peer that has stopped."""
     endpoint = tcp.endpoint("cloud")
     with service_process(endpoint, "b1") as service:
         robot = subprocess.Popen(
-            [sys.executable, "-c", ROBOT_THAT_ENDS, endpoint, manner],
+            [sys.executable, "-c", ROBOT_THAT_ENDS, endpoint, manner, str(after_s)],
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
         )
         try:
             assert robot.stdout is not None
+            assert robot.stdout.readline() == b"calling\n"
             if stopped:
-                time.sleep(0.1)
                 service.send_signal(signal.SIGSTOP)
             _, errors = robot.communicate(timeout=PATIENCE_S)
         finally:

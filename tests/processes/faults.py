@@ -44,6 +44,16 @@ PROBLEMS = ("peg_in_hole_2d", "multitier_peg_in_hole_2d", "peg_in_hole_3d", "cap
 STANDARD, LOCAL_RECOVERY, KEEP_ALIVE = "standard", "local_recovery", "keep_alive"
 RECOVERY = "cloud_active_sensing_recovery"
 
+PATIENT = {
+    "detection_timeout_ms": 30_000.0,
+    "lease_ms": 30_000.0,
+    "startup_timeout_ms": 30_000.0,
+}
+"""What is dead is still found by its broken link, and what is only slow is never taken for dead."""
+
+QUICK = {"detection_timeout_ms": 600.0, "lease_ms": 1000.0}
+"""For what is found by its silence."""
+
 LOST = (STANDARD, LOCAL_RECOVERY)
 RESTORED = (LOCAL_RECOVERY, KEEP_ALIVE)
 LOST_AGAIN = (KEEP_ALIVE, LOCAL_RECOVERY)
@@ -595,9 +605,15 @@ class Site:
                 wait_for_end(pid)
         assert set(self.left_behind()) <= allowed
 
-    def service(self, *options: str, endpoint: str | None = None) -> Service:
+    def service(
+        self, *options: str, endpoint: str | None = None, lease_ms: float = PATIENT["lease_ms"]
+    ) -> Service:
         """Return a service that is not started yet."""
-        return Service(self, endpoint or f"tcp/127.0.0.1:{free_port()}", options)
+        return Service(
+            self,
+            endpoint or f"tcp/127.0.0.1:{free_port()}",
+            ("--lease-ms", str(lease_ms), *options),
+        )
 
     def run(
         self,
@@ -662,14 +678,25 @@ class Site:
 
 
 class Story:
-    """A robot in its world, and services to which things happen."""
+    """A robot in its world, and services to which things happen.
+
+    Parameters
+    ----------
+    site : Site
+    references : References
+    document : dict
+        The configuration.
+    **sections
+        What is in its sections as well; ``offload`` is :data:`PATIENT` unless it says otherwise.
+    """
 
     def __init__(
         self, site: Site, references: References, document: dict[str, Any], **sections: Any
     ) -> None:
         self.site = site
         self.reference = references(document)
-        self.world, self.file = site.world(document, **sections)
+        offload = {**PATIENT, **sections.pop("offload", {})}
+        self.world, self.file = site.world(document, offload=offload, **sections)
 
     def at(
         self, what: str, step: int, *hooks: Hook, trial: int = 0, afterwards: bool = False

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from tests.processes.faults import (
     PATIENCE_S,
+    PATIENT,
     PROBLEMS,
     References,
     Service,
@@ -219,8 +220,7 @@ class TestTooManyForOne:
             world, file = site.world(
                 document,
                 f"robot-{number}",
-                # What is slow here is never dead.
-                offload={"detection_timeout_ms": 10_000.0, "lease_ms": 10_000.0},
+                offload=PATIENT,
                 recovery={"launch": recovery},
             )
             world.on("begin", 0, everybody.wait)
@@ -242,7 +242,9 @@ class TestTooManyForOne:
         worlds: list[World] = []
         robots = []
         for number, document in enumerate(documents):
-            world, file = site.world(document, f"robot-{number}", recovery={"launch": "never"})
+            world, file = site.world(
+                document, f"robot-{number}", offload=PATIENT, recovery={"launch": "never"}
+            )
             worlds.append(world)
             if number == 0:
                 world.on("perform", 30, in_order(cloud.kill, cloud.start))

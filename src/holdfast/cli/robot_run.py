@@ -71,9 +71,7 @@ def run_as_robot(
     from holdfast.runtime.robot_process import RobotProcess
 
     maker = load_environment(configuration)
-    links = make_links(configuration, directory.path / RECOVERY_LOG_NAME)
     with contextlib.ExitStack() as stack:
-        stack.callback(links.close)
         # What is only for people on a terminal is kept in the file all the same.
         sinks: list[EventSink] = [
             EventLog(directory.path / EVENTS_NAME, format="json", component="robot")
@@ -82,6 +80,8 @@ def run_as_robot(
             sinks.append(EventLog(sys.stderr, format=log_format, component="robot"))
         events = TeeEventLog(*sinks)
         stack.callback(events.close)
+        links = make_links(configuration, directory.path / RECOVERY_LOG_NAME, events)
+        stack.callback(links.close)
         timings = TimingTable(directory.path / TIMINGS_NAME)
         stack.callback(timings.close)
         robot = RobotProcess(
@@ -95,6 +95,7 @@ def run_as_robot(
             on_result,
             timings.add,
             rate_hz,
+            links.offload,
         )
         launcher = None if links.launcher is None else links.launcher(robot.deliver)
         robot.run(directory.journal.finished(), launcher)

@@ -333,7 +333,11 @@ def _run(options: _Options) -> None:
                 )
             raise
         except HoldfastError as error:
-            if directory.journal.unfinished_trial() is None:
+            from holdfast.session.robot import UnknownPerformanceError
+
+            if directory.journal.unfinished_trial() is None or isinstance(
+                error, UnknownPerformanceError
+            ):
                 raise
             command = options.resume_command(directory_path)
             raise HoldfastError(f"{error}\nGo on with: {command}") from error

@@ -10,6 +10,10 @@ one state, ``(num_particles, state_size)`` a belief, ``(trials, num_particles, s
 A function is called with any of these and returns the same leading shape, as float64. The arrays
 that it is given are read-only: make a new one instead of changing them.
 
+Two threads never use one instance at the same time, but a run has several instances, and each may
+be asked anything in any order. So what an instance keeps from one call to the next (a buffer, a
+cache) must not show in what it returns.
+
 Observations are Gaussian, by :meth:`Problem.observation_mean` and
 :meth:`Problem.observation_variance`, unless the problem has the two methods of
 :class:`GeneralObservationProblem`.

@@ -281,7 +281,7 @@ def parse_endpoint(text: str) -> Endpoint:
             f"endpoint {text!r} has no port: write {protocol}/HOST:PORT, "
             f"as in {protocol}/127.0.0.1:7447"
         )
-    if not (port_text.isascii() and port_text.isdigit() and int(port_text) <= 65535):
+    if not re.fullmatch(r"[0-9]{1,5}", port_text) or int(port_text) > 65535:
         raise TransportError(
             f"endpoint {text!r}: port {port_text!r} is not a number from 0 to 65535, "
             f"as in {protocol}/127.0.0.1:7447"

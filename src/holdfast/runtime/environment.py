@@ -293,7 +293,10 @@ def load_environment(configuration: Configuration) -> EnvironmentMaker:
     settings = configuration.environment
     problem, seed = configuration.problem, configuration.simulator.seed
     name = settings.object
-    if name is None:
+    if name is not None:
+        # It is used by the environment's thread, while the robot's own is by the loop's.
+        problem = type(configuration).from_plain(configuration.plain()).problem
+    else:
         return EnvironmentMaker(
             f"the simulated {configuration.problem_name}", problem, seed, settings.timeout_ms
         )

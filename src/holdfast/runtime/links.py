@@ -10,12 +10,19 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
+import msgspec
+
 from holdfast.configuration import Configuration
+from holdfast.runtime.logs import EventSink
 from holdfast.runtime.own_planner import OWN_PLANNER, OwnPlanner
 from holdfast.runtime.recovery_launcher import RecoveryExited, RecoveryLauncher
 from holdfast.runtime.transport.contract import RobotTransport
+from holdfast.settings import OffloadSettings
+from holdfast.user_code import account_of_user_error
 
 __all__ = ["RECOVERY_SERVICE", "Links", "make_links"]
+
+_FOR_EVER_MS = 3_600_000.0  # the largest that the settings allow
 
 RECOVERY_SERVICE = "cloud_active_sensing_recovery"
 """The name of the local service (the thesis's)."""
@@ -34,6 +41,8 @@ class Links(NamedTuple):
         The local service; None if there is none.
     launcher : callable or None
         Makes what launches it, given where to tell of its end.
+    offload : OffloadSettings
+        For the dispatcher.
     close : callable
         Releases what was made here; after the transport is closed.
     """
@@ -42,10 +51,11 @@ class Links(NamedTuple):
     services: tuple[str, ...]
     recovery: str | None
     launcher: Callable[[Callable[[RecoveryExited], None]], RecoveryLauncher] | None
+    offload: OffloadSettings
     close: Callable[[], None]
 
 
-def make_links(configuration: Configuration, log_path: Path | None) -> Links:
+def make_links(configuration: Configuration, log_path: Path | None, events: EventSink) -> Links:
     """Make the links that a configuration asks for.
 
     Parameters
@@ -53,6 +63,8 @@ def make_links(configuration: Configuration, log_path: Path | None) -> Links:
     configuration : Configuration
     log_path : Path or None
         Gets what the local service writes.
+    events : EventSink
+        Is told of links that are not safe.
 
     Raises
     ------
@@ -63,11 +75,20 @@ def make_links(configuration: Configuration, log_path: Path | None) -> Links:
     """
     offload = configuration.offload
     if not offload.services:
-        return Links(OwnPlanner(configuration.problem), (OWN_PLANNER,), None, None, lambda: None)
-    return _zenoh_links(configuration, log_path)
+        # It cannot be lost, so it may be silent for as long as it computes.
+        patient = msgspec.structs.replace(
+            offload, detection_timeout_ms=_FOR_EVER_MS, decision_timeout_ms=_FOR_EVER_MS
+        )
+        name = configuration.problem_name
+        planner = OwnPlanner(
+            Configuration.from_plain(configuration.plain()).problem,
+            lambda error: account_of_user_error(error, name) or f"{type(error).__name__}: {error}",
+        )
+        return Links(planner, (OWN_PLANNER,), None, None, patient, _nothing)
+    return _zenoh_links(configuration, log_path, events)
 
 
-def _zenoh_links(configuration: Configuration, log_path: Path | None) -> Links:
+def _zenoh_links(configuration: Configuration, log_path: Path | None, events: EventSink) -> Links:
     # Only a robot that has services needs these.
     from holdfast.runtime.credentials import load_credentials
     from holdfast.runtime.endpoints import (
@@ -79,9 +100,21 @@ def _zenoh_links(configuration: Configuration, log_path: Path | None) -> Links:
     from holdfast.runtime.transport.zenoh_transport import ZenohRobotTransport
 
     offload = configuration.offload
-    tls = None if offload.tls is None else load_credentials(Path(offload.tls), "robot")
+    tls = None
+    if offload.tls is not None:
+        tls = load_credentials(
+            Path(offload.tls), "robot", warn=lambda text: events.event("credentials", reason=text)
+        )
     for service in offload.services:
-        check_credentials(parse_endpoint(service), tls)
+        endpoint = parse_endpoint(service)
+        check_credentials(endpoint, tls)
+        if not endpoint.is_encrypted and not endpoint.is_loopback:
+            events.event(
+                "insecure",
+                service=service,
+                reason="whoever is on the way can read along and decide in its place; "
+                "use tls/... or quic/... with --tls",
+            )
     addresses = {service: ServiceAddress(service) for service in offload.services}
     recovery = None
     launcher = None
@@ -111,7 +144,7 @@ def _zenoh_links(configuration: Configuration, log_path: Path | None) -> Links:
         tls=tls,
         decision_timeout_ms=offload.decision_timeout_ms,
     )
-    return Links(transport, offload.services, recovery, launcher, close)
+    return Links(transport, offload.services, recovery, launcher, offload, close)
 
 
 def _problem_arguments(configuration: Configuration) -> list[str]:

@@ -11,8 +11,9 @@ A log must never hurt what it watches. A terminal that was closed, a full disk, 
 a number, a text of a megabyte or with control characters in it cost at most the line.
 
 Names of events in use. By the robot: status, launch, launched, launch_failed, recovery_exited,
-retry, hedge, restore, service_appeared, service_vanished, service_suspected, holding, resumed,
-refused, disagreement, trial, missed_ticks. By a service: ready, session_opened,
+retry, hedge, restore, restored, service_appeared, service_vanished, service_suspected, waiting,
+holding, resumed, busy, refused, malformed_reply, disagreement, prefetch_unused, resumed_trial,
+performed_unseen, trial, missed_ticks, stopped. By a service: ready, session_opened,
 session_taken_over, restored, refused, busy, evicted, stopping. Fields with a place of their own in
 the text form: ``from`` and ``to`` (of a change), ``service``, ``reason``, ``duration_ms``.
 """
@@ -20,8 +21,10 @@ the text form: ``from`` and ``to`` (of a change), ``service``, ``reason``, ``dur
 from __future__ import annotations
 
 import os
+import stat
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import TracebackType
@@ -47,6 +50,11 @@ MAX_LINE_BYTES = 4096
 
 MAX_VALUE_CHARACTERS = 800
 """Bound on a text within a line, and on a list or mapping once it is written out."""
+
+_MAX_WAITING_LINES = 10_000
+"""Lines that wait for a terminal that is not being read; further ones are lost, and counted."""
+
+_FLUSH_S = 0.5
 
 _COMPONENT_WIDTH = 8
 _EVENT_WIDTH = 18
@@ -141,10 +149,13 @@ class EventLog:
         # Taken again by the same thread if a signal's handler reports an event in mid-write.
         self._lock = threading.RLock()
         self.lost = 0
+        self._writer: _PatientWriter | None = None
         if isinstance(target, (str, Path)):
             self._descriptor = _open_for_lines(Path(target))
         else:
             self._stream = target
+            if _may_block(target):
+                self._writer = _PatientWriter(target)
 
     def event(self, name: str, /, **fields: object) -> None:
         """Write an event.
@@ -168,27 +179,24 @@ class EventLog:
             try:
                 if self._descriptor is not None:
                     os.write(self._descriptor, line.encode())
+                elif self._writer is not None:
+                    self.lost += not self._writer.put(line)
                 elif self._stream is not None:
-                    self._write(self._stream, line)
+                    _write_line(self._stream, line)
             # ValueError: it is closed. RuntimeError: a signal's handler came in mid-write.
             except (OSError, ValueError, RuntimeError):
                 self.lost += 1
 
-    @staticmethod
-    def _write(stream: TextIO, line: str) -> None:
-        try:
-            stream.write(line)
-        except UnicodeEncodeError:
-            stream.write(line.encode("ascii", "backslashreplace").decode())
-        stream.flush()
-
     def close(self) -> None:
-        """Write no more; may be repeated."""
+        """Write no more; may be repeated. Waits a moment for a terminal that is slow."""
         with self._lock:
+            writer, self._writer = self._writer, None
             self._stream = None
             if self._descriptor is not None:
                 os.close(self._descriptor)
                 self._descriptor = None
+        if writer is not None:
+            self.lost += writer.close()
 
     def __enter__(self) -> Self:
         return self
@@ -200,6 +208,75 @@ class EventLog:
         trace: TracebackType | None,
     ) -> None:
         self.close()
+
+
+class _PatientWriter:
+    """Writes lines from a thread of its own: whoever reports an event does not wait for a reader.
+
+    A terminal can be stopped with Ctrl-S, and a pipe may be read by nobody.
+    """
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+        self._lines: deque[str] = deque()
+        # Taken again by the same thread if a signal's handler reports an event.
+        self._changed = threading.Condition(threading.RLock())
+        self._closed = False
+        self._lost = 0
+        self._thread: threading.Thread | None = None
+
+    def put(self, line: str) -> bool:
+        """Take a line; False if too many are waiting."""
+        with self._changed:
+            if self._closed or len(self._lines) >= _MAX_WAITING_LINES:
+                return False
+            self._lines.append(line)
+            if self._thread is None:
+                self._thread = threading.Thread(target=self._work, name="holdfast-log", daemon=True)
+                self._thread.start()
+            self._changed.notify()
+        return True
+
+    def close(self) -> int:
+        """Write what can be written in a moment, and return how many lines could not be."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify()
+        if self._thread is not None:
+            self._thread.join(_FLUSH_S)
+        return self._lost + len(self._lines)
+
+    def _work(self) -> None:
+        while True:
+            with self._changed:
+                while not self._lines and not self._closed:
+                    self._changed.wait()
+                if not self._lines:
+                    return
+                line = self._lines[0]
+            try:
+                _write_line(self._stream, line)
+            except (OSError, ValueError, RuntimeError):
+                self._lost += 1
+            with self._changed:
+                self._lines.popleft()
+
+
+def _may_block(stream: TextIO) -> bool:
+    """Tell whether a reader is needed for a write to end."""
+    try:
+        mode = os.fstat(stream.fileno()).st_mode
+    except (OSError, ValueError, AttributeError):
+        return False
+    return stat.S_ISFIFO(mode) or stat.S_ISCHR(mode) or stat.S_ISSOCK(mode)
+
+
+def _write_line(stream: TextIO, line: str) -> None:
+    try:
+        stream.write(line)
+    except UnicodeEncodeError:
+        stream.write(line.encode("ascii", "backslashreplace").decode())
+    stream.flush()
 
 
 def _open_for_lines(path: Path) -> int:

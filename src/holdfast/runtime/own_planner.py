@@ -14,7 +14,7 @@ from time import monotonic
 from typing import NamedTuple
 
 from holdfast.problems.problem import Problem
-from holdfast.session.events import Appeared, Ended, Replied, TransportEvent
+from holdfast.session.events import Appeared, Ended, Replied, TransportEvent, Vanished
 from holdfast.session.messages import Opening
 from holdfast.session.service import Answer, Effect, End, Run, Service, ServiceLimits
 
@@ -38,17 +38,22 @@ class OwnPlanner:
     Parameters
     ----------
     problem : Problem
-        The robot's own; it answers for this one only.
+        It answers for this one only. An instance of its own: the robot's is used at the same time
+        by another thread.
+    describe_error : callable
+        Puts an error that the problem raised into words.
     """
 
-    def __init__(self, problem: Problem) -> None:
+    def __init__(
+        self, problem: Problem, describe_error: Callable[[BaseException], str] = repr
+    ) -> None:
         def make_problem(opening: Opening) -> Problem:
             del opening
             return problem
 
-        self._service = Service(make_problem, 1, _NO_LIMITS)
+        self._service = Service(make_problem, 1, _NO_LIMITS, describe_error)
         self._requests: SimpleQueue[_Request | None] = SimpleQueue()
-        self._abandoned: set[int] = set()
+        self._open: set[int] = set()
         self._deliver: Callable[[TransportEvent], None] | None = None
         self._thread = threading.Thread(target=self._work, name="holdfast-planner", daemon=True)
 
@@ -61,11 +66,12 @@ class OwnPlanner:
     def call(self, service: str, call: int, payload: bytes) -> None:
         """Take a request."""
         del service
+        self._open.add(call)
         self._requests.put(_Request(call, payload))
 
     def abandon(self, call: int) -> None:
         """Deliver nothing more of a call."""
-        self._abandoned.add(call)
+        self._open.discard(call)
 
     def close(self, timeout_s: float = 1.0) -> None:
         """Answer no more."""
@@ -76,20 +82,25 @@ class OwnPlanner:
 
     def _work(self) -> None:
         service = self._service
-        while (request := self._requests.get()) is not None:
-            effects = service.receive(request.call, request.payload, monotonic())
-            while effects:
-                effects += self._carry_out(effects.pop(0))
+        try:
+            while (request := self._requests.get()) is not None:
+                effects = service.receive(request.call, request.payload, monotonic())
+                while effects:
+                    effects += self._carry_out(effects.pop(0))
+        finally:
+            # If this is a defect of ours, the robot shall not wait for ever.
+            deliver = self._deliver
+            if deliver is not None:
+                deliver(Vanished(OWN_PLANNER, "own"))
 
     def _carry_out(self, effect: Effect) -> list[Effect]:
         deliver = self._deliver
         if isinstance(effect, Run) and deliver is not None:
             return self._service.finished(effect.job, effect.job.run(), monotonic())
-        if isinstance(effect, Answer):
-            if deliver is not None and effect.call not in self._abandoned:
+        if isinstance(effect, Answer | End) and deliver is not None and effect.call in self._open:
+            if isinstance(effect, Answer):
                 deliver(Replied(effect.call, effect.payload))
-        elif isinstance(effect, End):
-            if deliver is not None and effect.call not in self._abandoned:
+            else:
+                self._open.discard(effect.call)
                 deliver(Ended(effect.call))
-            self._abandoned.discard(effect.call)
         return []

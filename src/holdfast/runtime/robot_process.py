@@ -18,6 +18,7 @@ from time import monotonic
 from typing import NamedTuple, Protocol, TypeAlias
 
 from holdfast.configuration import Configuration
+from holdfast.errors import HoldfastError, TrialError
 from holdfast.outcome import TrialResult
 from holdfast.runtime.environment import EnvironmentMaker
 from holdfast.runtime.logs import EventSink
@@ -43,8 +44,13 @@ from holdfast.session.events import Begun, EnvironmentEvent, EnvironmentFailed, 
 from holdfast.session.messages import Opening
 from holdfast.session.records import Record
 from holdfast.session.robot import HeldError, History, Robot, replay
+from holdfast.settings import OffloadSettings
+from holdfast.user_code import account_of_user_error
 
 __all__ = ["Launcher", "RobotProcess", "StepJournal"]
+
+_DEAF_S = 0.005
+"""When the loop did not listen for longer than this, no service is blamed for that time."""
 
 _SWITCH_INTERVAL_S = 0.0005
 """How long a thread may hold the interpreter while the one that has the answer waits for it."""
@@ -130,6 +136,8 @@ class RobotProcess:
         Gets the times of each decision.
     rate_hz : float or None
         Task actions a second; None acts as soon as possible.
+    offload : OffloadSettings or None
+        Instead of the configuration's.
     """
 
     def __init__(
@@ -144,6 +152,7 @@ class RobotProcess:
         on_result: Callable[[TrialResult], None],
         on_timing: Callable[[Timing], None],
         rate_hz: float | None = None,
+        offload: OffloadSettings | None = None,
     ) -> None:
         self._configuration = configuration
         self._transport = transport
@@ -152,7 +161,8 @@ class RobotProcess:
         self._events = events
         self._on_result = on_result
         self._on_timing = on_timing
-        self._queue: SimpleQueue[_Happening] = SimpleQueue()
+        self._queue: SimpleQueue[tuple[float, _Happening]] = SimpleQueue()
+        self._now = monotonic()
         self._launcher: Launcher | None = None
         self._performer: Performer | None = None
         self._starting: tuple[int, History, bool] | None = None
@@ -166,7 +176,7 @@ class RobotProcess:
         dispatcher = Dispatcher(
             services,
             recovery,
-            configuration.offload,
+            offload or configuration.offload,
             configuration.recovery,
             journal.session(),
             journal.raise_epoch(),
@@ -189,7 +199,7 @@ class RobotProcess:
 
     def deliver(self, event: TransportEvent | EnvironmentEvent | RecoveryExited) -> None:
         """Take an event from any thread."""
-        self._queue.put(event)
+        self._queue.put((monotonic(), event))
 
     def run(self, finished: Collection[int], launcher: Launcher | None = None) -> None:
         """Run all trials that are not finished.
@@ -215,9 +225,21 @@ class RobotProcess:
         try:
             with self._signals_as_events():
                 self._transport.start(self.deliver)
-                self._carry_out(self._robot.start(monotonic()))
+                self._now = monotonic()
+                self._carry_out(self._robot.start(self._now))
                 self._begin_next()
                 self._loop()
+        except HoldfastError:
+            self._salvage()
+            raise
+        except Exception as error:
+            self._salvage()
+            account = account_of_user_error(error, self._configuration.problem_name)
+            if account is None:
+                raise
+            text = f"{self._where()}: {account}"
+            self._events.event("stopped", reason=text)
+            raise TrialError(text) from error
         finally:
             sys.setswitchinterval(before)
             if self._performer is not None:
@@ -228,23 +250,44 @@ class RobotProcess:
         if self._interrupted is not None:
             signal.raise_signal(self._interrupted)
 
+    def _salvage(self) -> None:
+        """Write down what is known to have happened, before an error ends the run."""
+        with contextlib.suppress(HoldfastError):
+            for effect in self._robot.salvage():
+                self._journal.append(effect.trial, effect.records)
+
+    def _where(self) -> str:
+        trial = self._robot.trial if self._starting is None else self._starting[0]
+        return f"trial {trial} (seed {self._configuration.simulator.seed})"
+
     def _loop(self) -> None:
         robot = self._robot
         while not self._ended:
             wake_at = robot.next_wakeup()
             try:
                 if wake_at is None:
-                    event = self._queue.get()
+                    came_at, event = self._queue.get()
                 else:
-                    event = self._queue.get(timeout=max(0.0, wake_at - monotonic()))
+                    timeout_s = max(0.0, wake_at - monotonic())
+                    came_at, event = self._queue.get(timeout=timeout_s)
             except Empty:
-                self._carry_out(robot.wake(monotonic()))
-                continue
-            self._handle(event)
+                began = monotonic()
+                if wake_at is not None and began - wake_at > _DEAF_S:
+                    # This process was stopped, or another one had its core.
+                    robot.was_deaf(began - wake_at)
+                self._now = began
+                self._carry_out(robot.wake(began))
+            else:
+                began = monotonic()
+                # When it happened, not when it is heard of: that may be long after.
+                self._now = max(self._now, came_at)
+                self._handle(event, self._now)
+            spent_s = monotonic() - began
+            if spent_s > _DEAF_S:
+                robot.was_deaf(spent_s)
 
-    def _handle(self, event: _Happening) -> None:
+    def _handle(self, event: _Happening, now: float) -> None:
         robot = self._robot
-        now = monotonic()
         if isinstance(event, _Interrupted):
             self._interrupted = event.number
             self._carry_out(robot.pause(now))
@@ -286,6 +329,7 @@ class RobotProcess:
             elif isinstance(effect, Paused):
                 self._ended = True
             elif isinstance(effect, Stop):
+                self._events.event("stopped", reason=str(effect.error))
                 raise effect.error
 
     def _launch(self, effect: Launch) -> None:
@@ -359,7 +403,7 @@ class RobotProcess:
             del frame
             for handled, before in saved.items():
                 signal.signal(handled, before)
-            self._queue.put(_Interrupted(number))
+            self._queue.put((monotonic(), _Interrupted(number)))
 
         try:
             for number in saved:

@@ -214,7 +214,14 @@ def _serve(options: argparse.Namespace) -> int:
         limits = ServiceLimits(max_sessions=options.max_sessions)
     workers = options.workers or len(os.sched_getaffinity(0))
     problems = KnownProblems(options.problem, options.problem_directory or Path.cwd())
-    service = Service(problems, workers, limits)
+
+    def describe_error(error: BaseException) -> str:
+        from holdfast.user_code import account_of_user_error
+
+        account = account_of_user_error(error, "the problem")
+        return account or f"{type(error).__name__}: {error}"
+
+    service = Service(problems, workers, limits, describe_error)
     events = EventLog(sys.stderr, format=options.log, component=options.name)
     metrics = metrics_server = None
     if options.metrics is not None:

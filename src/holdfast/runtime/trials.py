@@ -29,7 +29,7 @@ from typing import Any
 import msgspec
 
 from holdfast.configuration import Configuration
-from holdfast.errors import HoldfastError, InvalidValueError
+from holdfast.errors import HoldfastError, InvalidValueError, TrialError
 from holdfast.outcome import TrialResult
 from holdfast.problems.problem import Problem
 from holdfast.runtime.trial import (
@@ -57,10 +57,6 @@ _LOOKAHEAD_S = 0.1
 _MAX_LOOKAHEAD = 16
 
 _ENDING_SIGNALS = frozenset({signal.SIGINT, signal.SIGTERM, signal.SIGHUP})
-
-
-class TrialError(HoldfastError):
-    """What holdfast refused, or the problem's own code raised, with the trial where it happened."""
 
 
 class WorkerDiedError(HoldfastError):

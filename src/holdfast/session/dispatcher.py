@@ -61,6 +61,9 @@ _MAX_REFUSALS = 3
 _MAX_CALLS = 4
 """Bound on the calls to one service that may be open at a time."""
 
+_LONGEST_SILENT_WAIT_S = 1.0
+"""When the robot stands still for longer than this, somebody should know why."""
+
 _LARGE_CHECKPOINT = 1 << 20
 """Bytes from which a service rather plans the trial again than be sent its state."""
 
@@ -130,6 +133,8 @@ class Question:
         "task_count",
         "task_source",
         "tasks",
+        "times_asked",
+        "told_waiting",
     )
 
     def __init__(
@@ -145,6 +150,8 @@ class Question:
         self.observations = observations
         self.num_observations = num_observations
         self.needed_at: float | None = None
+        self.told_waiting = False
+        self.times_asked = 0
         self.tasks: list[FloatArray] | None = None
         self.sensing: SensingAnswer | None = None
         self.task_source: Provenance | None = None
@@ -177,15 +184,23 @@ class Question:
 class _Call:
     """One request that is on its way."""
 
-    __slots__ = ("number", "question", "restores", "sensing", "sent_at", "service", "task")
+    __slots__ = ("number", "opens", "question", "restores", "sensing", "sent_at", "service", "task")
 
     def __init__(
-        self, number: int, service: _Service, question: Question, sent_at: float, restores: bool
+        self,
+        number: int,
+        service: _Service,
+        question: Question,
+        sent_at: float,
+        *,
+        opens: bool,
+        restores: bool,
     ) -> None:
         self.number = number
         self.service = service
         self.question = question
         self.sent_at = sent_at
+        self.opens = opens
         self.restores = restores
         self.task = False
         self.sensing = False
@@ -306,6 +321,7 @@ class Dispatcher:
         self._cloud = [_Service(name, timeout_s) for name in services]
         wanted = recovery is not None and recovery_settings.launch != "never"
         self._timeout_s = timeout_s
+        self._patience_s = max(_LONGEST_SILENT_WAIT_S, timeout_s)
         self._local = (
             _Service(recovery, _LOCAL_PATIENCE * timeout_s)
             if recovery is not None and wanted
@@ -325,6 +341,7 @@ class Dispatcher:
         self._calls: dict[int, _Call] = {}
         self._number = 0
         self._startup_until: float | None = None
+        self._worked_at = float("-inf")
         self._budget = _HEDGING_BURST
         self._holding_since: float | None = None
         self._lost_at: float | None = None
@@ -407,7 +424,11 @@ class Dispatcher:
         now : float
         """
         local = self._local
-        if local is None or launch != self._launches or self._launch_after is not None:
+        if local is None:
+            return
+        if launch != self._launches or self._launch_after is not None:
+            # It was seen to be gone before; only the reason is new.
+            self._report("recovery_exited", reason=reason)
             return
         if local.detector.boot is not None:
             self._vanished(local, local.detector.boot, now)
@@ -437,6 +458,8 @@ class Dispatcher:
                 ]
                 if self._startup_until is not None and not self._any_seen():
                     due.append(self._startup_until)
+            if question.needed_at is not None and not question.told_waiting:
+                due.append(question.needed_at + self._patience_s)
             hedge_at = self._hedge_at(question)
             if hedge_at is not None:
                 due.append(hedge_at)
@@ -448,7 +471,13 @@ class Dispatcher:
         elif self._is_launching():
             assert self._launched_at is not None
             due.append(self._launched_at + 1e-3 * self._recovery.launch_timeout_ms)
-        return min(due, default=None)
+        # What was due when we worked last has been looked at; only something new can change it.
+        return min((at for at in due if at > self._worked_at), default=None)
+
+    def was_deaf(self, seconds: float) -> None:
+        """Take note that for this long nothing that came could be heard."""
+        for service in self._by_name.values():
+            service.detector.excuse(seconds)
 
     # -- presence --------------------------------------------------------------------------------
 
@@ -468,7 +497,7 @@ class Dispatcher:
         question = self.question
         if self.status is Status.LOCAL_RECOVERY and question is not None:
             # It need not wait for the next turn: with an answer to this one it holds the state.
-            self._send(service, question, now)
+            self._send(service, question, now, also=True)
 
     def _vanished(self, service: _Service | None, boot: str, now: float) -> None:
         if service is None or not service.detector.vanished(boot):
@@ -535,6 +564,11 @@ class Dispatcher:
             service.drifts = 0
         holds = (question.state.trial, question.num_observations)
         service.acknowledged = max(service.acknowledged or holds, holds)
+        if first and call.opens and (call.restores or question.state.step > 0):
+            restore_ms = 1e3 * (now - call.sent_at)
+            self._report(
+                "restored", service=service.name, step=question.state.step, restore_ms=restore_ms
+            )
         if call.finished:
             self._settle(call)
         if service is self._local:
@@ -590,13 +624,14 @@ class Dispatcher:
         service.acknowledged = None
         if reply.differs:
             service.drifts += 1
-        if call.restores:
-            # It was handed the state and asks for it again.
+        if call.opens and call.restores:
+            # It was handed everything and asks for it again.
             service.delay(now)
             self._refusal(service, "need_state", "asks again for a state that it was sent")
             return
         if question is self.question:
-            self._send(service, question, now, whole_state=reply.differs)
+            # Told everything but the state, it came to another one: only the state will do.
+            self._send(service, question, now, whole_state=reply.differs or call.opens, also=True)
 
     def _was_refused(self, call: _Call, reply: Refused, now: float) -> None:
         service = call.service
@@ -651,6 +686,7 @@ class Dispatcher:
         """Do what the time and the situation ask for."""
         if self.stopped:
             return
+        self._worked_at = now
         if self._startup_until is not None and now >= self._startup_until:
             self._startup_until = None
         self._look_for_silence(now)
@@ -665,6 +701,7 @@ class Dispatcher:
             return
         if self._is_being_asked(question):
             self._hedge(question, now)
+            self._tell_waiting(question, now)
             self._note_lost_cloud(now)
         else:
             self._choose(question, now)
@@ -782,6 +819,23 @@ class Dispatcher:
             reasons.append(f"{service.name}: {why}")
         return "; ".join(reasons)
 
+    def _tell_waiting(self, question: Question, now: float) -> None:
+        """Say once that the robot stands still although somebody is being asked."""
+        if question.needed_at is None or question.told_waiting:
+            return
+        waited_s = now - question.needed_at
+        if waited_s >= self._patience_s:
+            question.told_waiting = True
+            asked = {
+                call.service.name for call in self._calls.values() if call.question is question
+            }
+            self._report(
+                "waiting",
+                service=", ".join(sorted(asked)),
+                step=question.state.step,
+                waited_ms=1e3 * waited_s,
+            )
+
     def _let_go(self, now: float) -> None:
         """Note that the robot need not hold still any more."""
         if self._holding_since is not None:
@@ -801,7 +855,7 @@ class Dispatcher:
             # One try at a time, so that a service further away than a turn is long can answer.
             tries = [call.sent_at for call in service.calls.values() if not call.answered]
             if service.retry_at <= now and max(tries, default=-1e9) + self._timeout_s <= now:
-                self._send(service, question, now)
+                self._send(service, question, now, also=True)
 
     def _note_lost_cloud(self, now: float) -> None:
         """Notice that the cloud died while nothing was asked of it: recovery can start now."""
@@ -834,7 +888,11 @@ class Dispatcher:
         before = self.status
         self.status = next_status(before, cause)
         fields: dict[str, object] = {"from": before.value, "to": self.status.value}
-        if cause is Cause.CLOUD_ANSWERED and self._lost_at is not None:
+        if cause is Cause.CLOUD_LOST:
+            silences = [s.detector.silence_s(now) for s in self._cloud if s.detector.seen]
+            if silences:
+                fields["silent_ms"] = 1e3 * min(silences)
+        elif self._lost_at is not None:
             fields["outage_ms"] = 1e3 * (now - self._lost_at)
         self._report("status", **fields, reason=reason)
 
@@ -908,13 +966,20 @@ class Dispatcher:
         self._budget -= 1.0
         assert question.needed_at is not None
         self._report("hedge", step=question.state.step, waited_ms=1e3 * (now - question.needed_at))
-        self._send(self._local, question, now)
+        self._send(self._local, question, now, also=True)
 
     # -- sending ---------------------------------------------------------------------------------
 
     def _send(
-        self, service: _Service, question: Question, now: float, *, whole_state: bool = False
+        self,
+        service: _Service,
+        question: Question,
+        now: float,
+        *,
+        whole_state: bool = False,
+        also: bool = False,
     ) -> None:
+        """Send a question, with what the service lacks; ``also`` if another one is asked, too."""
         while len(service.calls) >= _MAX_CALLS:
             self._abandon(next(iter(service.calls.values())))
         state = question.state
@@ -924,9 +989,10 @@ class Dispatcher:
         start = known[1] if known is not None and known[0] == state.trial else 0
         missing = question.num_observations - start
         fresh = state.step == 0 and missing == 0
-        if not (whole_state or service.opened or fresh):
-            # It knows nothing. To plan the trial again is less than to be sent a large state.
-            whole_state = 8 * state.belief.states.size <= _LARGE_CHECKPOINT
+        if missing > 1 or not (service.opened or fresh):
+            # It knows nothing, or others have decided since. To plan what it has missed keeps it
+            # from other robots, just when it has too many; but a large state is worse.
+            whole_state |= 8 * state.belief.states.size <= _LARGE_CHECKPOINT
         if service.drifts >= _MAX_DRIFTS or missing > len(question.observations):
             whole_state = True
         if whole_state:
@@ -949,13 +1015,30 @@ class Dispatcher:
             opening,
             checkpoint,
         )
-        call = _Call(number, service, question, now, checkpoint is not None)
+        call = _Call(
+            number,
+            service,
+            question,
+            now,
+            opens=opening is not None,
+            restores=checkpoint is not None,
+        )
         self._calls[number] = call
         service.calls[number] = call
         service.detector.asked(now)
         payload = encode(request)
         if opening is not None and not fresh:
             self._report("restore", service=service.name, step=state.step, bytes=len(payload))
+        question.times_asked += 1
+        if question.times_asked > 1 and question is self.question and not also:
+            waited_s = 0.0 if question.needed_at is None else now - question.needed_at
+            self._report(
+                "retry",
+                service=service.name,
+                step=state.step,
+                attempt=question.times_asked,
+                waited_ms=1e3 * waited_s,
+            )
         self.effects.append(Send(service.name, number, payload))
 
     # -- saying ----------------------------------------------------------------------------------

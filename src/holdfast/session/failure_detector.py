@@ -6,9 +6,9 @@ decision. Four things are looked at:
 
 - *presence*: the liveliness token, which goes when the process dies or the link breaks; this finds
   a killed service in milliseconds, but a hung one keeps its token;
-- *signs of progress*: a service that computes for a robot says so every few tens of milliseconds
-  from the loop that does the work, so silence while something is awaited from it means that it
-  hangs, is stopped or cut off;
+- *signs of life*: a service that has a robot's request in work says so every few tens of
+  milliseconds, so silence while something is awaited from it means that its process hangs, is
+  stopped or cut off (a single computation that never ends is not seen by this);
 - *calls that end without an answer*: whoever was asked is gone;
 - *deadlines*: a decision that takes too long although signs come is no use either.
 
@@ -86,6 +86,14 @@ class FailureDetector:
         """Something came: it lives and makes progress."""
         self._last_sign = now
         self.suspicion = None
+
+    def excuse(self, seconds: float) -> None:
+        """Take note that for this long nothing could be heard."""
+        self._last_sign += seconds
+
+    def silence_s(self, now: float) -> float:
+        """Return how long nothing has been heard."""
+        return max(0.0, now - self._last_sign)
 
     def suspect(self, reason: str) -> None:
         """Trust it no more until it is heard or another process takes its place."""

@@ -205,7 +205,7 @@ class SensingAnswer(msgspec.Struct, array_like=True, frozen=True, tag=2):
 
 
 class Progress(msgspec.Struct, array_like=True, frozen=True, tag=3):
-    """The request is in work: a sign of life from the service's own loop.
+    """The request is in work: a sign of life from the service's process.
 
     Attributes
     ----------

@@ -371,7 +371,14 @@ class Robot:
             # Between trials, or after a stop, whatever comes late is of no use.
             if self._history is not None and self._in_environment and not self._stopped:
                 self._in_environment = False
-                if isinstance(event, Sensed):
+                if event.step != self._history.state.step:
+                    self._stop(
+                        HeldError(
+                            f"the environment answered for step {event.step} where step "
+                            f"{self._history.state.step} was asked of it; the robot holds still"
+                        )
+                    )
+                elif isinstance(event, Sensed):
                     self._sensed(event, now)
                 elif isinstance(event, Acted):
                     self._acted(event)
@@ -394,11 +401,23 @@ class Robot:
         self._go_on(now)
         return self._take()
 
+    def was_deaf(self, seconds: float) -> None:
+        """Take note that for this long nothing that came could be heard.
+
+        A write to a slow disk, a stopped process: whoever was silent in that time is not to blame.
+        """
+        self._dispatcher.was_deaf(seconds)
+
     def pause(self, now: float) -> list[Effect]:
         """End in order: after what is being performed, write everything down and stand still."""
         self._pausing = True
         self._go_on(now)
         return self._take()
+
+    def salvage(self) -> list[Journal]:
+        """Return what is still to be written down, after a method of this machine has raised."""
+        self._write()
+        return [effect for effect in self._dispatcher.take() if isinstance(effect, Journal)]
 
     def next_wakeup(self) -> float | None:
         """Return when :meth:`wake` must be called if nothing happens before."""
@@ -437,11 +456,9 @@ class Robot:
         try:
             history.performed(self._problem, self._planning, event.reward)
         except HoldfastError as error:
-            self._write()
             self._stop(error)
 
     def _failed(self, event: EnvironmentFailed) -> None:
-        self._write()
         unknown = (
             "; whether that task action was performed is not known"
             if event.performance_unknown
@@ -503,6 +520,7 @@ class Robot:
         self._timed("sensing", question, source, now)
         self._sensing_action = answer.sensing_action
         self._in_environment = True
+        self._write()
         self._effects.append(Sense(state.step, answer.sensing_action))
 
     def _next_action(self, state: PlanningState, now: float) -> None:
@@ -533,6 +551,7 @@ class Robot:
     def _ask(self, state_digest: bytes, now: float) -> None:
         history = self._history
         assert history is not None
+        self._write()
         question = Question(
             self._planning,
             history.state,
@@ -589,6 +608,7 @@ class Robot:
             decisions=decisions,
         )
         self._history = None
+        self._unwritten = []  # the result says all of it
         self._dispatcher.drop()
         self._effects.append(EndTrial(result))
 
@@ -622,7 +642,10 @@ class Robot:
 
     def _stop(self, error: HoldfastError) -> None:
         self._stopped = True
+        self._write()
         self._effects.append(Stop(error))
 
     def _take(self) -> list[Effect]:
+        # Before the robot waits for whatever comes next: it may be killed while it waits.
+        self._write()
         return self._dispatcher.take()

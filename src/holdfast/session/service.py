@@ -295,7 +295,11 @@ class _Fate(enum.Enum):
 
 
 class _LacksStateError(Exception):
-    """The events of a request do not connect to the state that is at hand."""
+    """The events of a request do not connect to the state at hand, or lead to another one."""
+
+    def __init__(self, *, differs: bool = False) -> None:
+        super().__init__()
+        self.differs = differs
 
 
 class Job:
@@ -306,9 +310,8 @@ class Job:
     kind : {"task", "sensing"}
     problem : Problem or None
         None if it is still to be built.
-    make_problem : callable
-    opening : Opening or None
-        There as long as ``problem`` is not.
+    make_problem, describe_error : callable
+    opening : Opening
     planning : PlanningSettings
     seed : int
     limits : ServiceLimits
@@ -319,6 +322,7 @@ class Job:
     """
 
     __slots__ = (
+        "_describe_error",
         "_limits",
         "_make_problem",
         "_opening",
@@ -335,7 +339,8 @@ class Job:
         kind: Literal["task", "sensing"],
         problem: Problem | None,
         make_problem: Callable[[Opening], Problem],
-        opening: Opening | None,
+        describe_error: Callable[[BaseException], str],
+        opening: Opening,
         planning: PlanningSettings,
         seed: int,
         limits: ServiceLimits,
@@ -345,6 +350,7 @@ class Job:
         self.kind = kind
         self._problem = problem
         self._make_problem = make_problem
+        self._describe_error = describe_error
         self._opening = opening
         self._planning = planning
         self._seed = seed
@@ -358,25 +364,20 @@ class Job:
         problem = self._problem
         try:
             if problem is None:
-                problem = self._built()
+                problem = self._make_problem(self._opening)
+            _check_work(problem, self._planning, self._limits)
             return self._computed(problem)
-        except _LacksStateError:
-            held = self._state is not None
-            return Outcome(lacks_state=True, differs=held, problem=problem)
+        except _LacksStateError as lack:
+            differs = lack.differs or self._state is not None
+            return Outcome(lacks_state=True, differs=differs, problem=problem)
+        except MemoryError:
+            return Outcome(failure=("busy", ""), problem=problem)
         except MessageError as error:
             return Outcome(failure=(error.code, str(error)), problem=problem)
         except HoldfastError as error:
             return Outcome(failure=(_code_of(error), str(error)), problem=problem)
         except (Exception, SystemExit) as error:  # noqa: BLE001 - the problem is anybody's code
-            text = f"{type(error).__name__}: {error}"
-            return Outcome(failure=("failed", text), problem=problem)
-
-    def _built(self) -> Problem:
-        """Return the problem, once it is known that this service can take it on."""
-        assert self._opening is not None
-        problem = self._make_problem(self._opening)
-        _check_work(problem, self._planning, self._limits)
-        return problem
+            return Outcome(failure=("failed", self._describe_error(error)), problem=problem)
 
     def _computed(self, problem: Problem) -> Outcome:
         planning, request = self._planning, self._request
@@ -424,7 +425,7 @@ class Job:
             state, _ = observe(problem, planning, state, observed.sensing_action, observation)
         state = self._rolled(problem, state, request.step, most)
         if state.sensed != request.sensed or digest(state)[:DIGEST_SIZE] != request.digest:
-            raise _LacksStateError
+            raise _LacksStateError(differs=True)
         return state
 
     def _rolled(
@@ -475,6 +476,10 @@ def _check_work(problem: Problem, planning: PlanningSettings, limits: ServiceLim
             f"action_size of {problem.name} is {problem.action_size}: a service takes at most "
             f"{_MAX_ACTION_SIZE}"
         )
+
+
+def _described(error: BaseException) -> str:
+    return f"{type(error).__name__}: {error}"
 
 
 def _code_of(error: HoldfastError) -> str:
@@ -564,6 +569,7 @@ class _Session:
         "ahead",
         "ahead_digest",
         "answers",
+        "built",
         "closed",
         "epoch",
         "held",
@@ -574,7 +580,6 @@ class _Session:
         "opening_key",
         "planning",
         "planning_single",
-        "problem",
         "problem_key",
         "running",
         "seed",
@@ -590,10 +595,10 @@ class _Session:
         self.key = request.session
         self.epoch = request.epoch
         self.number = -1
-        self.opening: Opening | None = opening
+        self.opening = opening
         self.opening_key = _key_of(opening)
         self.problem_key = _key_of((opening.problem, opening.model, opening.state_space_planner))
-        self.problem: Problem | None = None
+        self.built = False
         # The number of threads changes no result, so the service may choose it.
         sensing = opening.planning.active_sensing
         most = min(sensing.num_cores, max_threads)
@@ -660,6 +665,8 @@ class Service:
     workers : int
         Jobs that may run at a time.
     limits : ServiceLimits, optional
+    describe_error : callable, optional
+        Puts an error that a problem raised into words.
     """
 
     def __init__(
@@ -667,10 +674,12 @@ class Service:
         make_problem: Callable[[Opening], Problem],
         workers: int,
         limits: ServiceLimits | None = None,
+        describe_error: Callable[[BaseException], str] | None = None,
     ) -> None:
         if workers < 1:
             raise InvalidValueError(f"workers {workers}: a service needs at least 1")
         self._make_problem = make_problem
+        self._describe_error = describe_error or _described
         self._workers = workers
         self._limits = limits or ServiceLimits()
         self._progress_s = 1e-3 * self._limits.progress_interval_ms
@@ -680,7 +689,8 @@ class Service:
         self._sessions: OrderedDict[bytes, _Session] = OrderedDict()
         # Of sessions that were forgotten: a robot that was replaced stays replaced.
         self._epochs: OrderedDict[bytes, int] = OrderedDict()
-        self._problems: OrderedDict[bytes, Problem] = OrderedDict()
+        # Those that no job is using; the robots' that were heard last at the end.
+        self._problems: OrderedDict[bytes, list[Problem]] = OrderedDict()
         # No sign for the longest first.
         self._calls: OrderedDict[int, _Call] = OrderedDict()
         # Robots stand still for the urgent works; the later ones are ahead of their robots. Each
@@ -737,14 +747,15 @@ class Service:
         session.running[work.slot] = None
         if session.works.get(work.digest) is work:
             del session.works[work.digest]
+        self._give_back(session.problem_key, outcome.problem)
         if not session.closed:
             session.used_at = now
             self._sessions.move_to_end(session.key)
             # The first job of a problem also imports and builds it: no measure of the next ones.
-            typical = session.problem is not None
-            self._keep_problem(session, outcome.problem)
+            typical = session.built
+            session.built = session.built or outcome.problem is not None
             if outcome.failure is not None or outcome.lacks_state:
-                self._failed(work, outcome)
+                self._failed(work, outcome, now)
             else:
                 if typical:
                     self._learn(session, now - work.started_at, task=not work.sensing)
@@ -867,14 +878,6 @@ class Service:
             return None
         session = _Session(request, opening, limits.max_threads, (self._task_s, self._sensing_s))
         session.used_at = now
-        session.problem = self._problems.get(session.problem_key)
-        if session.problem is not None:
-            session.opening = None
-            try:
-                _check_work(session.problem, session.planning, limits)
-            except InvalidValueError as error:
-                self._refuse(call, request.number, "invalid", str(error))
-                return None
         unused = self._unused()
         if unused is not None and len(self._sessions) >= limits.max_sessions:
             self._forget(unused, "room needed")
@@ -1091,8 +1094,9 @@ class Service:
         alone = not self._running and self._num_waiting == 0
         job = Job(
             "sensing" if work.sensing else "task",
-            session.problem,
+            self._lend(session.problem_key),
             self._make_problem,
+            self._describe_error,
             session.opening,
             session.planning if alone else session.planning_single,
             session.seed,
@@ -1108,25 +1112,32 @@ class Service:
 
     # -- outcomes --------------------------------------------------------------------------------
 
-    def _keep_problem(self, session: _Session, problem: Problem | None) -> None:
-        if problem is None or session.problem is not None:
+    def _lend(self, key: bytes) -> Problem | None:
+        """Take a problem that nobody uses; None if one is to be built."""
+        idle = self._problems.get(key)
+        return idle.pop() if idle else None
+
+    def _give_back(self, key: bytes, problem: Problem | None) -> None:
+        """Keep a problem for the next job. No two jobs at a time have the same instance."""
+        if problem is None:
             return
-        # Another robot's may have been finished first: then that one is shared.
-        session.problem = self._problems.setdefault(session.problem_key, problem)
-        session.opening = None
-        self._problems.move_to_end(session.problem_key)
+        self._problems.setdefault(key, []).append(problem)
+        self._problems.move_to_end(key)
         while len(self._problems) > self._limits.max_problems:
             self._problems.popitem(last=False)
 
-    def _failed(self, work: _Work, outcome: Outcome) -> None:
+    def _failed(self, work: _Work, outcome: Outcome, now: float) -> None:
         session = work.session
         for record in self._released(work):
             if outcome.failure is None:
                 self._need_state(record.call, record.number, differs=outcome.differs)
             else:
                 code, text = outcome.failure
-                self._refuse(record.call, record.number, code, text)
-        if session.problem is None:
+                if code == "busy":
+                    self._turn_away(record.call, record.number, now)
+                else:
+                    self._refuse(record.call, record.number, code, text)
+        if not session.built:
             # Nothing can ever come of it.
             self._forget(session, "refused")
 

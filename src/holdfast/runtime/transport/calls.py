@@ -52,6 +52,9 @@ class PendingCall:
         self.number = number
         self.peer = peer
 
+    def over(self) -> None:
+        """Take note that nothing more will be delivered of this call; the table is locked."""
+
 
 class CallTable:
     """Calls in flight of one robot's end; delivers each one's events in order and one end.
@@ -105,13 +108,16 @@ class CallTable:
         """Deliver the end of a call, if it is still in flight."""
         with self._lock:
             if self._deliver is not None and self._calls.get(call.number) is call:
-                del self._calls[call.number]
+                self._take_out(call)
                 self._deliver(Ended(call.number))
 
     def abandon(self, number: int) -> PendingCall | None:
         """Take a call out without delivering anything."""
         with self._lock:
-            return self._calls.pop(number, None)
+            call = self._calls.get(number)
+            if call is not None:
+                self._take_out(call)
+            return call
 
     def appeared(self, service: str, boot: str) -> None:
         """Deliver that a service is there."""
@@ -127,15 +133,22 @@ class CallTable:
             self._deliver(Vanished(service, boot))
             lost = [call for call in self._calls.values() if call.peer == peer]
             for call in lost:
-                del self._calls[call.number]
+                self._take_out(call)
                 self._deliver(Ended(call.number))
             return lost
 
-    def close(self) -> None:
-        """Forget all calls and deliver nothing more."""
+    def close(self) -> list[PendingCall]:
+        """Forget all calls and deliver nothing more; return the calls that were in flight."""
         with self._lock:
             self._deliver = None
-            self._calls.clear()
+            calls = list(self._calls.values())
+            for call in calls:
+                self._take_out(call)
+            return calls
+
+    def _take_out(self, call: PendingCall) -> None:
+        del self._calls[call.number]
+        call.over()
 
 
 class Courier:

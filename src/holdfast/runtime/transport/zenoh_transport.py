@@ -11,20 +11,31 @@ What holds here was measured, not read:
 
 - Callbacks run on Zenoh's own threads (``indirect=False``). Zenoh's other way starts a Python
   thread for each call; it is slower, and such a thread keeps the process from ending.
-- A send to a peer that has stopped reading blocks, and Zenoh's lease does not end that;
-  ``wait_before_close`` does. Shorter than the lease it makes Zenoh hang, so it is a little longer.
-  Large requests are sent from a thread of their own, so that ``call`` never blocks.
+- A message that does not fit the buffers blocks its sender. If the other end has stopped reading,
+  the lease does not end that, only ``wait_before_close`` does; and that bounds how long a message
+  may take as a whole, so that a short one breaks the link to whoever is merely slow. Therefore each
+  large request has a thread, a session and a longer bound of its own, while the lease of the usual
+  session, over which nothing large goes, tells whether anybody is there. (Shorter than the lease,
+  ``wait_before_close`` makes Zenoh hang.)
+- A session whose service has vanished is replaced. Zenoh knows a peer by the identity of its
+  session, and when one comes back while the link to it is still being closed (a process that was
+  stopped goes on), it can be left half connected for ever: seen, and never answering.
 - ``connect/timeout_ms`` stays at its default: 0 would mean one attempt and no other.
-- ``close`` can take ten seconds when a peer has vanished, so it runs aside and is not waited for.
+- ``close`` can take ten seconds when a peer has vanished, so it runs aside and is not waited for. A
+  process that ends without it can be aborted in a callback, so it is also called at exit.
 """
 
 from __future__ import annotations
 
+import atexit
+import contextlib
 import json
 import re
 import threading
+import weakref
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
+from pathlib import Path
 from time import monotonic
 
 import zenoh
@@ -63,10 +74,16 @@ _OPEN_TIMEOUT_MS = 1000
 _BLOCKED_SEND_LEASES = 1.25
 """A send that blocks so many leases long breaks the link. Below 1, Zenoh 1.10 hangs instead."""
 
-_SENT_AT_ONCE_BYTES = 32 * 1024
-"""Larger requests may fill the buffers of a link, and so block: they are sent from a thread."""
+_LARGE_BYTES = 60_000
+"""Smaller requests fit into one of Zenoh's batches of 64 KiB; they do not block."""
+
+_LARGE_LEASE_MS = 10_000.0
+"""For links that large requests fill: nobody relies on these to tell who is there."""
 
 _FREE_PORT_ATTEMPTS = 8
+
+_EXIT_TIMEOUT_S = 2.0
+"""How long a process that ends waits for links that are still being closed."""
 
 _MAX_BOOTS = 64
 """Incarnations of one service that a robot takes note of at the same time."""
@@ -80,11 +97,12 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
 class _Boot:
     """One incarnation of a service, as a robot sees it."""
 
-    __slots__ = ("boot", "key")
+    __slots__ = ("alive", "boot", "decide")
 
-    def __init__(self, boot: str, key: zenoh.KeyExpr) -> None:
+    def __init__(self, boot: str, alive: str) -> None:
         self.boot = boot
-        self.key = key
+        self.alive = alive
+        self.decide = zenoh.KeyExpr(f"{alive.removesuffix('/alive')}/decide")
 
 
 class _Link:
@@ -95,9 +113,11 @@ class _Link:
         self.address = address
         self.endpoint = endpoint
         self.session: zenoh.Session | None = None
+        self.generation = 0
         self.boots: dict[str, _Boot] = {}
         self.newest: _Boot | None = None
         self.sender = Courier(f"holdfast-send-{service}")
+        self.keeper = Courier(f"holdfast-keep-{service}")
 
 
 class _ZenohCall(PendingCall):
@@ -105,10 +125,37 @@ class _ZenohCall(PendingCall):
 
     __slots__ = ("cancellation", "sending_thread")
 
-    def __init__(self, number: int, peer: _Boot | None) -> None:
-        super().__init__(number, peer)
+    def __init__(self, number: int, boot: _Boot | None) -> None:
+        super().__init__(number, boot)
         self.cancellation = zenoh.CancellationToken()
         self.sending_thread = 0
+
+
+class _LargeCall(_ZenohCall):
+    """A call with a thread and a session of its own.
+
+    Attributes
+    ----------
+    may_go_on : threading.Event
+        The service is seen over the session, or the call is over.
+    is_over : threading.Event
+    session : zenoh.Session or None
+    """
+
+    __slots__ = ("is_over", "may_go_on", "session")
+
+    def __init__(self, number: int, boot: _Boot | None) -> None:
+        super().__init__(number, boot)
+        self.may_go_on = threading.Event()
+        self.is_over = threading.Event()
+        self.session: zenoh.Session | None = None
+
+    def service_is_seen(self, _: zenoh.Sample) -> None:
+        self.may_go_on.set()
+
+    def over(self) -> None:
+        self.is_over.set()
+        self.may_go_on.set()
 
 
 class ZenohRobotTransport:
@@ -149,7 +196,9 @@ class ZenohRobotTransport:
             endpoint = _checked(address.endpoint, tls, listens=address.listens)
             if address.name is not None:
                 _check_name("name of a service", address.name)
-            if address.listens and endpoint.port == 0 and not endpoint.is_local_socket:
+            if address.listens and endpoint.is_local_socket:
+                parse_endpoint(f"{_numbered(endpoint, 10**9)}.lock")  # not too long later either
+            elif address.listens and endpoint.port == 0:
                 # Chosen now, so that a service can be told before it is launched.
                 endpoint = endpoint.with_port(free_port(endpoint))
             self._links[service] = _Link(service, address, endpoint)
@@ -159,7 +208,8 @@ class ZenohRobotTransport:
         self._tls = tls
         self._calls = CallTable()
         self._courier = Courier("holdfast-robot-end")
-        self._closing: list[threading.Thread] = []
+        self._closed = threading.Event()
+        self._threads: list[threading.Thread] = []
 
     def endpoint_of(self, service: str) -> str:
         """Return the endpoint of a service: for one that the robot listens for, where to connect.
@@ -176,7 +226,10 @@ class ZenohRobotTransport:
         TransportError
             If the robot cannot listen where it should.
         """
+        if self._closed.is_set():
+            raise TransportError("this transport is closed; make another one")
         self._calls.open(deliver)
+        atexit.register(self.close)
         try:
             for link in self._links.values():
                 self._open(link)
@@ -187,16 +240,28 @@ class ZenohRobotTransport:
     def call(self, service: str, call: int, payload: bytes) -> None:
         """Send a request; never blocks."""
         link = self._link(service)
+        # A robot that listens cannot open another session to a service; but it does so for one on
+        # the same machine, to which nothing is slow.
+        apart = len(payload) > _LARGE_BYTES and not link.address.listens
         with self._calls.lock:  # so that an incarnation does not vanish between these two lines
             boot = link.newest
-            pending = _ZenohCall(call, boot)
+            pending = _LargeCall(call, boot) if apart else _ZenohCall(call, boot)
             if not self._calls.begin(pending):
                 return
         if len(payload) > self._max_message_bytes:
             self._courier.post(partial(self._refuse, pending, len(payload)))
         elif boot is None:
             self._courier.post(partial(self._calls.ended, pending))
-        elif len(payload) > _SENT_AT_ONCE_BYTES or not link.sender.is_idle:
+        elif isinstance(pending, _LargeCall):
+            thread = threading.Thread(
+                target=self._send_apart,
+                args=(link, boot, pending, payload),
+                name=f"holdfast-send-{service}",
+                daemon=True,
+            )
+            thread.start()
+            self._wait_for_at_close(thread)
+        elif len(payload) > _LARGE_BYTES or not link.sender.is_idle:
             link.sender.post(partial(self._send, link, boot, pending, payload))
         else:
             self._send(link, boot, pending, payload)
@@ -206,22 +271,21 @@ class ZenohRobotTransport:
         pending = self._calls.abandon(call)
         if isinstance(pending, _ZenohCall):
             pending.cancellation.cancel()
+            self._close_apart([pending])
 
     def close(self, timeout_s: float = 1.0) -> None:
         """Close all links, within about this time whatever the other ends do. May be repeated."""
         deadline_s = monotonic() + timeout_s
-        self._calls.close()
-        with self._calls.lock:
-            sessions = [link.session for link in self._links.values() if link.session is not None]
-            for link in self._links.values():
-                link.session = None
-                link.newest = None
-                link.boots.clear()
-        self._closing += [_closed_aside(session) for session in sessions]
-        for courier in [self._courier, *(link.sender for link in self._links.values())]:
+        atexit.unregister(self.close)
+        self._closed.set()
+        self._close_apart(self._calls.close())
+        links = list(self._links.values())
+        for link in links:
+            link.keeper.stop(max(0.0, deadline_s - monotonic()))
+            self._put_aside(link)
+        for courier in [self._courier, *(link.sender for link in links)]:
             courier.stop(max(0.0, deadline_s - monotonic()))
-        for thread in self._closing:
-            thread.join(max(0.0, deadline_s - monotonic()))
+        _wait_for(self._threads, deadline_s)
 
     def _link(self, service: str) -> _Link:
         try:
@@ -232,31 +296,91 @@ class ZenohRobotTransport:
             ) from None
 
     def _open(self, link: _Link) -> None:
+        """Open a session of a link.
+
+        Raises
+        ------
+        TransportError
+            If the robot cannot listen where it should.
+        """
+        generation = link.generation  # what comes of this session counts while this is the link's
         listens = link.address.listens
-        link.session, _ = _opened(
-            listen=[link.endpoint] if listens else [],
-            connect=[] if listens else [link.endpoint],
+        place = link.endpoint
+        if listens and place.is_local_socket:
+            place = _numbered(place, generation)
+        session, _ = _opened(
+            listen=[place] if listens else [],
+            connect=[] if listens else [place],
             lease_ms=self._lease_ms,
             max_message_bytes=self._max_message_bytes,
             tls=self._tls,
         )
-        name = link.address.name or "*"
-        link.session.liveliness().declare_subscriber(
-            f"holdfast/{KEY_VERSION}/{name}/*/alive",
-            zenoh.handlers.Callback(partial(self._token_changed, link), indirect=False),
+        with self._calls.lock:
+            link.session = session  # before anybody can appear and be called
+        session.liveliness().declare_subscriber(
+            f"holdfast/{KEY_VERSION}/{link.address.name or '*'}/*/alive",
+            zenoh.handlers.Callback(partial(self._token_changed, link, generation), indirect=False),
             history=True,
         )
+        if place is not link.endpoint:
+            _point(link.endpoint, place)
 
-    def _token_changed(self, link: _Link, sample: zenoh.Sample) -> None:
+    def _put_aside(self, link: _Link) -> None:
+        """Take a link's session away and close it, on a thread of its own."""
+        with self._calls.lock:
+            session, link.session = link.session, None
+            link.newest = None
+            link.boots.clear()
+            link.generation += 1
+        if session is None:
+            return
+        if link.address.listens and link.endpoint.is_local_socket:
+            with contextlib.suppress(OSError):  # so that nobody connects to what is being closed
+                Path(link.endpoint.host).unlink()
+        self._close_aside(session)
+
+    def _close_aside(self, session: zenoh.Session) -> None:
+        self._wait_for_at_close(_closed_aside(session))
+
+    def _wait_for_at_close(self, thread: threading.Thread) -> None:
+        with self._calls.lock:
+            self._threads = [each for each in self._threads if each.is_alive()]
+            self._threads.append(thread)
+
+    def _close_apart(self, calls: Iterable[PendingCall]) -> None:
+        """Close the sessions of large calls that are over; a blocked send does not end itself."""
+        for call in calls:
+            if isinstance(call, _LargeCall):
+                with self._calls.lock:
+                    session, call.session = call.session, None
+                if session is not None:
+                    self._close_aside(session)
+
+    def _renew(self, link: _Link) -> None:
+        """Replace the session of a link whose service has vanished."""
+        self._put_aside(link)
+        while not self._closed.is_set():
+            try:
+                self._open(link)
+            except (TransportError, zenoh.ZError):
+                # The session before still listens there: closing it can take a while.
+                self._put_aside(link)
+                self._closed.wait(_RETRY_FIRST_MS / 1e3)
+            else:
+                break
+        if self._closed.is_set():
+            self._put_aside(link)
+
+    def _token_changed(self, link: _Link, generation: int, sample: zenoh.Sample) -> None:
         key = str(sample.key_expr)
         boot = key.split("/")[3]
         with self._calls.lock:
+            if link.generation != generation:
+                return
             if sample.kind == zenoh.SampleKind.PUT:
                 if boot in link.boots or len(link.boots) >= _MAX_BOOTS:
                     return
-                link.boots[boot] = link.newest = _Boot(
-                    boot, zenoh.KeyExpr(f"{key.removesuffix('/alive')}/decide")
-                )
+                link.boots[boot] = link.newest = _Boot(boot, key)
                 self._calls.appeared(link.service, boot)
                 return
             gone = link.boots.pop(boot, None)
@@ -264,16 +388,51 @@ class ZenohRobotTransport:
                 return
             link.newest = next(reversed(link.boots.values()), None)
             # Zenoh ends these calls too, but only when it gives up the link.
-            self._calls.vanished(link.service, boot, gone)
+            lost = self._calls.vanished(link.service, boot, gone)
+            if any(isinstance(call, _LargeCall) for call in lost):
+                link.keeper.post(partial(self._close_apart, lost))
+            if not link.boots:
+                link.generation += 1  # whatever this session still sees does not count
+                link.keeper.post(partial(self._renew, link))
 
     def _send(self, link: _Link, boot: _Boot, pending: _ZenohCall, payload: bytes) -> None:
         session = link.session
-        if session is None or not self._calls.is_pending(pending):
-            return
+        if session is not None and self._calls.is_pending(pending):
+            self._get(session, boot, pending, payload)
+
+    def _send_apart(self, link: _Link, boot: _Boot, pending: _LargeCall, payload: bytes) -> None:
+        """Send a large request over a session of its own, and close that after the call."""
+        try:
+            session, _ = _opened(
+                listen=[],
+                connect=[link.endpoint],
+                lease_ms=_LARGE_LEASE_MS,
+                blocked_send_ms=max(_LARGE_LEASE_MS, 1e3 * self._decision_timeout_s),
+                max_message_bytes=self._max_message_bytes,
+                tls=self._tls,
+            )
+            with self._calls.lock:
+                pending.session = session
+            session.liveliness().declare_subscriber(
+                boot.alive,
+                zenoh.handlers.Callback(pending.service_is_seen, indirect=False),
+                history=True,
+            )
+            if pending.may_go_on.wait(self._decision_timeout_s) and not pending.is_over.is_set():
+                self._get(session, boot, pending, payload)
+                pending.is_over.wait(self._decision_timeout_s)
+        except (TransportError, zenoh.ZError):
+            pass  # The endpoint was good before; so the service, or we, are going.
+        self._calls.ended(pending)
+        self._close_apart([pending])
+
+    def _get(
+        self, session: zenoh.Session, boot: _Boot, pending: _ZenohCall, payload: bytes
+    ) -> None:
         pending.sending_thread = threading.get_ident()
         try:
             session.get(
-                boot.key,
+                boot.decide,
                 zenoh.handlers.Callback(
                     partial(self._replied, pending), partial(self._dropped, pending), indirect=False
                 ),
@@ -423,6 +582,7 @@ class ZenohServiceTransport:
         if self._closed or self._session is not None:
             raise TransportError(f"service {self._prefix} was started before")
         self._deliver = deliver
+        atexit.register(self.close)
         self._session, self._listen = _opened(
             listen=self._listen,
             connect=self._connect,
@@ -439,6 +599,7 @@ class ZenohServiceTransport:
     def close(self, timeout_s: float = 1.0) -> None:
         """Be seen no more, end all calls, and close all links. May be repeated."""
         deadline_s = monotonic() + timeout_s
+        atexit.unregister(self.close)
         with self._state:
             self._closed = True
             self._deliver = None
@@ -449,7 +610,7 @@ class ZenohServiceTransport:
         if session is not None:
             self._closing = _closed_aside(session, partial(_take_leave, token, calls))
         if self._closing is not None:
-            self._closing.join(max(0.0, deadline_s - monotonic()))
+            _wait_for([self._closing], deadline_s)
 
     def _received(self, query: zenoh.Query) -> None:
         payload = query.payload
@@ -505,6 +666,49 @@ def _closed_aside(
     return thread
 
 
+_still_closing: weakref.WeakSet[threading.Thread] = weakref.WeakSet()
+
+
+def _wait_for(threads: Iterable[threading.Thread], deadline_s: float) -> None:
+    """Wait for sessions to be closed; those that are not in time are waited for again at exit."""
+    for thread in threads:
+        thread.join(max(0.0, deadline_s - monotonic()))
+        if thread.is_alive():
+            if not _still_closing:
+                atexit.register(_wait_at_exit)
+            _still_closing.add(thread)
+
+
+def _wait_at_exit() -> None:
+    # A thread that comes back from Zenoh while the interpreter goes down aborts the process.
+    deadline_s = monotonic() + _EXIT_TIMEOUT_S
+    for thread in list(_still_closing):
+        thread.join(max(0.0, deadline_s - monotonic()))
+
+
+def _numbered(endpoint: Endpoint, generation: int) -> Endpoint:
+    """Return the local socket of one session, near the one that is told to others."""
+    return endpoint._replace(host=f"{endpoint.host}.{generation}")
+
+
+def _point(endpoint: Endpoint, place: Endpoint) -> None:
+    """Let the path of a local socket lead to another one.
+
+    A session that is being closed keeps its socket for a while, and in the end removes it by name;
+    so each session has a socket of its own, and who connects follows the path to the newest.
+    """
+    path = Path(endpoint.host)
+    link = Path(f"{endpoint.host}.link")
+    try:
+        if path.exists() and not path.is_symlink():
+            raise TransportError(f"cannot listen on {endpoint}: there is a file of that name")
+        link.unlink(missing_ok=True)
+        link.symlink_to(Path(place.host).name)
+        link.replace(path)
+    except OSError as error:
+        raise TransportError(f"cannot listen on {endpoint}: {error.strerror}") from error
+
+
 def _checked(text: str, tls: TlsFiles | None, *, listens: bool) -> Endpoint:
     endpoint = parse_endpoint(text)
     check_credentials(endpoint, tls)
@@ -529,17 +733,22 @@ def _opened(
     listen: list[Endpoint],
     connect: list[Endpoint],
     lease_ms: float,
+    blocked_send_ms: float | None = None,
     max_message_bytes: int,
     tls: TlsFiles | None,
 ) -> tuple[zenoh.Session, list[Endpoint]]:
     """Open a session; return it and where it listens."""
+    if blocked_send_ms is None:
+        blocked_send_ms = _BLOCKED_SEND_LEASES * lease_ms
     any_port = any(each.port == 0 and not each.is_local_socket for each in listen)
     for attempt in range(_FREE_PORT_ATTEMPTS):
         places = [
             each if each.port or each.is_local_socket else each.with_port(free_port(each))
             for each in listen
         ]
-        configuration = _configuration(places, connect, lease_ms, max_message_bytes, tls)
+        configuration = _configuration(
+            places, connect, lease_ms, blocked_send_ms, max_message_bytes, tls
+        )
         try:
             return zenoh.open(configuration), places
         except zenoh.ZError as error:
@@ -565,6 +774,7 @@ def _configuration(
     listen: list[Endpoint],
     connect: list[Endpoint],
     lease_ms: float,
+    blocked_send_ms: float,
     max_message_bytes: int,
     tls: TlsFiles | None,
 ) -> zenoh.Config:
@@ -573,9 +783,7 @@ def _configuration(
         "tx": {
             "lease": round(lease_ms),
             "queue": {
-                "congestion_control": {
-                    "block": {"wait_before_close": round(lease_ms * 1e3 * _BLOCKED_SEND_LEASES)}
-                }
+                "congestion_control": {"block": {"wait_before_close": round(blocked_send_ms * 1e3)}}
             },
         },
         # Twice, so that what is a little too large is answered with the reason.

@@ -1,0 +1,159 @@
+"""Reading endpoints, and what is refused."""
+
+from __future__ import annotations
+
+import socket
+import stat
+from pathlib import Path
+
+import pytest
+
+from holdfast.errors import TransportError
+from holdfast.runtime.endpoints import (
+    Endpoint,
+    PrivateSocket,
+    TlsFiles,
+    check_credentials,
+    free_port,
+    parse_endpoint,
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("tcp/127.0.0.1:7447", Endpoint("tcp", "127.0.0.1", 7447)),
+        ("tcp/localhost:0", Endpoint("tcp", "localhost", 0)),
+        ("tls/planner.example.org:65535", Endpoint("tls", "planner.example.org", 65535)),
+        ("quic/[::1]:7447", Endpoint("quic", "::1", 7447)),
+        ("tcp/[fe80::1%eth0]:7447", Endpoint("tcp", "fe80::1%eth0", 7447)),
+        ("tcp/cloud_1:80", Endpoint("tcp", "cloud_1", 80)),
+        ("unixsock-stream//run/s", Endpoint("unixsock-stream", "/run/s", 0)),
+        ("unixsock-stream/s", Endpoint("unixsock-stream", "s", 0)),
+    ],
+)
+def test_an_endpoint_is_read_and_written(text: str, expected: Endpoint) -> None:
+    assert parse_endpoint(text) == expected
+    assert str(expected) == text
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "does not begin with a protocol.*tcp, tls, quic and unixsock-stream"),
+        ("127.0.0.1:7447", r"does not begin with a protocol.*as in tcp/127\.0\.0\.1:7447"),
+        ("localhost", "does not begin with a protocol"),
+        ("TCP/localhost:1", "does not begin with a protocol"),
+        ("udp/127.0.0.1:7447", "protocol udp is not allowed.*larger than one datagram.*quic"),
+        ("ws/127.0.0.1:7447", "protocol ws is not allowed"),
+        ("http/localhost:80", r"protocol http is not allowed; allowed are tcp"),
+        ("tcp/localhost", "has no port: write tcp/HOST:PORT"),
+        ("tcp/[::1]", "has no port"),
+        ("tcp/", "has no port"),
+        ("tcp/localhost:", "port '' is not a number from 0 to 65535"),
+        ("tcp/localhost:65536", "port '65536' is not a number"),
+        ("tcp/localhost:" + "9" * 5000, "is not a number from 0"),
+        ("tcp/localhost:-1", "port '-1' is not a number"),
+        ("tcp/localhost:7447/x", "port '7447/x' is not a number"),
+        ("tcp/localhost:\uff17\uff14", "is not a number"),
+        ("tcp/::1:7447", r"stands in brackets, as in tcp/\[::1\]:7447"),
+        ("tcp/[127.0.0.1]:7447", "is no IPv6 address"),
+        ("tcp/[nonsense]:7447", "is no IPv6 address"),
+        ("tcp/:7447", "'' is no host name or address"),
+        ("tcp/300.1.1.1:7447", "'300.1.1.1' is no host name or address"),
+        ("tcp/127.0.0:7447", "'127.0.0' is no host name or address"),
+        ("tcp/a b:7447", "'a b' is no host name or address"),
+        ("tcp/-a:7447", "'-a' is no host name or address"),
+        ("tcp/*:7447", r"'\*' is no host name or address"),
+        ("tcp/localhost:7447#iface=eth0", "options after"),
+        ("tcp/localhost:7447?rel=0", "options after"),
+        ("unixsock-stream/", "has no path"),
+        ("unixsock-stream//", "has no path"),
+        ("unixsock-stream//" + "x" * 107, "a path of 108 bytes; .* at most 107"),
+    ],
+)
+def test_what_is_no_endpoint_is_refused_with_the_reason(text: str, message: str) -> None:
+    with pytest.raises(TransportError, match=message):
+        parse_endpoint(text)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("tcp/127.0.0.1:1", True),
+        ("tcp/127.1.2.3:1", True),
+        ("tcp/[::1]:1", True),
+        ("tcp/[::ffff:127.0.0.1]:1", True),
+        ("tcp/localhost:1", True),
+        ("tcp/LOCALHOST:1", True),
+        ("unixsock-stream//run/s", True),
+        ("tcp/0.0.0.0:1", False),
+        ("tcp/[::]:1", False),
+        ("tcp/[::ffff:10.0.0.1]:1", False),
+        ("tcp/10.0.0.1:1", False),
+        ("tcp/localhost.example.org:1", False),
+        ("quic/planner:1", False),
+    ],
+)
+def test_loopback_is_what_only_this_machine_can_reach(text: str, expected: bool) -> None:
+    assert parse_endpoint(text).is_loopback is expected
+
+
+def test_localhost_that_leads_elsewhere_is_not_loopback(monkeypatch: pytest.MonkeyPatch) -> None:
+    elsewhere = [(socket.AF_INET, socket.SOCK_STREAM, 6, "", ("10.0.0.7", 0))]
+    monkeypatch.setattr(socket, "getaddrinfo", lambda *_: elsewhere)
+    assert not parse_endpoint("tcp/localhost:1").is_loopback
+
+
+def test_credentials_go_with_the_protocols_that_use_them(tmp_path: Path) -> None:
+    files = TlsFiles(*(tmp_path / name for name in ("authority.pem", "certificate.pem", "key.pem")))
+    for file in (files.authority, files.certificate, files.key):
+        file.touch()
+    tcp, tls, unix = map(
+        parse_endpoint, ("tcp/localhost:1", "tls/localhost:1", "unixsock-stream//run/s")
+    )
+    check_credentials(tcp, None)
+    check_credentials(tls, files)
+    check_credentials(unix, None)
+    check_credentials(unix, files)  # a robot has both: its services afar and the local one
+    with pytest.raises(TransportError, match="tls needs credentials"):
+        check_credentials(tls, None)
+    with pytest.raises(TransportError, match="tcp does not use the credentials"):
+        check_credentials(tcp, files)
+    files.key.unlink()
+    with pytest.raises(TransportError, match=r"key\.pem cannot be read: No such file"):
+        check_credentials(tls, files)
+
+
+@pytest.mark.parametrize("text", ["tcp/127.0.0.1:0", "quic/localhost:0"])
+def test_a_free_port_can_be_listened_on(text: str) -> None:
+    endpoint = parse_endpoint(text)
+    port = free_port(endpoint)
+    kind = socket.SOCK_DGRAM if endpoint.protocol == "quic" else socket.SOCK_STREAM
+    with socket.socket(socket.AF_INET, kind) as probe:
+        probe.bind(("127.0.0.1", port))
+
+
+def test_an_address_of_another_machine_has_no_free_port() -> None:
+    with pytest.raises(TransportError, match=r"cannot listen on tcp/192\.0\.2\.1:0"):
+        free_port(parse_endpoint("tcp/192.0.2.1:0"))
+
+
+def test_a_private_socket_is_private_and_goes_away() -> None:
+    with PrivateSocket() as place:
+        path = Path(parse_endpoint(place.endpoint).host)
+        assert stat.S_IMODE(path.parent.stat().st_mode) == 0o700
+        path.touch()
+    assert not path.parent.exists()
+    place.remove()
+
+
+def test_a_private_socket_that_would_be_too_long_says_what_to_do(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    deep = tmp_path / ("x" * 100)
+    deep.mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(deep))
+    with pytest.raises(TransportError, match="at most 107; set TMPDIR"):
+        PrivateSocket()
+    assert list(deep.iterdir()) == []
