@@ -55,6 +55,7 @@ _REFUSED = {
 }
 
 _LOCK = "lock"
+_LONGEST_SUFFIX = ".1000000000.lock"  # what the transport appends for a socket and its lock
 _HOST_NAME = re.compile(
     r"(?=.{1,253}\Z)[A-Za-z0-9_]([A-Za-z0-9_-]*[A-Za-z0-9_])?(\.[A-Za-z0-9_-]+)*"
 )
@@ -187,7 +188,7 @@ class PrivateSocket:
             self._lock = _locked(self._directory)
         self.endpoint = f"{_UNIX}/{self._directory / 's'}"
         try:
-            parse_endpoint(self.endpoint)
+            parse_endpoint(self.endpoint + _LONGEST_SUFFIX)
         except TransportError as error:
             self.remove()
             raise TransportError(

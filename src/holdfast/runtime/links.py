@@ -138,12 +138,16 @@ def _zenoh_links(configuration: Configuration, log_path: Path | None, events: Ev
         def launcher(deliver: Callable[[RecoveryExited], None]) -> RecoveryLauncher:
             return RecoveryLauncher(arguments, deliver, log_path)
 
-    transport = ZenohRobotTransport(
-        addresses,
-        lease_ms=offload.lease_ms,
-        tls=tls,
-        decision_timeout_ms=offload.decision_timeout_ms,
-    )
+    try:
+        transport = ZenohRobotTransport(
+            addresses,
+            lease_ms=offload.lease_ms,
+            tls=tls,
+            decision_timeout_ms=offload.decision_timeout_ms,
+        )
+    except BaseException:
+        close()
+        raise
     return Links(transport, offload.services, recovery, launcher, offload, close)
 
 

@@ -7,10 +7,12 @@ its standard input does, so that it outlives the robot by no more than that, how
 from __future__ import annotations
 
 import contextlib
+import os
 import signal
 import subprocess
 import sys
 import threading
+import weakref
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import IO, NamedTuple
@@ -57,7 +59,8 @@ class RecoveryLauncher:
         deliver: Callable[[RecoveryExited], None],
         log_path: Path | None = None,
     ) -> None:
-        self._command = [sys.executable, "-m", "holdfast", "serve", *arguments]
+        # -P: what lies in the directory that the robot was started in is nobody's module.
+        self._command = [sys.executable, "-P", "-m", "holdfast", "serve", *arguments]
         self._deliver = deliver
         self._log_path = log_path
         self._process: subprocess.Popen[bytes] | None = None
@@ -86,6 +89,8 @@ class RecoveryLauncher:
             self._deliver(RecoveryExited(number, f"cannot be started: {error.strerror}"))
             return
         self._process = process
+        if process.stdin is not None:
+            _close_in_forked_children(process.stdin)
         threading.Thread(
             target=self._watch, args=(process, number), name="holdfast-recovery", daemon=True
         ).start()
@@ -120,3 +125,16 @@ class RecoveryLauncher:
         if self._log_path is None:
             return contextlib.nullcontext(subprocess.DEVNULL)
         return self._log_path.open("ab")
+
+
+def _close_in_forked_children(stream: IO[bytes]) -> None:
+    """Keep a copy of this process from holding the stream open when this process is gone."""
+    kept = weakref.ref(stream)
+
+    def close() -> None:
+        inherited = kept()
+        if inherited is not None:
+            with contextlib.suppress(OSError):
+                inherited.close()
+
+    os.register_at_fork(after_in_child=close)

@@ -49,6 +49,8 @@ from holdfast.user_code import account_of_user_error
 
 __all__ = ["Launcher", "RobotProcess", "StepJournal"]
 
+_LONGEST_SLEEP_S = 3600.0  # the platform's clocks have limits of their own
+
 _DEAF_S = 0.005
 """When the loop did not listen for longer than this, no service is blamed for that time."""
 
@@ -268,7 +270,7 @@ class RobotProcess:
                 if wake_at is None:
                     came_at, event = self._queue.get()
                 else:
-                    timeout_s = max(0.0, wake_at - monotonic())
+                    timeout_s = min(max(0.0, wake_at - monotonic()), _LONGEST_SLEEP_S)
                     came_at, event = self._queue.get(timeout=timeout_s)
             except Empty:
                 began = monotonic()

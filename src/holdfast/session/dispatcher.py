@@ -61,6 +61,12 @@ _MAX_REFUSALS = 3
 _MAX_CALLS = 4
 """Bound on the calls to one service that may be open at a time."""
 
+_MAX_REPLAYED_STEPS = 1024
+"""A trial longer than this is not planned again for a service that knows nothing of it."""
+
+_TELLING_INTERVAL_S = 1.0
+"""What may happen many times a second is told this often, with a count."""
+
 _LONGEST_SILENT_WAIT_S = 1.0
 """When the robot stands still for longer than this, somebody should know why."""
 
@@ -230,11 +236,13 @@ class _Service:
         "drifts",
         "last_boot",
         "name",
+        "num_busy",
         "opened",
         "refusals",
         "refused",
         "refused_code",
         "retry_at",
+        "tell_busy_at",
     )
 
     def __init__(self, name: str, detection_timeout_s: float) -> None:
@@ -254,6 +262,8 @@ class _Service:
         self.refused_code = ""
         self.retry_at = 0.0
         self.backoff_s = _FIRST_RETRY_S
+        self.num_busy = 0
+        self.tell_busy_at = 0.0
 
     def usable(self, now: float) -> bool:
         return self.detector.trusted and self.refused is None and self.retry_at <= now
@@ -537,14 +547,27 @@ class Dispatcher:
             return
         service.detector.heard(now)
         if isinstance(reply, Progress):
+            if call.question is self.question:
+                self._let_go(now)
             return
         self._settle(call)
         self.effects.append(Abandon(call.number))
         if isinstance(reply, NeedState):
             self._need_state(call, reply, now)
         elif isinstance(reply, Busy):
-            service.retry_at = now + 1e-3 * max(1, reply.retry_after_ms)
-            self._report("busy", service=service.name, retry_after_ms=reply.retry_after_ms)
+            # Its own estimate, but never as often as it can answer.
+            after_s = max(1e-3 * reply.retry_after_ms, service.backoff_s)
+            service.delay(now)
+            service.retry_at = now + after_s
+            service.num_busy += 1
+            if now >= service.tell_busy_at:
+                service.tell_busy_at = now + _TELLING_INTERVAL_S
+                self._report(
+                    "busy",
+                    service=service.name,
+                    retry_after_ms=1e3 * after_s,
+                    times=service.num_busy,
+                )
         else:
             self._was_refused(call, reply, now)
 
@@ -569,6 +592,8 @@ class Dispatcher:
             self._report(
                 "restored", service=service.name, step=question.state.step, restore_ms=restore_ms
             )
+        if question is self.question:
+            self._let_go(now)
         if call.finished:
             self._settle(call)
         if service is self._local:
@@ -599,6 +624,8 @@ class Dispatcher:
                 "malformed",
                 f"a sensing action for step {reply.step} where {question.sensing_step} was asked",
             )
+        if question.task_count == 0 and reply.digest != question.digest:
+            raise MessageError("malformed", "a sensing action for another state than was asked")
         if reply.sensing_action >= self._num_sensing_actions:
             raise MessageError("malformed", f"there is no sensing action {reply.sensing_action}")
         if question.sensing is None:
@@ -705,8 +732,6 @@ class Dispatcher:
             self._note_lost_cloud(now)
         else:
             self._choose(question, now)
-        if self._is_being_asked(question):
-            self._let_go(now)
 
     def _look_for_silence(self, now: float) -> None:
         for service in self._by_name.values():
@@ -715,7 +740,10 @@ class Dispatcher:
                     "service_suspected", service=service.name, reason=service.detector.suspicion
                 )
                 if service is self._local:
-                    # It runs but does nothing: another one is started in its place.
+                    # It runs but does nothing: another one is started in its place, and is given
+                    # more time, for it may be that its decisions simply take long.
+                    limit_s = 1e-3 * self._offload.decision_timeout_ms
+                    service.detector.extend_patience(2.0, limit_s)
                     self._launch_failed(now)
         limit_s = 1e-3 * self._offload.decision_timeout_ms
         for call in list(self._calls.values()):
@@ -837,7 +865,7 @@ class Dispatcher:
             )
 
     def _let_go(self, now: float) -> None:
-        """Note that the robot need not hold still any more."""
+        """Note that somebody works on what the robot holds still for."""
         if self._holding_since is not None:
             self._report("resumed", held_ms=1e3 * (now - self._holding_since))
             self._holding_since = None
@@ -992,7 +1020,10 @@ class Dispatcher:
         if missing > 1 or not (service.opened or fresh):
             # It knows nothing, or others have decided since. To plan what it has missed keeps it
             # from other robots, just when it has too many; but a large state is worse.
-            whole_state |= 8 * state.belief.states.size <= _LARGE_CHECKPOINT
+            whole_state |= (
+                8 * state.belief.states.size <= _LARGE_CHECKPOINT
+                or state.step > _MAX_REPLAYED_STEPS
+            )
         if service.drifts >= _MAX_DRIFTS or missing > len(question.observations):
             whole_state = True
         if whole_state:

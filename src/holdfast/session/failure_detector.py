@@ -87,6 +87,10 @@ class FailureDetector:
         self._last_sign = now
         self.suspicion = None
 
+    def extend_patience(self, factor: float, limit_s: float) -> None:
+        """Allow a longer silence from now on, up to a limit."""
+        self._timeout_s = min(factor * self._timeout_s, max(limit_s, self._timeout_s))
+
     def excuse(self, seconds: float) -> None:
         """Take note that for this long nothing could be heard."""
         self._last_sign += seconds

@@ -52,9 +52,6 @@ class PendingCall:
         self.number = number
         self.peer = peer
 
-    def over(self) -> None:
-        """Take note that nothing more will be delivered of this call; the table is locked."""
-
 
 class CallTable:
     """Calls in flight of one robot's end; delivers each one's events in order and one end.
@@ -108,16 +105,13 @@ class CallTable:
         """Deliver the end of a call, if it is still in flight."""
         with self._lock:
             if self._deliver is not None and self._calls.get(call.number) is call:
-                self._take_out(call)
+                del self._calls[call.number]
                 self._deliver(Ended(call.number))
 
     def abandon(self, number: int) -> PendingCall | None:
         """Take a call out without delivering anything."""
         with self._lock:
-            call = self._calls.get(number)
-            if call is not None:
-                self._take_out(call)
-            return call
+            return self._calls.pop(number, None)
 
     def appeared(self, service: str, boot: str) -> None:
         """Deliver that a service is there."""
@@ -125,30 +119,21 @@ class CallTable:
             if self._deliver is not None:
                 self._deliver(Appeared(service, boot))
 
-    def vanished(self, service: str, boot: str, peer: Hashable) -> list[PendingCall]:
-        """Deliver that a service is gone, then the ends of its calls; return those calls."""
+    def vanished(self, service: str, boot: str, peer: Hashable) -> None:
+        """Deliver that a service is gone, then the ends of its calls."""
         with self._lock:
             if self._deliver is None:
-                return []
+                return
             self._deliver(Vanished(service, boot))
-            lost = [call for call in self._calls.values() if call.peer == peer]
-            for call in lost:
-                self._take_out(call)
+            for call in [call for call in self._calls.values() if call.peer == peer]:
+                del self._calls[call.number]
                 self._deliver(Ended(call.number))
-            return lost
 
-    def close(self) -> list[PendingCall]:
-        """Forget all calls and deliver nothing more; return the calls that were in flight."""
+    def close(self) -> None:
+        """Forget all calls and deliver nothing more."""
         with self._lock:
             self._deliver = None
-            calls = list(self._calls.values())
-            for call in calls:
-                self._take_out(call)
-            return calls
-
-    def _take_out(self, call: PendingCall) -> None:
-        del self._calls[call.number]
-        call.over()
+            self._calls.clear()
 
 
 class Courier:

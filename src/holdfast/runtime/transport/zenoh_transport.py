@@ -11,12 +11,12 @@ What holds here was measured, not read:
 
 - Callbacks run on Zenoh's own threads (``indirect=False``). Zenoh's other way starts a Python
   thread for each call; it is slower, and such a thread keeps the process from ending.
-- A message that does not fit the buffers blocks its sender. If the other end has stopped reading,
-  the lease does not end that, only ``wait_before_close`` does; and that bounds how long a message
-  may take as a whole, so that a short one breaks the link to whoever is merely slow. Therefore each
-  large request has a thread, a session and a longer bound of its own, while the lease of the usual
-  session, over which nothing large goes, tells whether anybody is there. (Shorter than the lease,
-  ``wait_before_close`` makes Zenoh hang.)
+- A message that does not fit the buffers blocks its sender, and with it, now and then, every other
+  session of the process. If the other end has stopped reading, the lease does not end that, only
+  ``wait_before_close`` does; and that bounds how long a message may take as a whole, so it breaks
+  the link to whoever is merely slow. (Shorter than the lease, it makes Zenoh hang.) Therefore large
+  requests are sent in parts, a few at a time, each of which is acknowledged, and no part is larger
+  than what a slow link carries within a lease.
 - A session whose service has vanished is replaced. Zenoh knows a peer by the identity of its
   session, and when one comes back while the link to it is still being closed (a process that was
   stopped goes on), it can be left half connected for ever: seen, and never answering.
@@ -30,7 +30,9 @@ from __future__ import annotations
 import atexit
 import contextlib
 import json
+import os
 import re
+import struct
 import threading
 import weakref
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -74,11 +76,34 @@ _OPEN_TIMEOUT_MS = 1000
 _BLOCKED_SEND_LEASES = 1.25
 """A send that blocks so many leases long breaks the link. Below 1, Zenoh 1.10 hangs instead."""
 
-_LARGE_BYTES = 60_000
-"""Smaller requests fit into one of Zenoh's batches of 64 KiB; they do not block."""
+_PART_BYTES = 36_000
+"""Larger requests are sent in parts; 1000 particles of three coordinates are one part."""
 
-_LARGE_LEASE_MS = 10_000.0
-"""For links that large requests fill: nobody relies on these to tell who is there."""
+_PARTS_AT_ONCE = 4
+"""Parts that are sent before one has been acknowledged: at best 140 KB in each round trip."""
+
+_BATCH_BYTES = 40_000
+"""What Zenoh sends at once. A link must carry so much within a lease to count as alive."""
+
+_BATCHES_QUEUED = 16
+"""Zenoh's upper bound; enough that the parts which are on their way never block."""
+
+_SMALLEST_PART_BYTES = 1000
+"""Bound on how many parts a request may have, which take memory each."""
+
+_LARGEST_MESSAGE_BYTES = 1_000_000
+"""What a service takes in one message; a robot that plays by the rules sends no such message."""
+
+_HEADER_BYTES = 1000
+"""What Zenoh may put around a reply; what it receives beyond the bound it drops."""
+
+_UPLOADS = 256
+"""Requests in parts that a service holds at the same time."""
+
+_UPLOADED_MESSAGES = 2
+"""Their size together, as a multiple of the largest request."""
+
+_PART = struct.Struct("<16sQII")  # request, its size, number of this part, number of parts
 
 _FREE_PORT_ATTEMPTS = 8
 
@@ -131,31 +156,32 @@ class _ZenohCall(PendingCall):
         self.sending_thread = 0
 
 
-class _LargeCall(_ZenohCall):
-    """A call with a thread and a session of its own.
+class _Outgoing:
+    """A request that is sent in parts; used on the sending thread alone."""
 
-    Attributes
-    ----------
-    may_go_on : threading.Event
-        The service is seen over the session, or the call is over.
-    is_over : threading.Event
-    session : zenoh.Session or None
-    """
+    def __init__(self, pending: _ZenohCall, boot: _Boot, payload: bytes) -> None:
+        self.pending = pending
+        self.boot = boot
+        self.payload = payload
+        self.name = os.urandom(16)
+        self.count = -(-len(payload) // _PART_BYTES)
+        self.sent = 0
+        self.acknowledged = 0
 
-    __slots__ = ("is_over", "may_go_on", "session")
+    def part(self, index: int) -> tuple[bytes, bytes]:
+        """Return a part and what says where it belongs."""
+        start = index * _PART_BYTES
+        description = _PART.pack(self.name, len(self.payload), index, self.count)
+        return self.payload[start : start + _PART_BYTES], description
 
-    def __init__(self, number: int, boot: _Boot | None) -> None:
-        super().__init__(number, boot)
-        self.may_go_on = threading.Event()
-        self.is_over = threading.Event()
-        self.session: zenoh.Session | None = None
 
-    def service_is_seen(self, _: zenoh.Sample) -> None:
-        self.may_go_on.set()
+class _PartSent:
+    """What has come back of one part."""
 
-    def over(self) -> None:
-        self.is_over.set()
-        self.may_go_on.set()
+    __slots__ = ("acknowledged",)
+
+    def __init__(self) -> None:
+        self.acknowledged = False
 
 
 class ZenohRobotTransport:
@@ -240,29 +266,18 @@ class ZenohRobotTransport:
     def call(self, service: str, call: int, payload: bytes) -> None:
         """Send a request; never blocks."""
         link = self._link(service)
-        # A robot that listens cannot open another session to a service; but it does so for one on
-        # the same machine, to which nothing is slow.
-        apart = len(payload) > _LARGE_BYTES and not link.address.listens
         with self._calls.lock:  # so that an incarnation does not vanish between these two lines
             boot = link.newest
-            pending = _LargeCall(call, boot) if apart else _ZenohCall(call, boot)
+            pending = _ZenohCall(call, boot)
             if not self._calls.begin(pending):
                 return
         if len(payload) > self._max_message_bytes:
             self._courier.post(partial(self._refuse, pending, len(payload)))
         elif boot is None:
             self._courier.post(partial(self._calls.ended, pending))
-        elif isinstance(pending, _LargeCall):
-            thread = threading.Thread(
-                target=self._send_apart,
-                args=(link, boot, pending, payload),
-                name=f"holdfast-send-{service}",
-                daemon=True,
-            )
-            thread.start()
-            self._wait_for_at_close(thread)
-        elif len(payload) > _LARGE_BYTES or not link.sender.is_idle:
-            link.sender.post(partial(self._send, link, boot, pending, payload))
+        elif len(payload) > _PART_BYTES:
+            outgoing = _Outgoing(pending, boot, payload)
+            link.sender.post(partial(self._send_parts, link, outgoing))
         else:
             self._send(link, boot, pending, payload)
 
@@ -271,14 +286,13 @@ class ZenohRobotTransport:
         pending = self._calls.abandon(call)
         if isinstance(pending, _ZenohCall):
             pending.cancellation.cancel()
-            self._close_apart([pending])
 
     def close(self, timeout_s: float = 1.0) -> None:
         """Close all links, within about this time whatever the other ends do. May be repeated."""
         deadline_s = monotonic() + timeout_s
         atexit.unregister(self.close)
         self._closed.set()
-        self._close_apart(self._calls.close())
+        self._calls.close()
         links = list(self._links.values())
         for link in links:
             link.keeper.stop(max(0.0, deadline_s - monotonic()))
@@ -312,7 +326,7 @@ class ZenohRobotTransport:
             listen=[place] if listens else [],
             connect=[] if listens else [place],
             lease_ms=self._lease_ms,
-            max_message_bytes=self._max_message_bytes,
+            max_received_bytes=self._max_message_bytes + _HEADER_BYTES,
             tls=self._tls,
         )
         with self._calls.lock:
@@ -330,31 +344,18 @@ class ZenohRobotTransport:
         with self._calls.lock:
             session, link.session = link.session, None
             link.newest = None
-            link.boots.clear()
+            for boot in list(link.boots.values()):
+                # Seen after it was decided to renew the link: it will be seen again.
+                del link.boots[boot.boot]
+                self._calls.vanished(link.service, boot.boot, boot)
             link.generation += 1
         if session is None:
             return
         if link.address.listens and link.endpoint.is_local_socket:
             with contextlib.suppress(OSError):  # so that nobody connects to what is being closed
                 Path(link.endpoint.host).unlink()
-        self._close_aside(session)
-
-    def _close_aside(self, session: zenoh.Session) -> None:
-        self._wait_for_at_close(_closed_aside(session))
-
-    def _wait_for_at_close(self, thread: threading.Thread) -> None:
-        with self._calls.lock:
-            self._threads = [each for each in self._threads if each.is_alive()]
-            self._threads.append(thread)
-
-    def _close_apart(self, calls: Iterable[PendingCall]) -> None:
-        """Close the sessions of large calls that are over; a blocked send does not end itself."""
-        for call in calls:
-            if isinstance(call, _LargeCall):
-                with self._calls.lock:
-                    session, call.session = call.session, None
-                if session is not None:
-                    self._close_aside(session)
+        self._threads = [thread for thread in self._threads if thread.is_alive()]
+        self._threads.append(_closed_aside(session))
 
     def _renew(self, link: _Link) -> None:
         """Replace the session of a link whose service has vanished."""
@@ -388,55 +389,95 @@ class ZenohRobotTransport:
                 return
             link.newest = next(reversed(link.boots.values()), None)
             # Zenoh ends these calls too, but only when it gives up the link.
-            lost = self._calls.vanished(link.service, boot, gone)
-            if any(isinstance(call, _LargeCall) for call in lost):
-                link.keeper.post(partial(self._close_apart, lost))
+            self._calls.vanished(link.service, boot, gone)
+            if link.newest is not None:
+                # An older one is still there: from now on it is the one that is called.
+                self._calls.appeared(link.service, link.newest.boot)
             if not link.boots:
                 link.generation += 1  # whatever this session still sees does not count
                 link.keeper.post(partial(self._renew, link))
 
     def _send(self, link: _Link, boot: _Boot, pending: _ZenohCall, payload: bytes) -> None:
-        session = link.session
-        if session is not None and self._calls.is_pending(pending):
-            self._get(session, boot, pending, payload)
+        self._get(
+            link,
+            boot,
+            pending,
+            payload,
+            None,
+            partial(self._replied, pending),
+            partial(self._ended, pending),
+        )
 
-    def _send_apart(self, link: _Link, boot: _Boot, pending: _LargeCall, payload: bytes) -> None:
-        """Send a large request over a session of its own, and close that after the call."""
-        try:
-            session, _ = _opened(
-                listen=[],
-                connect=[link.endpoint],
-                lease_ms=_LARGE_LEASE_MS,
-                blocked_send_ms=max(_LARGE_LEASE_MS, 1e3 * self._decision_timeout_s),
-                max_message_bytes=self._max_message_bytes,
-                tls=self._tls,
+    def _send_parts(self, link: _Link, outgoing: _Outgoing) -> None:
+        """Send what may be sent now: a few parts ahead, and the last one after all others."""
+        before_last = outgoing.count - 1
+        while (
+            outgoing.sent < before_last
+            and outgoing.sent - outgoing.acknowledged < _PARTS_AT_ONCE
+            and self._calls.is_pending(outgoing.pending)
+        ):
+            part, description = outgoing.part(outgoing.sent)
+            outgoing.sent += 1
+            sent = _PartSent()
+            self._get(
+                link,
+                outgoing.boot,
+                outgoing.pending,
+                part,
+                description,
+                partial(self._part_replied, outgoing.pending, sent),
+                lambda sent=sent: link.sender.post(  # type: ignore[misc]
+                    partial(self._part_over, link, outgoing, sent)
+                ),
             )
-            with self._calls.lock:
-                pending.session = session
-            session.liveliness().declare_subscriber(
-                boot.alive,
-                zenoh.handlers.Callback(pending.service_is_seen, indirect=False),
-                history=True,
+        if outgoing.acknowledged == before_last:
+            part, description = outgoing.part(before_last)
+            self._get(
+                link,
+                outgoing.boot,
+                outgoing.pending,
+                part,
+                description,
+                partial(self._replied, outgoing.pending),
+                partial(self._ended, outgoing.pending),
             )
-            if pending.may_go_on.wait(self._decision_timeout_s) and not pending.is_over.is_set():
-                self._get(session, boot, pending, payload)
-                pending.is_over.wait(self._decision_timeout_s)
-        except (TransportError, zenoh.ZError):
-            pass  # The endpoint was good before; so the service, or we, are going.
-        self._calls.ended(pending)
-        self._close_apart([pending])
+
+    def _part_replied(self, pending: _ZenohCall, sent: _PartSent, reply: zenoh.Reply) -> None:
+        sample = reply.ok
+        if sample is None:
+            return
+        if len(sample.payload) == 0:
+            sent.acknowledged = True
+        else:
+            self._replied(pending, reply)  # The request is refused before it is there as a whole.
+
+    def _part_over(self, link: _Link, outgoing: _Outgoing, sent: _PartSent) -> None:
+        if sent.acknowledged:
+            outgoing.acknowledged += 1
+            self._send_parts(link, outgoing)
+        else:
+            self._calls.ended(outgoing.pending)
 
     def _get(
-        self, session: zenoh.Session, boot: _Boot, pending: _ZenohCall, payload: bytes
+        self,
+        link: _Link,
+        boot: _Boot,
+        pending: _ZenohCall,
+        payload: bytes,
+        attachment: bytes | None,
+        replied: Callable[[zenoh.Reply], None],
+        ended: Callable[[], None],
     ) -> None:
+        session = link.session
+        if session is None or not self._calls.is_pending(pending):
+            return
         pending.sending_thread = threading.get_ident()
         try:
             session.get(
                 boot.decide,
-                zenoh.handlers.Callback(
-                    partial(self._replied, pending), partial(self._dropped, pending), indirect=False
-                ),
+                zenoh.handlers.Callback(replied, ended, indirect=False),
                 payload=payload,
+                attachment=attachment,
                 consolidation=zenoh.ConsolidationMode.NONE,
                 timeout=self._decision_timeout_s,
                 express=True,
@@ -455,7 +496,7 @@ class ZenohRobotTransport:
         if len(payload) <= self._max_message_bytes:
             self._calls.replied(pending, payload.to_bytes())
 
-    def _dropped(self, pending: _ZenohCall) -> None:
+    def _ended(self, pending: _ZenohCall) -> None:
         if pending.sending_thread == threading.get_ident():
             # Nobody is there: Zenoh says so from inside get, where our caller may hold a lock.
             self._courier.post(partial(self._calls.ended, pending))
@@ -475,7 +516,7 @@ class _ReceivedCall:
     def __init__(
         self,
         query: zenoh.Query,
-        received: zenoh.ZBytes | None,
+        received: zenoh.ZBytes | bytes | None,
         key: zenoh.KeyExpr,
         ended: Callable[[_ReceivedCall], None],
     ) -> None:
@@ -490,7 +531,7 @@ class _ReceivedCall:
     def payload(self) -> bytes:
         """The request; copied when it is first asked for, which is not on Zenoh's thread."""
         if self._payload is None:
-            self._payload = b"" if self._received is None else self._received.to_bytes()
+            self._payload = b"" if self._received is None else bytes(self._received)
             self._received = None
         return self._payload
 
@@ -509,6 +550,43 @@ class _ReceivedCall:
         self._ended(self)
 
 
+class _Incoming:
+    """A request of which parts have come."""
+
+    __slots__ = ("count", "parts", "size_bytes")
+
+    def __init__(self, count: int) -> None:
+        self.count = count
+        self.parts: dict[int, bytes] = {}
+        self.size_bytes = 0
+
+
+class _Assembly:
+    """Puts requests together from their parts; forgets the oldest when they become too many."""
+
+    def __init__(self, max_bytes: int) -> None:
+        self._max_bytes = max_bytes
+        self._incoming: dict[bytes, _Incoming] = {}
+        self._size_bytes = 0
+
+    def add(self, name: bytes, index: int, count: int, part: bytes) -> bytes | None:
+        """Take a part; return the request if this was the last one and all are there."""
+        incoming = self._incoming.pop(name, None) or _Incoming(count)
+        self._size_bytes -= incoming.size_bytes
+        if index < incoming.count and index not in incoming.parts:
+            incoming.parts[index] = part
+            incoming.size_bytes += len(part)
+        if index == incoming.count - 1:
+            if len(incoming.parts) < incoming.count:
+                return None
+            return b"".join(part for _, part in sorted(incoming.parts.items()))
+        self._incoming[name] = incoming  # the newest now
+        self._size_bytes += incoming.size_bytes
+        while self._size_bytes > self._max_bytes or len(self._incoming) > _UPLOADS:
+            self._size_bytes -= self._incoming.pop(next(iter(self._incoming))).size_bytes
+        return None
+
+
 class ZenohServiceTransport:
     """The service's end: see :class:`~holdfast.runtime.transport.contract.ServiceTransport`.
 
@@ -523,7 +601,7 @@ class ZenohServiceTransport:
     lease_ms : float
         A link over which nothing comes for this long is given up.
     max_message_bytes : int
-        A larger request is refused before it is copied. From twice that on it is dropped.
+        A larger request is refused before it is copied or read.
     tls : TlsFiles or None
         The service's credentials, for ``tls`` and ``quic``.
 
@@ -559,6 +637,7 @@ class ZenohServiceTransport:
         self._tls = tls
         self._deliver: Callable[[IncomingCall], None] | None = None
         self._calls: set[_ReceivedCall] = set()
+        self._assembly = _Assembly(_UPLOADED_MESSAGES * max_message_bytes)
         self._state = threading.Condition()
         self._deliveries = 0
         self._session: zenoh.Session | None = None
@@ -587,7 +666,7 @@ class ZenohServiceTransport:
             listen=self._listen,
             connect=self._connect,
             lease_ms=self._lease_ms,
-            max_message_bytes=self._max_message_bytes,
+            max_received_bytes=_LARGEST_MESSAGE_BYTES,
             tls=self._tls,
         )
         # In this order: who sees the token must find the queryable.
@@ -614,10 +693,39 @@ class ZenohServiceTransport:
 
     def _received(self, query: zenoh.Query) -> None:
         payload = query.payload
-        if payload is not None and len(payload) > self._max_message_bytes:
-            with query:
-                query.reply(self._key, too_large(len(payload), self._max_message_bytes))
+        attachment = query.attachment
+        if attachment is not None:
+            self._received_part(query, b"" if payload is None else payload.to_bytes(), attachment)
+        elif payload is not None and len(payload) > self._max_message_bytes:
+            self._refuse(query, len(payload))
+        else:
+            self._hand_over(query, payload)
+
+    def _received_part(self, query: zenoh.Query, part: bytes, attachment: zenoh.ZBytes) -> None:
+        try:
+            name, size_bytes, index, count = _PART.unpack(attachment.to_bytes())
+        except struct.error:
+            query.drop()  # Of another version; the robot sees a call that ends without an answer.
             return
+        if size_bytes > self._max_message_bytes:
+            self._refuse(query, size_bytes)
+            return
+        request = None
+        if index < count <= 1 + size_bytes // _SMALLEST_PART_BYTES:
+            with self._state:
+                request = self._assembly.add(name, index, count, part)
+        if request is not None and len(request) == size_bytes:
+            self._hand_over(query, request)
+            return
+        with query:
+            if index < count - 1:
+                query.reply(self._key, b"")
+
+    def _refuse(self, query: zenoh.Query, size_bytes: int) -> None:
+        with query:
+            query.reply(self._key, too_large(size_bytes, self._max_message_bytes))
+
+    def _hand_over(self, query: zenoh.Query, payload: zenoh.ZBytes | bytes | None) -> None:
         call = _ReceivedCall(query, payload, self._key, self._ended)
         with self._state:
             deliver = self._deliver
@@ -733,22 +841,17 @@ def _opened(
     listen: list[Endpoint],
     connect: list[Endpoint],
     lease_ms: float,
-    blocked_send_ms: float | None = None,
-    max_message_bytes: int,
+    max_received_bytes: int,
     tls: TlsFiles | None,
 ) -> tuple[zenoh.Session, list[Endpoint]]:
     """Open a session; return it and where it listens."""
-    if blocked_send_ms is None:
-        blocked_send_ms = _BLOCKED_SEND_LEASES * lease_ms
     any_port = any(each.port == 0 and not each.is_local_socket for each in listen)
     for attempt in range(_FREE_PORT_ATTEMPTS):
         places = [
             each if each.port or each.is_local_socket else each.with_port(free_port(each))
             for each in listen
         ]
-        configuration = _configuration(
-            places, connect, lease_ms, blocked_send_ms, max_message_bytes, tls
-        )
+        configuration = _configuration(places, connect, lease_ms, max_received_bytes, tls)
         try:
             return zenoh.open(configuration), places
         except zenoh.ZError as error:
@@ -774,20 +877,22 @@ def _configuration(
     listen: list[Endpoint],
     connect: list[Endpoint],
     lease_ms: float,
-    blocked_send_ms: float,
-    max_message_bytes: int,
+    max_received_bytes: int,
     tls: TlsFiles | None,
 ) -> zenoh.Config:
     link: dict[str, object] = {
         "protocols": sorted({endpoint.protocol for endpoint in [*listen, *connect]}),
         "tx": {
             "lease": round(lease_ms),
+            "batch_size": _BATCH_BYTES,
             "queue": {
-                "congestion_control": {"block": {"wait_before_close": round(blocked_send_ms * 1e3)}}
+                "size": {"data": _BATCHES_QUEUED},
+                "congestion_control": {
+                    "block": {"wait_before_close": round(_BLOCKED_SEND_LEASES * lease_ms * 1e3)}
+                },
             },
         },
-        # Twice, so that what is a little too large is answered with the reason.
-        "rx": {"max_message_size": 2 * max_message_bytes + 64 * 1024},
+        "rx": {"max_message_size": max_received_bytes},
     }
     if tls is not None:
         link["tls"] = {
