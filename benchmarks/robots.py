@@ -214,7 +214,7 @@ def run_robot(
     rate_hz : float or None
         Task actions a second.
     """
-    links = make_links(configuration, directory / "recovery.log")
+    links = make_links(configuration, directory / "recovery.log", notebook)
     with contextlib.ExitStack() as stack:
         stack.callback(links.close)
         run = stack.enter_context(RunDirectory.create(directory / "run", configuration))
@@ -234,6 +234,7 @@ def run_robot(
             on_result,
             notebook.add_timing,
             rate_hz,
+            links.offload,
         )
         launcher = None if links.launcher is None else links.launcher(robot.deliver)
         with contextlib.suppress(_EnoughError):

@@ -214,6 +214,8 @@ def main() -> None:
     complete = not options.quick and len(cases) == len(CASES)
     output = options.output or (RESULTS if complete or options.update else None)
 
+    # Services are started as they are where holdfast is installed: from compiled modules.
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
     console = Console()
     progress = Progress(cases, options.quick)
     machine, kernel = describe(), kernel_hash()

@@ -464,6 +464,8 @@ def serve(context: Context) -> Result:
     starts = 3 if context.quick else 25
     idle_s = 2.0 if context.quick else 10.0
     ready_s = []
+    with ServiceProcess():
+        pass  # modules that were changed are compiled now
     for number in range(starts):
         with ServiceProcess() as service:
             ready_s.append(service.ready_at - service.started_at)

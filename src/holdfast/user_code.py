@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import difflib
 import importlib
+import re
 import sys
 import sysconfig
 import traceback
@@ -136,17 +137,43 @@ def find_class(
             loaded = entry_point.load()
         except (ImportError, AttributeError) as error:
             raise error_type(
-                f"{what}: {name}, is registered as {entry_point.value}, which cannot be imported: "
+                f"{what}: {name} is registered as {entry_point.value}, which cannot be imported: "
                 f"{error}"
             ) from error
         return _as_class(name, what, loaded, error_type)
     known = registered_names(group)
-    close = difflib.get_close_matches(name, known, n=3)
-    suggestion = f"did you mean {' or '.join(close)}? " if close else ""
+    likely = _classes_beside(name, search_directory) or difflib.get_close_matches(name, known, n=3)
+    suggestion = f"; did you mean {' or '.join(likely)}?" if likely else ""
     raise error_type(
-        f"{what}: {name}, is not registered; {suggestion}Registered are "
-        f"{', '.join(known) or 'none'}; a class of your own is named module:Class"
+        f"{what}: {name} is not a registered name{suggestion} "
+        f"(registered: {', '.join(known) or 'none'}; a class of your own is named module:Class)"
     )
+
+
+def _classes_beside(name: str, directory: Path | None) -> list[str]:
+    """Return the classes, as ``module:Class``, that may be meant if a file of that name is there.
+
+    The file is read, not run: it may be no module at all.
+    """
+    import ast
+
+    stem, _, inner = name.removesuffix(".py").partition(".")
+    # A class MyRobot usually stands in my_robot.py.
+    snake = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", stem).lower()
+    for module in dict.fromkeys((stem, snake)):
+        for folder in dict.fromkeys((directory or Path(), Path())):
+            if not module.isidentifier() or not (folder / f"{module}.py").is_file():
+                continue
+            try:
+                text = (folder / f"{module}.py").read_text(encoding="utf-8")
+                statements = ast.parse(text).body
+            except (OSError, ValueError, SyntaxError):
+                continue
+            classes = [each.name for each in statements if isinstance(each, ast.ClassDef)]
+            public = [each for each in classes if not each.startswith("_")]
+            wanted = [each for each in public if each in (inner, stem)]
+            return [f"{module}:{each}" for each in (wanted or public)[:3]]
+    return []
 
 
 def _imported_class(
@@ -154,8 +181,12 @@ def _imported_class(
 ) -> type[Any]:
     module_name, _, class_name = name.partition(":")
     if not all(part.isidentifier() for part in [*module_name.split("."), class_name]):
-        raise error_type(f"{what}: {name}, must be a registered name or module:Class")
+        raise error_type(f"{what}: {name} is neither a registered name nor module:Class")
     if search_directory is not None:
+        if not search_directory.is_dir():
+            raise error_type(
+                f"{what}: {name} is looked for in {search_directory}, which is no directory"
+            )
         directory = str(search_directory.resolve())
         if directory not in sys.path:
             sys.path.insert(0, directory)
@@ -165,14 +196,14 @@ def _imported_class(
     except ImportError as error:
         where = "" if search_directory is None else f" (looked in {search_directory} first)"
         raise error_type(
-            f"{what}: {name}, the module {module_name} cannot be imported{where}: {error}"
+            f"{what}: {name}: the module {module_name} cannot be imported{where}: {error}"
         ) from error
     if not hasattr(module, class_name):
         classes = [key for key, value in vars(module).items() if isinstance(value, type)]
         close = difflib.get_close_matches(class_name, classes, n=3)
         suggestion = f"; did you mean {' or '.join(close)}?" if close else ""
         raise error_type(
-            f"{what}: {name}, the module {module_name} has no {class_name}{suggestion}"
+            f"{what}: {name}: the module {module_name} has no {class_name}{suggestion}"
         )
     return _as_class(name, what, getattr(module, class_name), error_type)
 
@@ -181,5 +212,5 @@ def _as_class(
     name: str, what: str, found: object, error_type: type[ConfigurationError]
 ) -> type[Any]:
     if not isinstance(found, type):
-        raise error_type(f"{what}: {name}, is not a class but {type(found).__name__}")
+        raise error_type(f"{what}: {name} is not a class but {type(found).__name__}")
     return found

@@ -15,6 +15,7 @@ import os
 import queue
 import signal
 import socket
+import struct
 import subprocess
 import sys
 import threading
@@ -282,6 +283,11 @@ def echo(call: IncomingCall) -> None:
     call.end()
 
 
+def echo_of_size(call: IncomingCall) -> None:
+    call.reply(b"%d" % len(call.payload))
+    call.end()
+
+
 def saying(text: bytes) -> Callable[[IncomingCall], None]:
     """Return a service that always says the same."""
 
@@ -331,6 +337,7 @@ class TestEveryWire:
         robot, inbox, _ = connected(wire, calls.put)
         robot.call("cloud", 1, b"question")
         call = calls.get(timeout=PATIENCE_S)
+        assert call.size_bytes == len(call.payload) == 8
         call.reply(b"first")
         inbox.wait_for(Replied(1, b"first"))
         assert Ended(1) not in inbox
@@ -750,6 +757,105 @@ class TestZenoh:
             assert Appeared("cloud", "rogue") not in inbox
             assert answered == []
 
+    def test_a_large_request_gets_through_a_slow_link(self, tcp: ZenohWire) -> None:
+        """Although it takes several leases; a link that carries it is no broken one."""
+        tcp.service("cloud", "b1").start(echo_of_size)
+        port = int(tcp.endpoint("cloud").rpartition(":")[2])
+        with slow_proxy(port, bytes_per_second=130_000) as slow_port:
+            address = ServiceAddress(f"tcp/127.0.0.1:{slow_port}")
+            robot = ZenohRobotTransport({"cloud": address}, lease_ms=LEASE_MS)
+            inbox = Inbox()
+            robot.start(inbox)
+            inbox.wait_for(Appeared("cloud", "b1"))
+            robot.call("cloud", 1, bytes(250_000))
+            robot.call("cloud", 2, b"small")
+            assert inbox.of_call(1) == [Replied(1, b"250000"), Ended(1)]
+            assert inbox.of_call(2) == [Replied(2, b"5"), Ended(2)]
+            assert Vanished("cloud", "b1") not in inbox
+            robot.close()
+
+    def test_broken_parts_are_nobody_else_s_trouble(self, tcp: ZenohWire) -> None:
+        sizes: list[int] = []
+
+        def serve(call: IncomingCall) -> None:
+            sizes.append(len(call.payload))
+            echo(call)
+
+        tcp.service("cloud", "b1").start(serve)
+        settings = {
+            "mode": "peer",
+            "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
+            "listen": {"endpoints": []},
+            "connect": {"endpoints": [tcp.endpoint("cloud")]},
+        }
+        robot, inbox = tcp.robot("cloud"), Inbox()
+        robot.start(inbox)
+        inbox.wait_for(Appeared("cloud", "b1"))
+        part = struct.Struct("<16sQII")
+        name = bytes(16)
+        with zenoh.open(zenoh.Config.from_json5(json.dumps(settings))) as rogue:
+            key = "holdfast/1/cloud/b1/decide"
+            while not list(rogue.get(key, payload=b"hello", timeout=PATIENCE_S)):
+                time.sleep(0.01)
+
+            def send(attachment: bytes, size: int = 2000) -> list[bytes]:
+                replies = rogue.get(
+                    key, payload=bytes(size), attachment=attachment, timeout=PATIENCE_S
+                )
+                return [reply.ok.payload.to_bytes() for reply in replies if reply.ok is not None]
+
+            assert send(b"") == send(b"x" * 31) == []  # not understood
+            assert send(part.pack(name, 4000, 7, 2)) == []  # beyond the last
+            assert send(part.pack(name, 4000, 0, 2**32 - 1)) == [b""]  # too many parts: not kept
+            assert send(part.pack(name, 4000, 1, 2)) == []  # the last without the others
+            assert send(part.pack(name, 4000, 0, 2)) == [b""]
+            assert send(part.pack(name, 4000, 0, 2)) == [b""]  # twice
+            assert send(part.pack(name, 9000, 1, 2)) == []  # another size than was said
+            (refused,) = send(part.pack(name, 2**63, 0, 2))
+            reply = decode_reply(refused)
+            assert isinstance(reply, Refused)
+            assert reply.code == "too_large"
+            for k in range(600):  # more than are kept
+                assert send(part.pack(k.to_bytes(16, "big"), 4000, 0, 2)) == [b""]
+        sizes.clear()
+        robot.call("cloud", 1, bytes(1_000_000))
+        assert inbox.of_call(1) == [Replied(1, bytes(1_000_000)), Ended(1)]
+        assert sizes == [1_000_000]
+
+
+@contextlib.contextmanager
+def slow_proxy(port: int, bytes_per_second: float) -> Iterator[int]:
+    """Carry connections to a port, slowly, with little room for what is on its way."""
+    listener = socket.socket()
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 16_384)
+    listener.bind(("127.0.0.1", 0))
+    listener.listen()
+    sockets = [listener]
+
+    def carry(source: socket.socket, target: socket.socket) -> None:
+        with contextlib.suppress(OSError):
+            while data := source.recv(2048):
+                time.sleep(len(data) / bytes_per_second)
+                target.sendall(data)
+
+    def accept() -> None:
+        with contextlib.suppress(OSError):
+            while True:
+                near, _ = listener.accept()
+                far = socket.create_connection(("127.0.0.1", port))
+                sockets.extend((near, far))
+                for ends in ((near, far), (far, near)):
+                    threading.Thread(target=carry, args=ends, daemon=True).start()
+
+    threading.Thread(target=accept, daemon=True).start()
+    try:
+        yield listener.getsockname()[1]
+    finally:
+        for each in sockets:
+            with contextlib.suppress(OSError):
+                each.shutdown(socket.SHUT_RDWR)  # wakes who waits for it
+            each.close()
+
 
 @pytest.mark.parametrize("protocol", ["tls", "quic"])
 class TestCertificates:
@@ -873,6 +979,13 @@ def service_process(
         process.communicate()
 
 
+def stop(process: subprocess.Popen[bytes]) -> None:
+    """Stop all threads of a child process; returns when they have stopped."""
+    process.send_signal(signal.SIGSTOP)
+    _, status = os.waitpid(process.pid, os.WUNTRACED)
+    assert os.WIFSTOPPED(status)
+
+
 @pytest.mark.parametrize("kind", ["tcp", "tls", "quic", "unixsock-stream", "robot_listens"])
 class TestProcesses:
     @pytest.fixture
@@ -927,7 +1040,7 @@ class TestProcesses:
             inbox.wait_for(Appeared("cloud", "b1"))
             robot.call("cloud", 1, b"wait")
             inbox.wait_for(Replied(1, b"begun"))
-            process.send_signal(signal.SIGSTOP)
+            stop(process)
             inbox.wait_for(Vanished("cloud", "b1"), Ended(1))
             robot.call("cloud", 2, b"echo")
             assert inbox.of_call(2) == [Ended(2)]
@@ -947,7 +1060,7 @@ class TestProcesses:
         for boot in ("b1", "b2"):
             with start(boot) as process:
                 inbox.wait_for(Appeared("cloud", boot), Appeared("idle", "b1"))
-                process.send_signal(signal.SIGSTOP)
+                stop(process)
                 large, small, other, late = itertools.islice(numbers, 4)
                 robot.call("cloud", large, bytes(MAX_BYTES))  # more than buffers take
                 robot.call("cloud", small, b"echo")
@@ -970,7 +1083,7 @@ class TestProcesses:
         with start("b1") as process:
             for k in range(1, 4):
                 inbox.wait(lambda _, k=k: inbox.count(Appeared("cloud", "b1")) >= k)  # type: ignore[misc]
-                process.send_signal(signal.SIGSTOP)
+                stop(process)
                 robot.call("cloud", next(numbers), bytes(0 if wire.robot_listens else MAX_BYTES))
                 inbox.wait(lambda _, k=k: inbox.count(Vanished("cloud", "b1")) >= k)  # type: ignore[misc]
                 process.send_signal(signal.SIGCONT)
@@ -1032,7 +1145,7 @@ def test_a_process_ends_quietly_whatever_its_links_do(
             assert robot.stdout is not None
             assert robot.stdout.readline() == b"calling\n"
             if stopped:
-                service.send_signal(signal.SIGSTOP)
+                stop(service)
             _, errors = robot.communicate(timeout=PATIENCE_S)
         finally:
             robot.kill()

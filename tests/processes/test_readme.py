@@ -87,6 +87,16 @@ def test_holdfast_commands(clone: Path) -> None:
         assert (clone / "runs" / "first" / name).stat().st_size > 0
 
 
+def test_the_robot_of_ones_own(clone: Path) -> None:
+    """The class and its configuration run as they stand there."""
+    for name in ("my_robot.py", "my_robot.yaml"):
+        (text,) = (text for _, text in BLOCKS if text.startswith(f"# {name}"))
+        (clone / name).write_text(text, encoding="utf-8")
+    done = run(["holdfast", "run", "my_robot.yaml", "--trials", "1"], clone)
+    assert done.returncode == 0, done.stderr
+    assert "(1 of 1; " in done.stdout
+
+
 def test_make_targets_exist() -> None:
     # The targets themselves are what .ci/run runs.
     for command in COMMANDS:

@@ -7,6 +7,7 @@ import csv
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -173,6 +174,26 @@ class TestOutput:
     def test_quiet_says_nothing(self, workplace: Path) -> None:
         done = holdfast(workplace, "run", "peg.yaml", "--out", "out", "--quiet")
         assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+    def test_with_log_json_the_standard_error_has_nothing_else(self, workplace: Path) -> None:
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            service = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+        arguments = ("run", "peg.yaml", "--trials", "1", "--log", "json", "--service", service)
+        done = holdfast(workplace, *arguments, "--out", "out")
+        assert done.returncode == 0, done.stderr
+        events = [json.loads(line) for line in done.stderr.splitlines()]
+        assert [event["reason"] for event in events if event["event"] == "unreachable"] == [
+            "connection refused"
+        ]
+        (status,) = [event for event in events if event["event"] == "status"]
+        assert status["reason"] == f"{service} has not appeared"
+        (note,) = [event for event in events if event["event"] == "note"]
+        assert note["reason"].startswith(f"{service} decided nothing")
+        found = summary(workplace / "out")
+        decided = found["sensing_decisions_by_service"]
+        assert decided == {"cloud_active_sensing_recovery": found["sensing_decisions"]}
+        assert "decided by" in done.stdout
 
     def test_without_out_directories_are_numbered(self, workplace: Path) -> None:
         for name in ("peg-seed3", "peg-seed3-2"):
@@ -380,6 +401,26 @@ class TestErrors:
         assert done.returncode == 1
         assert "Traceback" in done.stderr
         assert "in trial 0 (seed 3)" in done.stderr
+
+    @pytest.mark.parametrize(
+        ("options", "expected"),
+        [
+            (("--recovery", "at_start"), "--recovery at_start needs --service (or "),
+            (("--tls", "keys"), "--tls keys needs --service (or "),
+            (("--log", "json"), "--log json needs --service, --environment or --rate"),
+            (("--problem", "slow_problem"), "did you mean slow_problem:Slow?"),
+        ],
+    )
+    def test_what_would_do_nothing_is_refused(
+        self, workplace: Path, options: tuple[str, str], expected: str
+    ) -> None:
+        (workplace / "keys").mkdir()
+        assert expected in self.fails(workplace, "run", "peg.yaml", "--out", "out", *options)
+
+    def test_only_a_journal_is_compared(self, workplace: Path) -> None:
+        holdfast(workplace, "run", "peg.yaml", "--trials", "1", "--out", "out")
+        error = self.fails(workplace, "compare", "out", "out/trials.csv")
+        assert "out/trials.csv: is not a journal" in error
 
     def test_a_configuration_without_a_command(self, workplace: Path) -> None:
         error = self.fails(workplace, "peg.yaml", "--jobs", "2")

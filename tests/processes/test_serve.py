@@ -169,6 +169,13 @@ def refused_to_start(*arguments: str) -> str:
     return done.stderr
 
 
+def resident_kb(pid: int) -> int:
+    """Return the most memory that a process has had."""
+    lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+    (line,) = (line for line in lines if line.startswith("VmHWM"))
+    return int(line.split()[1])
+
+
 class TestServing:
     def test_decides_as_the_planner_does(self) -> None:
         with served(*ANYWHERE) as service:
@@ -184,6 +191,26 @@ class TestServing:
         assert code == 0
         assert "stopping" in log
         assert "Traceback" not in log
+
+    def test_a_large_message_that_is_no_request_disturbs_nobody(self) -> None:
+        hostile = b"\xdd" + (10**7).to_bytes(4, "big") + b"\x01" + b"\x90" * 10**7
+        with (
+            served(*ANYWHERE) as service,
+            robots_end(service.endpoint) as attacker,
+            robots_end(service.endpoint) as end,
+        ):
+            attacker.appeared()
+            end.appeared()
+            run_turns(end, Robot(), 1)
+            size_kb = resident_kb(service.process.pid)
+            attacker.send(hostile)
+            run_turns(end, Robot(key=2), 5)
+            (reply,) = attacker.collect()
+            assert isinstance(reply, Refused)
+            assert reply.code == "malformed"
+            # As lists of lists these would be 640 MB; the message itself comes in parts.
+            assert resident_kb(service.process.pid) - size_kb < 100_000
+            run_turns(end, Robot(key=3), 1)
 
     def test_restarted_after_a_kill_on_the_same_port(self) -> None:
         robot = Robot()
@@ -400,8 +427,9 @@ class TestRefusing:
             text=True,
             timeout=PATIENCE_S,
         )
-        assert done.returncode == 2
-        assert "standard input" in done.stderr
+        # It is as one that has ended: the service ends as well, and says why.
+        assert done.returncode == 0
+        assert "standard input has ended" in done.stderr
 
 
 class TestTls:

@@ -266,7 +266,7 @@ class TestRuns:
         for other, message in (
             ("missing", "no such directory"),
             ("empty", r"holds no journal\.sqlite"),
-            ("file", "damaged|not a usable journal"),
+            ("file", r"is not a journal; name the directory of a run, or its journal\.sqlite"),
         ):
             for pair in ((run, tmp_path / other), (tmp_path / other, run)):
                 with pytest.raises(OutputError, match=message):

@@ -310,9 +310,12 @@ class TestLoadEnvironment:
     @pytest.mark.parametrize(
         ("name", "arguments", "expected"),
         [
-            ("robots:Robt", {}, r"environment.object: robots:Robt, .* did you mean Robot"),
+            ("robots:Robt", {}, r"environment.object: robots:Robt: .* did you mean Robot"),
             ("robots:number", {}, "is not a class but int"),
-            ("turtle", {}, "environment.object: turtle, is not registered"),
+            ("turtle", {}, r"environment.object: turtle is not a registered name \(registered: "),
+            ("robots", {}, "robots is not a registered name; did you mean robots:"),
+            ("robots.Plain", {}, r"did you mean robots:Plain\? "),
+            ("robots.py", {}, "did you mean robots:"),
             ("lonely_robots:Robot", {}, "cannot be imported .*No module named 'absent_library'"),
             (
                 "broken_robots:Robot",

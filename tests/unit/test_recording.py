@@ -33,6 +33,7 @@ from holdfast.recording.tables import (
     csv_lines,
     wilson_interval,
 )
+from holdfast.recording.timings import AnswerCounts
 from holdfast.runtime.trial import run_trial
 from holdfast.session.records import PausedRecord
 from holdfast.settings import EnvironmentSettings
@@ -222,6 +223,25 @@ class TestTables:
         assert summary.sensing_ms_p99 == pytest.approx(2.98)
         assert summary.unexplained_observations == 3
         assert json.loads(summary.to_json())["digest"] == summary.digest
+
+    def test_decisions_of_earlier_processes_count(self) -> None:
+        """Their times are not known after a resume, but that they were made is."""
+        builder = SummaryBuilder()
+        result = result_of(0, sensing_ms=(1.0, 2.0))
+        builder.add(msgspec.structs.replace(result, sensing_decisions=17))
+        summary = builder.build(
+            problem="p",
+            seed=5,
+            version="1",
+            trials=1,
+            wall_time_s=2.0,
+            answers=AnswerCounts({"cloud": 13, "local": 4}, {"cloud": 17}, 12.5),
+        )
+        assert summary.sensing_decisions == 17
+        written = json.loads(summary.to_json())
+        assert written["sensing_decisions_by_service"] == {"cloud": 13, "local": 4}
+        assert written["task_answers_by_service"] == {"cloud": 17}
+        assert written["longest_wait_ms"] == 12.5
 
     def test_the_digest_depends_on_every_trial_and_their_order(self) -> None:
         def digest(*order: int) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import subprocess
 import sys
 import threading
@@ -20,7 +21,6 @@ from holdfast.problems import registry
 from holdfast.problems.capsule_robot import CapsuleRobot
 from holdfast.problems.problem import Problem
 from holdfast.runtime.service_shell import KnownProblems, ServiceBrokenError, ServiceShell
-from holdfast.runtime.transport.contract import IncomingCall
 from holdfast.runtime.transport.in_process import InProcessNetwork
 from holdfast.session.events import Appeared, Ended, Replied, TransportEvent
 from holdfast.session.messages import (
@@ -81,8 +81,11 @@ class Held(CapsuleRobot):
         super().__init__()
         self.begun = threading.Event()
         self.let_go = threading.Event()
+        self.error: BaseException | None = None
 
     def policy(self, states: Any, stage: Any) -> Any:
+        if self.error is not None:
+            raise self.error
         self.begun.set()
         assert self.let_go.wait(PATIENCE_S)
         return super().policy(states, stage)
@@ -221,6 +224,10 @@ class Call:
     def payload(self) -> bytes:
         return self._payload
 
+    @property
+    def size_bytes(self) -> int:
+        return len(self._payload)
+
     def reply(self, payload: bytes) -> None:
         self.replies.put(payload)
 
@@ -229,9 +236,37 @@ class Call:
 
 
 class Unreadable(Call):
+    def __init__(self, error: BaseException) -> None:
+        super().__init__(b"")
+        self._error = error
+
     @property
     def payload(self) -> bytes:
-        raise RuntimeError("no payload")
+        raise self._error
+
+
+class Unanswerable(Call):
+    def reply(self, payload: bytes) -> None:
+        raise RuntimeError("no reply")
+
+
+class Deaf(Call):
+    """Blocks whoever sends to it until it is let go."""
+
+    def __init__(self, payload: bytes, let_go: threading.Event) -> None:
+        super().__init__(payload)
+        self._let_go = let_go
+        self.threads: set[threading.Thread] = set()
+
+    def reply(self, payload: bytes) -> None:
+        self.threads.add(threading.current_thread())
+        assert self._let_go.wait(PATIENCE_S)
+        super().reply(payload)
+
+    def end(self) -> None:
+        self.threads.add(threading.current_thread())
+        assert self._let_go.wait(PATIENCE_S)
+        super().end()
 
 
 class Stuck(Call):
@@ -245,32 +280,177 @@ class Stuck(Call):
         return self._payload
 
 
-def test_calls_beyond_the_queue_are_turned_away_unread() -> None:
-    shell = ServiceShell(Service(KnownProblems(), 1), Silent(), 1, max_incoming=2)
+@pytest.mark.parametrize("bound", ["calls", "bytes"])
+def test_calls_beyond_the_queue_are_turned_away_unread(bound: str) -> None:
+    payload = b"x" * 100
+    limits: dict[str, Any] = (
+        {"max_incoming": 2} if bound == "calls" else {"max_incoming_bytes": 250}
+    )
+    Stuck.let_go.clear()
+    shell = ServiceShell(Service(KnownProblems(), 1), Silent(), 1, **limits)
     shell.start()
-    calls: list[Call] = [Stuck(b"") for _ in range(30)]
-    accepted: list[IncomingCall] = []
-    for call in calls:
+    try:
+        calls = [Stuck(payload) for _ in range(30)]
+        for call in calls:
+            shell.deliver(call)
+        delays = set()
+        for call in calls[2:]:
+            busy = decode_reply(call.replies.get(timeout=PATIENCE_S) or b"")
+            assert isinstance(busy, Busy)
+            assert busy.number == 0
+            delays.add(busy.retry_after_ms)
+            assert call.replies.get(timeout=PATIENCE_S) is None
+        assert min(delays) == 100
+        assert len(delays) > 20  # they do not come back all at once
+        assert shell.statistics().busy == 28
+        Stuck.let_go.set()
+        for call in calls[:2]:
+            assert isinstance(decode_reply(call.replies.get(timeout=PATIENCE_S) or b""), Refused)
+    finally:
+        Stuck.let_go.set()
+        shell.close()
+
+
+def test_one_call_is_let_in_however_large_it_is() -> None:
+    shell = ServiceShell(Service(KnownProblems(), 1), Silent(), 1, max_incoming_bytes=10)
+    shell.start()
+    try:
+        call = Call(b"x" * 1000)
         shell.deliver(call)
-        if call.replies.empty():
-            accepted.append(call)
-    assert 2 <= len(accepted) <= 4  # two in the queue, one with each thread
-    busy = decode_reply(calls[-1].replies.get(timeout=PATIENCE_S) or b"")
-    assert isinstance(busy, Busy)
-    assert busy.number == 0
-    assert calls[-1].replies.get(timeout=PATIENCE_S) is None
-    assert shell.statistics().busy == 30 - len(accepted)
-    Stuck.let_go.set()
-    shell.close()
+        assert isinstance(decode_reply(call.replies.get(timeout=PATIENCE_S) or b""), Refused)
+    finally:
+        shell.close()
 
 
-def test_a_failing_worker_ends_the_service() -> None:
+@pytest.mark.parametrize("error", [RuntimeError("no payload"), KeyboardInterrupt("no payload")])
+def test_a_failing_worker_ends_the_service(error: BaseException) -> None:
     shell = ServiceShell(Service(KnownProblems(), 1), Silent(), 1)
     shell.start()
-    shell.deliver(Unreadable(b""))
+    shell.deliver(Unreadable(error))
     with pytest.raises(ServiceBrokenError, match="no payload"):
         shell.wait()
     shell.close()
+
+
+def test_a_failing_sender_ends_the_service() -> None:
+    shell = ServiceShell(Service(KnownProblems(), 1), Silent(), 1)
+    shell.start()
+    shell.deliver(Unanswerable(b""))
+    with pytest.raises(ServiceBrokenError, match="no reply"):
+        shell.wait()
+    shell.close()
+
+
+@pytest.mark.parametrize(
+    "error", [KeyboardInterrupt(), asyncio.CancelledError(), GeneratorExit(), SystemExit(1)]
+)
+def test_a_problem_that_raises_anything_costs_no_worker(error: BaseException) -> None:
+    joined = Joined(workers=2)
+    try:
+        joined.held.error = error
+        patient = Patient(joined.network)
+        for key in range(1, 6):  # more often than there are threads
+            robot = Robot(key=key)
+            robot.opening = HELD_OPENING
+            (reply,) = patient.ask(encode(robot.request()))
+            assert isinstance(reply, Refused)
+            assert reply.code == "failed"
+            assert type(error).__name__ in reply.text
+        sound = Robot(key=9)
+        assert content(patient.ask(encode(sound.request()))) == sound.right_answer()
+        assert joined.shell.statistics().refusals == {"failed": 5}
+    finally:
+        joined.close()
+
+
+def test_clients_that_do_not_read_hold_up_nobody_else() -> None:
+    network = InProcessNetwork()
+    transport = network.service("service", "boot")
+    shell = ServiceShell(Service(KnownProblems(), 2, ServiceLimits(max_sessions=50)), transport, 2)
+    shell.start()
+    timekeeper = threading.Thread(target=shell.wait)
+    timekeeper.start()
+    let_go = threading.Event()
+    try:
+        # Much more of them than there are workers, and some of them robots, as far as one can tell.
+        rude = [Deaf(b"rubbish", let_go) for _ in range(200)]
+        rude += [Deaf(encode(Robot(key=key).request()), let_go) for key in range(1, 11)]
+        for call in rude:
+            shell.deliver(call)  # returns, although no reply can be sent
+        patient, robot = Patient(network), Robot(key=99)
+        for _ in range(5):
+            request = robot.request(since=max(0, len(robot.observed) - 1))
+            assert content(patient.ask(encode(request))) == robot.right_answer()
+            robot.act_until_sensing()
+            robot.sense()
+        assert all(call.replies.empty() for call in rude)
+        let_go.set()
+        for call in rude:
+            while call.replies.get(timeout=PATIENCE_S) is not None:
+                pass
+        assert threading.current_thread() not in {thread for c in rude for thread in c.threads}
+        assert timekeeper not in {thread for call in rude for thread in call.threads}
+    finally:
+        let_go.set()
+        shell.stop()
+        timekeeper.join(PATIENCE_S)
+        shell.close()
+
+
+def test_replies_of_one_call_keep_their_order() -> None:
+    shell = ServiceShell(Service(KnownProblems(), 4), Silent(), 4)
+    shell.start()
+    try:
+        robots = [Robot(key=key) for key in range(1, 41)]
+        calls = [Call(encode(robot.request())) for robot in robots for _ in range(5)]
+        for robot in robots:
+            robot.sense()
+        calls += [Call(encode(robot.request())) for robot in robots]
+        for call in calls:
+            shell.deliver(call)
+        for call in calls:
+            kinds = []
+            while (payload := call.replies.get(timeout=PATIENCE_S)) is not None:
+                kinds.append(type(decode_reply(payload)).__name__)
+            kinds = [kind for kind in kinds if kind != "Progress"]
+            # The end may come early, for a later request; nothing comes out of order, or after it.
+            expected = (["SensingAnswer"], ["TaskAnswer", "SensingAnswer"], ["Busy"])
+            assert any(kinds == each[: len(kinds)] for each in expected), kinds
+            assert call.replies.empty()
+    finally:
+        shell.close()
+
+
+def test_what_happens_often_is_logged_now_and_then_with_its_number() -> None:
+    events: SimpleQueue[tuple[str, dict[str, object]]] = SimpleQueue()
+
+    class Log:
+        def event(self, name: str, /, **fields: object) -> None:
+            events.put((name, fields))
+
+        def close(self) -> None:
+            pass
+
+    shell = ServiceShell(Service(KnownProblems(), 1), Silent(), 1, Log())
+    shell.start()
+    timekeeper = threading.Thread(target=shell.wait)
+    timekeeper.start()
+    try:
+        for _ in range(100):
+            shell.deliver(Call(b"rubbish"))
+        told: list[int] = []
+        while sum(1 + number for number in told) < 100:
+            name, fields = events.get(timeout=PATIENCE_S)
+            assert name == "refused"
+            omitted = fields.get("omitted", 0)
+            assert isinstance(omitted, int)
+            told.append(omitted)
+        assert sum(1 + number for number in told) == 100
+        assert len(told) < 50
+    finally:
+        shell.stop()
+        timekeeper.join(PATIENCE_S)
+        shell.close()
 
 
 def test_close_does_not_wait_for_a_computation() -> None:

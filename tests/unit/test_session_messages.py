@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import msgspec
 import numpy as np
 import pytest
@@ -12,6 +14,8 @@ from holdfast.session import messages
 from holdfast.session.messages import (
     DIGEST_SIZE,
     MAX_OBSERVATIONS,
+    MAX_OPENING_BYTES,
+    MAX_OPENING_VALUES,
     MAX_TASK_ACTIONS,
     PROTOCOL_VERSION,
     Busy,
@@ -92,7 +96,9 @@ def test_a_request_out_of_bounds_is_malformed(change: dict[str, object]) -> None
 
 def test_hostile_settings_are_malformed() -> None:
     fields = msgspec.msgpack.decode(encode(REQUEST))
-    fields[9][3]["particle_filter"]["num_particles"] = 10**12
+    opening = msgspec.msgpack.decode(fields[9])
+    opening[3]["particle_filter"]["num_particles"] = 10**12
+    fields[9] = msgspec.msgpack.encode(opening)
     with pytest.raises(MessageError):
         decode_request(msgspec.msgpack.encode(fields))
 
@@ -124,8 +130,107 @@ def test_a_damaged_request_decodes_or_is_refused(position: int, flip: int) -> No
     assert decoded != REQUEST
 
 
+LARGE = 8_000_000
+HEAD = msgspec.msgpack.decode(encode(REQUEST))[:8]
+
+
+def _packed(*fields: object) -> bytes:
+    """Pack fields; bytearrays are packed already."""
+    packed = (
+        bytes(field) if isinstance(field, bytearray) else msgspec.msgpack.encode(field)
+        for field in fields
+    )
+    return bytes([0x90 + len(fields)]) + b"".join(packed)
+
+
+def _empty_lists(count: int) -> bytearray:
+    return bytearray(b"\xdd" + count.to_bytes(4, "big") + b"\x90" * count)
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [
+        pytest.param(bytes(_empty_lists(LARGE)), id="no version"),
+        pytest.param(_packed(1, _empty_lists(LARGE)), id="session"),
+        pytest.param(_packed(2, _empty_lists(LARGE)), id="another version"),
+        pytest.param(_packed(*HEAD, _empty_lists(LARGE)), id="observations"),
+        pytest.param(
+            _packed(*HEAD, bytearray(b"\x91\x94\x01\x01\xc4\x00" + _empty_lists(LARGE))),
+            id="field of an observation",
+        ),
+        pytest.param(_packed(*HEAD, [], _empty_lists(LARGE), None), id="opening that is a list"),
+        pytest.param(_packed(*HEAD, [], b"\x90" * LARGE, None), id="opening"),
+        pytest.param(_packed(*HEAD, [], None, _empty_lists(LARGE)), id="checkpoint"),
+        pytest.param(_packed(*HEAD, [], None, None, _empty_lists(LARGE)), id="unknown field"),
+    ],
+)
+def test_a_large_message_that_is_no_request_is_not_read(payload: bytes) -> None:
+    tracemalloc.start()
+    try:
+        with pytest.raises(MessageError):
+            decode_request(payload)
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak < 100_000
+
+
+def _opening(model: dict[str, object]) -> Opening:
+    return Opening("peg_in_hole_2d", model, {}, PlanningSettings(), 9)
+
+
+@pytest.mark.parametrize(
+    "model",
+    [
+        {"a": [[]] * MAX_OPENING_VALUES},
+        {"a": [[[0] * 100] * 100]},
+        {str(number): number for number in range(MAX_OPENING_VALUES // 2 + 1)},
+        {"a": {"b": {str(number): 0 for number in range(MAX_OPENING_VALUES)}}},
+        {"a": {(0,) * MAX_OPENING_VALUES: 0}},
+    ],
+    ids=["empty lists", "nested lists", "keys", "keys inside", "a key"],
+)
+def test_an_opening_has_a_bounded_number_of_values(model: dict[str, object]) -> None:
+    request = msgspec.structs.replace(REQUEST, opening=_opening(model))
+    with pytest.raises(MessageError, match=f"more than {MAX_OPENING_VALUES} values") as raised:
+        decode_request(encode(request))
+    assert raised.value.code == "too_large"
+
+
+def test_an_opening_of_many_values_survives_the_wire() -> None:
+    model: dict[str, object] = {"a": [0.5] * (MAX_OPENING_VALUES - 100)}
+    request = msgspec.structs.replace(REQUEST, opening=_opening(model))
+    assert decode_request(encode(request)) == request
+
+
+def test_an_opening_has_a_bounded_size() -> None:
+    request = msgspec.structs.replace(REQUEST, opening=_opening({"a": "x" * MAX_OPENING_BYTES}))
+    with pytest.raises(MessageError, match=f"at most {MAX_OPENING_BYTES} are") as raised:
+        decode_request(encode(request))
+    assert raised.value.code == "too_large"
+
+
+@pytest.mark.parametrize("version", [0, 2, 127, 128, 255, 256, 65535, 65536, 2**32 - 1])
+@pytest.mark.parametrize("count", [1, 15, 16, 70_000])
+def test_a_version_is_read_in_every_form(version: int, count: int) -> None:
+    payload = msgspec.msgpack.encode([version, *[None] * (count - 1)])
+    with pytest.raises(MessageError, match=f"version {version}: ") as raised:
+        decode_request(payload)
+    assert raised.value.code == "version"
+    for end in range(min(len(payload), 9)):
+        with pytest.raises(MessageError):
+            decode_request(payload[:end])
+
+
+def encode_opening() -> bytes:
+    opening: bytes = msgspec.msgpack.encode(_opening({"a": None}))
+    return opening
+
+
 def test_deep_nesting_is_malformed() -> None:
-    for payload in (b"\x91" * 100_000, b"\x81\xa1a" * 100_000):
+    opening = encode_opening().replace(b"\xa1a\xc0", b"\xa1a" + b"\x91" * 100_000 + b"\xc0")
+    nested = _packed(*HEAD, [], opening, None)
+    for payload in (b"\x91" * 100_000, b"\x81\xa1a" * 100_000, nested):
         with pytest.raises(MessageError):
             decode_request(payload)
 

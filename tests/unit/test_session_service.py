@@ -6,6 +6,7 @@ The reference is planning itself: a robot here folds its own state with the func
 
 from __future__ import annotations
 
+import asyncio
 import random
 from collections import deque
 from collections.abc import Callable
@@ -38,6 +39,7 @@ from holdfast.session.messages import (
     MAX_TASK_ACTIONS,
     PROTOCOL_VERSION,
     Busy,
+    MessageError,
     NeedState,
     Observed,
     Opening,
@@ -727,6 +729,20 @@ class BrokenProblem(CapsuleRobot):
         return super().observation_mean(states, sensing_action)
 
 
+class Panic(BaseException):
+    """As an extension in Rust raises it."""
+
+
+class UnspeakableError(Exception):
+    def __str__(self) -> str:
+        raise KeyboardInterrupt
+
+
+class OurUnspeakableError(ProblemError):
+    def __str__(self) -> str:
+        raise ValueError("no words")
+
+
 class TestRefusals:
     @pytest.mark.parametrize(
         ("error", "code", "text"),
@@ -734,6 +750,16 @@ class TestRefusals:
             (ValueError("out of order"), "failed", "ValueError: out of order"),
             (ProblemError("policy is odd"), "failed", "policy is odd"),
             (SystemExit(3), "failed", "SystemExit: 3"),
+            (KeyboardInterrupt(), "failed", "KeyboardInterrupt"),
+            (asyncio.CancelledError(), "failed", "CancelledError"),
+            (GeneratorExit(), "failed", "GeneratorExit"),
+            (Panic("in Rust"), "failed", "Panic: in Rust"),
+            (UnspeakableError(), "failed", "UnspeakableError, which cannot be put into words"),
+            (
+                OurUnspeakableError(),
+                "failed",
+                "OurUnspeakableError, which cannot be put into words",
+            ),
             (RuntimeError("\ud800 half a pair"), "failed", "RuntimeError: ? half a pair"),
             (ValueError("x" * 10_000), "failed", "ValueError: xxx"),
         ],
@@ -973,6 +999,37 @@ class TestCapacity:
         assert isinstance(only(bench.replies[other]), Busy)
         bench.run_all()
         assert content(bench.replies[call]) == robot.right_answer()
+
+    def test_no_room_is_not_asked_for_again_at_once(self) -> None:
+        bench = Bench(max_sessions=2, max_waiting=1000, max_wait_ms=1e6)
+        for key in (1, 2):
+            bench.send(Robot(key=key).request())
+        delays = []
+        for key in range(3, 103):
+            reply = only(bench.replies[bench.send(Robot(key=key).request())])
+            assert isinstance(reply, Busy)
+            delays.append(reply.retry_after_ms)
+        assert 100 <= min(delays) < 110
+        assert 115 < max(delays) <= 126
+        # Each robot has its own delay, and it is the same in every run.
+        again = only(bench.replies[bench.send(Robot(key=3).request())])
+        assert isinstance(again, Busy)
+        assert again.retry_after_ms == delays[0]
+        assert len(set(delays)) > 15
+
+    def test_request_that_was_decoded_before(self) -> None:
+        bench, robot = Bench(), Robot()
+        robot.sense()
+        request = robot.request()
+        bench.replies[0] = []
+        size = len(encode(request))
+        bench.apply(bench.service.receive_request(0, request, size, bench.now))
+        bench.run_all()
+        assert content(bench.replies[0]) == robot.right_answer()
+        bench.replies[1] = []
+        error = MessageError("malformed", "no request")
+        bench.apply(bench.service.receive_request(1, error, 9, bench.now))
+        assert refused(bench.replies[1]) == Refused(0, "malformed", "no request")
 
     def test_bytes_of_states(self) -> None:
         robots = [Robot(key=key) for key in range(1, 6)]

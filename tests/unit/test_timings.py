@@ -9,7 +9,7 @@ import pytest
 
 from holdfast.cli.witness import DecisionTable, time_of
 from holdfast.files import OutputError
-from holdfast.recording.timings import TIMING_COLUMNS, TimingTable
+from holdfast.recording.timings import TIMING_COLUMNS, AnswerCounts, TimingTable, count_answers
 from holdfast.session.effects import Timing
 
 MOMENT_NS = 1_700_000_000_123_456_789
@@ -76,3 +76,40 @@ def test_it_is_read_while_it_grows(tmp_path: Path) -> None:
 def test_it_cannot_be_written(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="cannot be written"):
         TimingTable(tmp_path / "missing" / "timings.csv")
+
+
+class TestCountAnswers:
+    def test_each_decision_of_a_finished_trial_counts_once(self, tmp_path: Path) -> None:
+        path = tmp_path / "timings.csv"
+        table = TimingTable(path)
+        cloud, local = 'tcp/"a",b:7447', "local"
+        rows = [
+            (0, 0, "sensing", cloud, 4.0),
+            (0, 0, "task", cloud, 0.0),
+            # The robot was killed before it could use this one, and asked again.
+            (0, 9, "sensing", cloud, 900.0),
+            (0, 9, "sensing", local, 7.5),
+            (0, 9, "task", local, 0.0),
+            (1, 0, "sensing", cloud, 0.25),
+            (1, 0, "task", cloud, 0.0),
+            # Not finished.
+            (2, 0, "sensing", "another", 5000.0),
+        ]
+        for trial, step, kind, service, waited_ms in rows:
+            table.add(Timing(trial, step, kind, service, "standard", waited_ms, 1.0, 1.0))
+        table.close()
+        counts = count_answers(path, {0, 1})
+        assert counts == AnswerCounts({cloud: 2, local: 1}, {cloud: 2, local: 1}, 900.0)
+        assert list(counts.sensing) == [cloud, local]
+
+    def test_damaged_rows_do_not_count(self, tmp_path: Path) -> None:
+        path = tmp_path / "timings.csv"
+        table = TimingTable(path)
+        table.add(timing())
+        table.close()
+        with path.open("ab") as file:
+            file.write(b"2,18,task\n\0\0\0\0\n2,x,task,a,b,1.0,1.0,1.0,now\n\xff\xfe\n")
+        assert count_answers(path, {2}) == AnswerCounts({}, {"tcp/127.0.0.1:7447": 1}, 1.5)
+
+    def test_there_is_no_table(self, tmp_path: Path) -> None:
+        assert count_answers(tmp_path / "timings.csv", {0}) is None

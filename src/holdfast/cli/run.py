@@ -6,7 +6,7 @@ import contextlib
 import shlex
 import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from holdfast.outcome import TrialResult
     from holdfast.recording.recorder import Recorder, TrialRecord
     from holdfast.recording.run_directory import RunDirectory
+    from holdfast.recording.tables import RunSummary
 
 __all__ = ["run"]
 
@@ -259,6 +260,7 @@ def _run(options: _Options) -> None:
     from holdfast.cli.robot_run import is_robot_run, run_as_robot
     from holdfast.recording.recorder import Recorder
     from holdfast.recording.run_directory import (
+        FIGURE_NAME,
         RunDirectory,
         claim_default_directory,
         latest_default_directory,
@@ -277,7 +279,8 @@ def _run(options: _Options) -> None:
         directory = RunDirectory.create(directory_path, configuration)
     with directory:
         earlier = directory.journal.tally()
-        display = run_display(configuration, quiet=quiet)
+        notes = _Notes(options)
+        display = run_display(configuration, quiet=quiet or options.log == "json")
         recorder = Recorder(trial=0)
         missed_ticks = 0
         started = perf_counter()
@@ -318,19 +321,23 @@ def _run(options: _Options) -> None:
             summary = directory.write_tables(perf_counter() - started)
             if not quiet:
                 print_summary(summary)
-                if missed_ticks:
-                    sys.stderr.write(f"note: {missed_ticks} ticks of --rate were missed\n")
-            note = _draw_figure(configuration, directory, recorder)
+            if missed_ticks:
+                notes.note(f"{missed_ticks} ticks of --rate were missed")
+            for text in _idle_services(configuration, summary):
+                notes.note(text)
+            with notes.while_it_lasts(f"drawing {FIGURE_NAME} ..."):
+                note = _draw_figure(configuration, directory, recorder)
         except KeyboardInterrupt as interruption:
             command = options.resume_command(directory_path)
             finished = directory.journal.tally().finished
             ended = signal_of(interruption)
             how = "Interrupted" if ended == signal.SIGINT else f"Ended by {ended.name}"
-            with contextlib.suppress(OSError):
-                sys.stderr.write(
-                    f"\n{how}. {finished} of {configuration.simulator.num_trials} trials are "
-                    f"finished and kept in {directory_path}\nGo on with: {command}\n"
-                )
+            notes.ended_early(
+                how,
+                f"{finished} of {configuration.simulator.num_trials} trials are finished and kept "
+                f"in {directory_path}",
+                command,
+            )
             raise
         except HoldfastError as error:
             from holdfast.session.robot import UnknownPerformanceError
@@ -342,7 +349,22 @@ def _run(options: _Options) -> None:
             command = options.resume_command(directory_path)
             raise HoldfastError(f"{error}\nGo on with: {command}") from error
         if not quiet:
-            print_files(directory_path, note)
+            print_files(directory_path)
+        if note is not None:
+            notes.note(note)
+
+
+def _idle_services(configuration: Configuration, summary: RunSummary) -> list[str]:
+    """Say which of the services named have decided nothing: perhaps one was mistyped."""
+    sensing = summary.sensing_decisions_by_service
+    task = summary.task_answers_by_service
+    if sensing is None or task is None or not summary.finished:
+        return []
+    return [
+        f"{service} decided nothing; events.jsonl says why"
+        for service in configuration.offload.services
+        if service not in sensing and service not in task
+    ]
 
 
 def _require_effect(options: _Options, configuration: Configuration, *, as_robot: bool) -> None:
@@ -362,9 +384,67 @@ def _require_effect(options: _Options, configuration: Configuration, *, as_robot
     for option, value in (("--recovery", options.recovery), ("--tls", options.tls)):
         if value is not None and not configuration.offload.services:
             raise InvalidValueError(
-                f"{option} is {value}, but no service is named, so there is nothing to recover "
-                "from or to be known to: give --service"
+                f"{option} {value} needs --service (or offload.services in "
+                f"{options.configuration_path}): without a service it would do nothing"
             )
+    if options.log == "json" and not as_robot:
+        raise InvalidValueError(
+            "--log json needs --service, --environment or --rate (or offload.services or "
+            f"environment.object in {options.configuration_path}): without them there are no events"
+        )
+
+
+class _Notes:
+    """What a run has to say besides its progress: as text, or as an event among events.
+
+    Parameters
+    ----------
+    options : _Options
+    """
+
+    def __init__(self, options: _Options) -> None:
+        self._as_json = options.log == "json"
+        self._quiet = options.quiet
+        self.on_terminal = not (self._quiet or self._as_json) and sys.stderr.isatty()
+
+    def note(self, text: str) -> None:
+        """Say something that is good to know; nothing if the run is to be quiet."""
+        if self._quiet:
+            return
+        if self._as_json:
+            self._event("note", reason=text)
+        else:
+            sys.stderr.write(f"note: {text}\n")
+
+    def ended_early(self, how: str, kept: str, command: str) -> None:
+        """Say how a run ended before its end, what is kept, and how to go on."""
+        # After SIGHUP there is no terminal to write to.
+        with contextlib.suppress(OSError):
+            if self._as_json:
+                self._event("interrupted", reason=f"{how}. {kept}", resume_command=command)
+            else:
+                sys.stderr.write(f"\n{how}. {kept}\nGo on with: {command}\n")
+
+    @contextlib.contextmanager
+    def while_it_lasts(self, text: str) -> Iterator[None]:
+        """Show on a terminal what is being done, until it is done."""
+        if not self.on_terminal:
+            yield
+            return
+        sys.stderr.write(text)
+        sys.stderr.flush()
+        try:
+            yield
+        finally:
+            sys.stderr.write(f"\r{' ' * len(text)}\r")
+            sys.stderr.flush()
+
+    @staticmethod
+    def _event(name: str, **fields: object) -> None:
+        from holdfast.runtime.logs import EventLog
+
+        with EventLog(sys.stderr, format="json", component="robot") as log:
+            log.event(name, **fields)
 
 
 def _draw_figure(

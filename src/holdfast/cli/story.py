@@ -653,8 +653,8 @@ class Story:
             return f"trial {event['trial']} ends after {event['steps']} steps: {how}"
         if name == "resumed_trial":
             return f"goes on with trial {event['trial']} at step {event['step']}, from its journal"
-        if name == "missed_ticks":
-            return ""
+        if name in ("missed_ticks", "unreachable"):
+            return ""  # the second, because here it is the demo itself that killed the service
         sentences = {
             "service_appeared": "sees {who}",
             "service_vanished": "sees that {who} is gone",

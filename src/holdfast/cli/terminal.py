@@ -234,6 +234,7 @@ def print_summary(summary: RunSummary) -> None:
 
 def _summary_rows(summary: RunSummary) -> list[tuple[str, str]]:
     from holdfast.belief import UNEXPLAINED_DEVIATIONS_SQUARED
+    from holdfast.runtime.own_planner import OWN_PLANNER
 
     rows = []
     if summary.success_rate is not None and summary.success_rate_interval_95 is not None:
@@ -264,33 +265,38 @@ def _summary_rows(summary: RunSummary) -> list[tuple[str, str]]:
         deviations = f"{UNEXPLAINED_DEVIATIONS_SQUARED**0.5:g}"
         rows.append(
             (
-                "surprises",
+                "unexplained",
                 f"{summary.unexplained_observations:,} of "
                 f"{counted(summary.sensing_decisions, 'observation')} over {deviations} sigma "
                 "from every particle",
             )
         )
+    by_service = summary.sensing_decisions_by_service
+    if by_service and set(by_service) != {OWN_PLANNER}:
+        shares = ", ".join(f"{service} {count:,}" for service, count in by_service.items())
+        rows.append(("decided by", shares))
+        if summary.longest_wait_ms is not None:
+            wait_ms = summary.longest_wait_ms
+            text = f"{wait_ms:,.0f}" if wait_ms >= 100.0 else f"{wait_ms:.3g}"
+            rows.append(("longest wait", f"{text} ms for a decision"))
     rows.append(("wall time", duration(summary.wall_time_s)))
     rows.append(("digest", summary.digest[:16]))
     return rows
 
 
-def print_files(directory: Path, note: str | None) -> None:
-    """Print which files a run has left, and what is to be said about them.
+def print_files(directory: Path) -> None:
+    """Print which files a run has left.
 
     Parameters
     ----------
     directory : Path
         Of the run.
-    note : str or None
     """
     from holdfast.recording.run_directory import output_names
 
     names = [name for name in output_names() if (directory / name).exists()]
     sys.stdout.write(f"\n{directory}/\n  {'  '.join(names)}\n")
     sys.stdout.flush()
-    if note is not None:
-        sys.stderr.write(f"note: {note}\n")
 
 
 def counted(count: int, noun: str) -> str:

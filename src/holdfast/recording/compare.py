@@ -28,6 +28,8 @@ __all__ = ["Comparison", "Difference", "compare_runs"]
 
 _ABSENT = "not given"
 _ENDING = struct.Struct("<cQ32s")
+_DATABASE = b"SQLite format 3\0"
+"""What a file of SQLite begins with."""
 
 
 class Difference(msgspec.Struct, frozen=True, kw_only=True):
@@ -166,7 +168,21 @@ def _journal_path(run: Path) -> Path:
         return run / JOURNAL_NAME
     if not run.exists():
         raise OutputError(f"{run}: there is no such directory or journal, so no run to compare")
+    _require_database(run)
     return run
+
+
+def _require_database(path: Path) -> None:
+    """Refuse what was mistaken for a journal: a table of the run, say."""
+    try:
+        with path.open("rb") as file:
+            start = file.read(len(_DATABASE))
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be read: {error.strerror}") from error
+    if start and start != _DATABASE:
+        raise OutputError(
+            f"{path}: is not a journal; name the directory of a run, or its {JOURNAL_NAME}"
+        )
 
 
 def _compare(first: Journal, second: Journal, found: _Found) -> None:

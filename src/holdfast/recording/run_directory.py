@@ -23,6 +23,7 @@ from holdfast.outcome import TrialResult
 from holdfast.recording.fingerprint import difference, fingerprint
 from holdfast.recording.journal import Journal, Survives
 from holdfast.recording.tables import RunSummary, SummaryBuilder, csv_lines
+from holdfast.recording.timings import count_answers
 
 __all__ = [
     "CONFIGURATION_NAME",
@@ -184,6 +185,7 @@ class RunDirectory:
             version=__version__,
             trials=self.configuration.simulator.num_trials,
             wall_time_s=total_s,
+            answers=count_answers(self.path / TIMINGS_NAME, self.journal.finished()),
         )
         write_atomically(self.path / SUMMARY_NAME, summary.to_json())
         return summary

@@ -14,6 +14,7 @@ import msgspec
 import numpy as np
 
 from holdfast.outcome import TrialResult
+from holdfast.recording.timings import AnswerCounts
 
 __all__ = [
     "CSV_COLUMNS",
@@ -74,8 +75,14 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
         Observations that no particle explained.
     recoveries : int
         Times that another service took over.
+    sensing_decisions_by_service, task_answers_by_service : dict of str to int, or None
+        Which service made how many of these, and gave how many answers with task actions (one holds
+        those up to the next sensing step); None where ``timings.csv`` is not kept.
+    longest_wait_ms : float or None
+        The longest time that the robot stood still for a decision.
     sensing_ms_median, sensing_ms_p99 : float or None
-        Wall time of choosing a sensing action, over all of them.
+        Wall time of choosing a sensing action. Of a trial that was resumed, only those of the last
+        process are known.
     wall_time_s : float
         Time that the run took, over all its parts.
     digest : str
@@ -97,6 +104,9 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
     sensing_decisions: int
     unexplained_observations: int
     recoveries: int
+    sensing_decisions_by_service: dict[str, int] | None
+    task_answers_by_service: dict[str, int] | None
+    longest_wait_ms: float | None
     sensing_ms_median: float | None
     sensing_ms_p99: float | None
     wall_time_s: float
@@ -159,6 +169,7 @@ class SummaryBuilder:
         self._reward = 0.0
         self._reward_of_successes = 0.0
         self._steps = 0
+        self._sensing_decisions = 0
         self._unexplained = 0
         self._recoveries = 0
         self._sensing_ms = array("f")
@@ -172,13 +183,21 @@ class SummaryBuilder:
             self._successes += 1
             self._reward_of_successes += result.reward
         self._steps += result.steps
+        self._sensing_decisions += result.sensing_decisions
         self._unexplained += result.unexplained_observations
         self._recoveries += result.recoveries
         self._sensing_ms.extend(result.sensing_ms)
         self._digest.update(bytes.fromhex(result.digest))
 
     def build(
-        self, *, problem: str, seed: int, version: str, trials: int, wall_time_s: float
+        self,
+        *,
+        problem: str,
+        seed: int,
+        version: str,
+        trials: int,
+        wall_time_s: float,
+        answers: AnswerCounts | None = None,
     ) -> RunSummary:
         """Return the summary of what was added.
 
@@ -190,6 +209,8 @@ class SummaryBuilder:
         trials : int
             Trials that the configuration asks for.
         wall_time_s : float
+        answers : AnswerCounts or None
+            Who decided, where that is known.
         """
         count = self._finished
         median = p99 = None
@@ -210,9 +231,12 @@ class SummaryBuilder:
                 self._reward_of_successes / self._successes if self._successes else None
             ),
             mean_steps=self._steps / count if count else None,
-            sensing_decisions=len(self._sensing_ms),
+            sensing_decisions=self._sensing_decisions,
             unexplained_observations=self._unexplained,
             recoveries=self._recoveries,
+            sensing_decisions_by_service=None if answers is None else answers.sensing,
+            task_answers_by_service=None if answers is None else answers.task,
+            longest_wait_ms=None if answers is None else answers.longest_wait_ms,
             sensing_ms_median=median,
             sensing_ms_p99=p99,
             wall_time_s=round(wall_time_s, 3),

@@ -7,14 +7,17 @@ when the run goes on.
 
 from __future__ import annotations
 
+import csv
 import time
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Container
 from pathlib import Path
+from typing import NamedTuple
 
 from holdfast.files import OutputError
 from holdfast.session.effects import Timing
 
-__all__ = ["TIMING_COLUMNS", "TimingTable"]
+__all__ = ["TIMING_COLUMNS", "AnswerCounts", "TimingTable", "count_answers"]
 
 TIMING_COLUMNS = (
     "trial",
@@ -84,6 +87,70 @@ class TimingTable:
     def close(self) -> None:
         """Close the file."""
         self._file.close()
+
+
+class AnswerCounts(NamedTuple):
+    """Who made the decisions of a run.
+
+    Attributes
+    ----------
+    sensing, task : dict of str to int
+        Sensing decisions, and answers with task actions, of each service; the busiest first.
+    longest_wait_ms : float or None
+        The longest time that the robot stood still for a decision; None if there was none.
+    """
+
+    sensing: dict[str, int]
+    task: dict[str, int]
+    longest_wait_ms: float | None
+
+
+def count_answers(path: Path, trials: Container[int]) -> AnswerCounts | None:
+    """Count the rows of a run's ``timings.csv``.
+
+    Parameters
+    ----------
+    path : Path
+    trials : container of int
+        Those that count.
+
+    Returns
+    -------
+    AnswerCounts or None
+        None if there is no such table. A row that is damaged does not count. A decision that was
+        asked for again, because the robot was killed before it could use it, counts once: as what
+        it came to at last.
+    """
+    sensing: Counter[str] = Counter()
+    task: Counter[str] = Counter()
+    longest_ms: float | None = None
+    current: int | None = None
+    decided: dict[tuple[int, str], str] = {}  # of one trial: they are run one after another
+
+    def settle() -> None:
+        for (_, kind), service in decided.items():
+            (sensing if kind == "sensing" else task)[service] += 1
+        decided.clear()
+
+    try:
+        with path.open(encoding="utf-8", errors="replace", newline="") as file:
+            for row in csv.reader(line.replace("\0", "") for line in file):
+                try:
+                    trial, step, kind, service, _, waited_ms = row[:6]
+                    number, key, wait_ms = int(trial), (int(step), kind), float(waited_ms)
+                except ValueError:
+                    continue  # the head, or a row that a power cut has spoilt
+                if number not in trials:
+                    continue
+                if number != current:
+                    settle()
+                    current = number
+                decided[key] = service
+                longest_ms = wait_ms if longest_ms is None else max(longest_ms, wait_ms)
+    except (OSError, csv.Error):
+        return None
+    settle()
+    return AnswerCounts(dict(sensing.most_common()), dict(task.most_common()), longest_ms)
 
 
 def _cut_off_unfinished_line(path: Path) -> None:

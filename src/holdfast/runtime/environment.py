@@ -306,7 +306,8 @@ def load_environment(configuration: Configuration) -> EnvironmentMaker:
             name,
             what="environment.object",
             group=GROUP,
-            search_directory=directory,
+            # Else, for a name without a module: where to look for what may have been meant.
+            search_directory=directory if ":" in name else configuration.path.parent,
             error_type=ConfigurationError,
         )
     except ConfigurationError as error:

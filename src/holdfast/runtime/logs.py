@@ -11,11 +11,12 @@ A log must never hurt what it watches. A terminal that was closed, a full disk, 
 a number, a text of a megabyte or with control characters in it cost at most the line.
 
 Names of events in use. By the robot: status, launch, launched, launch_failed, recovery_exited,
-retry, hedge, restore, restored, service_appeared, service_vanished, service_suspected, waiting,
-holding, resumed, busy, refused, malformed_reply, disagreement, prefetch_unused, resumed_trial,
-performed_unseen, trial, missed_ticks, stopped. By a service: ready, session_opened,
-session_taken_over, restored, refused, busy, evicted, stopping. Fields with a place of their own in
-the text form: ``from`` and ``to`` (of a change), ``service``, ``reason``, ``duration_ms``.
+retry, hedge, restore, restored, service_appeared, service_vanished, service_suspected, unreachable,
+waiting, holding, resumed, busy, refused, malformed_reply, disagreement, prefetch_unused,
+resumed_trial, performed_unseen, trial, missed_ticks, stopped, note, interrupted. By a service:
+ready, session_opened, session_taken_over, restored, refused, busy, evicted, stopping. Fields with a
+place of their own in the text form: ``from`` and ``to`` (of a change), ``service``, ``reason``,
+``duration_ms``.
 """
 
 from __future__ import annotations
@@ -56,6 +57,7 @@ _MAX_WAITING_LINES = 10_000
 
 _FLUSH_S = 0.5
 
+_ROBOT = "robot"
 _COMPONENT_WIDTH = 8
 _EVENT_WIDTH = 18
 
@@ -118,7 +120,8 @@ class EventLog:
         so that several processes can write to the same one.
     format : {"text", "json"}
     component : str
-        Who reports: ``robot``, or a service's name.
+        Who reports: ``robot``, or a service's name. In the text form each service is ``service``,
+        because the names are longer than the column.
     clock : callable
         Returns nanoseconds since the epoch.
 
@@ -367,7 +370,7 @@ def _bounded(text: str, limit: int = MAX_VALUE_CHARACTERS) -> str:
 def _compose_text(now_ns: int, component: str, name: str, fields: Mapping[str, object]) -> str:
     seconds, rest_ns = divmod(now_ns, 1_000_000_000)
     moment = time.strftime("%H:%M:%S", time.localtime(seconds))
-    who = _readable(component, 100).ljust(_COMPONENT_WIDTH)
+    who = (_ROBOT if component == _ROBOT else "service").ljust(_COMPONENT_WIDTH)
     what = _readable(name.replace("_", " "), 100).ljust(_EVENT_WIDTH)
     line = f"{moment}.{rest_ns // 1_000_000:03d} {who} {what} {_sentence(fields)}".rstrip()
     data = line.encode()

@@ -13,6 +13,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Collection, Iterator, Sequence
+from pathlib import Path
 from queue import Empty, SimpleQueue
 from time import monotonic
 from typing import NamedTuple, Protocol, TypeAlias
@@ -20,6 +21,7 @@ from typing import NamedTuple, Protocol, TypeAlias
 from holdfast.configuration import Configuration
 from holdfast.errors import HoldfastError, TrialError
 from holdfast.outcome import TrialResult
+from holdfast.runtime.diagnosis import MissingServices
 from holdfast.runtime.environment import EnvironmentMaker
 from holdfast.runtime.logs import EventSink
 from holdfast.runtime.performer import Performer, make_performer
@@ -161,6 +163,10 @@ class RobotProcess:
         self._journal = journal
         self._maker = maker
         self._events = events
+        tls = configuration.offload.tls
+        self._missing = MissingServices(
+            configuration.offload.services, None if tls is None else Path(tls), events
+        )
         self._on_result = on_result
         self._on_timing = on_timing
         self._queue: SimpleQueue[tuple[float, _Happening]] = SimpleQueue()
@@ -324,6 +330,7 @@ class RobotProcess:
                 self._transport.abandon(effect.call)
             elif isinstance(effect, Report):
                 self._events.event(effect.name, **effect.fields)
+                self._missing.heard(effect.name, effect.fields)
             elif isinstance(effect, Launch):
                 self._launch(effect)
             elif isinstance(effect, EndTrial):

@@ -228,10 +228,12 @@ def _serve(options: argparse.Namespace) -> int:
         from holdfast.runtime.metrics import ServiceMetrics
 
         metrics = ServiceMetrics(lambda: shell.statistics(), name=options.name)
-        metrics_server = metrics.start(options.metrics)
     shell = ServiceShell(
         service, transport, workers, events, None if metrics is None else metrics.on_decision
     )
+    if metrics is not None:
+        # Not before: who asks at once is told what the shell counts.
+        metrics_server = metrics.start(options.metrics)
     sys.setswitchinterval(_SWITCH_INTERVAL_S)
     with _signals_to(shell.wakeup_descriptor):
         try:

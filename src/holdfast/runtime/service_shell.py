@@ -5,7 +5,14 @@ calls and jobs from one queue. The one that takes a call lets the machine handle
 comes of that, runs it and sends the answer, all by itself. There is one thread more than jobs may
 run at a time, so that a call is heard, and if need be turned away, while all others compute.
 
-The thread that calls :meth:`ServiceShell.wait` keeps the time: it sends the signs of progress,
+To send can block, if whoever is to receive it does not read, for as long as a link can be silent.
+So no thread that others depend on sends: not the transport's, on which all calls come in, nor the
+timekeeper. Replies go into *lanes*, one for each session and one for all messages that are none. Of
+a lane one thread sends at a time, mostly one of the *senders*, of which one more is started
+whenever the last free one begins. Only one worker at a time may send by itself, which saves a lone
+robot the hand-over: if it is held up, there are as many left as jobs may run.
+
+The thread that calls :meth:`ServiceShell.wait` keeps the time: it has the signs of progress sent,
 while the workers compute, and it sleeps without a break when no robot is about.
 """
 
@@ -31,7 +38,7 @@ from holdfast.problems import registry
 from holdfast.problems.problem import Problem
 from holdfast.runtime.logs import EventSink, NullEventLog
 from holdfast.runtime.transport.contract import IncomingCall, ServiceTransport
-from holdfast.session.messages import Busy, Opening, encode
+from holdfast.session.messages import Busy, MessageError, Opening, Request, decode_request, encode
 from holdfast.session.service import (
     Answer,
     Computed,
@@ -51,7 +58,22 @@ DecisionHook: TypeAlias = Callable[[Literal["task", "sensing"], float, float], N
 _MAX_INCOMING = 4096
 """Calls that nobody has looked at yet."""
 
-_UNREAD_BUSY = encode(Busy(0, 100))
+_MAX_INCOMING_BYTES = 128 << 20
+"""Of these calls: two of the largest requests. One is let in, however large it is."""
+
+_UNREAD_BUSY = [encode(Busy(0, retry_after_ms)) for retry_after_ms in range(100, 126)]
+"""Used in turn, so that robots that were turned away together do not come back together."""
+
+_MAX_SENDERS = 32
+"""Threads that send, at most: so many robots' links can be blocked, and the others notice nothing.
+"""
+
+_SENT_AT_A_TIME = 16
+"""Calls of a lane that are sent to before it is another one's turn."""
+
+_NOBODY = b""
+"""The lane of messages that name no session."""
+
 _TICK_S = 0.05
 _STAYS_AWAKE_S = 1.0
 """After a call the timekeeper goes on ticking for this long: to wake it costs the next call."""
@@ -137,11 +159,12 @@ class _OpenCall:
     whichever threads do it.
     """
 
-    __slots__ = ("_incoming", "_lock", "outbox")
+    __slots__ = ("_incoming", "_lock", "lane", "outbox")
 
-    def __init__(self, incoming: IncomingCall) -> None:
+    def __init__(self, incoming: IncomingCall, lane: bytes) -> None:
         self._incoming = incoming
         self._lock = threading.Lock()
+        self.lane = lane
         self.outbox: deque[bytes | None] = deque()
 
     def send(self) -> None:
@@ -152,6 +175,112 @@ class _OpenCall:
                     self._incoming.end()
                 else:
                     self._incoming.reply(payload)
+
+
+class _Senders:
+    """Sends what calls have in their outboxes, so that one that blocks holds up its lane alone.
+
+    Parameters
+    ----------
+    failed : callable
+        Is called on a thread that fails, which is a defect.
+    """
+
+    def __init__(self, failed: Callable[[], None]) -> None:
+        self._failed = failed
+        self._lock = threading.Lock()
+        # Those in which something waits or is being sent.
+        self._lanes: dict[bytes, deque[_OpenCall]] = {}
+        self._turns: SimpleQueue[bytes | None] = SimpleQueue()
+        self._by_itself = threading.Lock()
+        self._threads: list[threading.Thread] = []
+        self._free = 0
+        self._closed = False
+
+    def start(self) -> None:
+        """Begin to send."""
+        with self._lock:
+            self._add_thread()
+
+    def post(self, calls: Collection[_OpenCall]) -> None:
+        """Have the outboxes of these calls sent; never blocks."""
+        for lane in self._entered(calls):
+            self._turns.put(lane)
+
+    def send(self, calls: Collection[_OpenCall]) -> None:
+        """Send the outboxes of these calls, at once if no other thread is doing that.
+
+        What cannot be sent at once is posted.
+        """
+        for lane in self._entered(calls):
+            # What names no session is nobody's answer.
+            if lane != _NOBODY and self._by_itself.acquire(blocking=False):
+                try:
+                    self._send(lane)
+                finally:
+                    self._by_itself.release()
+            else:
+                self._turns.put(lane)
+
+    def close(self, until: float) -> None:
+        """Let the threads go; those that are blocked are not waited for beyond this time."""
+        with self._lock:
+            self._closed = True
+            threads = list(self._threads)
+        for _ in threads:
+            self._turns.put(None)
+        for thread in threads:
+            thread.join(max(0.0, until - monotonic()))
+
+    def _entered(self, calls: Collection[_OpenCall]) -> list[bytes]:
+        """Put calls into their lanes; return the lanes that nobody was taking care of."""
+        idle = []
+        with self._lock:
+            for call in calls:
+                lane = self._lanes.get(call.lane)
+                if lane is None:
+                    self._lanes[call.lane] = deque((call,))
+                    idle.append(call.lane)
+                else:
+                    lane.append(call)
+        return idle
+
+    def _send(self, lane: bytes) -> None:
+        """Send the first that wait in a lane, and leave the rest for another turn."""
+        calls = self._lanes[lane]
+        for _ in range(_SENT_AT_A_TIME):
+            with self._lock:
+                if not calls:
+                    del self._lanes[lane]
+                    return
+                call = calls.popleft()
+            call.send()
+        self._turns.put(lane)
+
+    def _add_thread(self) -> None:
+        """Start another thread; the lock is held."""
+        if self._closed or len(self._threads) >= _MAX_SENDERS:
+            return
+        thread = threading.Thread(
+            target=self._run, name=f"holdfast-sender-{len(self._threads)}", daemon=True
+        )
+        self._free += 1
+        self._threads.append(thread)
+        thread.start()
+
+    def _run(self) -> None:
+        try:
+            while (lane := self._turns.get()) is not None:
+                with self._lock:
+                    self._free -= 1
+                    if not self._free:
+                        # This one may be held up; somebody has to be there for the next lane.
+                        self._add_thread()
+                self._send(lane)
+                with self._lock:
+                    self._free += 1
+        except BaseException:  # noqa: BLE001 - half a service is worse than none
+            self._failed()
 
 
 class ServiceShell:
@@ -168,8 +297,8 @@ class ServiceShell:
         Is told what happens.
     on_decision : callable or None
         Is called with the kind, the time computed and the time waited of each part of an answer.
-    max_incoming : int
-        Calls beyond this that nobody has looked at yet are turned away unread.
+    max_incoming, max_incoming_bytes : int
+        Calls that nobody has looked at yet, and their size; what is beyond is turned away unread.
 
     Attributes
     ----------
@@ -185,18 +314,25 @@ class ServiceShell:
         events: EventSink | None = None,
         on_decision: DecisionHook | None = None,
         max_incoming: int = _MAX_INCOMING,
+        max_incoming_bytes: int = _MAX_INCOMING_BYTES,
     ) -> None:
         self._service = service
         self._transport = transport
         self._events = events or NullEventLog()
         self._on_decision = on_decision
         self._max_incoming = max_incoming
+        self._max_incoming_bytes = max_incoming_bytes
         self._lock = threading.Lock()
+        self._incoming_lock = threading.Lock()
+        self._incoming = 0
+        self._incoming_bytes = 0
+        self._senders = _Senders(self._broke)
         self._queue: SimpleQueue[IncomingCall | Job | None] = SimpleQueue()
         self._calls: dict[int, _OpenCall] = {}
         self._numbers = itertools.count(1)
         self._unread = 0
-        self._logged: dict[str, tuple[float, int]] = {}
+        self._unread_logged = 0
+        self._logged: dict[str, tuple[float, int, Noted]] = {}
         self._heard_at = -_STAYS_AWAKE_S
         self._wakes_at = 0.0
         self._failure: str | None = None
@@ -217,6 +353,7 @@ class ServiceShell:
         TransportError
             If the transport cannot be started.
         """
+        self._senders.start()
         for thread in self._threads:
             thread.start()
         self._transport.start(self.deliver)
@@ -282,6 +419,7 @@ class ServiceShell:
             if thread.is_alive():
                 # One that computes is not waited for; it ends with the process.
                 thread.join(max(0.0, until - monotonic()))
+        self._senders.close(until)
         if not any(thread.is_alive() for thread in self._threads):
             with self._lock:
                 descriptors = self._woken_by, self.wakeup_descriptor
@@ -292,10 +430,23 @@ class ServiceShell:
 
     def deliver(self, incoming: IncomingCall) -> None:
         """Take a call from the transport; never blocks."""
-        if self._queue.qsize() >= self._max_incoming:
-            self._unread += 1
-            incoming.reply(_UNREAD_BUSY)
-            incoming.end()
+        size = incoming.size_bytes
+        with self._incoming_lock:
+            full = self._incoming >= self._max_incoming or (
+                self._incoming > 0 and self._incoming_bytes + size > self._max_incoming_bytes
+            )
+            if full:
+                self._unread += 1
+                busy = _UNREAD_BUSY[self._unread % len(_UNREAD_BUSY)]
+            else:
+                self._incoming += 1
+                self._incoming_bytes += size
+        if full:
+            if self._unread == self._unread_logged + 1:
+                self._wake()  # to log it
+            call = _OpenCall(incoming, _NOBODY)
+            call.outbox += (busy, None)
+            self._senders.post((call,))
         else:
             self._queue.put(incoming)
 
@@ -308,19 +459,34 @@ class ServiceShell:
                 while job is not None:
                     outcome = job.run()
                     job = self._finish(job, outcome)
-        except Exception:  # noqa: BLE001 - half a service is worse than none
-            self._failure = traceback.format_exc()
-            self._wake()
+        except BaseException:  # noqa: BLE001 - half a service is worse than none
+            self._broke()
+
+    def _broke(self) -> None:
+        """Let :meth:`wait` raise what is being handled on this thread."""
+        self._failure = traceback.format_exc()
+        self._wake()
 
     def _receive(self, incoming: IncomingCall) -> Job | None:
-        payload = incoming.payload
-        call = _OpenCall(incoming)
+        size = incoming.size_bytes
+        request: Request | MessageError
+        try:
+            # Large ones take their time; the other workers have the machine meanwhile.
+            request = decode_request(incoming.payload)
+        except MessageError as error:
+            request = error
+        finally:
+            with self._incoming_lock:
+                self._incoming -= 1
+                self._incoming_bytes -= size
+        lane = request.session if isinstance(request, Request) else _NOBODY
+        call = _OpenCall(incoming, lane)
         with self._lock:
             number = next(self._numbers)
             self._calls[number] = call
             now = monotonic()
             self._heard_at = now
-            carried = self._sorted(self._service.receive(number, payload, now))
+            carried = self._sorted(self._service.receive_request(number, request, size, now))
             due = self._service.next_wakeup()
             late = due is not None and due < self._wakes_at
             if late:
@@ -362,14 +528,16 @@ class ServiceShell:
         """Send, hand jobs to other workers, and return the one for this worker."""
         for job in jobs[1:]:
             self._queue.put(job)
-        for call in calls:
-            call.send()
+        self._senders.send(calls)
+        self._take_note(notes)
+        return jobs[0] if jobs else None
+
+    def _take_note(self, notes: list[Noted | Computed]) -> None:
         for note in notes:
             if isinstance(note, Noted):
                 self._log(note)
             elif self._on_decision is not None:
                 self._on_decision(note.kind, note.computed_s, note.waited_s)
-        return jobs[0] if jobs else None
 
     # -- time ------------------------------------------------------------------------------------
 
@@ -377,12 +545,18 @@ class ServiceShell:
         """Let the machine take note of the time; return how long it can then be left alone."""
         with self._lock:
             now = monotonic()
-            carried = self._sorted(self._service.tick(now))
+            calls, _, notes = self._sorted(self._service.tick(now))
             due = self._service.next_wakeup()
             if now - self._heard_at < _STAYS_AWAKE_S:
                 due = now + _TICK_S if due is None else min(due, now + _TICK_S)
+            for logged_at, omitted, _ in self._logged.values():
+                tell_at = logged_at + _LOGGED_AT_MOST_EVERY_S
+                if omitted and tell_at > now:
+                    due = tell_at if due is None else min(due, tell_at)
             self._wakes_at = float("inf") if due is None else due
-        self._carry_out(*carried)
+        self._senders.post(calls)
+        self._take_note(notes)
+        self._log_omitted(now)
         return None if due is None else max(0.0, due - monotonic())
 
     def _wake(self) -> None:
@@ -397,10 +571,35 @@ class ServiceShell:
             return
         now = monotonic()
         with self._lock:
-            logged_at, omitted = self._logged.get(note.event, (-_LOGGED_AT_MOST_EVERY_S, 0))
-            if now - logged_at < _LOGGED_AT_MOST_EVERY_S:
-                self._logged[note.event] = (logged_at, omitted + 1)
-                return
-            self._logged[note.event] = (now, 0)
+            logged_at, omitted, _ = self._logged.get(
+                note.event, (-_LOGGED_AT_MOST_EVERY_S, 0, note)
+            )
+            tell_at = logged_at + _LOGGED_AT_MOST_EVERY_S
+            omit = now < tell_at
+            self._logged[note.event] = (logged_at, omitted + 1, note) if omit else (now, 0, note)
+            late = omit and tell_at < self._wakes_at
+            if late:
+                self._wakes_at = now
+        if late:
+            self._wake()
+        if not omit:
+            self._log_one(note, omitted)
+
+    def _log_omitted(self, now: float) -> None:
+        """Log the last of those that were left out, once its time has come, with their number."""
+        told = []
+        with self._lock:
+            for event, (logged_at, omitted, note) in self._logged.items():
+                if omitted and logged_at + _LOGGED_AT_MOST_EVERY_S <= now:
+                    self._logged[event] = (now, 0, note)
+                    told.append((note, omitted - 1))
+        for note, omitted in told:
+            self._log_one(note, omitted)
+        unread = self._unread
+        if unread != self._unread_logged:
+            self._unread_logged = unread
+            self._log(Noted("busy", {"turned_away_unread": unread}))
+
+    def _log_one(self, note: Noted, omitted: int) -> None:
         more = {"omitted": omitted} if omitted else {}
         self._events.event(note.event, **note.fields, **more)

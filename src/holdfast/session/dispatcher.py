@@ -841,7 +841,8 @@ class Dispatcher:
             if service.refused is not None:
                 why = f"{service.refused_code}: {service.refused}"
             elif not service.detector.present:
-                why = "is being launched" if service is self._local else "is not there"
+                absent = "is not there" if service.detector.seen else "has not appeared"
+                why = "is being launched" if service is self._local else absent
             else:
                 why = service.detector.suspicion or "is busy"
             reasons.append(f"{service.name}: {why}")
@@ -904,7 +905,8 @@ class Dispatcher:
             + (
                 service.refused
                 or service.detector.suspicion
-                or ("is busy" if service.detector.present else "is gone")
+                or ("is busy" if service.detector.present else None)
+                or ("is gone" if service.detector.seen else "has not appeared")
             )
             for service in self._cloud
         )

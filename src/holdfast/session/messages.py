@@ -25,6 +25,8 @@ from holdfast.settings import PlanningSettings
 __all__ = [
     "DIGEST_SIZE",
     "MAX_OBSERVATIONS",
+    "MAX_OPENING_BYTES",
+    "MAX_OPENING_VALUES",
     "MAX_TASK_ACTIONS",
     "PROTOCOL_VERSION",
     "Busy",
@@ -56,6 +58,13 @@ MAX_TASK_ACTIONS = 64
 MAX_OBSERVATIONS = 64
 """Bound on the observations of one request; a service further behind is handed the state."""
 
+MAX_OPENING_BYTES = 256 * 1024
+"""Bound on an opening as it is sent."""
+
+MAX_OPENING_VALUES = 10_000
+"""Bound on the values in an opening: the smallest fill one byte each as they are sent, and sixty in
+memory."""
+
 DIGEST_SIZE = 16
 """Bytes of a state's digest that are sent: the first ones of :func:`holdfast.planning.digest`."""
 
@@ -80,7 +89,7 @@ class MessageError(HoldfastError):
         self.code = code
 
 
-class Observed(msgspec.Struct, array_like=True, frozen=True):
+class Observed(msgspec.Struct, array_like=True, frozen=True, forbid_unknown_fields=True):
     """An observation that the robot has folded into its belief.
 
     Attributes
@@ -120,6 +129,8 @@ class Opening(msgspec.Struct, array_like=True, frozen=True):
 class Request(msgspec.Struct, array_like=True, frozen=True):
     """A robot's question: what to do from this state on, until it has sensed again.
 
+    It is to be encoded with :func:`encode` alone, for on the wire its opening has another form.
+
     Attributes
     ----------
     version : int
@@ -156,6 +167,28 @@ class Request(msgspec.Struct, array_like=True, frozen=True):
     digest: Digest
     observations: Annotated[tuple[Observed, ...], msgspec.Meta(max_length=MAX_OBSERVATIONS)] = ()
     opening: Opening | None = None
+    checkpoint: bytes | None = None
+
+
+class _SentRequest(msgspec.Struct, array_like=True, frozen=True, forbid_unknown_fields=True):
+    """A request on the wire.
+
+    Its opening is bytes inside the message. So the length of every field comes before the field,
+    and is checked before anything of it is read: what is no request is found out at once, however
+    large it is.
+    """
+
+    version: int
+    session: Session
+    epoch: Word
+    number: Word
+    trial: Word
+    step: Word
+    sensed: bool
+    digest: Digest
+    observations: Annotated[tuple[Observed, ...], msgspec.Meta(max_length=MAX_OBSERVATIONS)] = ()
+    # So much is read of one that is too large, so that the robot can be told that.
+    opening: Annotated[bytes, msgspec.Meta(max_length=16 * MAX_OPENING_BYTES)] | None = None
     checkpoint: bytes | None = None
 
 
@@ -271,36 +304,62 @@ class Refused(msgspec.Struct, array_like=True, frozen=True, tag=6):
 Reply: TypeAlias = TaskAnswer | SensingAnswer | Progress | NeedState | Busy | Refused
 
 _ENCODER = msgspec.msgpack.Encoder()
-_REQUEST_DECODER = msgspec.msgpack.Decoder(Request)
+_REQUEST_DECODER = msgspec.msgpack.Decoder(_SentRequest)
+_OPENING_DECODER = msgspec.msgpack.Decoder(Opening)
 _REPLY_DECODER: msgspec.msgpack.Decoder[Reply] = msgspec.msgpack.Decoder(Reply)
-_VERSION_DECODER = msgspec.msgpack.Decoder(list[msgspec.Raw])
+
+_ARRAY_HEADERS = {0xDC: 3, 0xDD: 5}
+_WORDS = {0xCC: 1, 0xCD: 2, 0xCE: 4}
+"""Of MessagePack: sizes of the longer headers of an array, and of the longer words."""
 
 
 def encode(message: Request | Reply) -> bytes:
     """Encode a message."""
+    if isinstance(message, Request) and message.opening is not None:
+        # Without an opening both forms are the same bytes.
+        return _ENCODER.encode(_sent(message, _ENCODER.encode(message.opening)))
     return _ENCODER.encode(message)
 
 
 def decode_request(payload: bytes) -> Request:
     """Decode a request and check all of it that can be checked by itself.
 
+    It takes no longer, and no more memory, for a large message that is no request than for a small
+    one.
+
     Raises
     ------
     MessageError
-        If the bytes are no request (``malformed``), or one of another version (``version``).
+        If the bytes are no request (``malformed``), one of another version (``version``), or one
+        whose opening has more than :data:`MAX_OPENING_BYTES` or :data:`MAX_OPENING_VALUES`
+        (``too_large``).
     """
+    # Other versions may have other fields.
+    version = _version_of(payload)
+    if version is not None and version != PROTOCOL_VERSION:
+        raise _other_version(version)
     try:
-        request = _REQUEST_DECODER.decode(payload)
+        sent = _REQUEST_DECODER.decode(payload)
+        opening = None if sent.opening is None else _opening_of(sent.opening)
     except (msgspec.DecodeError, RecursionError, UnicodeDecodeError) as error:
-        version = _version_of(payload)
-        if version is not None and version != PROTOCOL_VERSION:
-            raise _other_version(version) from None
         raise MessageError("malformed", f"{len(payload)} bytes are no request: {error}") from error
-    if request.version != PROTOCOL_VERSION:
-        raise _other_version(request.version)
-    if request.checkpoint is not None and request.observations:
+    if sent.version != PROTOCOL_VERSION:
+        raise _other_version(sent.version)
+    if sent.checkpoint is not None and sent.observations:
         raise MessageError("malformed", "a request has a checkpoint and observations as well")
-    return request
+    return Request(
+        sent.version,
+        sent.session,
+        sent.epoch,
+        sent.number,
+        sent.trial,
+        sent.step,
+        sent.sensed,
+        sent.digest,
+        sent.observations,
+        opening,
+        sent.checkpoint,
+    )
 
 
 def decode_reply(payload: bytes) -> Reply:
@@ -338,14 +397,65 @@ def numbers_from(data: bytes, size: int) -> FloatArray:
     return numbers
 
 
+def _sent(request: Request, opening: bytes) -> _SentRequest:
+    return _SentRequest(
+        request.version,
+        request.session,
+        request.epoch,
+        request.number,
+        request.trial,
+        request.step,
+        request.sensed,
+        request.digest,
+        request.observations,
+        opening,
+        request.checkpoint,
+    )
+
+
 def _version_of(payload: bytes) -> int | None:
-    """Return the version of what looks like a request of ours, whatever its other fields are."""
-    try:
-        fields = _VERSION_DECODER.decode(payload)
-        version = msgspec.msgpack.decode(fields[0]) if fields else None
-    except (msgspec.DecodeError, RecursionError):
+    """Return the version of what looks like a request of ours, from its first bytes alone."""
+    first = payload[0] if payload else 0
+    start = 1 if first & 0xF0 == 0x90 else _ARRAY_HEADERS.get(first)
+    if start is None or len(payload) <= start:
         return None
-    return version if isinstance(version, int) else None
+    word = payload[start]
+    if word < 0x80:
+        return word
+    size = _WORDS.get(word)
+    if size is None or len(payload) <= start + size:
+        return None
+    return int.from_bytes(payload[start + 1 : start + 1 + size], "big")
+
+
+def _opening_of(data: bytes) -> Opening:
+    if len(data) > MAX_OPENING_BYTES:
+        raise MessageError(
+            "too_large",
+            f"{len(data)} bytes of problem and settings, the sections model and "
+            f"state_space_planner among them: at most {MAX_OPENING_BYTES} are allowed",
+        )
+    opening = _OPENING_DECODER.decode(data)
+    _check_size(opening)
+    return opening
+
+
+def _check_size(opening: Opening) -> None:
+    """Check that the problem's sections do not have too many values, however they are nested."""
+    containers: list[object] = [opening.model, opening.state_space_planner]
+    count = 0
+    while containers:
+        container = containers.pop()
+        assert isinstance(container, dict | list | tuple)
+        count += len(container) * (2 if isinstance(container, dict) else 1)
+        if count > MAX_OPENING_VALUES:
+            raise MessageError(
+                "too_large",
+                f"problem {opening.problem}: more than {MAX_OPENING_VALUES} values in the sections "
+                f"model and state_space_planner",
+            )
+        parts = (*container, *container.values()) if isinstance(container, dict) else container
+        containers += (part for part in parts if isinstance(part, dict | list | tuple))
 
 
 def _other_version(version: int) -> MessageError:

@@ -89,6 +89,12 @@ _REQUESTED, _PREFETCHED = 0, 1
 _PROGRESS_TOGETHER = 0.8
 """Calls this far into the interval are told with those that are due: fewer wake-ups."""
 
+_NO_ROOM_RETRY_MS = 100.0
+"""A robot for which there is no room is to come back no sooner than after this."""
+
+_RETRY_SPREAD = 0.25
+"""By up to this share robots are to come back later than they could, each by its own."""
+
 
 class ServiceLimits(msgspec.Struct, frozen=True, kw_only=True):
     """What a service takes on. Beyond it robots are turned away, or forgotten and handed over anew.
@@ -359,7 +365,11 @@ class Job:
         self._state = state
 
     def run(self) -> Outcome:
-        """Compute; what goes wrong in the problem's functions is part of the outcome."""
+        """Compute; whatever goes wrong in the problem's functions is part of the outcome.
+
+        Whatever they raise, ``KeyboardInterrupt`` included: on a worker's thread it can only come
+        from them.
+        """
         # Kept as it becomes known, for it is worth keeping if the rest fails.
         problem = self._problem
         try:
@@ -375,9 +385,10 @@ class Job:
         except MessageError as error:
             return Outcome(failure=(error.code, str(error)), problem=problem)
         except HoldfastError as error:
-            return Outcome(failure=(_code_of(error), str(error)), problem=problem)
-        except (Exception, SystemExit) as error:  # noqa: BLE001 - the problem is anybody's code
-            return Outcome(failure=("failed", self._describe_error(error)), problem=problem)
+            return Outcome(failure=(_code_of(error), _account(error, str)), problem=problem)
+        except BaseException as error:  # noqa: BLE001 - the problem is anybody's code
+            text = _account(error, self._describe_error)
+            return Outcome(failure=("failed", text), problem=problem)
 
     def _computed(self, problem: Problem) -> Outcome:
         planning, request = self._planning, self._request
@@ -476,6 +487,14 @@ def _check_work(problem: Problem, planning: PlanningSettings, limits: ServiceLim
             f"action_size of {problem.name} is {problem.action_size}: a service takes at most "
             f"{_MAX_ACTION_SIZE}"
         )
+
+
+def _account(error: BaseException, describe: Callable[[BaseException], str]) -> str:
+    """Put an error of a problem into words, even one that fails at that itself."""
+    try:
+        return describe(error)
+    except BaseException:  # noqa: BLE001 - whoever wrote the problem may have written the error
+        return f"{type(error).__name__}, which cannot be put into words"
 
 
 def _described(error: BaseException) -> str:
@@ -730,12 +749,33 @@ class Service:
         now : float
             Seconds of any clock that does not go back.
         """
+        request: Request | MessageError
         try:
             request = decode_request(payload)
         except MessageError as error:
-            self._refuse(call, 0, error.code, str(error))
+            request = error
+        return self.receive_request(call, request, len(payload), now)
+
+    def receive_request(
+        self, call: int, request: Request | MessageError, size: int, now: float
+    ) -> list[Effect]:
+        """Take a request that was decoded already: whoever locks the machine decodes before.
+
+        Parameters
+        ----------
+        call : int
+            Names the call in the effects; never used before.
+        request : Request or MessageError
+            What :func:`~holdfast.session.messages.decode_request` returned or raised.
+        size : int
+            Bytes of the message.
+        now : float
+            Seconds of any clock that does not go back.
+        """
+        if isinstance(request, MessageError):
+            self._refuse(call, 0, request.code, str(request))
             return self._take()
-        self._received(call, request, len(payload), now)
+        self._received(call, request, size, now)
         self._dispatch(now)
         return self._take()
 
@@ -873,8 +913,12 @@ class Service:
             self._refuse(call, request.number, "invalid", text)
             return None
         room = len(self._sessions) < limits.max_sessions or self._unused() is not None
-        if not room or self._is_overloaded(now):
-            self._turn_away(call, request.number, now)
+        if not room:
+            # It is free once another robot has left, not once the next decision is computed.
+            self._turn_away(call, request.number, request.session, now, _NO_ROOM_RETRY_MS)
+            return None
+        if self._is_overloaded(now):
+            self._turn_away(call, request.number, request.session, now)
             return None
         session = _Session(request, opening, limits.max_threads, (self._task_s, self._sensing_s))
         session.used_at = now
@@ -955,7 +999,7 @@ class Service:
             None,
         )
         if waiting is None and self._is_overloaded(now):
-            self._turn_away(call, request.number, now)
+            self._turn_away(call, request.number, request.session, now)
             return _Fate.TURNED_AWAY
         if waiting is not None:
             # It keeps the turn of the request that it replaces, and adds nothing to the backlog.
@@ -1134,7 +1178,8 @@ class Service:
             else:
                 code, text = outcome.failure
                 if code == "busy":
-                    self._turn_away(record.call, record.number, now)
+                    number, key = record.number, session.key
+                    self._turn_away(record.call, number, key, now, _NO_ROOM_RETRY_MS)
                 else:
                     self._refuse(record.call, record.number, code, text)
         if not session.built:
@@ -1245,9 +1290,15 @@ class Service:
         self._statistics.state_requests += 1
         self._effects += (Answer(call, encode(NeedState(number, differs))), End(call))
 
-    def _turn_away(self, call: int, number: int, now: float) -> None:
+    def _turn_away(
+        self, call: int, number: int, key: bytes, now: float, least_ms: float = 1.0
+    ) -> None:
         self._statistics.busy += 1
-        retry_after_ms = min(_MAX_WORD, max(1, math.ceil(1e3 * self._wait_s(now))))
+        # Robots that were turned away together shall not come back together.
+        share = int.from_bytes(hashlib.blake2b(key, digest_size=2).digest(), "big") / 2**16
+        spread = 1.0 + _RETRY_SPREAD * share
+        retry_after_ms = math.ceil(max(least_ms, 1e3 * self._wait_s(now)) * spread)
+        retry_after_ms = min(_MAX_WORD, retry_after_ms)
         self._effects += (
             Answer(call, encode(Busy(number, retry_after_ms))),
             End(call),

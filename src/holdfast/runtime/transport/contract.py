@@ -60,6 +60,11 @@ class IncomingCall(Protocol):
         """The request."""
         ...
 
+    @property
+    def size_bytes(self) -> int:
+        """Of the request, without a copy of it."""
+        ...
+
     def reply(self, payload: bytes) -> None:
         """Send a reply; may be repeated, from any thread. A robot that is gone is no error."""
         ...

@@ -97,6 +97,10 @@ class _InProcessCall(PendingCall):
     def payload(self) -> bytes:
         return self._payload
 
+    @property
+    def size_bytes(self) -> int:
+        return len(self._payload)
+
     def reply(self, payload: bytes) -> None:
         self._robot._replied(self, payload)
 

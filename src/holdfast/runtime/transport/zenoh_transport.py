@@ -122,11 +122,10 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
 class _Boot:
     """One incarnation of a service, as a robot sees it."""
 
-    __slots__ = ("alive", "boot", "decide")
+    __slots__ = ("boot", "decide")
 
     def __init__(self, boot: str, alive: str) -> None:
         self.boot = boot
-        self.alive = alive
         self.decide = zenoh.KeyExpr(f"{alive.removesuffix('/alive')}/decide")
 
 
@@ -449,7 +448,10 @@ class ZenohRobotTransport:
         if len(sample.payload) == 0:
             sent.acknowledged = True
         else:
-            self._replied(pending, reply)  # The request is refused before it is there as a whole.
+            # Refused before it is there as a whole; the other parts' refusals come too late.
+            with self._calls.lock:
+                self._replied(pending, reply)
+                self._calls.ended(pending)
 
     def _part_over(self, link: _Link, outgoing: _Outgoing, sent: _PartSent) -> None:
         if sent.acknowledged:
@@ -511,7 +513,7 @@ class ZenohRobotTransport:
 class _ReceivedCall:
     """A request as the service sees it."""
 
-    __slots__ = ("_ended", "_key", "_lock", "_payload", "_query", "_received")
+    __slots__ = ("_ended", "_key", "_lock", "_payload", "_query", "_received", "_size_bytes")
 
     def __init__(
         self,
@@ -522,6 +524,7 @@ class _ReceivedCall:
     ) -> None:
         self._query = query
         self._received = received
+        self._size_bytes = 0 if received is None else len(received)
         self._key = key
         self._ended = ended
         self._lock = threading.Lock()
@@ -534,6 +537,11 @@ class _ReceivedCall:
             self._payload = b"" if self._received is None else bytes(self._received)
             self._received = None
         return self._payload
+
+    @property
+    def size_bytes(self) -> int:
+        """Of the request, without a copy of it."""
+        return self._size_bytes
 
     def reply(self, payload: bytes) -> None:
         """Send a reply. A robot that is gone is no error."""
@@ -717,13 +725,16 @@ class ZenohServiceTransport:
         if request is not None and len(request) == size_bytes:
             self._hand_over(query, request)
             return
-        with query:
-            if index < count - 1:
-                query.reply(self._key, b"")
+        # A last part that does not complete its request ends without an answer.
+        self._answer(query, b"" if index < count - 1 else None)
 
     def _refuse(self, query: zenoh.Query, size_bytes: int) -> None:
-        with query:
-            query.reply(self._key, too_large(size_bytes, self._max_message_bytes))
+        self._answer(query, too_large(size_bytes, self._max_message_bytes))
+
+    def _answer(self, query: zenoh.Query, reply: bytes | None) -> None:
+        with query, contextlib.suppress(zenoh.ZError):  # the session is being closed
+            if reply is not None:
+                query.reply(self._key, reply)
 
     def _hand_over(self, query: zenoh.Query, payload: zenoh.ZBytes | bytes | None) -> None:
         call = _ReceivedCall(query, payload, self._key, self._ended)
