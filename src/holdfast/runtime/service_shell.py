@@ -7,10 +7,11 @@ run at a time, so that a call is heard, and if need be turned away, while all ot
 
 To send can block, if whoever is to receive it does not read, for as long as a link can be silent.
 So no thread that others depend on sends: not the transport's, on which all calls come in, nor the
-timekeeper. Replies go into *lanes*, one for each session and one for all messages that are none. Of
-a lane one thread sends at a time, mostly one of the *senders*, of which one more is started
-whenever the last free one begins. Only one worker at a time may send by itself, which saves a lone
-robot the hand-over: if it is held up, there are as many left as jobs may run.
+timekeeper. Replies go into *lanes*: one for each session, one for all messages that are none, and
+one for the calls that are turned away unread. Of a lane one thread sends at a time, mostly one of
+the *senders*, of which one more is started whenever the last free one begins. Only one worker at a
+time may send by itself, which saves a lone robot the hand-over: if it is held up, there are as many
+left as jobs may run.
 
 The thread that calls :meth:`ServiceShell.wait` keeps the time: it has the signs of progress sent,
 while the workers compute, and it sleeps without a break when no robot is about.
@@ -73,6 +74,9 @@ _SENT_AT_A_TIME = 16
 
 _NOBODY = b""
 """The lane of messages that name no session."""
+
+_UNREAD = b"unread"
+"""The lane of those that are turned away unread: robots' calls may be among them."""
 
 _TICK_S = 0.05
 _STAYS_AWAKE_S = 1.0
@@ -444,7 +448,7 @@ class ServiceShell:
         if full:
             if self._unread == self._unread_logged + 1:
                 self._wake()  # to log it
-            call = _OpenCall(incoming, _NOBODY)
+            call = _OpenCall(incoming, _UNREAD)
             call.outbox += (busy, None)
             self._senders.post((call,))
         else:
