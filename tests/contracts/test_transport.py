@@ -987,6 +987,7 @@ def stop(process: subprocess.Popen[bytes]) -> None:
 
 
 @pytest.mark.parametrize("kind", ["tcp", "tls", "quic", "unixsock-stream", "robot_listens"])
+@pytest.mark.slow
 class TestProcesses:
     @pytest.fixture
     def wire(
@@ -1130,6 +1131,7 @@ if sys.argv[2] == "close":
 
 @pytest.mark.parametrize("manner", ["close", "leave"])
 @pytest.mark.parametrize(("stopped", "after_s"), [(False, 0.1), (True, 0.1), (True, 0.7)])
+@pytest.mark.slow
 def test_a_process_ends_quietly_whatever_its_links_do(
     tcp: ZenohWire, manner: str, stopped: bool, after_s: float
 ) -> None:

@@ -103,6 +103,7 @@ class TestCloud:
         assert robot.statuses()[:2] == [LOST, RESTORED]
 
     @pytest.mark.parametrize("problem", PEG_AND_SLOWLY_ALL)
+    @pytest.mark.slow
     def test_stopped_for_shorter_than_the_timeout(
         self, problem: str, site: Site, references: References
     ) -> None:
@@ -191,6 +192,7 @@ class TestCloud:
         robot = story.run(cloud)
         assert robot.statuses() == [LOST]
 
+    @pytest.mark.slow
     def test_hung_while_it_shows_progress(self, site: Site, references: References) -> None:
         gate = site.gate(9)
         cloud = site.service(*SERVES_GATED)
@@ -245,6 +247,7 @@ class TestCloud:
         assert set(robot.statuses()) <= {LOST, RESTORED, LOST_AGAIN}
 
 
+@pytest.mark.slow
 class TestRecovery:
     @pytest.mark.parametrize("problem", PEG_AND_SLOWLY_ALL)
     def test_killed_together_with_the_cloud(
@@ -396,6 +399,7 @@ def installation_in(directory: Path) -> Path:
     return python
 
 
+@pytest.mark.slow
 class TestDeadline:
     def test_a_late_decision_is_taken_from_the_local_service(
         self, site: Site, references: References

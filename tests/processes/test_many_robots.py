@@ -204,6 +204,7 @@ class TestNeighbours:
         assert "--problem" in refused["reason"]
 
 
+@pytest.mark.slow
 class TestTooManyForOne:
     @pytest.mark.parametrize("recovery", ["never", "on_failure"])
     def test_all_runs_stay_right(self, recovery: str, site: Site, references: References) -> None:

@@ -299,6 +299,7 @@ class Watched:
         return self.event()
 
 
+@pytest.mark.slow
 class TestFailures:
     def test_a_silent_controller_stops_the_robot_and_the_count_settles_it(
         self, controller: Controller
@@ -381,6 +382,7 @@ performer.close()
 """
 
 
+@pytest.mark.slow
 class TestProcesses:
     """The robot's own process meets its signals while the robot moves."""
 

@@ -131,6 +131,7 @@ def test_controller_killed_and_started_again(
     undisturbed.assert_same(robot.out, controller)
 
 
+@pytest.mark.slow
 def test_controller_killed_together_with_the_robot(
     controller: Controller, site: Site, undisturbed: Undisturbed
 ) -> None:
@@ -147,6 +148,7 @@ def test_controller_killed_together_with_the_robot(
     undisturbed.assert_same(robot.out, controller)
 
 
+@pytest.mark.slow
 def test_controller_that_falls_silent(
     controller: Controller, site: Site, undisturbed: Undisturbed
 ) -> None:
@@ -164,6 +166,7 @@ def test_controller_that_falls_silent(
     undisturbed.assert_same(robot.out, controller)
 
 
+@pytest.mark.slow
 def test_two_commands_say_whether_they_decided_the_same(
     controller: Controller, site: Site, undisturbed: Undisturbed
 ) -> None:

@@ -68,6 +68,7 @@ class TestKilled:
         assert len(cloud.process.matching("session_taken_over")) >= 1
 
     @pytest.mark.parametrize("problem", PEG_AND_SLOWLY_ALL)
+    @pytest.mark.slow
     def test_where_trials_begin_and_end(
         self, problem: str, site: Site, references: References
     ) -> None:
@@ -84,6 +85,7 @@ class TestKilled:
         assert story.run_and_resume(cloud) == 7
 
     @pytest.mark.parametrize("problem", PEG_AND_SLOWLY_ALL)
+    @pytest.mark.slow
     def test_together_with_the_cloud(
         self, problem: str, site: Site, references: References
     ) -> None:
@@ -118,6 +120,7 @@ class TestKilled:
         site.wait_for_nobody()
 
     @pytest.mark.parametrize("problem", PEG_AND_SLOWLY_ALL)
+    @pytest.mark.slow
     def test_with_the_planner_in_its_own_process(
         self, problem: str, site: Site, references: References
     ) -> None:
@@ -128,6 +131,7 @@ class TestKilled:
         assert story.run_and_resume() == 4
 
     @pytest.mark.parametrize("problem", PEG_AND_SLOWLY_ALL)
+    @pytest.mark.slow
     def test_in_a_simulated_world(self, problem: str, site: Site, references: References) -> None:
         """That world dies with the robot, and is made again from the journal."""
         document = document_of(problem, trials=2)
@@ -212,20 +216,21 @@ class TestEndedInOrder:
         robot = site.run(story.file, services=[cloud])
         assert robot.wait() == 128 + number
         # What was being performed was still written down, and nothing after it was begun.
-        assert f"{said}. 0 of 1 trials are finished" in robot.output
+        (told,) = robot.matching("interrupted")
+        assert str(told["reason"]).startswith(f"{said}. 0 of 1 trials are finished")
         assert 31 <= story.world.step < 80
         assert unfinished_steps(robot.out) == list(range(story.world.step))
         # No local service is left behind, and nothing else.
         site.wait_for_nobody()
         # The command that it names goes on.
-        command = robot.output.split("Go on with: ")[1].splitlines()[0]
-        words = shlex.split(command)
+        words = shlex.split(str(told["resume_command"]))
         assert words[:2] == ["holdfast", "run"]
         resumed = site.process(*COMMAND, *words[1:])
         assert resumed.wait() == 0, resumed.account()
         assert_identical(robot.out, story.reference)
         story.world.assert_each_once(story.reference)
 
+    @pytest.mark.slow
     def test_by_a_second_signal_while_the_robot_does_not_answer(
         self, site: Site, references: References
     ) -> None:
@@ -284,6 +289,7 @@ class TestEndedInOrder:
 
 class TestWorld:
     @pytest.mark.parametrize("performed", [False, True])
+    @pytest.mark.slow
     def test_a_robot_that_stalls_holds_and_is_resumed(
         self, performed: bool, site: Site, references: References
     ) -> None:
@@ -364,7 +370,8 @@ class TestRate:
         missed = sum(event["missed"] for event in robot.matching("missed_ticks"))
         assert missed >= 23
         assert robot.matching("missed_ticks")[-1]["total"] == missed
-        assert f"note: {missed} ticks of --rate were missed" in robot.output
+        told = [str(event["reason"]) for event in robot.matching("note")]
+        assert f"{missed} ticks of --rate were missed" in told
 
 
 SHORT = document_of(PEG, trials=2, max_steps=40)
@@ -382,6 +389,7 @@ def killed(tmp_path_factory: pytest.TempPathFactory) -> Path:
         return robot.out
 
 
+@pytest.mark.slow
 class TestDamagedJournal:
     @pytest.mark.parametrize("name", ["journal.sqlite", "journal.sqlite-wal"])
     @pytest.mark.parametrize(
@@ -418,6 +426,7 @@ class TestDamagedJournal:
         self, killed: Path, site: Site, references: References
     ) -> None:
         shutil.copytree(killed, site.directory / "out")
-        robot = site.run(site.configure(SHORT), resume=True)
-        robot.finish()
-        assert_identical(robot.out, references(SHORT))
+        configuration = site.configure(SHORT)
+        batch = site.holdfast("run", configuration, "--out", site.directory / "out", "--resume")
+        assert batch.wait() == 0, batch.account()
+        assert_identical(site.directory / "out", references(SHORT))

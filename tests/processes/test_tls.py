@@ -49,6 +49,7 @@ def secure(site: Site, keys: Path, protocol: str, authority: str = "ours") -> Se
 
 
 @pytest.mark.parametrize("protocol", ["tls", "quic"])
+@pytest.mark.slow
 def test_killed_stopped_and_started_again(
     protocol: str, keys: Path, site: Site, references: References
 ) -> None:
