@@ -6,6 +6,7 @@ import contextlib
 import json
 import os
 import socket
+import statistics
 import subprocess
 import sys
 import threading
@@ -14,7 +15,15 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-__all__ = ["CountingProxy", "EchoProcess", "ServiceProcess", "Usage", "free_tcp_port", "usage_of"]
+__all__ = [
+    "CountingProxy",
+    "EchoProcess",
+    "ServiceProcess",
+    "Usage",
+    "free_tcp_port",
+    "pipe_round_trip_s",
+    "usage_of",
+]
 
 _ECHO = Path(__file__).with_name("echo.py")
 _READY_TIMEOUT_S = 30.0
@@ -48,6 +57,43 @@ def usage_of(process_id: int) -> Usage:
         int(resident.split()[1]) * 1024,
         int(fields[17]),
     )
+
+
+_PONG = """
+import os, sys
+os.sched_setaffinity(0, {int(sys.argv[1])})
+while byte := os.read(0, 1):
+    os.write(1, byte)
+"""
+
+
+def pipe_round_trip_s(number: int = 500) -> float:
+    """Return how long a byte takes to a process on another core and back, through pipes.
+
+    It is the machine's own share of every exchange between two processes: a core that sleeps is
+    woken, twice. In virtual machines that can take ten times as long as elsewhere.
+    """
+    cores = sorted(os.sched_getaffinity(0))
+    seconds = []
+    with subprocess.Popen(
+        [sys.executable, "-c", _PONG, str(cores[-1])],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        bufsize=0,
+    ) as process:
+        assert process.stdin is not None and process.stdout is not None
+        os.sched_setaffinity(0, {cores[0]})
+        try:
+            for _ in range(number):
+                time.sleep(0.0005)
+                start = time.perf_counter()
+                process.stdin.write(b".")
+                process.stdout.read(1)
+                seconds.append(time.perf_counter() - start)
+        finally:
+            os.sched_setaffinity(0, set(cores))
+        process.stdin.close()
+    return statistics.median(seconds)
 
 
 def free_tcp_port() -> int:

@@ -20,15 +20,21 @@ import numpy.typing as npt
 
 from benchmarks.common import Context
 from benchmarks.measure import without_collection
-from benchmarks.processes import CountingProxy, EchoProcess, ServiceProcess, usage_of
+from benchmarks.processes import (
+    CountingProxy,
+    EchoProcess,
+    ServiceProcess,
+    pipe_round_trip_s,
+    usage_of,
+)
 from benchmarks.report import Bar, Result, Table, milliseconds, paragraph
 from benchmarks.robots import Notebook, configuration_for, run_robot
 from benchmarks.turns import Asker, Caller, decided_in_process, opening_of, recorded_turns
 from holdfast.outcome import TrialResult
-from holdfast.planning import choose_sensing_action, encode_checkpoint
+from holdfast.planning import choose_sensing_action, digest, encode_checkpoint, initial_state
 from holdfast.recording.journal import Journal
 from holdfast.runtime.trial import run_trial
-from holdfast.session.messages import numbers_to
+from holdfast.session.messages import DIGEST_SIZE, numbers_to
 from holdfast.session.records import ActingRecord, PerformedRecord
 
 __all__ = ["capacity", "offload", "paced", "robot_loop", "serve", "wire"]
@@ -58,7 +64,8 @@ _REQUEST_BYTES = 100
 def offload(context: Context) -> Result:
     """Compare single questions to a service with the same decisions in process, in turns."""
     num_trials = 3 if context.quick else 30
-    kinds = ("bare", "task", "turn", "again", "echo")
+    num_alone = 20 if context.quick else 600
+    kinds = ("steady", "bare", "task", "turn", "again", "echo")
     here: dict[str, list[float]] = {kind: [] for kind in kinds}
     there: dict[str, list[float]] = {kind: [] for kind in kinds}
     computed: dict[str, list[float]] = {kind: [] for kind in kinds}
@@ -111,9 +118,22 @@ def offload(context: Context) -> Result:
                         note("task", 0.0, whole.task_s, task_us)
                         sensing_us = whole.sensing.computed_us
                         note("turn", whole_s, whole.sensing_s, task_us + sensing_us)
-                context.progress(trial / num_trials)
+                context.progress(0.8 * trial / num_trials)
+            for trial in range(num_trials + 1, num_trials + 1 + num_alone):
+                # A trial's first question is for a sensing action and nothing else.
+                state = initial_state(problem, settings, configuration.simulator.seed, trial)
+                state_digest = digest(state)[:DIGEST_SIZE]
+                start = time.perf_counter()
+                sensing_action, _ = choose_sensing_action(problem, settings, state)
+                alone_s = time.perf_counter() - start
+                steady = follower.ask(state, state_digest)
+                if steady.sensing is None or steady.sensing.sensing_action != sensing_action:
+                    raise RuntimeError(f"wrong answer in trial {trial}")
+                note("steady", alone_s, steady.sensing_s, steady.sensing.computed_us)
+    wakes_s = pipe_round_trip_s()
     rows = []
     for kind, what in (
+        ("steady", "a sensing action"),
         ("bare", "a sensing action, the state handed over"),
         ("task", "a turn, until its task actions are there"),
         ("turn", "a turn, until its sensing action is there, too"),
@@ -135,7 +155,7 @@ def offload(context: Context) -> Result:
     bars = [
         _bar(f"{what}, 100 particles: more than in process", more, MORE_BAR_MS)
         for what, more in (
-            ("sensing decision", np.subtract(there["bare"], here["bare"])),
+            ("sensing decision", np.subtract(there["steady"], here["steady"])),
             ("whole turn", np.subtract(there["turn"], here["turn"])),
         )
     ]
@@ -149,8 +169,10 @@ def offload(context: Context) -> Result:
                 in, nine task actions, and the sensing action that comes after them. What was asked
                 before is answered from the service's memory. The wire alone is a process that
                 answers any request at once, over the same links and from a thread of its own: most
-                of that time is the system's, to wake four threads one after another. (The thesis's
-                service cost {THESIS_MORE_MS:g} ms more.)"""
+                of that time is the system's, to wake threads one after another. On this machine a
+                byte that goes through a pipe to a process on another core and back takes
+                {1e6 * wakes_s:.0f} microseconds, for two such wake-ups (a decision waits for five).
+                (The thesis's service cost {THESIS_MORE_MS:g} ms more.)"""
             ),
             Table(
                 (

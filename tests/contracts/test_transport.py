@@ -283,6 +283,15 @@ def echo(call: IncomingCall) -> None:
     call.end()
 
 
+def aside(answer: Callable[[IncomingCall], None]) -> Callable[[IncomingCall], None]:
+    """Return a service that answers on threads of its own: large replies can block."""
+
+    def answer_aside(call: IncomingCall) -> None:
+        threading.Thread(target=answer, args=(call,)).start()
+
+    return answer_aside
+
+
 def echo_of_size(call: IncomingCall) -> None:
     call.reply(b"%d" % len(call.payload))
     call.end()
@@ -391,7 +400,7 @@ class TestEveryWire:
         assert inbox.of_call(1) == [Replied(1, b"question"), Ended(1)]
 
     def test_large_messages_both_ways(self, wire: Wire) -> None:
-        robot, inbox, _ = connected(wire)
+        robot, inbox, _ = connected(wire, aside(echo))
         payload = bytes(range(256)) * (TWO_MEGABYTES // 256)
         robot.call("cloud", 1, payload)
         robot.call("cloud", 2, b"small, while the large one is on its way")
@@ -521,7 +530,7 @@ class TestEveryWire:
         assert Ended(2) not in inbox
 
     def test_a_request_that_is_too_large_is_refused(self, wire: Wire) -> None:
-        robot, inbox, _ = connected(wire)
+        robot, inbox, _ = connected(wire, aside(echo))
         robot.call("cloud", 1, bytes(MAX_BYTES + 1))
         replied, ended = inbox.of_call(1)
         assert ended == Ended(1)
@@ -539,7 +548,7 @@ class TestEveryWire:
             call.reply(b"small")
             call.end()
 
-        robot, inbox, _ = connected(wire, answer)
+        robot, inbox, _ = connected(wire, aside(answer))
         robot.call("cloud", 1, b"")
         assert inbox.of_call(1) == [Replied(1, b"small"), Ended(1)]
 

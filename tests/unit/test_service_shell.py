@@ -30,6 +30,7 @@ from holdfast.session.messages import (
     Refused,
     Reply,
     SensingAnswer,
+    TaskAnswer,
     decode_reply,
     encode,
 )
@@ -251,22 +252,33 @@ class Unanswerable(Call):
 
 
 class Deaf(Call):
-    """Blocks whoever sends to it until it is let go."""
+    """Blocks whoever sends to it until it is let go; the thread that delivered it for a moment.
+
+    (So does Zenoh: then it gives up the link. Other threads are blocked for longer here than there,
+    to tell what waits for them.)
+    """
 
     def __init__(self, payload: bytes, let_go: threading.Event) -> None:
         super().__init__(payload)
         self._let_go = let_go
+        self._delivered_by = threading.current_thread()
         self.threads: set[threading.Thread] = set()
 
     def reply(self, payload: bytes) -> None:
-        self.threads.add(threading.current_thread())
-        assert self._let_go.wait(PATIENCE_S)
+        self._block()
         super().reply(payload)
 
     def end(self) -> None:
-        self.threads.add(threading.current_thread())
-        assert self._let_go.wait(PATIENCE_S)
+        self._block()
         super().end()
+
+    def _block(self) -> None:
+        thread = threading.current_thread()
+        self.threads.add(thread)
+        if thread is self._delivered_by:
+            self._let_go.wait(0.2)
+        else:
+            assert self._let_go.wait(PATIENCE_S)
 
 
 class Stuck(Call):
@@ -289,9 +301,12 @@ def test_calls_beyond_the_queue_are_turned_away_unread(bound: str) -> None:
     Stuck.let_go.clear()
     shell = ServiceShell(Service(KnownProblems(), 1), Silent(), 1, **limits)
     shell.start()
+    calls = [Stuck(payload) for _ in range(30)]
+    # One holds up the thread of the transport itself.
+    transport = threading.Thread(target=shell.deliver, args=(calls[0],))
     try:
-        calls = [Stuck(payload) for _ in range(30)]
-        for call in calls:
+        transport.start()
+        for call in calls[1:]:
             shell.deliver(call)
         delays = set()
         for call in calls[2:]:
@@ -308,6 +323,7 @@ def test_calls_beyond_the_queue_are_turned_away_unread(bound: str) -> None:
             assert isinstance(decode_reply(call.replies.get(timeout=PATIENCE_S) or b""), Refused)
     finally:
         Stuck.let_go.set()
+        transport.join(PATIENCE_S)
         shell.close()
 
 
@@ -377,6 +393,9 @@ def test_clients_that_do_not_read_hold_up_nobody_else() -> None:
         rude += [Deaf(encode(Robot(key=key).request()), let_go) for key in range(1, 11)]
         for call in rude:
             shell.deliver(call)  # returns, although no reply can be sent
+        answered_here = [call for call in rude if threading.current_thread() in call.threads]
+        assert len(answered_here) <= 1  # once held up, it leaves the answers to others
+        rude = [call for call in rude if call not in answered_here]
         patient, robot = Patient(network), Robot(key=99)
         for _ in range(5):
             request = robot.request(since=max(0, len(robot.observed) - 1))
@@ -395,6 +414,92 @@ def test_clients_that_do_not_read_hold_up_nobody_else() -> None:
         shell.stop()
         timekeeper.join(PATIENCE_S)
         shell.close()
+
+
+class Noting(Call):
+    """Notes which threads reply to it."""
+
+    def __init__(self, payload: bytes) -> None:
+        super().__init__(payload)
+        self.threads: list[threading.Thread] = []
+
+    def reply(self, payload: bytes) -> None:
+        self.threads.append(threading.current_thread())
+        super().reply(payload)
+
+    def answer(self) -> list[Reply]:
+        replies = []
+        while (payload := self.replies.get(timeout=PATIENCE_S)) is not None:
+            replies.append(decode_reply(payload))
+        return replies
+
+
+def test_a_brief_call_is_answered_where_it_came_in() -> None:
+    shell = ServiceShell(Service(KnownProblems(), 1), Silent(), 1)
+    shell.start()
+    try:
+        here = []
+        robot = Robot(key=1)
+        for _ in range(20):
+            call = Noting(encode(robot.request(since=max(0, len(robot.observed) - 1))))
+            shell.deliver(call)
+            assert content(call.answer()) == robot.right_answer()
+            here.append(set(call.threads) == {threading.current_thread()})
+            robot.act_until_sensing()
+            robot.sense()
+            time.sleep(0.05)  # this thread is not to be taken for more than half of the time
+        assert not here[0]  # the problem was built, which takes long
+        assert any(here[1:])
+    finally:
+        shell.close()
+
+
+def test_code_of_others_does_not_run_on_the_transports_thread() -> None:
+    joined = Joined(workers=1)
+    joined.held.let_go.set()
+    try:
+        robot = Robot(key=1)
+        robot.opening = HELD_OPENING
+        for _ in range(10):
+            call = Noting(encode(robot.request(since=max(0, len(robot.observed) - 1))))
+            joined.shell.deliver(call)
+            assert isinstance(call.answer()[-1], SensingAnswer)
+            assert threading.current_thread() not in call.threads
+            robot.act_until_sensing()
+            robot.sense()
+            time.sleep(0.02)
+    finally:
+        joined.close()
+
+
+def test_a_worker_that_is_held_up_leads_no_more() -> None:
+    joined = Joined(workers=2)
+    joined.held.let_go.set()
+    try:
+        robot = Robot(key=1)
+        robot.opening = HELD_OPENING
+        for _ in range(12):  # its jobs are known to be brief
+            call = Noting(encode(robot.request(since=max(0, len(robot.observed) - 1))))
+            joined.shell.deliver(call)
+            assert isinstance(call.answer()[-1], SensingAnswer)
+            robot.act_until_sensing()
+            robot.sense()
+        joined.held.let_go.clear()
+        joined.held.begun.clear()
+        stuck = Noting(encode(robot.request(since=max(0, len(robot.observed) - 1))))
+        joined.shell.deliver(stuck)
+        assert joined.held.begun.wait(PATIENCE_S)
+        patient, other = Patient(joined.network), Robot(key=2)
+        for _ in range(3):
+            request = other.request(since=max(0, len(other.observed) - 1))
+            assert content(patient.ask(encode(request))) == other.right_answer()
+            other.act_until_sensing()
+            other.sense()
+        joined.held.let_go.set()
+        kinds = [type(reply) for reply in stuck.answer() if not isinstance(reply, Progress)]
+        assert kinds == [TaskAnswer, SensingAnswer]
+    finally:
+        joined.close()
 
 
 def test_replies_of_one_call_keep_their_order() -> None:

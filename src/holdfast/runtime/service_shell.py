@@ -1,25 +1,31 @@
 """The threads around a service's machine: what comes in, what is computed, what is sent.
 
-Few threads do everything, because each hand-over from one to another costs a robot time. They take
-calls and jobs from one queue. The one that takes a call lets the machine handle it, and if a job
-comes of that, runs it and sends the answer, all by itself. There is one thread more than jobs may
-run at a time, so that a call is heard, and if need be turned away, while all others compute.
+Two things cost a robot time beside the decision itself: to wake a thread on another core, which
+takes longer than many a decision; and threads that hold the interpreter against each other, as all
+of them do that run brief jobs. So as few threads as possible take part. While the service is idle,
+a call is answered on the thread of the transport on which it came in, if that is known to take a
+moment only and to run none but this project's code. All other calls and jobs wait in one queue,
+from which one worker, the *leader*, takes them. It lets the machine handle the call, and if a brief
+job comes of that, runs it and sends the answer, all by itself. Before a long job, which computes
+without the interpreter, it lets another worker lead. There is one worker more than jobs may run at
+a time, so that a call is heard, and if need be turned away, while all others compute.
 
-To send can block, if whoever is to receive it does not read, for as long as a link can be silent.
-So no thread that others depend on sends: not the transport's, on which all calls come in, nor the
-timekeeper. Replies go into *lanes*: one for each session, one for all messages that are none, and
-one for the calls that are turned away unread. Of a lane one thread sends at a time, mostly one of
-the *senders*, of which one more is started whenever the last free one begins. Only one worker at a
-time may send by itself, which saves a lone robot the hand-over: if it is held up, there are as many
-left as jobs may run.
+To send can block, if whoever is to receive it does not read, for as long as a link can be silent,
+and a job that was thought brief can take for ever. A leader that is held up is deposed; the
+transport's thread cannot be, so it does nothing for a while once it was held up. Replies go into
+*lanes*: one for each session, one for all messages that are none, and one for the calls that are
+turned away unread. Of a lane one thread sends at a time, mostly one of the *senders*, of which one
+more is started whenever the last free one begins. Only one thread at a time may answer by itself,
+which saves a lone robot the hand-over.
 
 The thread that calls :meth:`ServiceShell.wait` keeps the time: it has the signs of progress sent,
-while the workers compute, and it sleeps without a break when no robot is about.
+while the workers compute, deposes the leader, and sleeps without a break when no robot is about.
 """
 
 from __future__ import annotations
 
 import contextlib
+import enum
 import itertools
 import os
 import select
@@ -28,7 +34,7 @@ import traceback
 from collections import deque
 from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
-from queue import SimpleQueue
+from queue import Empty, SimpleQueue
 from time import monotonic
 from typing import Any, Literal, TypeAlias
 
@@ -47,6 +53,7 @@ from holdfast.session.service import (
     End,
     Job,
     Noted,
+    Outcome,
     Run,
     Service,
     ServiceStatistics,
@@ -68,6 +75,21 @@ _UNREAD_BUSY = [encode(Busy(0, retry_after_ms)) for retry_after_ms in range(100,
 _MAX_SENDERS = 32
 """Threads that send, at most: so many robots' links can be blocked, and the others notice nothing.
 """
+
+_HERE_BYTES = 32_000
+"""Larger calls are not even decoded on the transport's thread."""
+
+_BRIEF_S = 0.002
+"""Jobs that may take longer run beside others."""
+
+_HELD_UP_S = 0.02
+"""What takes so long though it is brief is held up, by a robot that does not read or otherwise."""
+
+_NOT_HERE_FOR_S = 10.0
+"""For so long after the transport's thread was held up, it only hands over."""
+
+_HEARD_AT_A_TIME = 16
+"""Calls that are let in before it is a job's turn."""
 
 _SENT_AT_A_TIME = 16
 """Calls of a lane that are sent to before it is another one's turn."""
@@ -154,6 +176,15 @@ class KnownProblems:
             f"problem {name}: is not known to this service{hint if ':' in name else ''}; known are "
             f"{known}"
         )
+
+
+class _Rest(enum.Enum):
+    """Instead of a call or job: nothing new."""
+
+    REST = enum.auto()
+
+
+_REST = _Rest.REST
 
 
 class _OpenCall:
@@ -331,13 +362,23 @@ class ServiceShell:
         self._incoming = 0
         self._incoming_bytes = 0
         self._senders = _Senders(self._broke)
-        self._queue: SimpleQueue[IncomingCall | Job | None] = SimpleQueue()
+        self._queue: SimpleQueue[IncomingCall | Run | _Rest | None] = SimpleQueue()
+        # The leader's alone.
+        self._ready: deque[Run] = deque()
         self._calls: dict[int, _OpenCall] = {}
         self._numbers = itertools.count(1)
         self._unread = 0
         self._unread_logged = 0
         self._logged: dict[str, tuple[float, int, Noted]] = {}
         self._heard_at = -_STAYS_AWAKE_S
+        # The transport's thread is free for what comes from this time on.
+        self._here = threading.Lock()
+        self._here_from = 0.0
+        # Who leads holds the baton; a term ends when it is passed on, by whomever.
+        self._baton = threading.Semaphore()
+        self._term = 0
+        # The term of a leader that is at work, and since when.
+        self._at_work: tuple[int, float] | None = None
         self._wakes_at = 0.0
         self._failure: str | None = None
         self._stopped = False
@@ -433,7 +474,7 @@ class ServiceShell:
                     os.close(descriptor)
 
     def deliver(self, incoming: IncomingCall) -> None:
-        """Take a call from the transport; never blocks."""
+        """Take a call from the transport; as good as never blocks."""
         size = incoming.size_bytes
         with self._incoming_lock:
             full = self._incoming >= self._max_incoming or (
@@ -451,27 +492,121 @@ class ServiceShell:
             call = _OpenCall(incoming, _UNREAD)
             call.outbox += (busy, None)
             self._senders.post((call,))
+        elif (
+            size <= _HERE_BYTES
+            and self._queue.empty()
+            and self._at_work is None
+            and self._here.acquire(blocking=False)
+        ):
+            try:
+                self._answer_here(incoming)
+            finally:
+                self._here.release()
         else:
             self._queue.put(incoming)
+
+    # -- the transport's thread ------------------------------------------------------------------
+
+    def _answer_here(self, incoming: IncomingCall) -> None:
+        """Answer a call on the transport's thread, or hand over to a worker what takes longer.
+
+        That thread is taken for half of the time at most: what it has not read yet no limit can
+        turn away.
+        """
+        began = monotonic()
+        if began < self._here_from:
+            self._queue.put(incoming)
+            return
+        try:
+            runs = self._receive(incoming)
+            while runs:
+                run, *others = runs
+                for other in others:
+                    self._queue.put(other)
+                if run.expected_s > _BRIEF_S or run.job.problem_name not in registry.BUILT_IN:
+                    self._queue.put(run)
+                    break
+                runs = self._finish(run.job, run.job.run())
+        except BaseException:  # noqa: BLE001 - half a service is worse than none
+            self._broke()
+        now = monotonic()
+        took_s = now - began
+        self._here_from = now + (_NOT_HERE_FOR_S if took_s > _HELD_UP_S else took_s)
 
     # -- workers ---------------------------------------------------------------------------------
 
     def _work(self) -> None:
         try:
-            while (item := self._queue.get()) is not None:
-                job = item if isinstance(item, Job) else self._receive(item)
-                while job is not None:
-                    outcome = job.run()
-                    job = self._finish(job, outcome)
+            while True:
+                self._baton.acquire()
+                if not self._lead():
+                    return
         except BaseException:  # noqa: BLE001 - half a service is worse than none
             self._broke()
+
+    def _lead(self) -> bool:
+        """Take calls and jobs as long as this thread's term lasts.
+
+        Calls go first, up to a number, so that the machine knows what waits: then it chooses what
+        is computed next, and turns away what is too much. Returns False if the service is being
+        closed.
+        """
+        term = self._term
+        heard = 0
+        while self._term == term:
+            if not self._ready:
+                self._at_work = None
+                item = self._queue.get()
+            elif heard < _HEARD_AT_A_TIME:
+                try:
+                    item = self._queue.get_nowait()
+                except Empty:
+                    item = _REST
+            else:
+                item = _REST
+            self._at_work = (term, monotonic())
+            if item is None:
+                self._baton.release()
+                return False
+            if isinstance(item, Run):
+                self._ready.append(item)
+            elif item is not _REST:
+                heard += 1
+                self._make_ready(term, self._receive(item))
+            elif self._ready:
+                heard = 0
+                run = self._ready.popleft()
+                if run.expected_s > _BRIEF_S:
+                    self._pass_on(term)
+                self._make_ready(term, self._finish(run.job, run.job.run()))
+        return True
+
+    def _make_ready(self, term: int, runs: list[Run]) -> None:
+        """Have jobs run: by this thread, if its term lasts, else by the leader."""
+        mine = self._term == term
+        for run in runs:
+            if mine:
+                self._ready.append(run)
+            else:
+                self._queue.put(run)
+        if mine and self._term != term:
+            self._queue.put(_REST)  # deposed just now: who leads may wait for something to come
+
+    def _pass_on(self, term: int) -> None:
+        """End a term, if it has not ended yet, and let another worker lead."""
+        with self._incoming_lock:
+            if self._term != term:
+                return
+            self._term += 1
+            self._at_work = None
+        self._baton.release()
 
     def _broke(self) -> None:
         """Let :meth:`wait` raise what is being handled on this thread."""
         self._failure = traceback.format_exc()
         self._wake()
 
-    def _receive(self, incoming: IncomingCall) -> Job | None:
+    def _receive(self, incoming: IncomingCall) -> list[Run]:
         size = incoming.size_bytes
         request: Request | MessageError
         try:
@@ -499,17 +634,17 @@ class ServiceShell:
             self._wake()
         return self._carry_out(*carried)
 
-    def _finish(self, job: Job, outcome: Any) -> Job | None:
+    def _finish(self, job: Job, outcome: Outcome) -> list[Run]:
         with self._lock:
             carried = self._sorted(self._service.finished(job, outcome, monotonic()))
         return self._carry_out(*carried)
 
     def _sorted(
         self, effects: list[Effect]
-    ) -> tuple[list[_OpenCall], list[Job], list[Noted | Computed]]:
+    ) -> tuple[list[_OpenCall], list[Run], list[Noted | Computed]]:
         """Put replies where they are sent from; the lock is held."""
         calls: list[_OpenCall] = []
-        jobs: list[Job] = []
+        runs: list[Run] = []
         notes: list[Noted | Computed] = []
         for effect in effects:
             if isinstance(effect, Answer):
@@ -521,20 +656,18 @@ class ServiceShell:
                 call.outbox.append(None)
                 calls.append(call)
             elif isinstance(effect, Run):
-                jobs.append(effect.job)
+                runs.append(effect)
             else:
                 notes.append(effect)
-        return calls, jobs, notes
+        return calls, runs, notes
 
     def _carry_out(
-        self, calls: list[_OpenCall], jobs: list[Job], notes: list[Noted | Computed]
-    ) -> Job | None:
-        """Send, hand jobs to other workers, and return the one for this worker."""
-        for job in jobs[1:]:
-            self._queue.put(job)
+        self, calls: list[_OpenCall], runs: list[Run], notes: list[Noted | Computed]
+    ) -> list[Run]:
+        """Send, and return what is to be run."""
         self._senders.send(calls)
         self._take_note(notes)
-        return jobs[0] if jobs else None
+        return runs
 
     def _take_note(self, notes: list[Noted | Computed]) -> None:
         for note in notes:
@@ -547,6 +680,9 @@ class ServiceShell:
 
     def _tick(self) -> float | None:
         """Let the machine take note of the time; return how long it can then be left alone."""
+        at_work = self._at_work
+        if at_work is not None and monotonic() - at_work[1] > _HELD_UP_S:
+            self._pass_on(at_work[0])
         with self._lock:
             now = monotonic()
             calls, _, notes = self._sorted(self._service.tick(now))

@@ -210,9 +210,18 @@ class End(NamedTuple):
 
 
 class Run(NamedTuple):
-    """Run a job, anywhere, and bring its outcome to :meth:`Service.finished`."""
+    """Run a job, anywhere, and bring its outcome to :meth:`Service.finished`.
+
+    Attributes
+    ----------
+    job : Job
+    expected_s : float
+        How long it may take, by what such jobs took before; infinite if the problem is still to be
+        built.
+    """
 
     job: Job
+    expected_s: float
 
 
 class Computed(NamedTuple):
@@ -363,6 +372,11 @@ class Job:
         self._limits = limits
         self._request = request
         self._state = state
+
+    @property
+    def problem_name(self) -> str:
+        """What the problem is called in the opening."""
+        return self._opening.problem
 
     def run(self) -> Outcome:
         """Compute; whatever goes wrong in the problem's functions is part of the outcome.
@@ -1136,9 +1150,10 @@ class Service:
                     self._need_state(record.call, record.number, differs=True)
                 return
         alone = not self._running and self._num_waiting == 0
+        problem = self._lend(session.problem_key)
         job = Job(
             "sensing" if work.sensing else "task",
-            self._lend(session.problem_key),
+            problem,
             self._make_problem,
             self._describe_error,
             session.opening,
@@ -1152,7 +1167,8 @@ class Service:
         work.started_at = now
         session.running[work.slot] = work
         self._running[job] = work
-        self._effects.append(Run(job))
+        expected_s = session.sensing_s if work.sensing else session.task_s
+        self._effects.append(Run(job, math.inf if problem is None else expected_s))
 
     # -- outcomes --------------------------------------------------------------------------------
 

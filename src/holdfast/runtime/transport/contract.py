@@ -1,7 +1,9 @@
 """What a wire must do, for the robot's end and for the service's.
 
 Both ends deliver what happens to one callable, from threads of their own; it must not block, so it
-is usually the ``put`` of a queue. Every implementation passes ``tests/contracts/test_transport``.
+is usually the ``put`` of a queue. (A small reply may be sent from there, which blocks only if the
+robot has not read many before; a large one must not.) Every implementation passes
+``tests/contracts/test_transport``.
 """
 
 from __future__ import annotations

@@ -20,6 +20,11 @@ What holds here was measured, not read:
 - A session whose service has vanished is replaced. Zenoh knows a peer by the identity of its
   session, and when one comes back while the link to it is still being closed (a process that was
   stopped goes on), it can be left half connected for ever: seen, and never answering.
+- Zenoh has five pools of threads, and hands each message over from one to the next: from the one
+  that sees that a socket has something to the one that reads, and back to the one that writes. To
+  wake a thread on another core takes longer than all the rest, so here one pool sees and reads, and
+  one thread writes (and says that this end lives, also while the others wait for Python). The
+  price: while a callback blocks, nothing may be seen of other links; so callbacks do not block.
 - ``connect/timeout_ms`` stays at its default: 0 would mean one attempt and no other.
 - ``close`` can take ten seconds when a peer has vanished, so it runs aside and is not waited for. A
   process that ends without it can be aborted in a callback, so it is also called at exit.
@@ -65,6 +70,11 @@ __all__ = ["KEY_VERSION", "ZenohRobotTransport", "ZenohServiceTransport"]
 
 KEY_VERSION = 1
 """Of the keys. The messages have a version of their own, which can be told to the other end."""
+
+_THREADS = (
+    "(acc: (handover: app), net: (handover: app), rx: (handover: app), app: (worker_threads: 2))"
+)
+"""Of Zenoh in this process, unless the environment's ZENOH_RUNTIME says otherwise."""
 
 _RETRY_FIRST_MS = 50
 _RETRY_MAX_MS = 100
@@ -856,6 +866,8 @@ def _opened(
     tls: TlsFiles | None,
 ) -> tuple[zenoh.Session, list[Endpoint]]:
     """Open a session; return it and where it listens."""
+    # Read by Zenoh when the first session of the process is opened.
+    os.environ.setdefault("ZENOH_RUNTIME", _THREADS)
     any_port = any(each.port == 0 and not each.is_local_socket for each in listen)
     for attempt in range(_FREE_PORT_ATTEMPTS):
         places = [
