@@ -363,7 +363,7 @@ class ServiceShell:
         self._incoming_bytes = 0
         self._senders = _Senders(self._broke)
         self._queue: SimpleQueue[IncomingCall | Run | _Rest | None] = SimpleQueue()
-        # The leader's alone.
+        # The leader's; one that was deposed may not know yet.
         self._ready: deque[Run] = deque()
         self._calls: dict[int, _OpenCall] = {}
         self._numbers = itertools.count(1)
@@ -566,16 +566,19 @@ class ServiceShell:
                 item = _REST
             self._at_work = (term, monotonic())
             if item is None:
-                self._baton.release()
+                self._pass_on(term)
                 return False
             if isinstance(item, Run):
-                self._ready.append(item)
+                self._make_ready(term, [item])
             elif item is not _REST:
                 heard += 1
                 self._make_ready(term, self._receive(item))
-            elif self._ready:
+            else:
                 heard = 0
-                run = self._ready.popleft()
+                try:
+                    run = self._ready.popleft()
+                except IndexError:
+                    continue  # whoever leads now was faster
                 if run.expected_s > _BRIEF_S:
                     self._pass_on(term)
                 self._make_ready(term, self._finish(run.job, run.job.run()))
