@@ -12,13 +12,15 @@ from tests.processes.faults import References, Site
 
 @pytest.fixture(scope="session", autouse=True)
 def _signals_are_heard() -> None:
-    """Let processes hear signals that a shell has its background jobs ignore."""
-    for number in (signal.SIGINT, signal.SIGQUIT):
+    """Let processes hear signals that a shell, or nohup, has its background jobs ignore."""
+    handlers = {
+        signal.SIGINT: signal.default_int_handler,
+        signal.SIGQUIT: signal.SIG_DFL,
+        signal.SIGHUP: signal.SIG_DFL,
+    }
+    for number, handler in handlers.items():
         if signal.getsignal(number) is signal.SIG_IGN:
-            signal.signal(
-                number,
-                signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL,
-            )
+            signal.signal(number, handler)
 
 
 @pytest.fixture
