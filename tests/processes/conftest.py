@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from tests.processes.faults import References, Site
@@ -13,7 +14,7 @@ from tests.processes.faults import References, Site
 @pytest.fixture(scope="session", autouse=True)
 def _signals_are_heard() -> None:
     """Let processes hear signals that a shell, or nohup, has its background jobs ignore."""
-    handlers = {
+    handlers: dict[int, Any] = {
         signal.SIGINT: signal.default_int_handler,
         signal.SIGQUIT: signal.SIG_DFL,
         signal.SIGHUP: signal.SIG_DFL,

@@ -92,6 +92,7 @@ def directory() -> Iterator[Path]:
         yield Path(path)
 
 
+@pytest.mark.slow
 def test_the_whole_story(directory: Path) -> None:
     demo = Demo(directory)
     try:

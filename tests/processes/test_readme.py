@@ -72,6 +72,7 @@ def test_every_command_is_known() -> None:
     assert len(PROGRAMS) >= 2
 
 
+@pytest.mark.slow
 def test_holdfast_commands(clone: Path) -> None:
     with in_background() as start:
         for command in COMMANDS:

@@ -312,6 +312,7 @@ class TestInterruption:
         assert resumed.returncode == 0, resumed.stderr
         assert summary(workplace / "out")["finished"] == 16
 
+    @pytest.mark.slow
     def test_a_killed_parent_leaves_a_run_that_can_go_on(
         self, workplace: Path, slow_run: SlowRun
     ) -> None:
@@ -427,6 +428,7 @@ class TestErrors:
         assert error.endswith("did you mean: holdfast run peg.yaml --jobs 2\n")
 
 
+@pytest.mark.slow
 def test_of_two_runs_at_once_in_one_directory_one_is_done(tmp_path: Path) -> None:
     """And what lies there afterwards is that one's, the configuration too."""
     configuration = Path(__file__).parents[2] / "examples" / "peg_in_hole_2d.yaml"
