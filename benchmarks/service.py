@@ -69,6 +69,7 @@ def offload(context: Context) -> Result:
     here: dict[str, list[float]] = {kind: [] for kind in kinds}
     there: dict[str, list[float]] = {kind: [] for kind in kinds}
     computed: dict[str, list[float]] = {kind: [] for kind in kinds}
+    after_pause: list[float] = []
 
     def note(kind: str, here_s: float, there_s: float, computed_us: int) -> None:
         here[kind].append(here_s)
@@ -130,6 +131,10 @@ def offload(context: Context) -> Result:
                 if steady.sensing is None or steady.sensing.sensing_action != sensing_action:
                     raise RuntimeError(f"wrong answer in trial {trial}")
                 note("steady", alone_s, steady.sensing_s, steady.sensing.computed_us)
+                time.sleep(0.001)
+                start = time.perf_counter()
+                choose_sensing_action(problem, settings, state)
+                after_pause.append(time.perf_counter() - start)
     wakes_s = pipe_round_trip_s()
     rows = []
     for kind, what in (
@@ -171,7 +176,10 @@ def offload(context: Context) -> Result:
                 answers any request at once, over the same links and from a thread of its own: most
                 of that time is the system's, to wake threads one after another. On this machine a
                 byte that goes through a pipe to a process on another core and back takes
-                {1e6 * wakes_s:.0f} microseconds, for two such wake-ups (a decision waits for five).
+                {1e6 * wakes_s:.0f} microseconds, for two such wake-ups (a decision waits for five). And
+                a core that has slept computes slower: the same sensing action in process, a
+                millisecond after the process last did something, takes
+                {milliseconds(float(np.median(after_pause)))} ms.
                 (The thesis's service cost {THESIS_MORE_MS:g} ms more.)"""
             ),
             Table(
