@@ -176,9 +176,9 @@ def offload(context: Context) -> Result:
                 answers any request at once, over the same links and from a thread of its own: most
                 of that time is the system's, to wake threads one after another. On this machine a
                 byte that goes through a pipe to a process on another core and back takes
-                {1e6 * wakes_s:.0f} microseconds, for two such wake-ups (a decision waits for five). And
-                a core that has slept computes slower: the same sensing action in process, a
-                millisecond after the process last did something, takes
+                {1e6 * wakes_s:.0f} microseconds, for two such wake-ups (a decision waits for
+                five). And a core that has slept computes slower: the same sensing action in
+                process, a millisecond after the process last did something, takes
                 {milliseconds(float(np.median(after_pause)))} ms.
                 (The thesis's service cost {THESIS_MORE_MS:g} ms more.)"""
             ),
