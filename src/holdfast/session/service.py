@@ -821,17 +821,6 @@ class Service:
         self._dispatch(now)
         return self._take()
 
-    def abandoned(self, call: int, now: float) -> list[Effect]:
-        """Take note that nobody waits for a call any more."""
-        record = self._calls.pop(call, None)
-        if record is not None:
-            work = record.work
-            del work.calls[call]
-            if not work.calls and not work.running:
-                self._withdraw(work)
-        self._dispatch(now)
-        return self._take()
-
     def tick(self, now: float) -> list[Effect]:
         """Take note of the time."""
         calls = self._calls
