@@ -54,16 +54,10 @@ from holdfast.session.messages import (
     numbers_from,
     numbers_to,
 )
-from holdfast.session.service import (
-    Answer,
-    Effect,
-    End,
-    Job,
-    Noted,
-    Run,
-    Service,
-    ServiceLimits,
-)
+from holdfast.session.service import Service
+from holdfast.session.service_effects import Answer, Effect, End, Noted, Run
+from holdfast.session.service_jobs import Job
+from holdfast.session.service_limits import ServiceLimits
 from holdfast.settings import (
     ActiveSensingSettings,
     ParticleFilterSettings,
