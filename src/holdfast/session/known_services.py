@@ -142,7 +142,7 @@ class KnownService:
 
     # -- what it says ----------------------------------------------------------------------------
 
-    def has_answered(self, question: Question, now: float, *, restored: bool) -> None:
+    def note_answer(self, question: Question, now: float, *, restored: bool) -> None:
         """Take note of an answer: it lives and holds the question's state.
 
         Parameters
@@ -162,7 +162,7 @@ class KnownService:
         holds = (question.state.trial, question.num_observations)
         self.acknowledged = max(self.acknowledged or holds, holds)
 
-    def is_busy(self, retry_after_s: float, now: float) -> float:
+    def note_busy(self, retry_after_s: float, now: float) -> float:
         """Take note that it asks for patience; return for how long it is left alone."""
         # Its own estimate, but never as often as it can answer.
         after_s = max(retry_after_s, self.backoff_s)
@@ -171,14 +171,14 @@ class KnownService:
         self.num_busy += 1
         return after_s
 
-    def has_no_state(self, *, differs: bool) -> None:
+    def note_lost_state(self, *, differs: bool) -> None:
         """Take note that it holds no state, or one that is not the robot's."""
         self.opened = False
         self.acknowledged = None
         if differs:
             self.drifts += 1
 
-    def refuses(self, code: str, text: str) -> bool:
+    def note_refusal(self, code: str, text: str) -> bool:
         """Take note of a refusal; True if it is asked no more."""
         self.refusals += 1
         final = code in _FINAL_REFUSALS or self.refusals >= _MAX_REFUSALS

@@ -121,7 +121,7 @@ class Replies:
         if isinstance(reply, NeedState):
             return self._need_state(call, reply, now)
         if isinstance(reply, Busy):
-            self._is_busy(service, reply, now)
+            self._was_busy(service, reply, now)
         else:
             self._was_refused(service, reply, now)
         return News.NOTHING
@@ -152,7 +152,7 @@ class Replies:
             call.task = True
         else:
             call.sensing = True
-        service.has_answered(question, now, restored=call.restores)
+        service.note_answer(question, now, restored=call.restores)
         if first and call.opens and (call.restores or question.state.step > 0):
             restore_ms = 1e3 * (now - call.sent_at)
             self._report(
@@ -166,7 +166,7 @@ class Replies:
 
     def _need_state(self, call: Call, reply: NeedState, now: float) -> News:
         service = call.service
-        service.has_no_state(differs=reply.differs)
+        service.note_lost_state(differs=reply.differs)
         if call.opens and call.restores:
             # It was handed everything and asks for it again.
             service.delay(now)
@@ -175,8 +175,8 @@ class Replies:
         # Told everything but the state, it came to another one: only the state will do.
         return News.LACKS_STATE if reply.differs or call.opens else News.LACKS
 
-    def _is_busy(self, service: KnownService, reply: Busy, now: float) -> None:
-        after_s = service.is_busy(1e-3 * reply.retry_after_ms, now)
+    def _was_busy(self, service: KnownService, reply: Busy, now: float) -> None:
+        after_s = service.note_busy(1e-3 * reply.retry_after_ms, now)
         if now >= service.tell_busy_at:
             service.tell_busy_at = now + _TELLING_INTERVAL_S
             self._report(
@@ -192,12 +192,12 @@ class Replies:
                 f"{service.name}: {reply.text}; another process has resumed this run, "
                 "so this one stops"
             )
-        service.has_no_state(differs=False)
+        service.note_lost_state(differs=False)
         service.delay(now)
         self._refusal(service, reply.code, reply.text)
 
     def _refusal(self, service: KnownService, code: str, text: str) -> None:
-        final = service.refuses(code, text)
+        final = service.note_refusal(code, text)
         self._report("refused", service=service.name, code=code, reason=text, final=final)
 
     def _report(self, name: str, **fields: object) -> None:
