@@ -15,7 +15,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from holdfast import __version__
 from holdfast.runtime.metrics import BUCKETS_S, MetricsError, ServiceMetrics
-from holdfast.session.service import ServiceStatistics
+from holdfast.session.service_limits import ServiceStatistics
 
 Samples = dict[tuple[str, tuple[tuple[str, str], ...]], float]
 

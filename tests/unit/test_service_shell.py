@@ -34,7 +34,8 @@ from holdfast.session.messages import (
     decode_reply,
     encode,
 )
-from holdfast.session.service import Service, ServiceLimits
+from holdfast.session.service import Service
+from holdfast.session.service_limits import ServiceLimits
 
 PATIENCE_S = 20.0
 

@@ -6,7 +6,8 @@ import pytest
 from tests.unit.test_session_robot import LOCAL, PROBLEM, SmallService, World
 
 from holdfast.session.messages import Opening, Reply, decode_reply
-from holdfast.session.service import Answer, Run, Service
+from holdfast.session.service import Service
+from holdfast.session.service_effects import Answer, Run
 
 
 class WholeService(SmallService):

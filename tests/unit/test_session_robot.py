@@ -25,7 +25,7 @@ from holdfast.planning import (
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.runtime.environment import SimulatedEnvironment
 from holdfast.runtime.trial import run_trial
-from holdfast.session.dispatcher import Dispatcher, ServiceRefusedError, StaleEpochError
+from holdfast.session.dispatcher import Dispatcher, ServiceRefusedError
 from holdfast.session.effects import (
     Abandon,
     Act,
@@ -68,6 +68,7 @@ from holdfast.session.messages import (
     numbers_to,
 )
 from holdfast.session.records import ActingRecord, ObservedRecord, PerformedRecord, Record
+from holdfast.session.replies import StaleEpochError
 from holdfast.session.robot import HeldError, Robot, UnknownPerformanceError, replay
 from holdfast.session.status import Status
 from holdfast.settings import (

@@ -54,16 +54,10 @@ from holdfast.session.messages import (
     numbers_from,
     numbers_to,
 )
-from holdfast.session.service import (
-    Answer,
-    Effect,
-    End,
-    Job,
-    Noted,
-    Run,
-    Service,
-    ServiceLimits,
-)
+from holdfast.session.service import Service
+from holdfast.session.service_effects import Answer, Effect, End, Noted, Run
+from holdfast.session.service_jobs import Job
+from holdfast.session.service_limits import ServiceLimits
 from holdfast.settings import (
     ActiveSensingSettings,
     ParticleFilterSettings,
@@ -526,11 +520,15 @@ class TestOnce:
         call = bench.send(robot.request())
         bench.send(other.request())
         bench.run()
-        bench.apply(bench.service.abandoned(call, bench.now))
+        # The robot's next process asks the same: what the one before waited for is dropped.
+        robot.epoch += 1
+        again = bench.send(robot.request())
+        assert call in bench.ended
+        assert bench.kinds(again) == ["TaskAnswer"]
         bench.run_all()
-        assert bench.service.statistics.sensing_parts == 1  # the other robot's
-        assert content(bench.ask(robot.request())) == robot.right_answer()
+        assert content(bench.replies[again]) == robot.right_answer()
         assert self.computed(bench) == (1, 2)
+        assert bench.service.statistics.superseded == 1
 
 
 class TestOrder:
@@ -647,17 +645,6 @@ class TestOrder:
         assert len(bench.jobs) == 2
         bench.run_all()
         assert content(bench.replies[newer]) == robot.right_answer()
-
-    def test_abandoned_request_is_not_computed(self) -> None:
-        bench, robot, other = Bench(), Robot(), Robot(key=2)
-        bench.send(other.request())
-        call = bench.send(robot.request())
-        bench.apply(bench.service.abandoned(call, bench.now))
-        bench.apply(bench.service.abandoned(call, bench.now))
-        bench.run_all()
-        assert bench.replies[call] == []
-        statistics = bench.service.statistics
-        assert (statistics.sensing_parts, statistics.waiting, statistics.calls) == (1, 0, 0)
 
 
 class TestEpochs:
@@ -1135,7 +1122,7 @@ class TestAnyOrder:
         for _ in range(900):
             index = chance.randrange(6)
             robot = robots[index]
-            match chance.choice(["ask", "ask", "run", "run", "run", "tick", "again", "drop"]):
+            match chance.choice(["ask", "ask", "run", "run", "run", "tick", "again"]):
                 case "ask":
                     whole = chance.random() < 0.3
                     request = robot.restore() if whole else robot.request()
@@ -1152,12 +1139,6 @@ class TestAnyOrder:
                     if due is not None:
                         bench.now = max(bench.now, due)
                         bench.apply(bench.service.tick(bench.now))
-                case "drop" if open_calls and chance.random() < 0.3:
-                    call = chance.choice(sorted(open_calls))
-                    if call not in bench.ended:
-                        bench.apply(bench.service.abandoned(call, bench.now))
-                        bench.ended.add(call)
-                        del open_calls[call]
                 case _:
                     pass
             for call in sorted(set(open_calls) & bench.ended):

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from prometheus_client import CollectorRegistry
     from prometheus_client.core import Metric
 
-    from holdfast.session.service import ServiceStatistics
+    from holdfast.session.service_limits import ServiceStatistics
 
 __all__ = [
     "BUCKETS_S",
@@ -54,8 +54,9 @@ class ServiceMetrics:
     Parameters
     ----------
     statistics : callable
-        Returns what the service has counted (:class:`holdfast.session.service.ServiceStatistics`);
-        called from a thread of the metrics server.
+        Returns what the service has counted
+        (:class:`holdfast.session.service_limits.ServiceStatistics`); called from a thread of the
+        metrics server.
     name : str
         Of the service.
 

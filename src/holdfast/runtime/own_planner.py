@@ -16,7 +16,9 @@ from typing import NamedTuple
 from holdfast.problems.problem import Problem
 from holdfast.session.events import Appeared, Ended, Replied, TransportEvent, Vanished
 from holdfast.session.messages import Opening
-from holdfast.session.service import Answer, Effect, End, Run, Service, ServiceLimits
+from holdfast.session.service import Service
+from holdfast.session.service_effects import Answer, Effect, End, Run
+from holdfast.session.service_limits import ServiceLimits
 
 __all__ = ["OWN_PLANNER", "OwnPlanner"]
 

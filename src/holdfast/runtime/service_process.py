@@ -207,7 +207,8 @@ def _serve(options: argparse.Namespace) -> int:
 
     from holdfast.runtime.logs import EventLog
     from holdfast.runtime.service_shell import KnownProblems, ServiceShell
-    from holdfast.session.service import Service, ServiceLimits
+    from holdfast.session.service import Service
+    from holdfast.session.service_limits import ServiceLimits
 
     limits = ServiceLimits()
     if options.max_sessions is not None:

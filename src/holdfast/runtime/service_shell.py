@@ -46,18 +46,10 @@ from holdfast.problems.problem import Problem
 from holdfast.runtime.logs import EventSink, NullEventLog
 from holdfast.runtime.transport.contract import IncomingCall, ServiceTransport
 from holdfast.session.messages import Busy, MessageError, Opening, Request, decode_request, encode
-from holdfast.session.service import (
-    Answer,
-    Computed,
-    Effect,
-    End,
-    Job,
-    Noted,
-    Outcome,
-    Run,
-    Service,
-    ServiceStatistics,
-)
+from holdfast.session.service import Service
+from holdfast.session.service_effects import Answer, Computed, Effect, End, Noted, Run
+from holdfast.session.service_jobs import Job, Outcome
+from holdfast.session.service_limits import ServiceStatistics
 
 __all__ = ["KnownProblems", "ServiceBrokenError", "ServiceShell"]
 

@@ -31,7 +31,7 @@ from holdfast.planning import (
     observe,
 )
 from holdfast.problems.problem import Problem
-from holdfast.session.dispatcher import Dispatcher, Provenance, Question
+from holdfast.session.dispatcher import Dispatcher
 from holdfast.session.effects import (
     Act,
     Effect,
@@ -59,6 +59,7 @@ from holdfast.session.messages import (
     numbers_from,
     numbers_to,
 )
+from holdfast.session.question import Provenance, Question
 from holdfast.session.records import (
     ActingRecord,
     ObservedRecord,

@@ -1,0 +1,210 @@
+"""What a reply says of the service that it comes from, and what is left of it for the question.
+
+Every reply shows that its service lives. Most say more: that it holds the robot's state now, or has
+lost it, wants to be left alone, or refuses. All that is noted here, where it stands: in the
+question, the call, and what is known of the service. What follows for the choice of whom to ask is
+not decided here; it is returned as :class:`News`.
+
+A reply may be spoilt, or come from a service that errs. So nothing of it is kept before all of it
+has been checked against the question.
+"""
+
+from __future__ import annotations
+
+import enum
+
+from holdfast.errors import HoldfastError
+from holdfast.session.calls import Call, Calls
+from holdfast.session.effects import Effect, Report
+from holdfast.session.known_services import KnownService
+from holdfast.session.messages import (
+    Busy,
+    MessageError,
+    NeedState,
+    Progress,
+    Refused,
+    Reply,
+    SensingAnswer,
+    TaskAnswer,
+    decode_reply,
+)
+from holdfast.session.question import Provenance
+
+__all__ = ["News", "Replies", "StaleEpochError"]
+
+_TELLING_INTERVAL_S = 1.0
+"""What may happen many times a second is told this often, with a count."""
+
+
+class StaleEpochError(HoldfastError):
+    """Another process has taken this run over: this robot must not go on."""
+
+
+class News(enum.Enum):
+    """What a reply comes to for the question of its call."""
+
+    NOTHING = enum.auto()
+    """No answer comes of this call: the service is busy, refuses or errs."""
+
+    AT_WORK = enum.auto()
+    """An answer is on its way."""
+
+    ANSWERED = enum.auto()
+    """The first part of the answer has come."""
+
+    ANSWERED_MORE = enum.auto()
+    """A part has come after another."""
+
+    LACKS = enum.auto()
+    """The service would answer if it were told what it lacks."""
+
+    LACKS_STATE = enum.auto()
+    """It would if it were handed the state; nothing else will do."""
+
+    @property
+    def at_work(self) -> bool:
+        """Whether somebody works on the question, or has done so."""
+        return self in (News.AT_WORK, News.ANSWERED, News.ANSWERED_MORE)
+
+
+class Replies:
+    """Takes note of replies.
+
+    Parameters
+    ----------
+    calls : Calls
+    action_size, num_sensing_actions : int
+        Of the problem, to check the answers.
+    effects : list of Effect
+        What is to be given up and told is added to it.
+    """
+
+    def __init__(
+        self, calls: Calls, action_size: int, num_sensing_actions: int, effects: list[Effect]
+    ) -> None:
+        self._calls = calls
+        self._action_size = action_size
+        self._num_sensing_actions = num_sensing_actions
+        self._effects = effects
+
+    def take(self, call: Call, payload: bytes, now: float) -> News:
+        """Take note of a reply to an open call.
+
+        Parameters
+        ----------
+        call : Call
+        payload : bytes
+        now : float
+
+        Raises
+        ------
+        StaleEpochError
+            If the service says that the robot has been replaced.
+        """
+        service = call.service
+        try:
+            reply = decode_reply(payload)
+            _check_number(reply, call.number)
+            if isinstance(reply, TaskAnswer | SensingAnswer):
+                self._take_answer(call, reply, now)
+                return self._was_answered(call, reply, now)
+        except MessageError as error:
+            # Spoilt on its way, or by a service that errs: the answer is asked for again.
+            self._report("malformed_reply", service=service.name, reason=str(error))
+            self._calls.abandon(call)
+            service.delay(now)
+            return News.NOTHING
+        service.detector.heard(now)
+        if isinstance(reply, Progress):
+            return News.AT_WORK
+        self._calls.abandon(call)
+        if isinstance(reply, NeedState):
+            return self._need_state(call, reply, now)
+        if isinstance(reply, Busy):
+            self._was_busy(service, reply, now)
+        else:
+            self._was_refused(service, reply, now)
+        return News.NOTHING
+
+    # -- answers ---------------------------------------------------------------------------------
+
+    def _take_answer(self, call: Call, reply: TaskAnswer | SensingAnswer, now: float) -> None:
+        question = call.question
+        source = Provenance(call.service.name, now - call.sent_at, 1e-6 * reply.computed_us)
+        if isinstance(reply, TaskAnswer):
+            kind, agrees = "task", question.take_tasks(reply, self._action_size, source)
+        else:
+            most = self._num_sensing_actions
+            kind, agrees = "sensing", question.take_sensing(reply, most, source)
+        if not agrees:
+            self._report(
+                "disagreement",
+                service=call.service.name,
+                step=question.state.step,
+                kind=kind,
+                reason="two services decided differently; the first answer stands",
+            )
+
+    def _was_answered(self, call: Call, reply: TaskAnswer | SensingAnswer, now: float) -> News:
+        service, question = call.service, call.question
+        first = not call.answered
+        if isinstance(reply, TaskAnswer):
+            call.task = True
+        else:
+            call.sensing = True
+        service.note_answer(question, now, restored=call.restores)
+        if first and call.opens and (call.restores or question.state.step > 0):
+            restore_ms = 1e3 * (now - call.sent_at)
+            self._report(
+                "restored", service=service.name, step=question.state.step, restore_ms=restore_ms
+            )
+        if call.finished:
+            self._calls.settle(call)
+        return News.ANSWERED if first else News.ANSWERED_MORE
+
+    # -- anything else ---------------------------------------------------------------------------
+
+    def _need_state(self, call: Call, reply: NeedState, now: float) -> News:
+        service = call.service
+        service.note_lost_state(differs=reply.differs)
+        if call.opens and call.restores:
+            # It was handed everything and asks for it again.
+            service.delay(now)
+            self._refusal(service, "need_state", "asks again for a state that it was sent")
+            return News.NOTHING
+        # Told everything but the state, it came to another one: only the state will do.
+        return News.LACKS_STATE if reply.differs or call.opens else News.LACKS
+
+    def _was_busy(self, service: KnownService, reply: Busy, now: float) -> None:
+        after_s = service.note_busy(1e-3 * reply.retry_after_ms, now)
+        if now >= service.tell_busy_at:
+            service.tell_busy_at = now + _TELLING_INTERVAL_S
+            self._report(
+                "busy",
+                service=service.name,
+                retry_after_ms=1e3 * after_s,
+                times=service.num_busy,
+            )
+
+    def _was_refused(self, service: KnownService, reply: Refused, now: float) -> None:
+        if reply.code == "stale_epoch":
+            raise StaleEpochError(
+                f"{service.name}: {reply.text}; another process has resumed this run, "
+                "so this one stops"
+            )
+        service.note_lost_state(differs=False)
+        service.delay(now)
+        self._refusal(service, reply.code, reply.text)
+
+    def _refusal(self, service: KnownService, code: str, text: str) -> None:
+        final = service.note_refusal(code, text)
+        self._report("refused", service=service.name, code=code, reason=text, final=final)
+
+    def _report(self, name: str, **fields: object) -> None:
+        self._effects.append(Report(name, fields))
+
+
+def _check_number(reply: Reply, asked: int) -> None:
+    unread = reply.number == 0 and isinstance(reply, Busy | Refused)
+    if reply.number != asked and not unread:
+        raise MessageError("malformed", f"reply to request {reply.number}, asked was {asked}")

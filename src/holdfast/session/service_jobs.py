@@ -1,0 +1,334 @@
+"""The computations of a service: each a pure function of what it was made with.
+
+A job rolls the robot's state forward, or takes it from a checkpoint, makes sure by the digest that
+it is the state that the request names, and decides in it. It belongs to no session while it runs,
+so it can run on any thread, and nothing that it comes to is kept before its outcome is handed in.
+
+Problems are anybody's code. So whatever goes wrong in one is a refusal with an account of it, never
+an error of the service, and the instances are lent to one job at a time (:class:`ProblemPool`).
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable
+from typing import Literal, NamedTuple
+
+from holdfast.errors import (
+    CheckpointError,
+    ConfigurationError,
+    HoldfastError,
+    InvalidValueError,
+    UnknownProblemError,
+)
+from holdfast.planning import (
+    PlanningState,
+    advance,
+    check_state,
+    choose_sensing_action,
+    choose_task_action,
+    decode_checkpoint,
+    digest,
+    initial_state,
+    needs_sensing,
+    observe,
+)
+from holdfast.problems.problem import Problem
+from holdfast.session.messages import (
+    DIGEST_SIZE,
+    MAX_TASK_ACTIONS,
+    MessageError,
+    Opening,
+    Request,
+    numbers_from,
+    numbers_to,
+)
+from holdfast.session.service_limits import ServiceLimits
+from holdfast.settings import PlanningSettings
+
+__all__ = ["Job", "Outcome", "ProblemPool"]
+
+_MAX_ACTION_SIZE = 4096
+
+
+class Outcome(NamedTuple):
+    """What a job came to.
+
+    Attributes
+    ----------
+    failure : tuple of str or None
+        Code and text of the refusal; None if it succeeded, or lacks the state.
+    lacks_state : bool
+        The requested state does not follow from what the service holds.
+    differs : bool
+        It held a state of this trial that leads elsewhere.
+    problem : Problem or None
+        As far as it was there or could be built.
+    state : PlanningState or None
+        The state that the request named, verified.
+    restored : bool
+        It came from a checkpoint.
+    num_actions : int
+        Task actions.
+    actions : bytes
+        These, as they are sent.
+    ahead : PlanningState or None
+        The state that they lead to.
+    ahead_digest : bytes
+        The part of its digest that is sent.
+    sensing_action : int
+        That was chosen; -1 if none was to be.
+    """
+
+    failure: tuple[str, str] | None = None
+    lacks_state: bool = False
+    differs: bool = False
+    problem: Problem | None = None
+    state: PlanningState | None = None
+    restored: bool = False
+    num_actions: int = 0
+    actions: bytes = b""
+    ahead: PlanningState | None = None
+    ahead_digest: bytes = b""
+    sensing_action: int = -1
+
+
+class _LacksStateError(Exception):
+    """The events of a request do not connect to the state at hand, or lead to another one."""
+
+    def __init__(self, *, differs: bool = False) -> None:
+        super().__init__()
+        self.differs = differs
+
+
+class Job:
+    """A part of an answer to be computed: a pure function of what it was made with.
+
+    Parameters
+    ----------
+    kind : {"task", "sensing"}
+    problem : Problem or None
+        None if it is still to be built.
+    make_problem, describe_error : callable
+    opening : Opening
+    planning : PlanningSettings
+    seed : int
+    limits : ServiceLimits
+    request : Request or None
+        Names the state; None if ``state`` is that state already.
+    state : PlanningState or None
+        From where the request's state is reached; None if from the trial's beginning.
+    """
+
+    __slots__ = (
+        "_describe_error",
+        "_limits",
+        "_make_problem",
+        "_opening",
+        "_planning",
+        "_problem",
+        "_request",
+        "_seed",
+        "_state",
+        "kind",
+    )
+
+    def __init__(
+        self,
+        kind: Literal["task", "sensing"],
+        problem: Problem | None,
+        make_problem: Callable[[Opening], Problem],
+        describe_error: Callable[[BaseException], str],
+        opening: Opening,
+        planning: PlanningSettings,
+        seed: int,
+        limits: ServiceLimits,
+        request: Request | None,
+        state: PlanningState | None,
+    ) -> None:
+        self.kind = kind
+        self._problem = problem
+        self._make_problem = make_problem
+        self._describe_error = describe_error
+        self._opening = opening
+        self._planning = planning
+        self._seed = seed
+        self._limits = limits
+        self._request = request
+        self._state = state
+
+    @property
+    def problem_name(self) -> str:
+        """What the problem is called in the opening."""
+        return self._opening.problem
+
+    def run(self) -> Outcome:
+        """Compute; whatever goes wrong in the problem's functions is part of the outcome.
+
+        Whatever they raise, ``KeyboardInterrupt`` included: on a worker's thread it can only come
+        from them.
+        """
+        # Kept as it becomes known, for it is worth keeping if the rest fails.
+        problem = self._problem
+        try:
+            if problem is None:
+                problem = self._make_problem(self._opening)
+            _check_work(problem, self._planning, self._limits)
+            return self._computed(problem)
+        except _LacksStateError as lack:
+            differs = lack.differs or self._state is not None
+            return Outcome(lacks_state=True, differs=differs, problem=problem)
+        except MemoryError:
+            return Outcome(failure=("busy", ""), problem=problem)
+        except MessageError as error:
+            return Outcome(failure=(error.code, str(error)), problem=problem)
+        except HoldfastError as error:
+            return Outcome(failure=(_code_of(error), _account(error, str)), problem=problem)
+        except BaseException as error:  # noqa: BLE001 - the problem is anybody's code
+            text = _account(error, self._describe_error)
+            return Outcome(failure=("failed", text), problem=problem)
+
+    def _computed(self, problem: Problem) -> Outcome:
+        planning, request = self._planning, self._request
+        if request is None:
+            assert self._state is not None
+            index, _ = choose_sensing_action(problem, planning, self._state)
+            return Outcome(problem=problem, sensing_action=index)
+        state = self._reached(problem, request)
+        restored = request.checkpoint is not None
+        if needs_sensing(planning, state):
+            index, _ = choose_sensing_action(problem, planning, state)
+            return Outcome(problem=problem, state=state, restored=restored, sensing_action=index)
+        actions: list[bytes] = []
+        ahead = state
+        while len(actions) < MAX_TASK_ACTIONS and not needs_sensing(planning, ahead):
+            action, _ = choose_task_action(problem, planning, ahead)
+            ahead = advance(problem, planning, ahead, action)
+            actions.append(numbers_to(action))
+        return Outcome(
+            problem=problem,
+            state=state,
+            restored=restored,
+            num_actions=len(actions),
+            actions=b"".join(actions),
+            ahead=ahead,
+            ahead_digest=digest(ahead)[:DIGEST_SIZE],
+        )
+
+    def _reached(self, problem: Problem, request: Request) -> PlanningState:
+        """Return the state that the request names."""
+        planning = self._planning
+        if request.checkpoint is not None:
+            return self._restored(problem, request, request.checkpoint)
+        state = self._state
+        if state is None:
+            state = initial_state(problem, planning, self._seed, request.trial)
+        most = state.step + self._limits.max_steps
+        for observed in request.observations:
+            if (observed.step, True) <= (state.step, state.sensed):
+                continue  # part of the state already
+            state = self._rolled(problem, state, observed.step, most)
+            if not needs_sensing(planning, state):
+                raise _LacksStateError
+            observation = numbers_from(observed.observation, len(observed.observation) // 8)
+            state, _ = observe(problem, planning, state, observed.sensing_action, observation)
+        state = self._rolled(problem, state, request.step, most)
+        if state.sensed != request.sensed or digest(state)[:DIGEST_SIZE] != request.digest:
+            raise _LacksStateError(differs=True)
+        return state
+
+    def _rolled(
+        self, problem: Problem, state: PlanningState, step: int, most: int
+    ) -> PlanningState:
+        """Return the state at a later step, by task actions alone."""
+        if not state.step <= step <= most:
+            raise _LacksStateError
+        planning = self._planning
+        while state.step < step:
+            if needs_sensing(planning, state):
+                raise _LacksStateError
+            action, _ = choose_task_action(problem, planning, state)
+            state = advance(problem, planning, state, action)
+        return state
+
+    def _restored(self, problem: Problem, request: Request, checkpoint: bytes) -> PlanningState:
+        state = decode_checkpoint(checkpoint)
+        check_state(problem, self._planning, state)
+        for name, came, asked in (
+            ("seed", state.seed, self._seed),
+            ("trial", state.trial, request.trial),
+            ("step", state.step, request.step),
+            ("sensed", state.sensed, request.sensed),
+        ):
+            if came != asked:
+                raise CheckpointError(f"checkpoint with {name} {came}: the request says {asked}")
+        if digest(state)[:DIGEST_SIZE] != request.digest:
+            raise CheckpointError("checkpoint of a state that has another digest than the request")
+        return state
+
+
+def _check_work(problem: Problem, planning: PlanningSettings, limits: ServiceLimits) -> None:
+    """Check that a service can take decisions of this size on."""
+    count = planning.particle_filter.num_particles
+    sensing = planning.active_sensing
+    actions = len(problem.sensing_actions)
+    work = count * sensing.num_observation_samples * actions * sensing.horizon
+    if work > limits.max_work:
+        raise InvalidValueError(
+            f"a decision of {work} units of work (particle_filter.num_particles {count} x "
+            f"active_sensing.num_observation_samples {sensing.num_observation_samples} x "
+            f"{actions} sensing actions x active_sensing.horizon {sensing.horizon}): this "
+            f"service takes at most {limits.max_work} (max_work)"
+        )
+    if problem.action_size > _MAX_ACTION_SIZE:
+        raise InvalidValueError(
+            f"action_size of {problem.name} is {problem.action_size}: a service takes at most "
+            f"{_MAX_ACTION_SIZE}"
+        )
+
+
+def _account(error: BaseException, describe: Callable[[BaseException], str]) -> str:
+    """Put an error of a problem into words, even one that fails at that itself."""
+    try:
+        return describe(error)
+    except BaseException:  # noqa: BLE001 - whoever wrote the problem may have written the error
+        return f"{type(error).__name__}, which cannot be put into words"
+
+
+def _code_of(error: HoldfastError) -> str:
+    if isinstance(error, UnknownProblemError):
+        return "unknown_problem"
+    if isinstance(error, InvalidValueError | CheckpointError | ConfigurationError):
+        return "invalid"
+    # ProblemError, and whatever a problem raises of ours for reasons of its own.
+    return "failed"
+
+
+class ProblemPool:
+    """The problem instances that no job is using.
+
+    No two jobs at a time have the same instance: a user's problem may keep buffers.
+
+    Parameters
+    ----------
+    max_problems : int
+        Problems kept; the one that was given back the longest ago goes first.
+    """
+
+    def __init__(self, max_problems: int) -> None:
+        self._max_problems = max_problems
+        self._idle: OrderedDict[bytes, list[Problem]] = OrderedDict()
+
+    def lend(self, key: bytes) -> Problem | None:
+        """Take a problem that nobody uses; None if one is to be built."""
+        idle = self._idle.get(key)
+        return idle.pop() if idle else None
+
+    def give_back(self, key: bytes, problem: Problem | None) -> None:
+        """Keep a problem for the next job."""
+        if problem is None:
+            return
+        self._idle.setdefault(key, []).append(problem)
+        self._idle.move_to_end(key)
+        while len(self._idle) > self._max_problems:
+            self._idle.popitem(last=False)
