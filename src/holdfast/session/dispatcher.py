@@ -328,7 +328,7 @@ class Dispatcher:
                     service.detector.extend_patience(2.0, self._limit_s)
                     self._launches.failed(now)
         for call in self._calls:
-            if now - call.sent_at >= self._limit_s:
+            if now >= call.sent_at + self._limit_s:
                 service = call.service
                 self._calls.abandon(call)
                 service.delay(now)

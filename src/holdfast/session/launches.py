@@ -30,7 +30,7 @@ class Launches:
     """
 
     def __init__(self, settings: RecoverySettings) -> None:
-        self._timeout_ms = settings.launch_timeout_ms
+        self._timeout_s = 1e-3 * settings.launch_timeout_ms
         self._pause_s = 1e-3 * settings.relaunch_delay_ms
         self._launched_at: float | None = None
         self._launch_after: float | None = None
@@ -73,8 +73,8 @@ class Launches:
         """
         if self._launched_at is None or self._launch_after is not None or present:
             return None
-        waited_s = now - self._launched_at
-        return waited_s if 1e3 * waited_s >= self._timeout_ms else None
+        # The same sum as in next_wakeup: the difference may be rounded to less than the limit.
+        return now - self._launched_at if now >= self._launched_at + self._timeout_s else None
 
     def failed(self, now: float) -> None:
         """Launch again: at once the first time, then ever more rarely."""
@@ -86,8 +86,7 @@ class Launches:
 
     def ended(self, now: float) -> None:
         """Take note that its process is gone."""
-        lived_s = now - (self._launched_at or now)
-        if lived_s > _LONG_LIFE_S:
+        if self._launched_at is not None and now - self._launched_at > _LONG_LIFE_S:
             self.succeeded()
         self.failed(now)
 
@@ -100,5 +99,5 @@ class Launches:
         if self._launch_after is not None:
             return self._launch_after
         if self._launched_at is not None and not present:
-            return self._launched_at + 1e-3 * self._timeout_ms
+            return self._launched_at + self._timeout_s
         return None

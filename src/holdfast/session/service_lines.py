@@ -16,7 +16,7 @@ from collections import OrderedDict
 from holdfast.session.messages import Request
 from holdfast.session.service_jobs import Job
 from holdfast.session.service_limits import ServiceLimits
-from holdfast.session.service_sessions import REQUESTED, Session, Work
+from holdfast.session.service_sessions import Session, Work
 
 __all__ = ["Lines"]
 
@@ -80,12 +80,13 @@ class Lines:
 
     def hasten(self, work: Work) -> None:
         """Let a prefetched work go with the urgent ones: its robot stands still now."""
+        work.urgent = True  # also if it is held back yet
         if work in self._later:
             del self._later[work]
             self._urgent[work] = None
 
     def _line_of(self, work: Work) -> OrderedDict[Work, None]:
-        return self._urgent if work.slot == REQUESTED else self._later
+        return self._urgent if work.urgent else self._later
 
     def _count(self, work: Work, sign: int) -> None:
         self.num_waiting += sign

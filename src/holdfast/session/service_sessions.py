@@ -132,6 +132,7 @@ class Work:
         "slot",
         "started_at",
         "state",
+        "urgent",
     )
 
     def __init__(
@@ -153,6 +154,7 @@ class Work:
         self.size = size
         self.since = since
         self.slot = PREFETCHED if request is None else REQUESTED
+        self.urgent = request is not None
         self.calls: dict[int, WaitingCall] = {}
         self.cost_s = session.expected_s(task=not sensing)
         self.running = False

@@ -42,9 +42,8 @@ class Standstill:
 
     def waits_long(self, question: Question, now: float) -> bool:
         """Tell whether it is to be said now."""
-        if question.needed_at is None or question.told_waiting:
-            return False
-        return now - question.needed_at >= self._patience_s
+        at = self.waiting_at(question)
+        return at is not None and now >= at
 
     def tell_waiting(self, question: Question, asked: Collection[str], now: float) -> None:
         """Say once that the robot stands still although somebody is being asked."""

@@ -1,0 +1,138 @@
+"""The small parts of both machines, each alone: launches, lines of work."""
+
+from __future__ import annotations
+
+import random
+
+import pytest
+from tests.unit.test_session_service import Robot, make_problem
+
+from holdfast.session.launches import Launches
+from holdfast.session.messages import Request
+from holdfast.session.service_jobs import Job
+from holdfast.session.service_limits import ServiceLimits
+from holdfast.session.service_lines import Lines
+from holdfast.session.service_sessions import ExpectedTimes, Session, Work
+from holdfast.settings import RecoverySettings
+
+
+class TestLaunches:
+    @pytest.mark.parametrize("seed", range(20))
+    def test_a_launch_is_overdue_when_it_was_said_to_be(self, seed: int) -> None:
+        # On the bit: who is woken at the time that was asked for must find that it has come.
+        draw = random.Random(seed)
+        for _ in range(500):
+            launches = Launches(RecoverySettings(launch_timeout_ms=draw.uniform(1.0, 5000.0)))
+            now = draw.uniform(0.0, 10.0)
+            launches.want(now)
+            assert launches.is_due(now)
+            launches.begin(now)
+            at = launches.next_wakeup(present=False)
+            assert at is not None
+            assert launches.overdue_s(at, present=False) is not None
+
+    @pytest.mark.parametrize("begun_at", [0.0, 7.0])
+    def test_a_long_life_makes_up_for_failures(self, begun_at: float) -> None:
+        launches = Launches(RecoverySettings(relaunch_delay_ms=100.0))
+        launches.want(begun_at)
+        launches.failed(begun_at)
+        launches.begin(begun_at)
+        launches.failed(begun_at)
+        launches.begin(begun_at)
+        launches.ended(begun_at + 5.0)
+        assert launches.is_due(begun_at + 5.0)  # at once, as after the first failure
+
+    def test_a_short_life_does_not(self) -> None:
+        launches = Launches(RecoverySettings(relaunch_delay_ms=100.0))
+        launches.want(0.0)
+        for _ in range(3):
+            launches.begin(0.0)
+            launches.ended(0.5)
+        assert launches.next_wakeup(present=False) == pytest.approx(0.5 + 0.2)
+
+
+class TestLines:
+    """One worker; works named by the order in which they came."""
+
+    def setup_method(self) -> None:
+        self.lines = Lines(1, ServiceLimits(prefetch_patience_ms=20.0))
+
+    def session(self, key: int) -> Session:
+        robot = Robot(key=key)
+        request = robot.request()
+        return Session(request, robot.opening, 1, ExpectedTimes(4.0, 0.001, 0.001))
+
+    def work(self, session: Session, name: bytes, since: float, *, prefetched: bool) -> Work:
+        request: Request | None = None if prefetched else Robot().request()
+        work = Work(session, name, sensing=True, request=request, state=None, size=10, since=since)
+        self.lines.line_up(work)
+        return work
+
+    def run_one(self) -> tuple[bytes, Job]:
+        work = self.lines.take()
+        assert work is not None
+        robot = Robot()
+        job = Job(
+            "sensing",
+            None,
+            make_problem,
+            str,
+            robot.opening,
+            robot.opening.planning,
+            5,
+            ServiceLimits(),
+            work.request,
+            None,
+        )
+        self.lines.begin(work, job, 0.0)
+        return work.digest, job
+
+    def finish(self, job: Job) -> None:
+        self.lines.let_go_on(self.lines.end(job).session)
+
+    def test_those_that_robots_stand_still_for_go_first(self) -> None:
+        self.work(self.session(1), b"ahead", 0.0, prefetched=True)
+        self.work(self.session(2), b"awaited", 0.01, prefetched=False)
+        assert self.run_one()[0] == b"awaited"
+
+    def test_but_not_for_ever(self) -> None:
+        self.work(self.session(1), b"ahead", 0.0, prefetched=True)
+        self.work(self.session(2), b"awaited", 0.03, prefetched=False)
+        assert self.run_one()[0] == b"ahead"
+
+    @pytest.mark.parametrize("held", [False, True])
+    def test_what_is_awaited_meanwhile_goes_first(self, held: bool) -> None:
+        session = self.session(1)
+        job = None
+        if held:
+            # Behind another one of the same robot.
+            self.work(session, b"before", 0.0, prefetched=True)
+            _, job = self.run_one()
+        hastened = self.work(session, b"hastened", 0.0, prefetched=True)
+        self.work(self.session(2), b"other", 0.001, prefetched=True)
+        self.lines.hasten(hastened)
+        if job is not None:
+            self.finish(job)
+        self.work(self.session(3), b"awaited", 0.002, prefetched=False)
+        assert self.run_one()[0] == b"hastened"
+
+    def test_a_robot_has_one_turn_at_a_time(self) -> None:
+        session = self.session(1)
+        self.work(session, b"first", 0.0, prefetched=False)
+        name, job = self.run_one()
+        assert name == b"first"
+        self.work(session, b"second", 0.0, prefetched=False)
+        self.work(self.session(2), b"other", 0.1, prefetched=False)
+        self.finish(job)
+        # It was held back meanwhile, so the other robot's turn comes before.
+        assert self.run_one()[0] == b"other"
+
+    def test_no_more_than_there_are_workers(self) -> None:
+        for key in range(3):
+            self.work(self.session(key), b"%d" % key, 0.0, prefetched=False)
+        _, job = self.run_one()
+        assert self.lines.take() is None
+        assert self.lines.num_waiting == 2
+        self.finish(job)
+        assert self.run_one()[0] == b"1"
+        assert self.lines.num_waiting == 1
