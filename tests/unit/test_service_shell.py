@@ -253,33 +253,22 @@ class Unanswerable(Call):
 
 
 class Deaf(Call):
-    """Blocks whoever sends to it until it is let go; the thread that delivered it for a moment.
-
-    (So does Zenoh: then it gives up the link. Other threads are blocked for longer here than there,
-    to tell what waits for them.)
-    """
+    """Blocks whoever sends to it until it is let go."""
 
     def __init__(self, payload: bytes, let_go: threading.Event) -> None:
         super().__init__(payload)
         self._let_go = let_go
-        self._delivered_by = threading.current_thread()
         self.threads: set[threading.Thread] = set()
 
     def reply(self, payload: bytes) -> None:
-        self._block()
+        self.threads.add(threading.current_thread())
+        assert self._let_go.wait(PATIENCE_S)
         super().reply(payload)
 
     def end(self) -> None:
-        self._block()
+        self.threads.add(threading.current_thread())
+        assert self._let_go.wait(PATIENCE_S)
         super().end()
-
-    def _block(self) -> None:
-        thread = threading.current_thread()
-        self.threads.add(thread)
-        if thread is self._delivered_by:
-            self._let_go.wait(0.2)
-        else:
-            assert self._let_go.wait(PATIENCE_S)
 
 
 class Stuck(Call):
@@ -302,12 +291,9 @@ def test_calls_beyond_the_queue_are_turned_away_unread(bound: str) -> None:
     Stuck.let_go.clear()
     shell = ServiceShell(Service(KnownProblems(), 1), Silent(), 1, **limits)
     shell.start()
-    calls = [Stuck(payload) for _ in range(30)]
-    # One holds up the thread of the transport itself.
-    transport = threading.Thread(target=shell.deliver, args=(calls[0],))
     try:
-        transport.start()
-        for call in calls[1:]:
+        calls = [Stuck(payload) for _ in range(30)]
+        for call in calls:
             shell.deliver(call)
         delays = set()
         for call in calls[2:]:
@@ -324,7 +310,6 @@ def test_calls_beyond_the_queue_are_turned_away_unread(bound: str) -> None:
             assert isinstance(decode_reply(call.replies.get(timeout=PATIENCE_S) or b""), Refused)
     finally:
         Stuck.let_go.set()
-        transport.join(PATIENCE_S)
         shell.close()
 
 
@@ -394,9 +379,6 @@ def test_clients_that_do_not_read_hold_up_nobody_else() -> None:
         rude += [Deaf(encode(Robot(key=key).request()), let_go) for key in range(1, 11)]
         for call in rude:
             shell.deliver(call)  # returns, although no reply can be sent
-        answered_here = [call for call in rude if threading.current_thread() in call.threads]
-        assert len(answered_here) <= 1  # once held up, it leaves the answers to others
-        rude = [call for call in rude if call not in answered_here]
         patient, robot = Patient(network), Robot(key=99)
         for _ in range(5):
             request = robot.request(since=max(0, len(robot.observed) - 1))
@@ -422,83 +404,135 @@ class Noting(Call):
 
     def __init__(self, payload: bytes) -> None:
         super().__init__(payload)
-        self.threads: list[threading.Thread] = []
+        self.threads: set[threading.Thread] = set()
 
     def reply(self, payload: bytes) -> None:
-        self.threads.append(threading.current_thread())
+        self.threads.add(threading.current_thread())
         super().reply(payload)
 
     def answer(self) -> list[Reply]:
         replies = []
         while (payload := self.replies.get(timeout=PATIENCE_S)) is not None:
             replies.append(decode_reply(payload))
-        return replies
+        return [reply for reply in replies if not isinstance(reply, Progress)]
 
 
-def test_a_brief_call_is_answered_where_it_came_in() -> None:
-    shell = ServiceShell(Service(KnownProblems(), 1), Silent(), 1)
-    shell.start()
-    try:
-        here = []
-        robot = Robot(key=1)
-        for _ in range(20):
-            call = Noting(encode(robot.request(since=max(0, len(robot.observed) - 1))))
-            shell.deliver(call)
-            assert content(call.answer()) == robot.right_answer()
-            here.append(set(call.threads) == {threading.current_thread()})
-            robot.act_until_sensing()
-            robot.sense()
-            time.sleep(0.05)  # this thread is not to be taken for more than half of the time
-        assert not here[0]  # the problem was built, which takes long
-        assert any(here[1:])
-    finally:
-        shell.close()
+class Slow(Call):
+    """Takes longer for each reply than it takes until there is another sign of progress."""
+
+    def reply(self, payload: bytes) -> None:
+        time.sleep(0.06)
+        super().reply(payload)
 
 
-def test_code_of_others_does_not_run_on_the_transports_thread() -> None:
-    joined = Joined(workers=1)
+def next_request(robot: Robot) -> bytes:
+    return encode(robot.request(since=max(0, len(robot.observed) - 1)))
+
+
+def go_on(robot: Robot) -> None:
+    robot.act_until_sensing()
+    robot.sense()
+
+
+def take_a_brief_job_and_stand_still(joined: Joined) -> Noting:
+    """Let the leader have a job that is known to be brief, and never let it end."""
     joined.held.let_go.set()
+    robot = Robot(key=1)
+    robot.opening = HELD_OPENING
+    for _ in range(12):
+        call = Noting(next_request(robot))
+        joined.shell.deliver(call)
+        assert isinstance(call.answer()[-1], SensingAnswer)
+        go_on(robot)
+    joined.held.let_go.clear()
+    joined.held.begun.clear()
+    stuck = Noting(next_request(robot))
+    joined.shell.deliver(stuck)
+    assert joined.held.begun.wait(PATIENCE_S)
+    return stuck
+
+
+def test_the_transports_thread_only_hands_over(joined: Joined) -> None:
+    robot = Robot(key=1)
+    for _ in range(5):
+        call = Noting(next_request(robot))
+        joined.shell.deliver(call)
+        assert content(call.answer()) == robot.right_answer()
+        assert threading.current_thread() not in call.threads
+        go_on(robot)
+
+
+def test_a_worker_that_is_held_up_leads_no_more(joined: Joined) -> None:
+    stuck = take_a_brief_job_and_stand_still(joined)
+    patient, other = Patient(joined.network), Robot(key=2)
+    for _ in range(3):
+        assert content(patient.ask(next_request(other))) == other.right_answer()
+        go_on(other)
+    joined.held.let_go.set()
+    assert [type(reply) for reply in stuck.answer()] == [TaskAnswer, SensingAnswer]
+
+
+def test_one_that_was_deposed_while_it_waited_takes_nothing() -> None:
+    # A timekeeper that was stopped deposes by what it saw long ago. Two wait for calls then.
+    joined = Joined(workers=2)
     try:
-        robot = Robot(key=1)
-        robot.opening = HELD_OPENING
-        for _ in range(10):
-            call = Noting(encode(robot.request(since=max(0, len(robot.observed) - 1))))
-            joined.shell.deliver(call)
-            assert isinstance(call.answer()[-1], SensingAnswer)
-            assert threading.current_thread() not in call.threads
-            robot.act_until_sensing()
-            robot.sense()
-            time.sleep(0.02)
+        for _ in range(3):
+            term = joined.shell._term
+            assert term is not None
+            joined.shell._pass_on(term)
+            deadline = time.monotonic() + PATIENCE_S
+            while joined.shell._term in (None, term):
+                assert time.monotonic() < deadline
+                time.sleep(0.001)
+            patient, robot = Patient(joined.network), Robot(key=7)
+            for _ in range(3):
+                assert content(patient.ask(next_request(robot))) == robot.right_answer()
+                go_on(robot)
+        # The one that leads now can be deposed as well.
+        stuck = take_a_brief_job_and_stand_still(joined)
+        patient, other = Patient(joined.network), Robot(key=9)
+        assert content(patient.ask(next_request(other))) == other.right_answer()
+        joined.held.let_go.set()
+        assert isinstance(stuck.answer()[-1], SensingAnswer)
     finally:
         joined.close()
 
 
-def test_a_worker_that_is_held_up_leads_no_more() -> None:
-    joined = Joined(workers=2)
-    joined.held.let_go.set()
+def test_the_timekeeper_is_awake_when_a_reply_blocks(joined: Joined) -> None:
+    robot = Robot(key=1)
+    call = Noting(next_request(robot))
+    joined.shell.deliver(call)
+    assert isinstance(call.answer()[-1], SensingAnswer)
+    deadline = time.monotonic() + PATIENCE_S
+    while joined.shell._wakes_at < time.monotonic() + 10.0:  # sleeps until something happens
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    let_go = threading.Event()
     try:
-        robot = Robot(key=1)
-        robot.opening = HELD_OPENING
-        for _ in range(12):  # its jobs are known to be brief
-            call = Noting(encode(robot.request(since=max(0, len(robot.observed) - 1))))
-            joined.shell.deliver(call)
-            assert isinstance(call.answer()[-1], SensingAnswer)
-            robot.act_until_sensing()
-            robot.sense()
-        joined.held.let_go.clear()
-        joined.held.begun.clear()
-        stuck = Noting(encode(robot.request(since=max(0, len(robot.observed) - 1))))
-        joined.shell.deliver(stuck)
-        assert joined.held.begun.wait(PATIENCE_S)
+        # The same question again: answered from memory, so no work is open.
+        deaf = Deaf(next_request(robot), let_go)
+        joined.shell.deliver(deaf)
         patient, other = Patient(joined.network), Robot(key=2)
+        assert content(patient.ask(next_request(other))) == other.right_answer()
+        assert deaf.replies.empty()
+    finally:
+        let_go.set()
+
+
+def test_a_robot_that_reads_slowly_keeps_no_worker() -> None:
+    joined = Joined(workers=1)
+    try:
+        slow_robot = Robot(key=1)
         for _ in range(3):
-            request = other.request(since=max(0, len(other.observed) - 1))
-            assert content(patient.ask(encode(request))) == other.right_answer()
-            other.act_until_sensing()
-            other.sense()
-        joined.held.let_go.set()
-        kinds = [type(reply) for reply in stuck.answer() if not isinstance(reply, Progress)]
-        assert kinds == [TaskAnswer, SensingAnswer]
+            slow = Slow(next_request(slow_robot))
+            joined.shell.deliver(slow)
+            patient, robot = Patient(joined.network), Robot(key=2)
+            for _ in range(2):
+                assert content(patient.ask(next_request(robot))) == robot.right_answer()
+                go_on(robot)
+            while slow.replies.get(timeout=PATIENCE_S) is not None:
+                pass
+            go_on(slow_robot)
     finally:
         joined.close()
 

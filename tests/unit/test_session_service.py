@@ -7,6 +7,7 @@ The reference is planning itself: a robot here folds its own state with the func
 from __future__ import annotations
 
 import asyncio
+import math
 import random
 from collections import deque
 from collections.abc import Callable
@@ -1171,3 +1172,37 @@ class TestAnyOrder:
         )
         bench, robot = Bench(), Robot(planning=planning)
         assert content(bench.ask(robot.request())) == robot.right_answer()
+
+
+def test_only_what_was_measured_of_a_robot_is_expected_to_be_brief() -> None:
+    service = Service(make_problem, 1)
+
+    def runs_of(call: int, request: Request, now: float) -> list[float]:
+        """Have a request answered; return how long each of its jobs was expected to take."""
+        expected = []
+        effects = service.receive(call, encode(request), now)
+        while runs := [effect for effect in effects if isinstance(effect, Run)]:
+            (run,) = runs
+            expected.append(run.expected_s)
+            service.begun(run.job, now)
+            now += 0.001
+            effects = service.finished(run.job, run.job.run(), now)
+        return expected
+
+    light = Robot(key=1)
+    found = []
+    for call in range(1, 5):
+        found.append(runs_of(call, light.request(since=max(0, len(light.observed) - 1)), call))
+        light.act_until_sensing()
+        light.sense()
+    assert found[0] == [math.inf]  # the problem is to be built
+    assert found[1][0] == math.inf  # the first task part of this robot
+    assert all(expected_s == pytest.approx(0.001) for expected_s in found[3])
+    # Another robot with the same problem may have other settings: nothing is known of it.
+    heavy = Robot(key=2, planning=planning_of(particles=500))
+    assert runs_of(10, heavy.request(), 20.0) == [math.inf]
+    # Neither of a request that takes more than one observation to answer, or a whole state.
+    for _ in range(2):
+        light.act_until_sensing()
+        light.sense()
+    assert runs_of(11, light.request(since=len(light.observed) - 3), 21.0)[0] == math.inf

@@ -1,22 +1,19 @@
 """The threads around a service's machine: what comes in, what is computed, what is sent.
 
 Two things cost a robot time beside the decision itself: to wake a thread on another core, which
-takes longer than many a decision; and threads that hold the interpreter against each other, as all
-of them do that run brief jobs. So as few threads as possible take part. While the service is idle,
-a call is answered on the thread of the transport on which it came in, if that is known to take a
-moment only and to run none but this project's code. All other calls and jobs wait in one queue,
-from which one worker, the *leader*, takes them. It lets the machine handle the call, and if a brief
-job comes of that, runs it and sends the answer, all by itself. Before a long job, which computes
-without the interpreter, it lets another worker lead. There is one worker more than jobs may run at
-a time, so that a call is heard, and if need be turned away, while all others compute.
+takes longer than many a decision; and threads that take the interpreter from each other, as all of
+them do that run brief jobs. So as few threads as possible take part. Calls and jobs wait in one
+queue, from which one worker, the *leader*, takes them. It lets the machine handle the call, and if
+a brief job comes of that, runs it and sends the answer, all by itself. Before a long job, which
+computes without the interpreter, it lets another worker lead. There is one worker more than jobs
+may run at a time, so that a call is heard, and if need be turned away, while all others compute.
 
-To send can block, if whoever is to receive it does not read, for as long as a link can be silent,
-and a job that was thought brief can take for ever. A leader that is held up is deposed; the
-transport's thread cannot be, so it does nothing for a while once it was held up. Replies go into
-*lanes*: one for each session, one for all messages that are none, and one for the calls that are
-turned away unread. Of a lane one thread sends at a time, mostly one of the *senders*, of which one
-more is started whenever the last free one begins. Only one thread at a time may answer by itself,
-which saves a lone robot the hand-over.
+Any of that can be held up: a reply blocks if whoever is to receive it does not read, and a job that
+was thought brief can take for ever. A leader that is held up is deposed (after 20 to 70 ms), and
+another one leads. The transport's threads, on which all calls come in, do nothing but hand over.
+Replies go through :mod:`~holdfast.runtime.senders`, in one lane for each session, one for all
+messages that are none, and one for the calls that are turned away unread. Only one thread at a time
+may send by itself, which saves a lone robot the hand-over.
 
 The thread that calls :meth:`ServiceShell.wait` keeps the time: it has the signs of progress sent,
 while the workers compute, deposes the leader, and sleeps without a break when no robot is about.
@@ -44,11 +41,12 @@ from holdfast.errors import HoldfastError, UnknownProblemError
 from holdfast.problems import registry
 from holdfast.problems.problem import Problem
 from holdfast.runtime.logs import EventSink, NullEventLog
+from holdfast.runtime.senders import NOBODY, Senders
 from holdfast.runtime.transport.contract import IncomingCall, ServiceTransport
 from holdfast.session.messages import Busy, MessageError, Opening, Request, decode_request, encode
 from holdfast.session.service import Service
 from holdfast.session.service_effects import Answer, Computed, Effect, End, Noted, Run
-from holdfast.session.service_jobs import Job, Outcome
+from holdfast.session.service_jobs import Job
 from holdfast.session.service_limits import ServiceStatistics
 
 __all__ = ["KnownProblems", "ServiceBrokenError", "ServiceShell"]
@@ -64,30 +62,14 @@ _MAX_INCOMING_BYTES = 128 << 20
 _UNREAD_BUSY = [encode(Busy(0, retry_after_ms)) for retry_after_ms in range(100, 126)]
 """Used in turn, so that robots that were turned away together do not come back together."""
 
-_MAX_SENDERS = 32
-"""Threads that send, at most: so many robots' links can be blocked, and the others notice nothing.
-"""
-
-_HERE_BYTES = 32_000
-"""Larger calls are not even decoded on the transport's thread."""
-
 _BRIEF_S = 0.002
 """Jobs that may take longer run beside others."""
 
 _HELD_UP_S = 0.02
-"""What takes so long though it is brief is held up, by a robot that does not read or otherwise."""
-
-_NOT_HERE_FOR_S = 10.0
-"""For so long after the transport's thread was held up, it only hands over."""
+"""A leader that is at work for so long is held up: by a robot that does not read, or otherwise."""
 
 _HEARD_AT_A_TIME = 16
 """Calls that are let in before it is a job's turn."""
-
-_SENT_AT_A_TIME = 16
-"""Calls of a lane that are sent to before it is another one's turn."""
-
-_NOBODY = b""
-"""The lane of messages that name no session."""
 
 _UNREAD = b"unread"
 """The lane of those that are turned away unread: robots' calls may be among them."""
@@ -179,6 +161,21 @@ class _Rest(enum.Enum):
 _REST = _Rest.REST
 
 
+class _Term:
+    """One worker's time as the leader.
+
+    Attributes
+    ----------
+    since : float or None
+        When it began what it is doing; None while it waits for something to do.
+    """
+
+    __slots__ = ("since",)
+
+    def __init__(self) -> None:
+        self.since: float | None = None
+
+
 class _OpenCall:
     """A call, and what is still to be sent to it.
 
@@ -196,118 +193,13 @@ class _OpenCall:
 
     def send(self) -> None:
         with self._lock:
-            while self.outbox:
+            # No more than there is now: a robot that reads slowly would keep this thread for ever.
+            for _ in range(len(self.outbox)):
                 payload = self.outbox.popleft()
                 if payload is None:
                     self._incoming.end()
                 else:
                     self._incoming.reply(payload)
-
-
-class _Senders:
-    """Sends what calls have in their outboxes, so that one that blocks holds up its lane alone.
-
-    Parameters
-    ----------
-    failed : callable
-        Is called on a thread that fails, which is a defect.
-    """
-
-    def __init__(self, failed: Callable[[], None]) -> None:
-        self._failed = failed
-        self._lock = threading.Lock()
-        # Those in which something waits or is being sent.
-        self._lanes: dict[bytes, deque[_OpenCall]] = {}
-        self._turns: SimpleQueue[bytes | None] = SimpleQueue()
-        self._by_itself = threading.Lock()
-        self._threads: list[threading.Thread] = []
-        self._free = 0
-        self._closed = False
-
-    def start(self) -> None:
-        """Begin to send."""
-        with self._lock:
-            self._add_thread()
-
-    def post(self, calls: Collection[_OpenCall]) -> None:
-        """Have the outboxes of these calls sent; never blocks."""
-        for lane in self._entered(calls):
-            self._turns.put(lane)
-
-    def send(self, calls: Collection[_OpenCall]) -> None:
-        """Send the outboxes of these calls, at once if no other thread is doing that.
-
-        What cannot be sent at once is posted.
-        """
-        for lane in self._entered(calls):
-            # What names no session is nobody's answer.
-            if lane != _NOBODY and self._by_itself.acquire(blocking=False):
-                try:
-                    self._send(lane)
-                finally:
-                    self._by_itself.release()
-            else:
-                self._turns.put(lane)
-
-    def close(self, until: float) -> None:
-        """Let the threads go; those that are blocked are not waited for beyond this time."""
-        with self._lock:
-            self._closed = True
-            threads = list(self._threads)
-        for _ in threads:
-            self._turns.put(None)
-        for thread in threads:
-            thread.join(max(0.0, until - monotonic()))
-
-    def _entered(self, calls: Collection[_OpenCall]) -> list[bytes]:
-        """Put calls into their lanes; return the lanes that nobody was taking care of."""
-        idle = []
-        with self._lock:
-            for call in calls:
-                lane = self._lanes.get(call.lane)
-                if lane is None:
-                    self._lanes[call.lane] = deque((call,))
-                    idle.append(call.lane)
-                else:
-                    lane.append(call)
-        return idle
-
-    def _send(self, lane: bytes) -> None:
-        """Send the first that wait in a lane, and leave the rest for another turn."""
-        calls = self._lanes[lane]
-        for _ in range(_SENT_AT_A_TIME):
-            with self._lock:
-                if not calls:
-                    del self._lanes[lane]
-                    return
-                call = calls.popleft()
-            call.send()
-        self._turns.put(lane)
-
-    def _add_thread(self) -> None:
-        """Start another thread; the lock is held."""
-        if self._closed or len(self._threads) >= _MAX_SENDERS:
-            return
-        thread = threading.Thread(
-            target=self._run, name=f"holdfast-sender-{len(self._threads)}", daemon=True
-        )
-        self._free += 1
-        self._threads.append(thread)
-        thread.start()
-
-    def _run(self) -> None:
-        try:
-            while (lane := self._turns.get()) is not None:
-                with self._lock:
-                    self._free -= 1
-                    if not self._free:
-                        # This one may be held up; somebody has to be there for the next lane.
-                        self._add_thread()
-                self._send(lane)
-                with self._lock:
-                    self._free += 1
-        except BaseException:  # noqa: BLE001 - half a service is worse than none
-            self._failed()
 
 
 class ServiceShell:
@@ -353,24 +245,20 @@ class ServiceShell:
         self._incoming_lock = threading.Lock()
         self._incoming = 0
         self._incoming_bytes = 0
-        self._senders = _Senders(self._broke)
+        self._senders = Senders("holdfast-sender", self._broke)
         self._queue: SimpleQueue[IncomingCall | Run | _Rest | None] = SimpleQueue()
-        # The leader's; one that was deposed may not know yet.
-        self._ready: deque[Run] = deque()
         self._calls: dict[int, _OpenCall] = {}
         self._numbers = itertools.count(1)
         self._unread = 0
         self._unread_logged = 0
         self._logged: dict[str, tuple[float, int, Noted]] = {}
         self._heard_at = -_STAYS_AWAKE_S
-        # The transport's thread is free for what comes from this time on.
-        self._here = threading.Lock()
-        self._here_from = 0.0
-        # Who leads holds the baton; a term ends when it is passed on, by whomever.
+        # Who leads holds the baton; it is passed on, by whomever, when the term ends. What is ready
+        # to run belongs to the leader of the moment; both are changed under this lock.
+        self._leading = threading.Lock()
         self._baton = threading.Semaphore()
-        self._term = 0
-        # The term of a leader that is at work, and since when.
-        self._at_work: tuple[int, float] | None = None
+        self._term: _Term | None = None
+        self._ready: deque[Run] = deque()
         self._wakes_at = 0.0
         self._failure: str | None = None
         self._stopped = False
@@ -466,7 +354,7 @@ class ServiceShell:
                     os.close(descriptor)
 
     def deliver(self, incoming: IncomingCall) -> None:
-        """Take a call from the transport; as good as never blocks."""
+        """Take a call from the transport; never blocks."""
         size = incoming.size_bytes
         with self._incoming_lock:
             full = self._incoming >= self._max_incoming or (
@@ -484,46 +372,14 @@ class ServiceShell:
             call = _OpenCall(incoming, _UNREAD)
             call.outbox += (busy, None)
             self._senders.post((call,))
-        elif (
-            size <= _HERE_BYTES
-            and self._queue.empty()
-            and self._at_work is None
-            and self._here.acquire(blocking=False)
-        ):
-            try:
-                self._answer_here(incoming)
-            finally:
-                self._here.release()
         else:
+            now = monotonic()
+            self._heard_at = now
+            if self._wakes_at > now + _TICK_S:
+                # Somebody may have to be deposed, or told that his request is in work.
+                self._wakes_at = now
+                self._wake()
             self._queue.put(incoming)
-
-    # -- the transport's thread ------------------------------------------------------------------
-
-    def _answer_here(self, incoming: IncomingCall) -> None:
-        """Answer a call on the transport's thread, or hand over to a worker what takes longer.
-
-        That thread is taken for half of the time at most: what it has not read yet no limit can
-        turn away.
-        """
-        began = monotonic()
-        if began < self._here_from:
-            self._queue.put(incoming)
-            return
-        try:
-            runs = self._receive(incoming)
-            while runs:
-                run, *others = runs
-                for other in others:
-                    self._queue.put(other)
-                if run.expected_s > _BRIEF_S or run.job.problem_name not in registry.BUILT_IN:
-                    self._queue.put(run)
-                    break
-                runs = self._finish(run.job, run.job.run())
-        except BaseException:  # noqa: BLE001 - half a service is worse than none
-            self._broke()
-        now = monotonic()
-        took_s = now - began
-        self._here_from = now + (_NOT_HERE_FOR_S if took_s > _HELD_UP_S else took_s)
 
     # -- workers ---------------------------------------------------------------------------------
 
@@ -531,81 +387,91 @@ class ServiceShell:
         try:
             while True:
                 self._baton.acquire()
-                if not self._lead():
+                term = _Term()
+                with self._leading:
+                    self._term = term
+                if not self._lead(term):
                     return
         except BaseException:  # noqa: BLE001 - half a service is worse than none
             self._broke()
 
-    def _lead(self) -> bool:
-        """Take calls and jobs as long as this thread's term lasts.
+    def _lead(self, term: _Term) -> bool:
+        """Take calls and jobs as long as a term lasts.
 
         Calls go first, up to a number, so that the machine knows what waits: then it chooses what
         is computed next, and turns away what is too much. Returns False if the service is being
         closed.
         """
-        term = self._term
         heard = 0
-        while self._term == term:
-            if not self._ready:
-                self._at_work = None
-                item = self._queue.get()
-            elif heard < _HEARD_AT_A_TIME:
-                try:
-                    item = self._queue.get_nowait()
-                except Empty:
-                    item = _REST
-            else:
-                item = _REST
-            self._at_work = (term, monotonic())
-            if item is None:
+        while self._term is term:
+            item = self._next(term, look=heard < _HEARD_AT_A_TIME)
+            term.since = monotonic()
+            if self._term is not term:
+                # Deposed while it waited: this is for whoever leads now.
+                self._queue.put(item)
+            elif item is None:
                 self._pass_on(term)
                 return False
-            if isinstance(item, Run):
-                self._make_ready(term, [item])
+            elif isinstance(item, Run):
+                self._make_ready([item], term)
             elif item is not _REST:
                 heard += 1
-                self._make_ready(term, self._receive(item))
-            else:
+                self._receive(item, term)
+            elif (run := self._take_ready(term)) is not None:
                 heard = 0
-                try:
-                    run = self._ready.popleft()
-                except IndexError:
-                    continue  # whoever leads now was faster
                 if run.expected_s > _BRIEF_S:
                     self._pass_on(term)
-                self._make_ready(term, self._finish(run.job, run.job.run()))
+                self._run(run.job, term)
         return True
 
-    def _make_ready(self, term: int, runs: list[Run]) -> None:
-        """Have jobs run: by this thread, if its term lasts, else by the leader."""
-        mine = self._term == term
-        for run in runs:
-            if mine:
-                self._ready.append(run)
-            else:
-                self._queue.put(run)
-        if mine and self._term != term:
-            self._queue.put(_REST)  # deposed just now: who leads may wait for something to come
+    def _next(self, term: _Term, *, look: bool) -> IncomingCall | Run | _Rest | None:
+        """Return what has come; if there is something to run, do not wait for more."""
+        if not self._ready:
+            term.since = None
+            return self._queue.get()
+        if look:
+            with contextlib.suppress(Empty):
+                return self._queue.get_nowait()
+        return _REST
 
-    def _pass_on(self, term: int) -> None:
-        """End a term, if it has not ended yet, and let another worker lead."""
-        with self._incoming_lock:
-            if self._term != term:
+    def _take_ready(self, term: _Term) -> Run | None:
+        with self._leading:
+            return self._ready.popleft() if self._ready and self._term is term else None
+
+    def _make_ready(self, runs: list[Run], term: _Term) -> None:
+        """Have jobs run: by this thread, if its term lasts, else by the leader."""
+        with self._leading:
+            if self._term is term:
+                self._ready += runs
                 return
-            self._term += 1
-            self._at_work = None
+        for run in runs:
+            self._queue.put(run)
+
+    def _pass_on(self, term: _Term) -> None:
+        """End a term, if it has not ended yet, and let another worker lead."""
+        with self._leading:
+            if self._term is not term:
+                return
+            self._term = None
         self._baton.release()
+
+    def _depose(self, now: float) -> None:
+        """Let another worker lead if the leader is held up."""
+        term = self._term
+        since = None if term is None else term.since
+        if term is not None and since is not None and now - since > _HELD_UP_S:
+            self._pass_on(term)
 
     def _broke(self) -> None:
         """Let :meth:`wait` raise what is being handled on this thread."""
         self._failure = traceback.format_exc()
         self._wake()
 
-    def _receive(self, incoming: IncomingCall) -> list[Run]:
+    def _receive(self, incoming: IncomingCall, term: _Term) -> None:
         size = incoming.size_bytes
         request: Request | MessageError
         try:
-            # Large ones take their time; the other workers have the machine meanwhile.
+            # Large ones take their time; the other threads have the machine meanwhile.
             request = decode_request(incoming.payload)
         except MessageError as error:
             request = error
@@ -613,37 +479,38 @@ class ServiceShell:
             with self._incoming_lock:
                 self._incoming -= 1
                 self._incoming_bytes -= size
-        lane = request.session if isinstance(request, Request) else _NOBODY
+        lane = request.session if isinstance(request, Request) else NOBODY
         call = _OpenCall(incoming, lane)
         with self._lock:
             number = next(self._numbers)
             self._calls[number] = call
-            now = monotonic()
-            self._heard_at = now
-            carried = self._sorted(self._service.receive_request(number, request, size, now))
-            due = self._service.next_wakeup()
-            late = due is not None and due < self._wakes_at
-            if late:
-                self._wakes_at = now
-        if late:
-            self._wake()
-        return self._carry_out(*carried)
+            effects = self._service.receive_request(number, request, size, monotonic())
+            carried = self._sorted(effects)
+        self._carry_out(*carried, term)
 
-    def _finish(self, job: Job, outcome: Outcome) -> list[Run]:
+    def _run(self, job: Job, term: _Term) -> None:
+        with self._lock:
+            self._service.begun(job, monotonic())
+        outcome = job.run()
         with self._lock:
             carried = self._sorted(self._service.finished(job, outcome, monotonic()))
-        return self._carry_out(*carried)
+        self._carry_out(*carried, term)
 
     def _sorted(
-        self, effects: list[Effect]
+        self, effects: list[Effect], *, only_if_nothing_waits: bool = False
     ) -> tuple[list[_OpenCall], list[Run], list[Noted | Computed]]:
-        """Put replies where they are sent from; the lock is held."""
+        """Put replies where they are sent from; the lock is held.
+
+        A sign of progress need not be sent to a robot to whom something is being sent.
+        """
         calls: list[_OpenCall] = []
         runs: list[Run] = []
         notes: list[Noted | Computed] = []
         for effect in effects:
             if isinstance(effect, Answer):
                 call = self._calls[effect.call]
+                if only_if_nothing_waits and call.outbox:
+                    continue
                 call.outbox.append(effect.payload)
                 calls.append(call)
             elif isinstance(effect, End):
@@ -657,12 +524,17 @@ class ServiceShell:
         return calls, runs, notes
 
     def _carry_out(
-        self, calls: list[_OpenCall], runs: list[Run], notes: list[Noted | Computed]
-    ) -> list[Run]:
-        """Send, and return what is to be run."""
+        self,
+        calls: list[_OpenCall],
+        runs: list[Run],
+        notes: list[Noted | Computed],
+        term: _Term,
+    ) -> None:
+        # In this order: whoever leads when this thread is held up in sending finds the jobs.
+        if runs:
+            self._make_ready(runs, term)
         self._senders.send(calls)
         self._take_note(notes)
-        return runs
 
     def _take_note(self, notes: list[Noted | Computed]) -> None:
         for note in notes:
@@ -675,12 +547,10 @@ class ServiceShell:
 
     def _tick(self) -> float | None:
         """Let the machine take note of the time; return how long it can then be left alone."""
-        at_work = self._at_work
-        if at_work is not None and monotonic() - at_work[1] > _HELD_UP_S:
-            self._pass_on(at_work[0])
+        self._depose(monotonic())
         with self._lock:
             now = monotonic()
-            calls, _, notes = self._sorted(self._service.tick(now))
+            calls, _, notes = self._sorted(self._service.tick(now), only_if_nothing_waits=True)
             due = self._service.next_wakeup()
             if now - self._heard_at < _STAYS_AWAKE_S:
                 due = now + _TICK_S if due is None else min(due, now + _TICK_S)

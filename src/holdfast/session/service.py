@@ -65,6 +65,11 @@ class _Fate(enum.Enum):
     TURNED_AWAY = enum.auto()
 
 
+def _is_next(request: Request) -> bool:
+    """Tell whether a request is as most are: one observation further than the one before."""
+    return request.checkpoint is None and len(request.observations) <= 1
+
+
 class Service:
     """Answers the requests of many robots.
 
@@ -154,6 +159,10 @@ class Service:
         self._received(call, request, size, now)
         self._dispatch(now)
         return self._take()
+
+    def begun(self, job: Job, now: float) -> None:
+        """Take note that a job which was handed out is begun only now."""
+        self._lines.begun(job, now)
 
     def finished(self, job: Job, outcome: Outcome, now: float) -> list[Effect]:
         """Take the outcome of a job that was handed out."""
@@ -422,8 +431,10 @@ class Service:
             state,
         )
         self._lines.begin(work, job, now)
-        expected_s = session.times.sensing_s if work.sensing else session.times.task_s
-        self._effects.append(Run(job, math.inf if problem is None else expected_s))
+        expected_s = session.times.known_s(task=not work.sensing)
+        if problem is None or (request is not None and not _is_next(request)):
+            expected_s = math.inf
+        self._effects.append(Run(job, expected_s))
 
     # -- outcomes --------------------------------------------------------------------------------
 

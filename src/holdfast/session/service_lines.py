@@ -121,6 +121,10 @@ class Lines:
         work.session.running[work.slot] = work
         self._running[job] = work
 
+    def begun(self, job: Job, now: float) -> None:
+        """Take note that a worker has begun only now what it has."""
+        self._running[job].started_at = now
+
     def end(self, job: Job) -> Work:
         """Take note that a worker is free; return the work that it had."""
         work = self._running.pop(job)

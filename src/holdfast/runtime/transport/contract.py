@@ -1,8 +1,7 @@
 """What a wire must do, for the robot's end and for the service's.
 
 Both ends deliver what happens to one callable, from threads of their own; it must not block, so it
-is usually the ``put`` of a queue. (A small reply may be sent from there, which blocks only if the
-robot has not read many before; a large one must not.) Every implementation passes
+is usually the ``put`` of a queue. To reply can block. Every implementation passes
 ``tests/contracts/test_transport``.
 """
 

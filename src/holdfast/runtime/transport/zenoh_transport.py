@@ -24,7 +24,8 @@ What holds here was measured, not read:
   that sees that a socket has something to the one that reads, and back to the one that writes. To
   wake a thread on another core takes longer than all the rest, so here one pool sees and reads, and
   one thread writes (and says that this end lives, also while the others wait for Python). The
-  price: while a callback blocks, nothing may be seen of other links; so callbacks do not block.
+  price: while callbacks block, nothing is seen of other links (two clients that did not read what
+  was sent to them from a callback cut all others off); so callbacks send nothing.
 - ``connect/timeout_ms`` stays at its default: 0 would mean one attempt and no other.
 - ``close`` can take ten seconds when a peer has vanished, so it runs aside and is not waited for. A
   process that ends without it can be aborted in a callback, so it is also called at exit.
@@ -56,6 +57,7 @@ from holdfast.runtime.endpoints import (
     free_port,
     parse_endpoint,
 )
+from holdfast.runtime.senders import NOBODY, Senders
 from holdfast.runtime.transport.calls import (
     DEFAULT_MAX_MESSAGE_BYTES,
     CallTable,
@@ -605,6 +607,25 @@ class _Assembly:
         return None
 
 
+class _ShortAnswer:
+    """Ends a query, after a reply if there is one."""
+
+    __slots__ = ("_key", "_query", "_reply", "lane")
+
+    def __init__(
+        self, query: zenoh.Query, key: zenoh.KeyExpr, reply: bytes | None, lane: bytes
+    ) -> None:
+        self._query = query
+        self._key = key
+        self._reply = reply
+        self.lane = lane
+
+    def send(self) -> None:
+        with self._query, contextlib.suppress(zenoh.ZError):  # the session is being closed
+            if self._reply is not None:
+                self._query.reply(self._key, self._reply)
+
+
 class ZenohServiceTransport:
     """The service's end: see :class:`~holdfast.runtime.transport.contract.ServiceTransport`.
 
@@ -656,6 +677,7 @@ class ZenohServiceTransport:
         self._deliver: Callable[[IncomingCall], None] | None = None
         self._calls: set[_ReceivedCall] = set()
         self._assembly = _Assembly(_UPLOADED_MESSAGES * max_message_bytes)
+        self._senders = Senders("holdfast-service-end")
         self._state = threading.Condition()
         self._deliveries = 0
         self._session: zenoh.Session | None = None
@@ -679,6 +701,7 @@ class ZenohServiceTransport:
         if self._closed or self._session is not None:
             raise TransportError(f"service {self._prefix} was started before")
         self._deliver = deliver
+        self._senders.start()
         atexit.register(self.close)
         self._session, self._listen = _opened(
             listen=self._listen,
@@ -706,6 +729,7 @@ class ZenohServiceTransport:
             token, self._token = self._token, None
         if session is not None:
             self._closing = _closed_aside(session, partial(_take_leave, token, calls))
+        self._senders.close(deadline_s)
         if self._closing is not None:
             _wait_for([self._closing], deadline_s)
 
@@ -723,7 +747,8 @@ class ZenohServiceTransport:
         try:
             name, size_bytes, index, count = _PART.unpack(attachment.to_bytes())
         except struct.error:
-            query.drop()  # Of another version; the robot sees a call that ends without an answer.
+            # Of another version; the robot sees a call that ends without an answer.
+            self._answer(query, None, NOBODY)
             return
         if size_bytes > self._max_message_bytes:
             self._refuse(query, size_bytes)
@@ -736,15 +761,14 @@ class ZenohServiceTransport:
             self._hand_over(query, request)
             return
         # A last part that does not complete its request ends without an answer.
-        self._answer(query, b"" if index < count - 1 else None)
+        self._answer(query, b"" if index < count - 1 else None, name)
 
     def _refuse(self, query: zenoh.Query, size_bytes: int) -> None:
-        self._answer(query, too_large(size_bytes, self._max_message_bytes))
+        self._answer(query, too_large(size_bytes, self._max_message_bytes), NOBODY)
 
-    def _answer(self, query: zenoh.Query, reply: bytes | None) -> None:
-        with query, contextlib.suppress(zenoh.ZError):  # the session is being closed
-            if reply is not None:
-                query.reply(self._key, reply)
+    def _answer(self, query: zenoh.Query, reply: bytes | None, lane: bytes) -> None:
+        """Answer from a thread of our own: if it blocks, other robots' calls are to come in."""
+        self._senders.post((_ShortAnswer(query, self._key, reply, lane),))
 
     def _hand_over(self, query: zenoh.Query, payload: zenoh.ZBytes | bytes | None) -> None:
         call = _ReceivedCall(query, payload, self._key, self._ended)
