@@ -36,6 +36,8 @@ from tests.processes.faults import (
     wait_until,
 )
 
+from holdfast.recording.journal import Journal
+
 PEG = "peg_in_hole_2d"
 PEG_AND_SLOWLY_ALL = [
     PEG,
@@ -118,6 +120,12 @@ class TestKilled:
         assert story.run_and_resume(cloud) == 1
         assert ended
         site.wait_for_nobody()
+        # What the first of the two processes did counts in the tables too.
+        with Journal.read(story.running.out / "journal.sqlite") as journal:
+            (result,) = journal.results()
+        assert result.recoveries == 2
+        assert len(result.sensing_ms) == result.sensing_decisions == len(sensing_steps(document))
+        assert all(result.sensing_ms)
 
     @pytest.mark.parametrize("problem", PEG_AND_SLOWLY_ALL)
     @pytest.mark.slow
