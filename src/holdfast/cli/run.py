@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from holdfast.cli.endings import ended_by_signals, signal_of
+from holdfast.cli.endings import ResumableError, ended_by_signals, signal_of
 from holdfast.cli.terminal import duration, print_files, print_summary, run_display
 from holdfast.errors import HoldfastError, InvalidValueError
 
