@@ -265,12 +265,15 @@ def _run(options: _Options) -> None:
         claim_default_directory,
         latest_default_directory,
     )
+    from holdfast.runtime.environment import load_environment
     from holdfast.runtime.trials import available_cores, run_trials
 
     configuration = options.load()
     quiet = options.quiet
     as_robot = is_robot_run(configuration, options.rate)
     _require_effect(options, configuration, as_robot=as_robot)
+    # Before a directory is claimed, too: what cannot be imported shall leave nothing behind.
+    maker = load_environment(configuration) if as_robot else None
     if options.resume:
         directory_path = options.out or latest_default_directory(configuration, _RUNS)
         directory = RunDirectory.resume(directory_path, configuration)
@@ -292,10 +295,11 @@ def _run(options: _Options) -> None:
         try:
             display.start(earlier.finished, earlier.successes, directory_path)
             try:
-                if as_robot:
+                if maker is not None:
                     missed_ticks = run_as_robot(
                         configuration,
                         directory,
+                        maker,
                         on_result,
                         rate_hz=options.rate,
                         log_format="json" if options.log == "json" else "text",
@@ -347,7 +351,7 @@ def _run(options: _Options) -> None:
             ):
                 raise
             command = options.resume_command(directory_path)
-            raise HoldfastError(f"{error}\nGo on with: {command}") from error
+            raise ResumableError(error, command) from error
         if not quiet:
             print_files(directory_path)
         if note is not None:
