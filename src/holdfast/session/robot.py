@@ -293,6 +293,11 @@ class Robot:
         """The trial that is running, None between two."""
         return None if self._history is None else self._trial
 
+    @property
+    def step(self) -> int | None:
+        """The step of the trial that is running, None between two."""
+        return None if self._history is None else self._history.state.step
+
     def start(self, now: float) -> list[Effect]:
         """Begin the run: from now on services are looked for."""
         self._dispatcher.start(now)
