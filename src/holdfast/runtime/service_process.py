@@ -135,7 +135,8 @@ def _parser() -> _Parser:
         type=_number(50.0, 60_000.0),
         default=400.0,
         metavar="MS",
-        help="a link over which nothing comes for this long is given up (default: 400)",
+        help="robots give up this service when nothing comes from it for this long (default: 400); "
+        "how long a robot may be silent, the robot says: offload.lease_ms",
     )
     add(
         "--max-sessions",
