@@ -427,6 +427,20 @@ class TestErrors:
         assert left == {"peg.yaml", "slow.yaml", "slow_problem.py", "my_robot.py"}
 
     @pytest.mark.parametrize(
+        ("options", "expected"),
+        [
+            (("--tls", "nowhere"), "nowhere/authority.pem: cannot be read"),
+            ((), "tls needs credentials"),
+        ],
+    )
+    def test_credentials_that_are_not_there_claim_no_directory(
+        self, workplace: Path, options: tuple[str, ...], expected: str
+    ) -> None:
+        arguments = ("peg.yaml", "--service", "tls/127.0.0.1:7", "--out", "out", *options)
+        assert expected in self.fails(workplace, "run", *arguments)
+        assert not (workplace / "out").exists()
+
+    @pytest.mark.parametrize(
         ("command", "expected"),
         [
             (["run", "missing.yaml"], "missing.yaml: there is no such file"),

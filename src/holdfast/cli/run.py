@@ -381,10 +381,18 @@ def _require_effect(options: _Options, configuration: Configuration, *, as_robot
         )
     if configuration.offload.services:
         # Before a directory is claimed: a mistyped one shall leave nothing behind.
-        from holdfast.runtime.endpoints import parse_endpoint
+        from holdfast.runtime.endpoints import check_credentials, parse_endpoint
 
-        for service in configuration.offload.services:
-            parse_endpoint(service)
+        endpoints = [parse_endpoint(service) for service in configuration.offload.services]
+        tls = None
+        if configuration.offload.tls is not None:
+            from holdfast.runtime.credentials import load_credentials
+
+            # What is only to be warned of is told when the run begins.
+            directory = Path(configuration.offload.tls)
+            tls = load_credentials(directory, "robot", warn=lambda _: None)
+        for endpoint in endpoints:
+            check_credentials(endpoint, tls)
     for option, value in (("--recovery", options.recovery), ("--tls", options.tls)):
         if value is not None and not configuration.offload.services:
             raise InvalidValueError(
