@@ -530,7 +530,6 @@ class TestErrors:
         [
             (("--recovery", "at_start"), "--recovery at_start needs --service (or "),
             (("--tls", "keys"), "--tls keys needs --service (or "),
-            (("--log", "json"), "--log json needs --service, --environment or --rate"),
             (("--problem", "slow_problem"), "did you mean slow_problem:Slow?"),
         ],
     )
