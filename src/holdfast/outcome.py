@@ -143,7 +143,8 @@ class TrialResult(msgspec.Struct, frozen=True, kw_only=True):
     mean_sensing_ms : float
         Mean wall time of choosing a sensing action, 0 if none was chosen.
     recoveries : int
-        Times that another service took over; 0 with the planner in process.
+        Times that the local service took over, in all processes that had a part in the trial; 0
+        with the planner in process.
     unexplained_observations : int
         Observations that no particle of the belief explained.
     digest : str

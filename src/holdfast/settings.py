@@ -150,9 +150,9 @@ class OffloadSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
     startup_timeout_ms : float
         At the start of a run, how long to wait for a service that has never been seen yet.
     lease_ms : float
-        Services give up the link to this robot when nothing comes over it for this long; the robot
-        gives up the local service's after the same time, and any other's after what that one says
-        itself (``holdfast serve --lease-ms``).
+        How long this robot may be silent before services give up the link to it. Each end says
+        this of itself: how long a service may be silent before robots give it up, that one says
+        (``holdfast serve --lease-ms``). For the local service, which the robot starts, it is both.
     decision_deadline_ms : float or None
         A decision that is not there this long after it was needed is asked of the local service
         as well, if that is running; the first answer wins.

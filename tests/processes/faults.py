@@ -146,7 +146,7 @@ class Process:
 
     @property
     def output(self) -> str:
-        """What it has said that is no event."""
+        """What it has said that is no event, and the error that it has ended with."""
         return "".join(self._said)
 
     def _read(self, stream: IO[str]) -> None:
@@ -158,6 +158,8 @@ class Process:
                 with self._heard:
                     if isinstance(event, dict) and "event" in event:
                         self.events.append(event)
+                        if event["event"] == "error":
+                            self._said.append(_error_as_text(event))
                     else:
                         self._said.append(line)
                     self._heard.notify_all()
@@ -215,6 +217,16 @@ class Process:
         for reader in self._readers:
             reader.join(PATIENCE_S)
         return code
+
+
+def _error_as_text(event: Mapping[str, Any]) -> str:
+    """Return what the command says without ``--log json``."""
+    lines = [f"holdfast: error: {event['reason']}"]
+    if "details" in event:
+        lines.append(event["details"])
+    if "resume_command" in event:
+        lines.append(f"Go on with: {event['resume_command']}")
+    return "".join(f"{line}\n" for line in lines)
 
 
 class Service:

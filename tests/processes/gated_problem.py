@@ -2,6 +2,9 @@
 
 With the variable ``HOLDFAST_TEST_GATE`` (a port) in its environment, a process says so before each
 of the problem's longer computations and goes on when it is told to. Without it, it is the peg.
+
+With the variable ``HOLDFAST_TEST_STUCK`` (a file) it raises instead of moving while that file is
+there.
 """
 
 from __future__ import annotations
@@ -13,16 +16,23 @@ import numpy as np
 import numpy.typing as npt
 
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
+from holdfast.randomness import Stream
 
 FloatArray = npt.NDArray[np.float64]
 
 VARIABLE = "HOLDFAST_TEST_GATE"
+STUCK = "HOLDFAST_TEST_STUCK"
 
 
 class GatedPeg(PegInHole2D):
     """The peg in the plane, with a gate before whatever is computed on many particles."""
 
     name = "gated_peg"
+
+    def move(self, states: FloatArray, actions: FloatArray, stream: Stream) -> FloatArray:
+        if os.path.exists(os.environ.get(STUCK, "")):  # noqa: PTH110 - called a thousand times
+            raise RuntimeError("the wheels are stuck")
+        return super().move(states, actions, stream)
 
     def policy(self, states: FloatArray, stage: int | npt.NDArray[np.int64]) -> FloatArray:
         if len(states) > 1:

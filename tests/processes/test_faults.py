@@ -86,6 +86,18 @@ class TestCloud:
         # It was its silence that gave it away, before its link was given up.
         assert "no sign of progress" in robot.matching("service_suspected")[0]["reason"]
 
+    def test_given_up_after_its_own_lease(self, site: Site, references: References) -> None:
+        """How long it may be silent it says itself, and the robot's own lease is of no account."""
+        cloud = site.service(lease_ms=300.0).start()
+        story = Story(site, references, document_of(PEG), offload={"lease_ms": 60_000.0})
+
+        # While nothing is awaited of it, only the link can tell.
+        def wait_until_it_is_given_up() -> None:
+            story.running.wait_for("service_vanished", service=cloud.endpoint)
+
+        story.at("perform", 12, cloud.stop, wait_until_it_is_given_up, cloud.resume)
+        story.run(cloud)
+
     def test_with_the_settings_that_nobody_has_chosen(
         self, site: Site, references: References
     ) -> None:
@@ -424,6 +436,62 @@ class TestDeadline:
             line.split(",")[3] for line in (robot.out / "timings.csv").read_text().splitlines()[1:]
         }
         assert services == {cloud.endpoint, RECOVERY}
+
+
+@pytest.mark.slow
+class TestAnotherService:
+    """In the place of the service that was lost comes one that does not know the problem."""
+
+    def test_the_local_service_decides_until_the_right_one_comes(
+        self, site: Site, references: References
+    ) -> None:
+        cloud = site.service(*SERVES_GATED).start()
+        steps = sensing_steps(GATED)
+        story = Story(site, references, GATED)
+
+        def start_without_the_problem() -> None:
+            cloud.options = tuple(each for each in cloud.options if each not in SERVES_GATED)
+            cloud.start()
+            story.running.wait_for("service_appeared", 2)
+
+        def start_the_right_one() -> None:
+            cloud.kill()
+            cloud.options = (*cloud.options, *SERVES_GATED)
+            cloud.start()
+
+        # The next decision is awaited as soon as the robot has sensed.
+        story.at("sense", steps[1], cloud.kill, start_without_the_problem)
+        story.at("perform", steps[3], start_the_right_one, story.status(KEEP_ALIVE))
+        robot = story.run(cloud)
+        assert robot.statuses() == [LOST, RESTORED]
+        told = robot.matching("refused", service=cloud.endpoint)
+        assert told
+        assert all("gated_problem:GatedPeg" in event["reason"] for event in told)
+
+    def test_without_a_local_service_the_run_ends_says_why_and_can_go_on(
+        self, site: Site, references: References
+    ) -> None:
+        cloud = site.service(*SERVES_GATED).start()
+        steps = sensing_steps(GATED)
+        story = Story(site, references, GATED, recovery={"launch": "never"})
+
+        def start_without_the_problem() -> None:
+            cloud.options = tuple(each for each in cloud.options if each not in SERVES_GATED)
+            cloud.start()
+            story.running.wait_for("service_appeared", 2)
+
+        story.at("sense", steps[1], cloud.kill, start_without_the_problem)
+        robot = site.run(story.file, services=[cloud])
+        assert robot.wait() == 2
+        (told,) = robot.matching("error")
+        assert told["reason"].startswith(f"no service will decide: {cloud.endpoint}: ")
+        assert "problem gated_problem:GatedPeg: is not known to this service" in told["reason"]
+        assert "(--problem)" in told["reason"]
+        assert story.world.step == steps[1]
+        cloud.kill()
+        cloud.options = (*cloud.options, *SERVES_GATED)
+        cloud.start()
+        story.finish(site.run(story.file, services=[cloud], resume=True))
 
 
 class TestReplicas:

@@ -17,8 +17,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.processes import gated_problem
 from tests.processes.faults import (
     COMMAND,
+    HERE,
     KEEP_ALIVE,
     LOCAL_RECOVERY,
     PATIENT,
@@ -35,6 +37,8 @@ from tests.processes.faults import (
     wait_for_end,
     wait_until,
 )
+
+from holdfast.recording.journal import Journal
 
 PEG = "peg_in_hole_2d"
 PEG_AND_SLOWLY_ALL = [
@@ -66,6 +70,24 @@ class TestKilled:
         assert story.run_and_resume(cloud) == 3
         # Each robot came with a higher epoch, so the cloud has taken the session over.
         assert len(cloud.process.matching("session_taken_over")) >= 1
+
+    @pytest.mark.parametrize("world", ["PlainWorldClient", "WorldClient"])
+    @pytest.mark.parametrize("shown", [False, True])
+    @pytest.mark.slow
+    def test_while_it_senses(
+        self, world: str, shown: bool, site: Site, references: References
+    ) -> None:
+        """Sensing moves nothing, so it may be done again by a robot that cannot count its steps."""
+        document = document_of(PEG)
+        steps = sensing_steps(document)
+        cloud = site.service().start()
+        story = Story(site, references, document, environment={"object": f"world_client:{world}"})
+        for step in (steps[0], steps[2], steps[5]):
+            story.at("sense", step, site.kill_robot, afterwards=shown)
+        assert story.run_and_resume(cloud) == 3
+        said = site.holdfast("compare", story.reference, story.running.out)
+        assert said.process.returncode == 0, said.account()
+        assert "\nidentical: 1 trial, " in said.output
 
     @pytest.mark.parametrize("problem", PEG_AND_SLOWLY_ALL)
     @pytest.mark.slow
@@ -118,6 +140,12 @@ class TestKilled:
         assert story.run_and_resume(cloud) == 1
         assert ended
         site.wait_for_nobody()
+        # What the first of the two processes did counts in the tables too.
+        with Journal.read(story.running.out / "journal.sqlite") as journal:
+            (result,) = journal.results()
+        assert result.recoveries == 2
+        assert len(result.sensing_ms) == result.sensing_decisions == len(sensing_steps(document))
+        assert all(result.sensing_ms)
 
     @pytest.mark.parametrize("problem", PEG_AND_SLOWLY_ALL)
     @pytest.mark.slow
@@ -173,6 +201,55 @@ class TestKilled:
                 hooks = faults[random.integers(3)]
                 story.at("perform", step, *hooks, trial=trial, afterwards=bool(random.integers(2)))
         story.run_and_resume(cloud)
+
+
+class TestProblem:
+    @pytest.mark.slow
+    def test_a_transition_that_raises_in_the_robot_alone(
+        self, site: Site, references: References
+    ) -> None:
+        document = {
+            **document_of(PEG, max_steps=40),
+            "problem": "gated_problem:GatedPeg",
+            "problem_directory": str(HERE),
+        }
+        cloud = site.service(
+            "--problem", "gated_problem:GatedPeg", "--problem-directory", str(HERE)
+        )
+        cloud.start()
+        story = Story(site, references, document)
+        mark = site.directory / "stuck"
+        story.at("perform", 12, mark.touch, afterwards=True)
+        variables = {"HOLDFAST_TEST_STUCK": str(mark)}
+        robot = site.run(story.file, services=[cloud], variables=variables)
+        assert robot.wait() == 2
+        (told,) = robot.matching("error")
+        assert told["reason"] == (
+            "trial 0 (seed 3), step 12: gated_problem:GatedPeg raised RuntimeError: the wheels are "
+            "stuck"
+        )
+        line = next(
+            number
+            for number, text in enumerate(Path(gated_problem.__file__).read_text().splitlines(), 1)
+            if "raise RuntimeError" in text
+        )
+        assert told["details"] == (
+            f'  File "{gated_problem.__file__}", line {line}, in move\n'
+            '    raise RuntimeError("the wheels are stuck")'
+        )
+        assert "Traceback" not in robot.output
+        # The motion was performed, and it is known that it was.
+        assert story.world.step == 13
+        assert unfinished_steps(robot.out) == list(range(13))
+        # It is still stuck: then the journal cannot be read, which says the same.
+        again = site.run(story.file, services=[cloud], variables=variables, resume=True)
+        assert again.wait() == 2
+        (told,) = again.matching("error")
+        assert told["reason"].startswith(
+            "trial 0 (seed 3), as the journal has it: gated_problem:GatedPeg raised RuntimeError: "
+        )
+        mark.unlink()
+        story.finish(site.run(story.file, services=[cloud], resume=True))
 
 
 class TestStopped:

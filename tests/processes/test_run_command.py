@@ -46,6 +46,18 @@ class Slow(PegInHole2D):
         return super().initial_states(stream, count)
 """
 
+BROKEN_ROBOT = """
+class MyRobot:
+    def perform_sensing(self, sensing_action):
+        return [0.5]
+
+    def perform(self, task_action):
+        raise RuntimeError("the gripper is stuck")
+
+    def is_done(self):
+        return False
+"""
+
 SLOW_CONFIGURATION = """
 problem: slow_problem:Slow
 particle_filter: {num_particles: 20}
@@ -194,6 +206,38 @@ class TestOutput:
         decided = found["sensing_decisions_by_service"]
         assert decided == {"cloud_active_sensing_recovery": found["sensing_decisions"]}
         assert "decided by" in done.stdout
+
+    @pytest.mark.parametrize(
+        "options", [(), ("--rate", "10000"), ("--rate", "10000", "--log", "json")]
+    )
+    def test_a_standard_error_that_cannot_be_written_ends_no_run(
+        self, workplace: Path, options: tuple[str, ...]
+    ) -> None:
+        arguments = ("run", "peg.yaml", "--trials", "1", "--out", "out", *options)
+        with Path("/dev/full").open("w") as full:
+            done = subprocess.run(
+                [*COMMAND, *arguments],
+                cwd=workplace,
+                stdout=subprocess.PIPE,
+                stderr=full,
+                text=True,
+                timeout=120,
+                check=False,
+            )
+        assert done.returncode == 0
+        assert "digest" in done.stdout
+        assert summary(workplace / "out")["finished"] == 1
+
+    def test_nor_a_reader_that_has_ended(self, workplace: Path) -> None:
+        reading, writing = os.pipe()
+        os.close(reading)
+        command = [*COMMAND, "run", "peg.yaml", "--trials", "1", "--rate", "10000", "--out", "out"]
+        with os.fdopen(writing, "w") as pipe:
+            done = subprocess.run(
+                command, cwd=workplace, stdout=subprocess.DEVNULL, stderr=pipe, check=False
+            )
+        assert done.returncode == 0
+        assert summary(workplace / "out")["finished"] == 1
 
     def test_without_out_directories_are_numbered(self, workplace: Path) -> None:
         for name in ("peg-seed3", "peg-seed3-2"):
@@ -356,6 +400,85 @@ class TestErrors:
     def test_nothing_to_resume(self, workplace: Path) -> None:
         assert "no run to resume" in self.fails(workplace, "run", "peg.yaml", "--resume")
 
+    def test_the_exit_code_says_it_where_nothing_can_be_written(self, workplace: Path) -> None:
+        for command, code in ((["run", "missing.yaml"], 2), (["run", "--bogus"], 2)):
+            with Path("/dev/full").open("w") as full:
+                done = subprocess.run([*COMMAND, *command], cwd=workplace, stderr=full, check=False)
+            assert done.returncode == code
+
+    @pytest.mark.parametrize(
+        ("name", "text", "expected"),
+        [
+            ("my_robot:Robot", "class MyRobot: pass\n", "did you mean MyRobot?"),
+            ("my_robt:MyRobot", "class MyRobot: pass\n", "there is no module my_robt"),
+            ("my_robot:MyRobot", "import no_such_library\n", "No module named 'no_such_library'"),
+            ("my_robot:MyRobot", "import math\nmath.sqrt(-1)\n", 'my_robot.py", line 2'),
+            ("my_robot:MyRobot", "import sys\nsys.exit(0)\n", "raised SystemExit: 0"),
+            ("my_robot:MyRobot", "class MyRobot\n", 'my_robot.py", line 1'),
+        ],
+    )
+    @pytest.mark.parametrize("out", [("--out", "out"), ()])
+    def test_an_environment_that_is_not_there_claims_no_directory(
+        self, workplace: Path, name: str, text: str, expected: str, out: tuple[str, ...]
+    ) -> None:
+        (workplace / "my_robot.py").write_text(text)
+        error = self.fails(workplace, "run", "peg.yaml", "--environment", name, *out)
+        assert expected in error
+        left = {path.name for path in workplace.iterdir()} - {"__pycache__"}
+        assert left == {"peg.yaml", "slow.yaml", "slow_problem.py", "my_robot.py"}
+
+    @pytest.mark.parametrize(
+        ("options", "expected"),
+        [
+            (("--tls", "nowhere"), "nowhere/authority.pem: cannot be read"),
+            ((), "tls needs credentials"),
+        ],
+    )
+    def test_credentials_that_are_not_there_claim_no_directory(
+        self, workplace: Path, options: tuple[str, ...], expected: str
+    ) -> None:
+        arguments = ("peg.yaml", "--service", "tls/127.0.0.1:7", "--out", "out", *options)
+        assert expected in self.fails(workplace, "run", *arguments)
+        assert not (workplace / "out").exists()
+
+    @pytest.mark.parametrize(
+        ("command", "expected"),
+        [
+            (["run", "missing.yaml"], "missing.yaml: there is no such file"),
+            (["run", "peg.yaml", "--trials", "x"], "Invalid value for '--trials'"),
+            (
+                ["run", "peg.yaml", "--environment", "my_robt:MyRobot"],
+                "environment.object, given instead of",
+            ),
+            (["run", "peg.yaml"], "--log json needs --service, --environment or --rate"),
+            (["serve", "--listen", "tcp/nowhere"], "endpoint 'tcp/nowhere'"),
+            (["serve", "--lease-ms", "1"], "argument --lease-ms: '1' is not a number from 50"),
+        ],
+    )
+    @pytest.mark.parametrize("log", [("--log", "json"), ("--log=json",)])
+    def test_with_log_json_the_error_is_an_event(
+        self, workplace: Path, command: list[str], expected: str, log: tuple[str, ...]
+    ) -> None:
+        done = holdfast(workplace, *command, *log)
+        assert done.returncode == 2
+        (event,) = map(json.loads, done.stderr.splitlines())
+        assert event["event"] == "error"
+        assert event["reason"].startswith(expected), event
+        assert event["component"] == ("service" if command[0] == "serve" else "robot")
+
+    def test_with_log_json_the_error_says_how_to_go_on(self, workplace: Path) -> None:
+        (workplace / "my_robot.py").write_text(BROKEN_ROBOT)
+        arguments = ("run", "peg.yaml", "--environment", "my_robot:MyRobot", "--out", "out")
+        done = holdfast(workplace, *arguments, "--log", "json")
+        assert done.returncode == 2
+        *_, last = map(json.loads, done.stderr.splitlines())
+        assert last["event"] == "error"
+        assert last["reason"].startswith("the robot holds still in trial 0, step 0: ")
+        assert f'File "{workplace / "my_robot.py"}", line ' in last["details"]
+        command = last["resume_command"]
+        assert command.startswith("holdfast run peg.yaml --environment my_robot:MyRobot ")
+        assert command.endswith("--out out --resume")
+
     def test_what_a_problem_raises_is_shown_without_our_frames(self, workplace: Path) -> None:
         (workplace / "broken.py").write_text(
             "from holdfast.problems.peg_in_hole_2d import PegInHole2D\n"
@@ -408,7 +531,6 @@ class TestErrors:
         [
             (("--recovery", "at_start"), "--recovery at_start needs --service (or "),
             (("--tls", "keys"), "--tls keys needs --service (or "),
-            (("--log", "json"), "--log json needs --service, --environment or --rate"),
             (("--problem", "slow_problem"), "did you mean slow_problem:Slow?"),
         ],
     )

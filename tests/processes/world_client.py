@@ -16,8 +16,8 @@ import numpy.typing as npt
 FloatArray = npt.NDArray[np.float64]
 
 
-class WorldClient:
-    """A world behind a socket, which counts what it is asked to do."""
+class PlainWorldClient:
+    """A world behind a socket, with no more than the three methods that it must have."""
 
     def __init__(self, port: int, trial: int, resumed: bool) -> None:
         self._socket = socket.create_connection(("127.0.0.1", port))
@@ -34,9 +34,6 @@ class WorldClient:
     def is_done(self) -> bool:
         return bool(self._ask(do="is_done")["done"])
 
-    def steps_performed(self) -> int:
-        return int(self._ask(do="count")["count"])
-
     def close(self) -> None:
         self._lines.close()
         self._socket.close()
@@ -49,3 +46,10 @@ class WorldClient:
             raise ConnectionError("the world has hung up")
         answer: dict[str, Any] = json.loads(line)
         return answer
+
+
+class WorldClient(PlainWorldClient):
+    """The same, which tells how much it was made to do."""
+
+    def steps_performed(self) -> int:
+        return int(self._ask(do="count")["count"])

@@ -89,7 +89,7 @@ def run_of(
         if unfinished is not None:
             journal.append(
                 unfinished,
-                [ObservedRecord(0, 1, b"\0" * 8, b"\0" * 32), ActingRecord(0, b"\0" * 16)],
+                [ObservedRecord(0, 1, b"\0" * 8, b"\0" * 32, 0.5), ActingRecord(0, b"\0" * 16)],
             )
     return directory
 

@@ -34,7 +34,8 @@ TRIAL = 3
 def records_of(step: int) -> list[Record]:
     """What a robot writes at one step, with numbers that tell the step."""
     action = struct.pack("<3d", step, -0.0, 1.0 / (step + 1))
-    observed = ObservedRecord(step, step % 5, struct.pack("<d", step / 7), bytes([100 + step]) * 32)
+    shown, reached = struct.pack("<d", step / 7), bytes([100 + step]) * 32
+    observed = ObservedRecord(step, step % 5, shown, reached, step / 3)
     performed = [PerformedRecord(step - 1, -float(step))] if step else []
     return [*performed, observed, ActingRecord(step, action)]
 

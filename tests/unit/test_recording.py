@@ -175,7 +175,7 @@ class TestJournal:
         path = tmp_path / "journal.sqlite"
         with Journal.create(path, {}) as journal:
             journal.set_meta("schema_version", "999")
-        with pytest.raises(OutputError, match="schema version 999; this holdfast reads version 2"):
+        with pytest.raises(OutputError, match="schema version 999; this holdfast reads version 3"):
             Journal.open(path)
 
 
@@ -224,8 +224,7 @@ class TestTables:
         assert summary.unexplained_observations == 3
         assert json.loads(summary.to_json())["digest"] == summary.digest
 
-    def test_decisions_of_earlier_processes_count(self) -> None:
-        """Their times are not known after a resume, but that they were made is."""
+    def test_who_decided_is_told_where_it_is_known(self) -> None:
         builder = SummaryBuilder()
         result = result_of(0, sensing_ms=(1.0, 2.0))
         builder.add(msgspec.structs.replace(result, sensing_decisions=17))

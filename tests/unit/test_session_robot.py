@@ -6,6 +6,7 @@ import heapq
 from collections.abc import Callable
 from typing import NamedTuple
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -761,6 +762,81 @@ def test_resumed_from_any_moment(performed: bool) -> None:
         steps = [step for step, _ in world.acted]
         assert steps == list(range(14 - len(steps), 14))
         assert len(history.actions) + missing + len(steps) == 14
+
+
+def test_what_earlier_processes_did_counts_in_the_result() -> None:
+    """Each sensing decision with its time, and each time that another service took over."""
+
+    def resumed(records: list[Record], lost_at: int | None, dies_at: int | None) -> World:
+        world = World(simulator=SimulatorSettings(num_trials=1, max_steps=30, seed=11))
+        cloud = world.services["cloud"]
+        answer = cloud.answer
+
+        def timed(payload: bytes) -> list[Reply]:
+            return [
+                msgspec.structs.replace(reply, computed_us=1000 * reply.step)
+                if isinstance(reply, SensingAnswer)
+                else reply
+                for reply in answer(payload)
+            ]
+
+        cloud.answer = timed  # type: ignore[method-assign]
+        world.services[LOCAL].answer = timed  # type: ignore[method-assign]
+
+        def fault(step: int) -> None:
+            if step == lost_at:
+                world.kill("cloud")
+                world.bring_up("cloud", 0.012)
+            if step == dies_at:
+                world.heap.clear()
+                world.ended = True
+
+        world.on_act = fault
+        world.start(records=tuple(records))
+        world.run()
+        return world
+
+    first = resumed([], 5, 12)
+    second = resumed(first.journal, 16, 20)
+    third = resumed(second.journal, None, None)
+    (result,) = third.results
+    assert result.recoveries == 2
+    assert result.sensing_decisions == 8
+    assert result.sensing_ms == pytest.approx([4.0 * number for number in range(8)])
+    assert result.mean_sensing_ms == pytest.approx(14.0)
+    assert result.digest == run_trial(PROBLEM, PLANNING, third.simulator, 0).digest
+
+
+def test_a_recovery_alone_begins_no_trial_and_counts_in_the_next_one() -> None:
+    world = World(simulator=SimulatorSettings(num_trials=1, max_steps=14, seed=11))
+    written: list[Record] = []
+    world.launchable = False
+    world.start(present=False)
+    world.run(until_s=3.0)
+    assert world.statuses() == ["local_recovery"]
+    written = world.journal.copy()
+    assert written == []
+    world.bring_up("cloud")
+    world.run()
+    assert world.results[0].recoveries == 1
+
+
+def test_a_pause_is_the_last_that_is_written_down() -> None:
+    """Although another service took over since the record before."""
+    world = World(simulator=SimulatorSettings(num_trials=1, max_steps=14, seed=11))
+
+    def fault(step: int) -> None:
+        if step == 6:
+            world.kill("cloud", 0.001)
+            world.after(0.002, lambda: world.robot.pause(world.now))
+
+    world.on_act = fault
+    world.start()
+    world.run()
+    assert world.statuses() == ["local_recovery"]
+    history = replay(PROBLEM, PLANNING, 11, 0, world.journal)
+    assert history.paused
+    assert history.recoveries == 1
 
 
 def begin_after(

@@ -13,7 +13,6 @@ line that is made for people.
 
 from __future__ import annotations
 
-import os
 import sys
 
 __all__ = ["main"]
@@ -21,9 +20,11 @@ __all__ = ["main"]
 
 def main() -> None:
     """Run the command line and exit."""
+    from holdfast.cli.streams import forgive_unwritable_errors, replace_closed_streams
     from holdfast.errors import HoldfastError
 
-    _replace_closed_streams()
+    replace_closed_streams()
+    forgive_unwritable_errors()
     arguments = sys.argv[1:]
     try:
         if arguments[:1] == ["serve"]:
@@ -34,25 +35,11 @@ def main() -> None:
 
         run_application(arguments)
     except HoldfastError as error:
-        from holdfast.cli.endings import EXIT_ERROR
+        from holdfast.cli.endings import EXIT_ERROR, tell_error
 
-        sys.stderr.write(f"holdfast: error: {error}\n")
+        tell_error(error, arguments)
         sys.exit(EXIT_ERROR)
     except KeyboardInterrupt as interruption:
         from holdfast.cli.endings import EXIT_SIGNAL, signal_of
 
         sys.exit(EXIT_SIGNAL + signal_of(interruption))
-
-
-def _replace_closed_streams() -> None:
-    """Give a process that was started without a terminal or file (``2>&-``) somewhere to write.
-
-    It also keeps the three first descriptors taken, which otherwise the next file would get, and
-    with it whatever a library writes to "the standard error".
-    """
-    for descriptor, name, mode in ((0, "stdin", "r"), (1, "stdout", "w"), (2, "stderr", "w")):
-        if getattr(sys, name) is None:
-            stream = open(os.devnull, mode)  # noqa: SIM115, PTH123 - open as long as the process
-            if stream.fileno() != descriptor:
-                os.dup2(stream.fileno(), descriptor)
-            setattr(sys, name, stream)

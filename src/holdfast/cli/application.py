@@ -14,10 +14,11 @@ import typer
 from holdfast import __version__
 from holdfast.cli.compare import compare
 from holdfast.cli.demo import demo
-from holdfast.cli.endings import EXIT_ERROR
 from holdfast.cli.keys import keys
 from holdfast.cli.run import run
 from holdfast.cli.serve import serve
+from holdfast.errors import HoldfastError
+from holdfast.runtime.command_line import wants_json
 
 __all__ = ["app", "run_application"]
 
@@ -68,9 +69,18 @@ def run_application(arguments: list[str]) -> None:
     first = arguments[0] if arguments else ""
     if first.endswith((".yaml", ".yml")):
         command = shlex.join(["holdfast", "run", *arguments])
-        sys.stderr.write(f"holdfast: error: {first} is no command; did you mean: {command}\n")
-        sys.exit(EXIT_ERROR)
-    app(args=arguments, prog_name="holdfast")
+        raise HoldfastError(f"{first} is no command; did you mean: {command}")
+    if not wants_json(arguments):
+        app(args=arguments, prog_name="holdfast")
+    try:
+        code = app(args=arguments, prog_name="holdfast", standalone_mode=False)
+    except Exception as error:
+        # Typer has had more than one place for the class of what it has to say of an option.
+        message = getattr(error, "format_message", None)
+        if not callable(message):
+            raise
+        raise HoldfastError(message()) from error
+    sys.exit(code)
 
 
 def _print_version(wanted: bool) -> None:

@@ -1,18 +1,24 @@
-"""How a command ends: its exit codes, and signals that end it in order."""
+"""How a command ends: its exit codes, its last words, and signals that end it in order."""
 
 from __future__ import annotations
 
 import contextlib
 import signal
-from collections.abc import Iterator
+import sys
+from collections.abc import Iterator, Sequence
+
+from holdfast.errors import HoldfastError
+from holdfast.runtime.command_line import wants_json
 
 __all__ = [
     "EXIT_DIFFERENT",
     "EXIT_ERROR",
     "EXIT_SIGNAL",
     "EndedBySignal",
+    "ResumableError",
     "ended_by_signals",
     "signal_of",
+    "tell_error",
 ]
 
 EXIT_DIFFERENT = 1
@@ -23,6 +29,54 @@ EXIT_ERROR = 2
 
 EXIT_SIGNAL = 128
 """Added to the number of the signal that ended a run, as shells do it."""
+
+
+class ResumableError(HoldfastError):
+    """What ended a run that can go on.
+
+    Parameters
+    ----------
+    error : HoldfastError
+    command : str
+        The command that goes on.
+
+    Attributes
+    ----------
+    reason, command : str
+        Both of them; the message has them together.
+    """
+
+    def __init__(self, error: HoldfastError, command: str) -> None:
+        super().__init__(f"{error}\nGo on with: {command}")
+        self.reason = str(error)
+        self.command = command
+
+
+def tell_error(error: HoldfastError, arguments: Sequence[str]) -> None:
+    """Say on the standard error what ended a command: as text, or as the last of its events.
+
+    Parameters
+    ----------
+    error : HoldfastError
+    arguments : sequence of str
+        What stands after ``holdfast``; they say which of both.
+    """
+    if not wants_json(arguments):
+        sys.stderr.write(f"holdfast: error: {error}\n")
+        return
+    from holdfast.runtime.logs import EventLog
+
+    text = error.reason if isinstance(error, ResumableError) else str(error)
+    # The rest, such as lines of the user's code, apart: a value of an event has its bound.
+    reason, _, details = text.partition("\n")
+    fields = {"reason": reason}
+    if details:
+        fields["details"] = details
+    if isinstance(error, ResumableError):
+        fields["resume_command"] = error.command
+    component = "service" if arguments[:1] == ["serve"] else "robot"
+    with EventLog(sys.stderr, format="json", component=component) as log:
+        log.event("error", **fields)
 
 
 class EndedBySignal(KeyboardInterrupt):

@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from holdfast.configuration import Configuration
     from holdfast.outcome import TrialResult
     from holdfast.recording.run_directory import RunDirectory
+    from holdfast.runtime.environment import EnvironmentMaker
     from holdfast.runtime.logs import EventSink, LogFormat
 
 __all__ = ["is_robot_run", "run_as_robot"]
@@ -37,6 +38,7 @@ def is_robot_run(configuration: Configuration, rate_hz: float | None) -> bool:
 def run_as_robot(
     configuration: Configuration,
     directory: RunDirectory,
+    maker: EnvironmentMaker,
     on_result: Callable[[TrialResult], None],
     *,
     rate_hz: float | None,
@@ -50,6 +52,8 @@ def run_as_robot(
     configuration : Configuration
     directory : RunDirectory
         Its journal keeps each step.
+    maker : EnvironmentMaker
+        Makes what the robot acts on.
     on_result : callable
         Gets each trial's result, and keeps it.
     rate_hz : float or None
@@ -65,12 +69,10 @@ def run_as_robot(
     """
     from holdfast.recording.run_directory import EVENTS_NAME, TIMINGS_NAME
     from holdfast.recording.timings import TimingTable
-    from holdfast.runtime.environment import load_environment
     from holdfast.runtime.links import make_links
     from holdfast.runtime.logs import EventLog, TeeEventLog
     from holdfast.runtime.robot_process import RobotProcess
 
-    maker = load_environment(configuration)
     with contextlib.ExitStack() as stack:
         # What is only for people on a terminal is kept in the file all the same.
         sinks: list[EventSink] = [

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from holdfast.cli.endings import ended_by_signals, signal_of
+from holdfast.cli.endings import ResumableError, ended_by_signals, signal_of
 from holdfast.cli.terminal import duration, print_files, print_summary, run_display
 from holdfast.errors import HoldfastError, InvalidValueError
 
@@ -265,12 +265,15 @@ def _run(options: _Options) -> None:
         claim_default_directory,
         latest_default_directory,
     )
+    from holdfast.runtime.environment import load_environment
     from holdfast.runtime.trials import available_cores, run_trials
 
     configuration = options.load()
     quiet = options.quiet
     as_robot = is_robot_run(configuration, options.rate)
     _require_effect(options, configuration, as_robot=as_robot)
+    # Before a directory is claimed, too: what cannot be imported shall leave nothing behind.
+    maker = load_environment(configuration) if as_robot else None
     if options.resume:
         directory_path = options.out or latest_default_directory(configuration, _RUNS)
         directory = RunDirectory.resume(directory_path, configuration)
@@ -292,10 +295,11 @@ def _run(options: _Options) -> None:
         try:
             display.start(earlier.finished, earlier.successes, directory_path)
             try:
-                if as_robot:
+                if maker is not None:
                     missed_ticks = run_as_robot(
                         configuration,
                         directory,
+                        maker,
                         on_result,
                         rate_hz=options.rate,
                         log_format="json" if options.log == "json" else "text",
@@ -347,7 +351,7 @@ def _run(options: _Options) -> None:
             ):
                 raise
             command = options.resume_command(directory_path)
-            raise HoldfastError(f"{error}\nGo on with: {command}") from error
+            raise ResumableError(error, command) from error
         if not quiet:
             print_files(directory_path)
         if note is not None:
@@ -377,10 +381,18 @@ def _require_effect(options: _Options, configuration: Configuration, *, as_robot
         )
     if configuration.offload.services:
         # Before a directory is claimed: a mistyped one shall leave nothing behind.
-        from holdfast.runtime.endpoints import parse_endpoint
+        from holdfast.runtime.endpoints import check_credentials, parse_endpoint
 
-        for service in configuration.offload.services:
-            parse_endpoint(service)
+        endpoints = [parse_endpoint(service) for service in configuration.offload.services]
+        tls = None
+        if configuration.offload.tls is not None:
+            from holdfast.runtime.credentials import load_credentials
+
+            # What is only to be warned of is told when the run begins.
+            directory = Path(configuration.offload.tls)
+            tls = load_credentials(directory, "robot", warn=lambda _: None)
+        for endpoint in endpoints:
+            check_credentials(endpoint, tls)
     for option, value in (("--recovery", options.recovery), ("--tls", options.tls)):
         if value is not None and not configuration.offload.services:
             raise InvalidValueError(

@@ -40,7 +40,7 @@ __all__ = ["SCHEMA_VERSION", "Journal", "Survives", "Tally", "UnfinishedTrial"]
 Survives: TypeAlias = Literal["process_crash", "power_cut"]
 """What a journalled step outlives; see :class:`holdfast.settings.RecoverySettings`."""
 
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
 """Raised whenever the tables or what is in them change their form."""
 
 _SCHEMA = (

@@ -74,17 +74,17 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
     unexplained_observations : int
         Observations that no particle explained.
     recoveries : int
-        Times that another service took over.
+        Times that the local service took over, in all processes of the run.
     sensing_decisions_by_service, task_answers_by_service : dict of str to int, or None
         Which service made how many of these, and gave how many answers with task actions (one holds
         those up to the next sensing step); None where ``timings.csv`` is not kept.
     longest_wait_ms : float or None
         The longest time that the robot stood still for a decision.
     sensing_ms_median, sensing_ms_p99 : float or None
-        Wall time of choosing a sensing action. Of a trial that was resumed, only those of the last
-        process are known.
+        Wall time of choosing a sensing action. Each decision counts once, as it was carried out,
+        also those of earlier processes of a run that was resumed.
     wall_time_s : float
-        Time that the run took, over all its parts.
+        Time that the run took, over all its parts; of a part that was killed it is not known.
     digest : str
         BLAKE2b-256 over the digests of the trials in order: equal if, and only if, all decisions
         of two runs are.

@@ -2,7 +2,7 @@
 
 These times are for people and figures; nothing is decided by them. So a row is handed to the
 operating system at once but not forced to the disk, and what a crash cuts off is cut off here too
-when the run goes on.
+when the run goes on. (The times in the tables of the trials come from the journal.)
 """
 
 from __future__ import annotations

@@ -312,8 +312,8 @@ def load_environment(configuration: Configuration) -> EnvironmentMaker:
         )
     except ConfigurationError as error:
         raise ConfigurationError(f"{configuration.path}: {error}") from error
-    except Exception as error:
-        # Its module was found, but does not come through its own import.
+    except (Exception, SystemExit) as error:
+        # Its module was found, but does not come through its own import; a script may even exit.
         account = account_of_user_error(error, name)
         if account is None:
             raise

@@ -173,6 +173,7 @@ class RobotProcess:
         self._now = monotonic()
         self._launcher: Launcher | None = None
         self._performer: Performer | None = None
+        self._replayed: int | None = None
         self._starting: tuple[int, History, bool] | None = None
         self._finished: set[int] = set()
         self._numbers = iter(range(configuration.simulator.num_trials))
@@ -265,8 +266,12 @@ class RobotProcess:
                 self._journal.append(effect.trial, effect.records)
 
     def _where(self) -> str:
-        trial = self._robot.trial if self._starting is None else self._starting[0]
-        return f"trial {trial} (seed {self._configuration.simulator.seed})"
+        seed = self._configuration.simulator.seed
+        if self._replayed is not None:
+            return f"trial {self._replayed} (seed {seed}), as the journal has it"
+        if self._starting is not None:
+            return f"trial {self._starting[0]} (seed {seed})"
+        return f"trial {self._robot.trial} (seed {seed}), step {self._robot.step}"
 
     def _loop(self) -> None:
         robot = self._robot
@@ -379,6 +384,7 @@ class RobotProcess:
                 return
             trial, records, tail_is_certain = following, (), True
         configuration = self._configuration
+        self._replayed = trial
         history = replay(
             configuration.problem,
             configuration.planning,
@@ -386,6 +392,7 @@ class RobotProcess:
             trial,
             records,
         )
+        self._replayed = None
         self._starting = (trial, history, tail_is_certain)
         self._performer = make_performer(
             self._maker,

@@ -15,9 +15,10 @@ import signal
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NoReturn
 
 from holdfast.errors import InvalidValueError, TransportError
+from holdfast.runtime.command_line import wants_json
 
 if TYPE_CHECKING:
     from holdfast.runtime.endpoints import Endpoint, TlsFiles
@@ -54,7 +55,9 @@ def main(arguments: Sequence[str]) -> int:
     HoldfastError
         If an option cannot be used; the message says which and why.
     """
-    options = _parser().parse_args(arguments)
+    parser = _parser()
+    parser.arguments = arguments
+    options = parser.parse_args(arguments)
     # Nothing is thrown away while modules are loaded, so there is nothing to look for.
     gc.disable()
     # NumPy's BLAS would start threads that nothing here has work for.
@@ -62,8 +65,19 @@ def main(arguments: Sequence[str]) -> int:
     return _serve(options)
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+class _Parser(argparse.ArgumentParser):
+    """Raises what another one would write as text, if the text is to be an event."""
+
+    arguments: Sequence[str] = ()
+
+    def error(self, message: str) -> NoReturn:
+        if wants_json(self.arguments):
+            raise InvalidValueError(message)
+        super().error(message)
+
+
+def _parser() -> _Parser:
+    parser = _Parser(
         prog="holdfast serve",
         description="Decide for robots, as a service: many at once, on all cores.",
         allow_abbrev=False,
@@ -121,7 +135,8 @@ def _parser() -> argparse.ArgumentParser:
         type=_number(50.0, 60_000.0),
         default=400.0,
         metavar="MS",
-        help="a link over which nothing comes for this long is given up (default: 400)",
+        help="robots give up this service when nothing comes from it for this long (default: 400); "
+        "how long a robot may be silent, the robot says: offload.lease_ms",
     )
     add(
         "--max-sessions",
@@ -186,7 +201,7 @@ def _serve(options: argparse.Namespace) -> int:
     if options.tls is not None:
         from holdfast.runtime.credentials import load_credentials
 
-        tls = load_credentials(Path(options.tls), "service", warn=_warn)
+        tls = load_credentials(Path(options.tls), "service", warn=lambda text: _warn(options, text))
     listen, connect = options.listen, options.connect
     if not listen and not connect:
         listen = [f"{'tcp' if tls is None else 'tls'}/{_DEFAULT_PLACE}"]
@@ -272,8 +287,14 @@ def _check_safe(endpoint: Endpoint, tls: TlsFiles | None, *, insecure: bool) -> 
     )
 
 
-def _warn(text: str) -> None:
-    sys.stderr.write(f"holdfast serve: warning: {text}\n")
+def _warn(options: argparse.Namespace, text: str) -> None:
+    if options.log == "json":
+        from holdfast.runtime.logs import EventLog
+
+        with EventLog(sys.stderr, format="json", component=options.name) as log:
+            log.event("credentials", reason=text)
+    else:
+        sys.stderr.write(f"holdfast serve: warning: {text}\n")
 
 
 def _say_ready(options: argparse.Namespace, boot: str, where: dict[str, object]) -> None:

@@ -20,6 +20,7 @@ __all__ = [
     "PerformedRecord",
     "Record",
     "RecordError",
+    "RecoveredRecord",
     "decode_record",
     "encode_record",
 ]
@@ -39,12 +40,15 @@ class ObservedRecord(msgspec.Struct, array_like=True, frozen=True, tag=1):
         Little-endian float64.
     digest : bytes
         32 bytes of the state that it led to: tells whether going on leads to the same state.
+    sensing_ms : float
+        How long the sensing action was computed; nothing is decided by it.
     """
 
     step: int
     sensing_action: int
     observation: bytes
     digest: bytes
+    sensing_ms: float
 
 
 class ActingRecord(msgspec.Struct, array_like=True, frozen=True, tag=2):
@@ -78,7 +82,19 @@ class PausedRecord(msgspec.Struct, array_like=True, frozen=True, tag=4):
     """The robot's process ended in order: nothing happened that is not written here."""
 
 
-Record: TypeAlias = ObservedRecord | ActingRecord | PerformedRecord | PausedRecord
+class RecoveredRecord(msgspec.Struct, array_like=True, frozen=True, tag=5):
+    """Another service had to take over. For the tables: nothing follows from it.
+
+    Attributes
+    ----------
+    times : int
+        Since the last such record.
+    """
+
+    times: int
+
+
+Record: TypeAlias = ObservedRecord | ActingRecord | PerformedRecord | PausedRecord | RecoveredRecord
 
 _ENCODER = msgspec.msgpack.Encoder()
 _DECODER: msgspec.msgpack.Decoder[Record] = msgspec.msgpack.Decoder(Record)

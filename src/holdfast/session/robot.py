@@ -67,6 +67,7 @@ from holdfast.session.records import (
     PerformedRecord,
     Record,
     RecordError,
+    RecoveredRecord,
 )
 from holdfast.session.status import Status
 from holdfast.settings import PlanningSettings, SimulatorSettings
@@ -110,6 +111,10 @@ class History:
         Whether the process before ended in order.
     num_unexplained : int
         Observations that no particle explained.
+    sensing_ms : list of float
+        How long each sensing action that was performed had been computed.
+    recoveries : int
+        Times that another service took over.
     """
 
     def __init__(self, problem: Problem, settings: PlanningSettings, seed: int, trial: int) -> None:
@@ -122,6 +127,8 @@ class History:
         self.pending: FloatArray | None = None
         self.paused = False
         self.num_unexplained = 0
+        self.sensing_ms: list[float] = []
+        self.recoveries = 0
 
     @property
     def begun(self) -> bool:
@@ -134,6 +141,7 @@ class History:
         self.observations = (*self.observations, kept)[-MAX_OBSERVATIONS:]
         self.num_observations += 1
         self.num_unexplained += not explained
+        self.sensing_ms.append(record.sensing_ms)
         self.log.sensed(record.step, record.sensing_action, record.digest)
         self.state = after
 
@@ -186,6 +194,9 @@ def _replay_record(
     problem: Problem, settings: PlanningSettings, history: History, record: Record
 ) -> None:
     if isinstance(record, PausedRecord):
+        return
+    if isinstance(record, RecoveredRecord):
+        history.recoveries += record.times
         return
     state = history.state
     if not isinstance(record, PerformedRecord) and history.pending is not None:
@@ -262,13 +273,13 @@ class Robot:
         self._done = False
         self._in_environment = False
         self._sensing_action = 0
+        self._computed_ms = 0.0
         self._unwritten: list[Record] = []
         self._pausing = False
         self._stopped = False
         self._next_tick: float | None = None
         self._asleep_until: float | None = None
-        self._sensing_ms: list[float] = []
-        self._recoveries_before = 0
+        self._recoveries_counted = 0
         self._told_ticks = 0
         self._tell_ticks_at = 0.0
         self.missed_ticks = 0
@@ -282,6 +293,11 @@ class Robot:
     def trial(self) -> int | None:
         """The trial that is running, None between two."""
         return None if self._history is None else self._trial
+
+    @property
+    def step(self) -> int | None:
+        """The step of the trial that is running, None between two."""
+        return None if self._history is None else self._history.state.step
 
     def start(self, now: float) -> list[Effect]:
         """Begin the run: from now on services are looked for."""
@@ -310,8 +326,6 @@ class Robot:
         self._done = begun.done
         self._in_environment = False
         self._unwritten = []
-        self._sensing_ms = []
-        self._recoveries_before = self._dispatcher.recoveries
         self._next_tick = None
         resumed = history.begun
         if resumed:
@@ -442,7 +456,11 @@ class Robot:
             return
         reached = digest(after)
         record = ObservedRecord(
-            state.step, self._sensing_action, numbers_to(event.observation), reached
+            state.step,
+            self._sensing_action,
+            numbers_to(event.observation),
+            reached,
+            self._computed_ms,
         )
         history.observed(record, after, explained=info.explained)
         self._write(record)
@@ -484,8 +502,7 @@ class Robot:
                 self._effects.append(Paused())
             return
         if self._pausing:
-            self._unwritten.append(PausedRecord())
-            self._write()
+            self._write(PausedRecord())
             self._history = None
             self._dispatcher.drop()
             self._effects.append(Paused())
@@ -517,7 +534,7 @@ class Robot:
             return
         source = question.sensing_source
         assert source is not None
-        self._sensing_ms.append(1e3 * source.computed_s)
+        self._computed_ms = 1e3 * source.computed_s
         self._timed("sensing", question, source, now)
         self._sensing_action = answer.sensing_action
         self._in_environment = True
@@ -593,7 +610,8 @@ class Robot:
         self._tell_ticks(now)
         history.log.ended(state.step, digest(state))
         decisions = history.log.decisions()
-        sensing_ms = tuple(self._sensing_ms)
+        self._count_recoveries()
+        sensing_ms = tuple(history.sensing_ms)
         result = TrialResult(
             trial=self._trial,
             seed=self._simulator.seed,
@@ -602,7 +620,7 @@ class Robot:
             reward=history.total_reward,
             sensing_decisions=history.num_observations,
             mean_sensing_ms=sum(sensing_ms) / len(sensing_ms) if sensing_ms else 0.0,
-            recoveries=self._dispatcher.recoveries - self._recoveries_before,
+            recoveries=history.recoveries,
             unexplained_observations=history.num_unexplained,
             digest=decisions.digest(),
             sensing_ms=sensing_ms,
@@ -616,11 +634,28 @@ class Robot:
     # -- effects ---------------------------------------------------------------------------------
 
     def _write(self, *records: Record) -> None:
+        history = self._history
+        if history is not None and (records or self._unwritten or history.begun):
+            # A trial of which there is nothing else has not begun.
+            self._count_recoveries()
         self._unwritten += records
         if self._unwritten:
             # What the dispatcher wants to send may rest on these records, so they go first.
             self._effects.append(Journal(self._trial, tuple(self._unwritten)))
             self._unwritten = []
+
+    def _count_recoveries(self) -> None:
+        """Count, and write down, that another service had to take over.
+
+        What happens between two trials counts for the second one.
+        """
+        history = self._history
+        assert history is not None
+        times = self._dispatcher.recoveries - self._recoveries_counted
+        if times:
+            self._recoveries_counted = self._dispatcher.recoveries
+            history.recoveries += times
+            self._unwritten.append(RecoveredRecord(times))
 
     def _timed(self, kind: str, question: Question, source: Provenance, now: float) -> None:
         waited_s = 0.0 if question.needed_at is None else now - question.needed_at
