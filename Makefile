@@ -23,7 +23,7 @@ demo: $(INSTALLED_FIGURES) ## a cloud and a robot are killed, and no decision ch
 	$(BIN)/holdfast demo --out demo-run
 
 test: $(INSTALLED_DEV) ## the quick tests
-	$(BIN)/pytest -q
+	$(BIN)/pytest -q -n 2 --dist loadfile
 
 test-slow: $(INSTALLED_DEV) ## the tests that take minutes
 	$(BIN)/pytest -q -m slow
