@@ -87,7 +87,7 @@ class TestKilled:
         assert story.run_and_resume(cloud) == 3
         said = site.holdfast("compare", story.reference, story.running.out)
         assert said.process.returncode == 0, said.account()
-        assert "\nidentical: 1 trial, " in said.output
+        assert "identical: 1 trial, " in said.output
 
     @pytest.mark.parametrize("problem", PEG_AND_SLOWLY_ALL)
     @pytest.mark.slow
