@@ -121,12 +121,13 @@ def offload(context: Context) -> Result:
                         note("turn", whole_s, whole.sensing_s, task_us + sensing_us)
                 context.progress(0.8 * trial / num_trials)
             for trial in range(num_trials + 1, num_trials + 1 + num_alone):
-                # A trial's first question is for a sensing action and nothing else.
-                state = initial_state(problem, settings, configuration.simulator.seed, trial)
-                state_digest = digest(state)[:DIGEST_SIZE]
+                # A trial's first question is for a sensing action and nothing else. The service
+                # makes the trial's first state, too, and holds its digest against the robot's.
                 start = time.perf_counter()
+                state = initial_state(problem, settings, configuration.simulator.seed, trial)
                 sensing_action, _ = choose_sensing_action(problem, settings, state)
                 alone_s = time.perf_counter() - start
+                state_digest = digest(state)[:DIGEST_SIZE]
                 steady = follower.ask(state, state_digest)
                 if steady.sensing is None or steady.sensing.sensing_action != sensing_action:
                     raise RuntimeError(f"wrong answer in trial {trial}")
