@@ -508,6 +508,16 @@ class TestTelling:
             assert option in done.stdout
 
 
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="Linux tells the threads' names")
+def test_zenoh_has_the_threads_that_were_asked_for() -> None:
+    """What it is asked with is no part of its interface: a later version may call it otherwise."""
+    with served(*ANYWHERE) as service:
+        tasks = Path(f"/proc/{service.process.pid}/task").iterdir()
+        pools = {(task / "comm").read_text().strip().rpartition("-")[0] for task in tasks}
+    assert "app" in pools
+    assert not pools & {"rx", "net", "acc"}
+
+
 def test_a_service_is_ready_without_what_it_does_not_need() -> None:
     """Start-up time is recovery time: nothing heavy but NumPy is loaded."""
     program = """
