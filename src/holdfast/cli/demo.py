@@ -88,8 +88,7 @@ def _tell(out: Path | None, seed: int, *, quick: bool) -> Findings:
     except KeyboardInterrupt as interruption:
         ended = signal_of(interruption)
         how = "Interrupted" if ended == signal.SIGINT else f"Ended by {ended.name}"
-        with contextlib.suppress(OSError):
-            sys.stderr.write(f"\n{how}; all processes are ended. The logs are in {directory}\n")
+        sys.stderr.write(f"\n{how}; all processes are ended. The logs are in {directory}\n")
         raise
     show.conclude(story.chronicle)
     sys.stdout.write(account(findings, directory))

@@ -64,7 +64,7 @@ def tell_error(error: HoldfastError, arguments: Sequence[str]) -> None:
     if not wants_json(arguments):
         sys.stderr.write(f"holdfast: error: {error}\n")
         return
-    from holdfast.runtime.logs import EventLog
+    from holdfast.runtime.logs import tell_event
 
     text = error.reason if isinstance(error, ResumableError) else str(error)
     # The rest, such as lines of the user's code, apart: a value of an event has its bound.
@@ -75,8 +75,7 @@ def tell_error(error: HoldfastError, arguments: Sequence[str]) -> None:
     if isinstance(error, ResumableError):
         fields["resume_command"] = error.command
     component = "service" if arguments[:1] == ["serve"] else "robot"
-    with EventLog(sys.stderr, format="json", component=component) as log:
-        log.event("error", **fields)
+    tell_event(component, "error", **fields)
 
 
 class EndedBySignal(KeyboardInterrupt):

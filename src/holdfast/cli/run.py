@@ -430,12 +430,10 @@ class _Notes:
 
     def ended_early(self, how: str, kept: str, command: str) -> None:
         """Say how a run ended before its end, what is kept, and how to go on."""
-        # After SIGHUP there is no terminal to write to.
-        with contextlib.suppress(OSError):
-            if self._as_json:
-                self._event("interrupted", reason=f"{how}. {kept}", resume_command=command)
-            else:
-                sys.stderr.write(f"\n{how}. {kept}\nGo on with: {command}\n")
+        if self._as_json:
+            self._event("interrupted", reason=f"{how}. {kept}", resume_command=command)
+        else:
+            sys.stderr.write(f"\n{how}. {kept}\nGo on with: {command}\n")
 
     @contextlib.contextmanager
     def while_it_lasts(self, text: str) -> Iterator[None]:
@@ -453,10 +451,9 @@ class _Notes:
 
     @staticmethod
     def _event(name: str, **fields: object) -> None:
-        from holdfast.runtime.logs import EventLog
+        from holdfast.runtime.logs import tell_event
 
-        with EventLog(sys.stderr, format="json", component="robot") as log:
-            log.event(name, **fields)
+        tell_event("robot", name, **fields)
 
 
 def _draw_figure(

@@ -24,6 +24,7 @@ from __future__ import annotations
 
 import os
 import stat
+import sys
 import threading
 import time
 from collections import deque
@@ -43,6 +44,7 @@ __all__ = [
     "LogFormat",
     "NullEventLog",
     "TeeEventLog",
+    "tell_event",
 ]
 
 LogFormat: TypeAlias = Literal["text", "json"]
@@ -212,6 +214,20 @@ class EventLog:
         trace: TracebackType | None,
     ) -> None:
         self.close()
+
+
+def tell_event(component: str, name: str, /, **fields: object) -> None:
+    """Write one event to the standard error, as JSON, where no log is open for more of them.
+
+    Parameters
+    ----------
+    component, name : str
+        Whose event it is, and what it is called.
+    **fields
+        As those of :meth:`EventSink.event`.
+    """
+    with EventLog(sys.stderr, format="json", component=component) as log:
+        log.event(name, **fields)
 
 
 class _PatientWriter:

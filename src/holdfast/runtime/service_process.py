@@ -289,10 +289,9 @@ def _check_safe(endpoint: Endpoint, tls: TlsFiles | None, *, insecure: bool) -> 
 
 def _warn(options: argparse.Namespace, text: str) -> None:
     if options.log == "json":
-        from holdfast.runtime.logs import EventLog
+        from holdfast.runtime.logs import tell_event
 
-        with EventLog(sys.stderr, format="json", component=options.name) as log:
-            log.event("credentials", reason=text)
+        tell_event(options.name, "credentials", reason=text)
     else:
         sys.stderr.write(f"holdfast serve: warning: {text}\n")
 

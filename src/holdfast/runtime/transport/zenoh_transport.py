@@ -408,13 +408,21 @@ class ZenohRobotTransport:
                 link.generation += 1  # whatever this session still sees does not count
                 link.keeper.post(partial(self._renew, link))
 
-    def _send(self, link: _Link, boot: _Boot, pending: _ZenohCall, payload: bytes) -> None:
+    def _send(
+        self,
+        link: _Link,
+        boot: _Boot,
+        pending: _ZenohCall,
+        payload: bytes,
+        attachment: bytes | None = None,
+    ) -> None:
+        """Send a request, or its last part, which is the one that is answered."""
         self._get(
             link,
             boot,
             pending,
             payload,
-            None,
+            attachment,
             partial(self._replied, pending),
             partial(self._ended, pending),
         )
@@ -443,15 +451,7 @@ class ZenohRobotTransport:
             )
         if outgoing.acknowledged == before_last:
             part, description = outgoing.part(before_last)
-            self._get(
-                link,
-                outgoing.boot,
-                outgoing.pending,
-                part,
-                description,
-                partial(self._replied, outgoing.pending),
-                partial(self._ended, outgoing.pending),
-            )
+            self._send(link, outgoing.boot, outgoing.pending, part, description)
 
     def _part_replied(self, pending: _ZenohCall, sent: _PartSent, reply: zenoh.Reply) -> None:
         sample = reply.ok
