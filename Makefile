@@ -13,7 +13,7 @@ NATIVE_SOURCES := $(wildcard CMakeLists.txt) $(shell find cpp -type f)
 CPP_FILES := $(shell find cpp -name '*.hpp' -o -name '*.cpp')
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-slow lint format bench clean
+.PHONY: help demo test test-slow lint format simulate chaos fuzz soak bench clean
 
 help: ## what there is to make
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -28,6 +28,12 @@ test: $(INSTALLED_DEV) ## the quick tests
 test-slow: $(INSTALLED_DEV) ## the tests that take minutes
 	$(BIN)/pytest -q -m slow
 
+fuzz: $(INSTALLED_DEV) ## 1,000,000 hostile messages to a live service; some 15 minutes
+	$(BIN)/python -m tests.fuzz.live --messages 1000000 --seed 1
+
+soak: $(INSTALLED_DEV) ## sessions come and go for 10 minutes, and nothing may grow
+	$(BIN)/python -m tests.fuzz.soak --minutes 10 --seed 1
+
 lint: $(INSTALLED_DEV) ## style, types and layers
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -40,11 +46,18 @@ format: $(INSTALLED_DEV) ## rewrite the code in the common style
 	$(BIN)/ruff format .
 	$(BIN)/clang-format -i $(CPP_FILES)
 
+simulate: $(INSTALLED_DEV) ## 100,000 simulated runs with faults: minutes
+	$(BIN)/holdfast simulate --seeds 0:100000
+
 bench: $(INSTALLED_DEV) ## the benchmarks
 	$(BIN)/python benchmarks/run.py
 
+chaos: $(INSTALLED_FIGURES) ## 500 runs with real faults, about 25 minutes; see chaos-run
+	rm -rf chaos-run
+	$(BIN)/holdfast chaos --trials 500 --jobs 2 --out chaos-run
+
 clean: ## remove what was built or run here, but keep .venv
-	rm -rf build dist demo-run .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis
+	rm -rf build dist demo-run chaos-run .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis
 	rm -f $(INSTALLED_FIGURES) $(INSTALLED_DEV)
 
 # The interpreter is looked at first: without this, what is missing shows only as an error deep in

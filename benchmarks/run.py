@@ -17,11 +17,11 @@ from typing import NamedTuple
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+import scipy
 from rich.console import Console
 
 from benchmarks.cases import CASES
 from benchmarks.common import Case, Context
-from benchmarks.machine import describe, kernel_hash
 from benchmarks.measure import OtherLoad
 from benchmarks.report import (
     BARS_HEADER,
@@ -31,6 +31,7 @@ from benchmarks.report import (
     show,
     write_atomically,
 )
+from holdfast.recording.machine import describe, kernel_hash
 from holdfast.runtime.trials import available_cores
 
 RESULTS = Path(__file__).with_name("RESULTS.md")
@@ -218,7 +219,7 @@ def main() -> None:
     os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
     console = Console()
     progress = Progress(cases, options.quick)
-    machine, kernel = describe(), kernel_hash()
+    machine, kernel = {**describe(), "SciPy": scipy.__version__}, kernel_hash()
     sections = {}
     loads = []
     for case in cases:

@@ -1,5 +1,7 @@
 #include <nanobind/stl/array.h>
 
+#include <cmath>
+
 #include "bindings.hpp"
 #include "deterministic_math.hpp"
 #include "resampling.hpp"
@@ -21,6 +23,16 @@ Output<double> elementwise(const Input<1>& in) {
     return result;
 }
 
+// Of any rank: it is asked of whatever somebody's code returned.
+using AnyArray = nb::ndarray<const double, nb::c_contig, nb::device::cpu>;
+
+bool all_finite(const AnyArray& in) {
+    const double* values = in.data();
+    bool finite = true;
+    for (std::size_t i = 0; i < in.size(); ++i) finite &= std::isfinite(values[i]);
+    return finite;
+}
+
 }  // namespace
 
 void holdfast::bind_numerics(nb::module_& module) {
@@ -31,6 +43,7 @@ void holdfast::bind_numerics(nb::module_& module) {
     define(module, "arcsin", [](double x) { return arcsin(x); });
     define(module, "sum",
            [](const Input<1>& in) { return vector_kernels().sum(in.data(), in.shape(0)); });
+    define(module, "all_finite", &all_finite);
     define(module, "weighted_sums", [](const Input<1>& weights, const Input<2>& rows) {
         double* out;
         auto result = make_array<double>({rows.shape(1)}, out);

@@ -78,7 +78,7 @@ class Belief(NamedTuple):
             raise InvalidValueError(
                 f"states of shape {array.shape}: need (num_particles, state_size), at least 1 each"
             )
-        if not np.isfinite(array).all():
+        if not numerics.all_finite(array):
             bad = int(np.argmin(np.isfinite(array).all(axis=1)))
             raise InvalidValueError(f"state of particle {bad} is {array[bad]}: must be finite")
         array.setflags(write=False)
@@ -104,7 +104,7 @@ class Belief(NamedTuple):
         count = belief.states.shape[0]
         if array.shape != (count,):
             raise InvalidValueError(f"weights of shape {array.shape}: need ({count},)")
-        if not np.isfinite(array).all() or (array < 0.0).any():
+        if not numerics.all_finite(array) or (array < 0.0).any():
             bad = int(np.argmin(np.isfinite(array) & (array >= 0.0)))
             raise InvalidValueError(
                 f"weight of particle {bad} is {array[bad]}: must be >= 0, finite"
@@ -186,7 +186,7 @@ def update(
         If what the problem returns is not what its contract says.
     """
     observed = np.ascontiguousarray(observation, dtype=np.float64).reshape(-1)
-    if not np.isfinite(observed).all():
+    if not numerics.all_finite(observed):
         raise InvalidValueError(f"observation {observed}: every coordinate must be finite")
     if not contract.has_general_observations(problem):
         mean = contract.observation_mean(problem, belief.states, sensing_action)
@@ -214,9 +214,9 @@ def _gaussian_log_likelihood(
     observed: FloatArray, mean: FloatArray, variance: FloatArray, weights: FloatArray
 ) -> tuple[FloatArray, bool]:
     """Return log p(observed | state) up to a constant, and whether a particle explains it."""
-    if not np.isfinite(mean).all():
+    if not numerics.all_finite(mean):
         raise ProblemError("observation_mean is not finite for a particle")
-    if not (variance > 0.0).all() or not np.isfinite(variance).all():
+    if not (variance > 0.0).all() or not numerics.all_finite(variance):
         raise ProblemError(f"observation_variance {variance}: every entry must be > 0 and finite")
     # An observation of 1e200 is as good as one at infinity: no particle explains it.
     with np.errstate(over="ignore"):

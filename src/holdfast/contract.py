@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from holdfast import _kernel
 from holdfast.errors import ProblemError
 
 __all__ = [
@@ -174,7 +175,7 @@ def states_of(
     """Return states that a function of the problem made, checked, and read-only from now on."""
     if not _is_array(states, len(shape)) or states.shape != shape:
         raise _misfit(problem, function, states, shape)
-    if not np.isfinite(states).all():
+    if not _kernel.all_finite(states):
         rows = states.reshape(-1, shape[-1])
         bad = int(np.argmin(np.isfinite(rows).all(axis=-1)))
         raise ProblemError(f"{function} of {_name(problem)} put particle {bad} at {rows[bad]}")
@@ -189,6 +190,8 @@ def scalar(problem: Any, function: str, value: object) -> float:
 
 
 def _single(problem: Any, function: str, value: object) -> Any:
+    if type(value) in (int, float, bool):
+        return value
     if value is None or isinstance(value, (str, list, tuple)) or np.ndim(value) != 0:  # type: ignore[arg-type]
         raise _misfit(problem, function, value, ())
     return value

@@ -16,7 +16,15 @@ from typing import NamedTuple
 
 from holdfast.errors import HoldfastError
 
-__all__ = ["NewFile", "OutputError", "create_directory_atomically", "write_atomically"]
+__all__ = [
+    "NewFile",
+    "OutputError",
+    "claim_directory",
+    "create_directory_atomically",
+    "write_atomically",
+]
+
+_MAX_DEFAULT_DIRECTORIES = 10_000
 
 
 class OutputError(HoldfastError):
@@ -106,3 +114,38 @@ def create_directory_atomically(path: Path, files: Mapping[str, NewFile]) -> Non
             reason = "it exists already" if path.exists() else error.strerror
             raise OutputError(f"{path}: cannot be created: {reason}") from error
         raise
+
+
+def claim_directory(out: Path | None, parent: Path, name: str) -> Path:
+    """Make the directory of a command that writes into an empty one.
+
+    Parameters
+    ----------
+    out : Path or None
+        It may be there already if it is empty. None: the name in the parent, numbered if taken.
+    parent : Path
+        Made if it is not there.
+    name : str
+
+    Raises
+    ------
+    OutputError
+        If it holds something, or cannot be made.
+    """
+    try:
+        if out is not None:
+            out.mkdir(parents=True, exist_ok=True)
+            if any(out.iterdir()):
+                raise OutputError(
+                    f"{out}: holds files already; remove it, or choose another directory (--out)"
+                )
+            return out
+        parent.mkdir(parents=True, exist_ok=True)
+        for number in range(1, _MAX_DEFAULT_DIRECTORIES):
+            path = parent / (f"{name}-{number}" if number > 1 else name)
+            with contextlib.suppress(FileExistsError):
+                path.mkdir()
+                return path
+    except OSError as error:
+        raise OutputError(f"{out or parent}: cannot be made: {error.strerror}") from error
+    raise OutputError(f"{parent}: more than {_MAX_DEFAULT_DIRECTORIES} of {name}; give --out")

@@ -134,7 +134,9 @@ class _World:
             )
         if actions.size != dimension and actions.shape != states.shape:
             states, actions = _broadcast(states, actions)
-        next_states = np.empty(np.broadcast_shapes(states.shape, actions.shape))
+        one_action = actions.shape == (dimension,)
+        shape = states.shape if one_action else np.broadcast_shapes(states.shape, actions.shape)
+        next_states = np.empty(shape)
         moved = self._kernel.move(
             states.reshape(-1, dimension),
             actions.reshape(-1, dimension),

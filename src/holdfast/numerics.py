@@ -15,7 +15,7 @@ import numpy.typing as npt
 from holdfast import _kernel
 from holdfast.errors import ConfigurationError, InvalidValueError
 
-__all__ = ["arcsin", "cos", "exp", "log", "sin", "sum", "weighted_mean"]
+__all__ = ["all_finite", "arcsin", "cos", "exp", "log", "sin", "sum", "weighted_mean"]
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -58,6 +58,11 @@ def arcsin(value: float) -> float:
 def sum(values: npt.ArrayLike) -> float:  # noqa: A001 - always used as numerics.sum
     """Return the sum of all values, added in one fixed order."""
     return _kernel.sum(np.ascontiguousarray(values, dtype=np.float64).reshape(-1))
+
+
+def all_finite(values: FloatArray) -> bool:
+    """Tell whether every value is finite; of few values in less time than NumPy takes."""
+    return _kernel.all_finite(values)
 
 
 def weighted_mean(rows: FloatArray, weights: FloatArray) -> FloatArray:

@@ -27,7 +27,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from holdfast import contract, sensing
+from holdfast import contract, numerics, sensing
 from holdfast.belief import Belief, estimate, resample, uniform_weights, update
 from holdfast.errors import CheckpointError, InvalidValueError, ProblemError
 from holdfast.problems.problem import Problem
@@ -37,6 +37,7 @@ from holdfast.settings import MAX_PARTICLES, PlanningSettings, check_settings
 
 __all__ = [
     "ObservationInfo",
+    "Planner",
     "PlanningState",
     "SensingInfo",
     "TaskInfo",
@@ -273,7 +274,7 @@ def choose_task_action(
     stage = contract.next_stage(problem, mean, state.stage)
     commanded = contract.policy(problem, mean, stage)
     action = contract.executed_action(problem, commanded)
-    if not np.isfinite(action).all():
+    if not numerics.all_finite(action):
         raise ProblemError(f"policy of {problem.name} gives {action} in state {mean}")
     return action, TaskInfo(mean, commanded, stage)
 
@@ -300,7 +301,7 @@ def advance(
     """
     del settings
     action = np.asarray(task_action, dtype=np.float64)
-    if action.shape != (problem.action_size,) or not np.isfinite(action).all():
+    if action.shape != (problem.action_size,) or not numerics.all_finite(action):
         raise InvalidValueError(
             f"task action {action}: {problem.name} needs {problem.action_size} finite coordinates"
         )
@@ -313,6 +314,41 @@ def advance(
     return PlanningState(
         state.seed, state.trial, state.step + 1, stage, False, Belief(states, belief.weights)
     )
+
+
+class Planner:
+    """The functions that change a state, for one problem and its settings.
+
+    Whoever only follows a robot's belief needs no more of this module; and because they are pure,
+    another object in the place of this one may remember what they came to.
+
+    Parameters
+    ----------
+    problem : Problem
+    settings : PlanningSettings
+    """
+
+    def __init__(self, problem: Problem, settings: PlanningSettings) -> None:
+        self.problem = problem
+        self.settings = settings
+
+    def initial_state(self, seed: int, trial: int) -> PlanningState:
+        """Return the state before the first step; see :func:`initial_state`."""
+        return initial_state(self.problem, self.settings, seed, trial)
+
+    def needs_sensing(self, state: PlanningState) -> bool:
+        """Tell whether the next decision is a sensing action; see :func:`needs_sensing`."""
+        return needs_sensing(self.settings, state)
+
+    def observe(
+        self, state: PlanningState, sensing_action: int, observation: npt.ArrayLike
+    ) -> tuple[PlanningState, ObservationInfo]:
+        """Fold an observation into the belief; see :func:`observe`."""
+        return observe(self.problem, self.settings, state, sensing_action, observation)
+
+    def advance(self, state: PlanningState, task_action: FloatArray) -> PlanningState:
+        """Predict the belief and go to the next step; see :func:`advance`."""
+        return advance(self.problem, self.settings, state, task_action)
 
 
 def digest(state: PlanningState) -> bytes:
@@ -402,10 +438,13 @@ def decode_checkpoint(data: bytes) -> PlanningState:
     weights = np.frombuffer(content.weights, dtype="<f8").astype(np.float64)
     states.setflags(write=False)
     weights.setflags(write=False)
-    if not np.isfinite(states).all():
+    if not numerics.all_finite(states):
         raise CheckpointError("checkpoint has a state that is not finite")
-    if not (weights >= 0.0).all() or not abs(float(weights.sum()) - 1.0) < 1e-6:
-        raise CheckpointError(f"checkpoint has weights that are negative or sum to {weights.sum()}")
+    # Numbers from anywhere may overflow; NumPy's warning would tell nothing that is not told here.
+    with np.errstate(over="ignore", invalid="ignore"):
+        total = float(weights.sum())
+    if not (weights >= 0.0).all() or not abs(total - 1.0) < 1e-6:
+        raise CheckpointError(f"checkpoint has weights that are negative or sum to {total}")
     return PlanningState(
         content.seed,
         content.trial,

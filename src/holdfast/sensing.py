@@ -238,7 +238,7 @@ def _predictions(problem: Problem, belief: Belief) -> tuple[list[int], FloatArra
             own_variance.T if own_variance.ndim > 1 else own_variance.reshape(-1, 1)
         )
         row += size
-    if not np.isfinite(predicted).all():
+    if not numerics.all_finite(predicted):
         raise ProblemError(f"observation_mean of {problem.name} is not finite for a particle")
     # A comparison with NaN is false.
     if not ((variance > 0.0) & (variance < np.inf)).all():

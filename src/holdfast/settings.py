@@ -186,7 +186,7 @@ class RecoverySettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
         the robot holds still until one of them answers.
     launch_timeout_ms : float
         A local service that has not been seen this long after its launch is ended and launched
-        again.
+        again. Doubles with each such launch in a row, up to 8 times: a busy machine is only slow.
     relaunch_delay_ms : float
         Pause after a failed launch; it doubles with each failure in a row, up to 32 times.
     journal_survives : {"process_crash", "power_cut"}

@@ -30,6 +30,7 @@ from holdfast.session.messages import (
     SensingAnswer,
     decode_reply,
     encode,
+    sealed,
 )
 
 PATIENCE_S = 30.0
@@ -185,7 +186,7 @@ class TestServing:
             with robots_end(service.endpoint, name="cloud_active_sensing") as end:
                 end.appeared()
                 run_turns(end, Robot("peg_in_hole_2d"), 4)
-                assert isinstance(end.ask(b"rubbish")[0], Refused)
+                assert isinstance(end.ask(sealed(b"rubbish"))[0], Refused)
                 run_turns(end, Robot("peg_in_hole_3d", key=2), 3)
             code, log = service.end()
         assert code == 0
@@ -193,7 +194,7 @@ class TestServing:
         assert "Traceback" not in log
 
     def test_a_large_message_that_is_no_request_disturbs_nobody(self) -> None:
-        hostile = b"\xdd" + (10**7).to_bytes(4, "big") + b"\x01" + b"\x90" * 10**7
+        hostile = sealed(b"\xdd" + (10**7).to_bytes(4, "big") + b"\x02" + b"\x90" * 10**7)
         with (
             served(*ANYWHERE) as service,
             robots_end(service.endpoint) as attacker,
@@ -467,7 +468,7 @@ class TestTelling:
                 end.appeared()
                 run_turns(end, Robot(), 1)
                 end.ask(encode(Robot(key=2).restore()))
-                end.ask(b"rubbish")
+                end.ask(sealed(b"rubbish"))
             _, log = service.end()
         events = {record["event"]: record for record in map(json.loads, log.splitlines())}
         assert set(events) >= {"session_opened", "restored", "refused", "evicted", "stopping"}
@@ -481,7 +482,7 @@ class TestTelling:
             with robots_end(ready["listen"][0]) as end:
                 end.appeared()
                 run_turns(end, Robot(), 3)
-                end.ask(b"rubbish")
+                end.ask(sealed(b"rubbish"))
             url = f"http://127.0.0.1:{ready['metrics_port']}/metrics"
             with urllib.request.urlopen(url, timeout=PATIENCE_S) as response:
                 lines = response.read().decode().splitlines()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pytest
+
 from holdfast.session.failure_detector import FailureDetector
 
 
@@ -70,3 +72,31 @@ def test_several_awaited_things_are_one_silence() -> None:
     assert detector.deadline() is None
     detector.asked(9.0)
     assert detector.deadline() == 9.25
+
+
+def test_patience_that_was_not_needed_is_given_back() -> None:
+    """A local service that was silent once was given ever more time, for ever."""
+    detector = present()
+    for _ in range(5):
+        detector.extend_patience(2.0, 60.0)
+    detector.asked(0.0)
+    assert detector.deadline() == 8.0
+    deadlines = []
+    for _ in range(6):
+        detector.heard(0.01)
+        detector.answered()
+        deadlines.append(detector.deadline())
+    assert deadlines == [4.01, 2.01, 1.01, 0.51, 0.26, 0.26]
+
+
+def test_patience_that_is_needed_is_kept() -> None:
+    detector = present()
+    for _ in range(4):
+        detector.extend_patience(2.0, 60.0)  # to 4 s
+    for turn in range(10):
+        detector.asked(10.0 * turn)
+        detector.heard(10.0 * turn + 0.1)
+        detector.heard(10.0 * turn + 3.1)
+        detector.answered()
+        assert detector.deadline() == pytest.approx(10.0 * turn + 7.1)
+        detector.settled()

@@ -515,6 +515,34 @@ class TestDamage:
         with pytest.raises(OutputError, match=f"record {sequence} .* is missing"):
             unfinished_of(path)
 
+    @pytest.mark.parametrize("value", [5, 2.5, b"\x00\xff", None], ids=repr)
+    def test_a_value_of_another_type_is_damage(
+        self, killed: Path, tmp_path: Path, value: object
+    ) -> None:
+        """SQLite keeps a type with each value: a flipped bit can make it any."""
+        path = copy_of(killed, tmp_path)
+        with contextlib.closing(sqlite3.connect(path, isolation_level=None)) as connection:
+            connection.execute("PRAGMA writable_schema = ON")
+            # As it is after damage: no constraint and no affinity has seen the value.
+            for declared in ("value TEXT NOT NULL", "trial INTEGER NOT NULL"):
+                name = declared.split()[0]
+                connection.execute(
+                    "UPDATE sqlite_schema SET sql = replace(sql, ?, ?)", (declared, f"{name} BLOB")
+                )
+        with contextlib.closing(sqlite3.connect(path, isolation_level=None)) as connection:
+            connection.execute("UPDATE meta SET value = ? WHERE key = 'epoch'", (value,))
+            connection.execute("UPDATE steps SET trial = ?", (value,))
+        with Journal.open(path) as journal:
+            with pytest.raises(OutputError, match="its note 'epoch' has a wrong checksum"):
+                journal.meta()
+            with pytest.raises(OutputError, match=r"journal is damaged .*its session|its note"):
+                journal.session()
+            if not isinstance(value, int):
+                with pytest.raises(OutputError, match=r"its unfinished trial is .*, no number"):
+                    journal.unfinished_trial()
+            with pytest.raises(OutputError, match="record 0 of the unfinished trial"):
+                journal.unfinished()
+
     def test_a_log_without_its_journal_is_nobodys(self, killed: Path, tmp_path: Path) -> None:
         """A new journal beside it would get the pages of the old one."""
         path = copy_of(killed, tmp_path)

@@ -15,6 +15,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from holdfast import __version__
 from holdfast.runtime.metrics import BUCKETS_S, MetricsError, ServiceMetrics
+from holdfast.session.messages import PROTOCOL_VERSION
 from holdfast.session.service_limits import ServiceStatistics
 
 Samples = dict[tuple[str, tuple[tuple[str, str], ...]], float]
@@ -93,7 +94,7 @@ class TestWhatIsTold:
         for kind in ("task", "sensing"):
             assert samples["holdfast_decisions_total", (("kind", kind),)] == 0
         labels = (
-            ("protocol", "1"),
+            ("protocol", str(PROTOCOL_VERSION)),
             ("service", "cloud_active_sensing"),
             ("version", __version__),
         )

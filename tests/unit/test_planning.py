@@ -476,6 +476,8 @@ class TestCheckpoint:
             (9, np.zeros(10).tobytes(), "weights .* sum to 0"),
             (9, np.array([np.nan] + [0.1] * 9).tobytes(), "weights .* sum to nan"),
             (9, np.array([np.inf] + [0.0] * 9).tobytes(), "weights .* sum to inf"),
+            (9, np.array([1e308] * 10).tobytes(), "weights .* sum to inf"),
+            (9, np.array([np.inf, -np.inf] * 5).tobytes(), "weights .* sum to nan"),
         ],
     )
     def test_bounds(self, peg: Problem, field: int, value: object, text: str) -> None:

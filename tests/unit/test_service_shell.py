@@ -593,6 +593,36 @@ def test_what_happens_often_is_logged_now_and_then_with_its_number() -> None:
         shell.close()
 
 
+def test_takeovers_are_logged_now_and_then() -> None:
+    """Whoever raises the epoch of its own session with each message must not fill a disk."""
+    events: SimpleQueue[tuple[str, dict[str, object]]] = SimpleQueue()
+
+    class Log:
+        def event(self, name: str, /, **fields: object) -> None:
+            events.put((name, fields))
+
+        def close(self) -> None:
+            pass
+
+    shell = ServiceShell(Service(KnownProblems(), 1), Silent(), 1, Log())
+    shell.start()
+    try:
+        robot = Robot()
+        calls = []
+        for epoch in range(1, 101):
+            calls.append(Call(encode(robot.request(epoch=epoch))))
+            shell.deliver(calls[-1])
+        for call in calls:
+            while call.replies.get(timeout=PATIENCE_S) is not None:
+                pass
+        told = 0
+        while not events.empty():
+            told += events.get()[0] == "session_taken_over"
+        assert 1 <= told < 50
+    finally:
+        shell.close()
+
+
 def test_close_does_not_wait_for_a_computation() -> None:
     joined = Joined(workers=1)
     patient = Patient(joined.network)
@@ -630,6 +660,25 @@ class TestKnownProblems:
     def test_unknown_name(self) -> None:
         with pytest.raises(UnknownProblemError, match=r"problem nix: .*capsule_robot"):
             KnownProblems()(Opening("nix", {}, {}, planning_of(), 0))
+
+    def test_unknown_names_are_not_looked_for_each_time(
+        self, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """To look through all that is installed takes as long as ten decisions."""
+        looked: list[str] = []
+        registered = registry.names()
+
+        def names() -> list[str]:
+            looked.append("names")
+            return registered
+
+        monkeypatch.setattr(registry, "names", names)
+        monkeypatch.setattr(registry, "problem_class", looked.append)
+        known = KnownProblems()
+        for number in range(20):
+            with pytest.raises(UnknownProblemError, match=f"problem nobody_{number}: is not known"):
+                known(Opening(f"nobody_{number}", {}, {}, planning_of(), 0))
+        assert looked == ["names"]
 
     def test_code_of_the_robots_choice_is_not_run(self, tmp_path: Path) -> None:
         opening = Opening("holdfast.problems.capsule_robot:CapsuleRobot", {}, {}, planning_of(), 0)

@@ -12,6 +12,7 @@ import pytest
 
 from holdfast.outcome import TrialResult
 from holdfast.planning import (
+    Planner,
     PlanningState,
     advance,
     check_state,
@@ -87,6 +88,11 @@ PLANNING = PlanningSettings(
 SIMULATOR = SimulatorSettings(num_trials=2, max_steps=40, seed=11)
 OPENING = Opening("peg_in_hole_2d", {}, {}, PLANNING, SIMULATOR.seed)
 LOCAL = "local"
+
+
+def nth(request: Request) -> int:
+    """Return which of its process's requests it is: the numbers of all processes are different."""
+    return request.number % (1 << 20)
 
 
 class SmallService:
@@ -181,8 +187,8 @@ class World:
             PROBLEM.action_size,
             len(PROBLEM.sensing_actions),
         )
-        self.planning, self.simulator = planning, simulator
-        self.robot = Robot(PROBLEM, planning, simulator, dispatcher, rate_hz)
+        self.planner, self.simulator = Planner(PROBLEM, planning), simulator
+        self.robot = Robot(self.planner, simulator, dispatcher, rate_hz)
         self.environment = SimulatedEnvironment(PROBLEM, simulator.seed, 0)
         self.heap: list[tuple[float, int, Callable[[], list[Effect]]]] = []
         self.count = 0
@@ -234,7 +240,7 @@ class World:
         self.begin(0)
 
     def begin(self, trial: int) -> None:
-        history = replay(PROBLEM, self.planning, self.simulator.seed, trial, self.journal)
+        history = replay(self.planner, self.simulator.seed, trial, self.journal)
         self.environment = SimulatedEnvironment(PROBLEM, self.simulator.seed, trial)
         for action in history.actions:
             self.environment.perform(action)
@@ -353,7 +359,7 @@ class World:
     def assert_same_as_without_faults(self) -> None:
         assert len(self.results) == self.simulator.num_trials
         for result in self.results:
-            expected = run_trial(PROBLEM, self.planning, self.simulator, result.trial)
+            expected = run_trial(PROBLEM, self.planner.settings, self.simulator, result.trial)
             assert result.digest == expected.digest
             assert result.reward == expected.reward
             assert (result.success, result.steps) == (expected.success, expected.steps)
@@ -530,7 +536,7 @@ def test_a_lost_reply_is_asked_for_again() -> None:
 
     def lose_some(request: Request) -> list[Reply] | None:
         nonlocal dropped
-        if request.number in (2, 3, 7):
+        if nth(request) in (2, 3, 7):
             dropped += 1
             return []
         return None
@@ -580,7 +586,7 @@ def test_a_service_that_lost_the_session_is_handed_the_state() -> None:
 def test_busy_is_waited_for_if_short_and_evaded_if_long() -> None:
     world = World()
     cloud = world.services["cloud"]
-    cloud.rule = lambda r: [Busy(r.number, 20)] if r.number in (3, 4) else None
+    cloud.rule = lambda r: [Busy(r.number, 20)] if nth(r) in (3, 4) else None
     world.start()
     world.run()
     world.assert_same_as_without_faults()
@@ -588,7 +594,7 @@ def test_busy_is_waited_for_if_short_and_evaded_if_long() -> None:
 
     world = World()
     cloud = world.services["cloud"]
-    cloud.rule = lambda r: [Busy(r.number, 5000)] if r.number == 3 else None
+    cloud.rule = lambda r: [Busy(r.number, 5000)] if nth(r) == 3 else None
     world.start()
     world.run()
     world.assert_same_as_without_faults()
@@ -601,7 +607,7 @@ def test_progress_keeps_a_slow_service_trusted() -> None:
     cloud.latency_s = 0.1
 
     def slow(request: Request) -> list[Reply] | None:
-        if request.number != 3:
+        if nth(request) != 3:
             return None
         cloud.rule = lambda _: None
         signs: list[Reply] = [Progress(request.number, False) for _ in range(10)]
@@ -648,7 +654,7 @@ def test_a_problem_that_every_service_refuses_stops_the_robot() -> None:
 def test_a_stale_epoch_stops_the_robot() -> None:
     world = World()
     world.services["cloud"].rule = lambda r: (
-        [Refused(r.number, "stale_epoch", "epoch 1, seen was 2")] if r.number == 3 else None
+        [Refused(r.number, "stale_epoch", "epoch 1, seen was 2")] if nth(r) == 3 else None
     )
     world.start()
     world.run()
@@ -662,7 +668,7 @@ def test_a_reply_to_another_request_is_not_taken(number: int) -> None:
     cloud = world.services["cloud"]
 
     def confuse(request: Request) -> list[Reply] | None:
-        if request.number != number:
+        if nth(request) != number:
             return None
         return [TaskAnswer(request.number + 1, 4, bytes(8 * 12), 1)]
 
@@ -678,12 +684,12 @@ def test_wrong_answers_are_refused() -> None:
 
     def lie(request: Request) -> list[Reply] | None:
         lies: dict[int, Reply] = {
-            2: TaskAnswer(2, 3, bytes(8 * 9), 1),
-            4: TaskAnswer(4, 4, numbers_to([np.nan] * 12), 1),
-            6: SensingAnswer(6, 8, 17, b"d" * DIGEST_SIZE, 1),
-            8: SensingAnswer(8, 1, 0, b"d" * DIGEST_SIZE, 1),
+            2: TaskAnswer(request.number, 3, bytes(8 * 9), 1),
+            4: TaskAnswer(request.number, 4, numbers_to([np.nan] * 12), 1),
+            6: SensingAnswer(request.number, 8, 17, b"d" * DIGEST_SIZE, 1),
+            8: SensingAnswer(request.number, 1, 0, b"d" * DIGEST_SIZE, 1),
         }
-        return [lies[request.number]] if request.number in lies else None
+        return [lies[nth(request)]] if nth(request) in lies else None
 
     cloud.rule = lie
     world.start()
@@ -697,7 +703,7 @@ def test_a_sensing_action_for_another_state_is_not_followed() -> None:
     cloud = world.services["cloud"]
 
     def drift(request: Request) -> list[Reply] | None:
-        if request.number != 3:
+        if nth(request) != 3:
             return None
         cloud.rule = lambda _: None
         replies = cloud.answer(encode(request))
@@ -705,7 +711,7 @@ def test_a_sensing_action_for_another_state_is_not_followed() -> None:
         return [
             reply
             if isinstance(reply, TaskAnswer)
-            else SensingAnswer(3, request.step + 4, 2, b"x" * DIGEST_SIZE, 1)
+            else SensingAnswer(request.number, request.step + 4, 2, b"x" * DIGEST_SIZE, 1)
             for reply in replies
         ]
 
@@ -742,7 +748,7 @@ def test_resumed_from_any_moment(performed: bool) -> None:
     stages, whole = recorded()
     for records in stages:
         world = World(simulator=SimulatorSettings(num_trials=1, max_steps=14, seed=11))
-        history = replay(PROBLEM, PLANNING, 11, 0, records)
+        history = replay(Planner(PROBLEM, PLANNING), 11, 0, records)
         world.journal = list(records)
         world.environment = SimulatedEnvironment(PROBLEM, 11, 0)
         for action in history.actions:
@@ -834,7 +840,7 @@ def test_a_pause_is_the_last_that_is_written_down() -> None:
     world.start()
     world.run()
     assert world.statuses() == ["local_recovery"]
-    history = replay(PROBLEM, PLANNING, 11, 0, world.journal)
+    history = replay(Planner(PROBLEM, PLANNING), 11, 0, world.journal)
     assert history.paused
     assert history.recoveries == 1
 
@@ -843,7 +849,7 @@ def begin_after(
     records: tuple[Record, ...], steps_performed: int | None, *, tail_is_certain: bool = True
 ) -> World:
     world = World()
-    history = replay(PROBLEM, PLANNING, 11, 0, records)
+    history = replay(Planner(PROBLEM, PLANNING), 11, 0, records)
     world.journal = list(records)
     world.environment = SimulatedEnvironment(PROBLEM, 11, 0)
     for action in history.actions:
@@ -920,7 +926,7 @@ def test_pause_writes_everything_down_and_a_new_robot_goes_on() -> None:
     world.run()
     assert world.ended
     assert not world.results
-    history = replay(PROBLEM, PLANNING, 11, 0, world.journal)
+    history = replay(Planner(PROBLEM, PLANNING), 11, 0, world.journal)
     assert history.paused
     assert history.pending is None
     assert history.state.step == 7
@@ -995,7 +1001,7 @@ def test_a_performance_is_written_down_before_the_robot_stops() -> None:
     world.start()
     world.run()
     assert world.stopped is not None
-    history = replay(PROBLEM, PLANNING, 11, 0, world.journal)
+    history = replay(Planner(PROBLEM, PLANNING), 11, 0, world.journal)
     assert history.pending is None
 
 
@@ -1012,7 +1018,7 @@ def test_an_observation_of_the_wrong_size_stops_the_robot_resumably() -> None:
     world.start()
     world.run()
     assert world.stopped is not None
-    history = replay(PROBLEM, PLANNING, 11, 0, world.journal)
+    history = replay(Planner(PROBLEM, PLANNING), 11, 0, world.journal)
     assert history.pending is None
     assert history.state.step == 4
 
@@ -1109,7 +1115,7 @@ def test_a_long_wait_is_told_although_the_service_shows_life() -> None:
     cloud.latency_s = 0.1
 
     def slow(request: Request) -> list[Reply] | None:
-        if request.number != 3:
+        if nth(request) != 3:
             return None
         cloud.rule = lambda _: None
         signs: list[Reply] = [Progress(request.number, False) for _ in range(20)]
@@ -1143,3 +1149,23 @@ def test_events_say_how_long_things_took() -> None:
     assert all("restore_ms" in fields for fields in world.reports("restored"))
     assert world.reports("restored")
     assert all("launch_ms" in fields for fields in world.reports("launched"))
+
+
+def test_a_robot_that_waits_for_a_silent_local_service_asks_the_cloud_again() -> None:
+    """Found by the simulator: it waited for the local one alone, for many seconds."""
+    world = World()
+
+    def fault(performed: int) -> None:
+        if performed == 4 and not world.results:
+            world.services["cloud"].stopped = True
+        if performed == 8 and not world.results:
+            # The cloud answers again, but only what it is asked from now on.
+            world.services[LOCAL].stopped = True
+            world.services["cloud"].stopped = False
+
+    world.on_act = fault
+    world.start()
+    world.run()
+    world.assert_same_as_without_faults()
+    timeout_ms = world.offload.detection_timeout_ms
+    assert world.longest_wait_ms() < 2 * timeout_ms + 300.0

@@ -885,7 +885,7 @@ class TestRefusals:
 
 class TestCapacity:
     def test_beyond_the_longest_line(self) -> None:
-        bench = Bench(max_waiting=2)
+        bench = Bench(max_waiting=4)  # half of it is for those who were served before
         calls = [bench.send(Robot(key=key).request()) for key in range(1, 6)]
         assert [len(bench.replies[call]) for call in calls] == [0, 0, 0, 1, 1]
         reply = only(bench.replies[calls[-1]])
@@ -897,7 +897,7 @@ class TestCapacity:
         assert bench.ended == set(calls)
 
     def test_bytes_of_the_line(self) -> None:
-        bench = Bench(max_waiting_bytes=3000)
+        bench = Bench(max_waiting_bytes=6000)  # and so is half of this
         robots = [Robot(key=key) for key in range(1, 8)]
         size = len(encode(robots[0].restore()))
         calls = [bench.send(robot.restore()) for robot in robots]
@@ -924,6 +924,55 @@ class TestCapacity:
         busy = only(bench.replies[calls[-1]])
         assert isinstance(busy, Busy)
         assert 60 <= busy.retry_after_ms <= 250
+
+    def test_newcomers_turn_nobody_away_who_was_served_before(self) -> None:
+        """To be somebody new costs nothing: one client can be thousands of them."""
+        bench = Bench(max_wait_ms=10.0)
+        known = Robot(key=1)
+        bench.ask(known.request())
+        known.sense()
+        newcomers = [Robot(key=key) for key in range(2, 60)]
+        calls = [bench.send(robot.request()) for robot in newcomers]
+        assert any(bench.replies[call] for call in calls)
+        right = known.right_answer()
+        call = bench.send(known.request())
+        assert bench.replies[call] == []
+        # It does not wait for those who came before it either.
+        bench.run()
+        bench.run()
+        assert content(bench.replies[call]) == right[:1]
+        bench.run_all()
+        assert content(bench.replies[call]) == right
+
+    def test_newcomers_have_half_of_the_room(self) -> None:
+        bench = Bench(max_sessions=10, max_waiting=12)
+        known = [Robot(key=key) for key in range(1, 4)]
+        for robot in known:
+            bench.ask(robot.request())
+            robot.sense()
+        for key in range(4, 60):
+            bench.send(Robot(key=key).request())
+        calls = [bench.send(robot.request(opening=False)) for robot in known]
+        assert all(not bench.replies[call] for call in calls), "neither forgotten nor turned away"
+        bench.run_all()
+        for robot, call in zip(known, calls, strict=True):
+            assert content(bench.replies[call]) == robot.right_answer()
+
+    def test_newcomers_have_their_turn(self) -> None:
+        bench = Bench(max_wait_ms=100.0)
+        known = [Robot(key=key) for key in range(1, 6)]
+        for robot in known:
+            bench.ask(robot.request())
+            robot.sense()
+        calls = [bench.send(robot.request()) for robot in known]
+        newcomer = bench.send(Robot(key=9).request())
+        bench.now += 0.11
+        late = bench.send(known[0].request(digest=bytes(16)))
+        while newcomer not in bench.ended:
+            assert late not in bench.ended
+            bench.run()
+        bench.run_all()
+        assert set(calls) <= bench.ended
 
     def test_one_job_that_was_held_up_turns_nobody_away(self) -> None:
         bench = Bench(max_wait_ms=100.0)
@@ -1039,6 +1088,43 @@ class TestCapacity:
         robot.sense()
         assert isinstance(only(bench.ask(robot.request(since=1))), NeedState)
         assert content(bench.ask(robot.restore())) == robot.right_answer()
+
+    def test_bytes_of_openings(self) -> None:
+        """A plate with a thousand holes is 24 KB on the wire and half a megabyte in memory."""
+        holes = [{"center": [4.0, 6.0 - 0.01 * number], "depth": 0.01} for number in range(900)]
+        opening = Opening("multitier_peg_in_hole_2d", {"holes": holes}, {}, planning_of(), 5)
+        bench = Bench(max_opening_bytes=3 << 20)
+        for key in range(1, 31):
+            bench.ask(Robot(key=key).request())
+        assert bench.service.statistics.sessions == 30
+        for key in range(31, 61):
+            request = msgspec.structs.replace(Robot(key=key).request(), opening=opening)
+            bench.ask(request)
+            held = [session.opening for session in bench.service._sessions._sessions.values()]
+            assert sum(len(str(each.model)) for each in held) < 4 << 20
+        assert 4 <= bench.service.statistics.sessions <= 8
+        # Each by itself is served, however large it is beside the limit.
+        small = Bench(max_opening_bytes=100)
+        robot = Robot()
+        assert content(small.ask(robot.request())) == robot.right_answer()
+        other = small.send(Robot(key=2).request())
+        assert small.replies[other] == []
+        third = small.send(Robot(key=3).request())
+        assert isinstance(only(small.replies[third]), Busy)
+        small.run_all()
+        assert small.service.statistics.sessions == 1
+
+    def test_requests_that_wait_hold_no_opening(self) -> None:
+        bench = Bench()
+        first = Robot(key=2)
+        bench.send(first.request())
+        robot = Robot()
+        robot.sense()
+        bench.send(robot.request())
+        waiting = bench.service._sessions.get(robot.session)
+        assert waiting is not None
+        assert [work.request and work.request.opening for work in waiting.works.values()] == [None]
+        bench.run_all()
 
     def test_idle_session_is_forgotten(self) -> None:
         bench, robot = Bench(max_idle_s=10.0), Robot()

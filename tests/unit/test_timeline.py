@@ -9,9 +9,9 @@ import pytest
 
 from holdfast.cli.chronicle import Change, Chronicle, Line, Mark
 from holdfast.cli.demo import account
-from holdfast.cli.story import Findings, Outage, claim_directory
+from holdfast.cli.story import Findings, Outage
 from holdfast.cli.timeline import ASCII, UNICODE, bars, legend, plain_line
-from holdfast.files import OutputError
+from holdfast.files import OutputError, claim_directory
 from holdfast.recording.compare import Comparison, Difference
 
 
@@ -177,25 +177,25 @@ def test_account_of_a_difference() -> None:
 
 class TestDirectory:
     def test_the_default_is_numbered(self, tmp_path: Path) -> None:
-        claimed = [claim_directory(None, tmp_path / "runs") for _ in range(3)]
+        claimed = [claim_directory(None, tmp_path / "runs", "demo") for _ in range(3)]
         assert [path.name for path in claimed] == ["demo", "demo-2", "demo-3"]
         assert all(path.is_dir() for path in claimed)
 
     def test_what_is_there_is_kept(self, tmp_path: Path) -> None:
         out = tmp_path / "a" / "out"
-        assert claim_directory(out, tmp_path) == out
-        assert claim_directory(out, tmp_path) == out
+        assert claim_directory(out, tmp_path, "demo") == out
+        assert claim_directory(out, tmp_path, "demo") == out
         (out / "file").touch()
         with pytest.raises(OutputError, match=r"out: holds files already.*--out"):
-            claim_directory(out, tmp_path)
+            claim_directory(out, tmp_path, "demo")
 
     def test_it_cannot_be_made(self, tmp_path: Path) -> None:
         (tmp_path / "file").touch()
         for out in (tmp_path / "file", tmp_path / "file" / "out"):
             with pytest.raises(OutputError, match="cannot be made"):
-                claim_directory(out, tmp_path)
+                claim_directory(out, tmp_path, "demo")
         with pytest.raises(OutputError, match="cannot be made"):
-            claim_directory(None, tmp_path / "file")
+            claim_directory(None, tmp_path / "file", "demo")
 
 
 def test_states_change_where_they_should() -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from holdfast.cli.witness import DecisionTable, time_of
+from holdfast.chaos.processes import DecisionTable, time_of
 from holdfast.files import OutputError
 from holdfast.recording.timings import TIMING_COLUMNS, AnswerCounts, TimingTable, count_answers
 from holdfast.session.effects import Timing

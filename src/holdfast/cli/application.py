@@ -12,11 +12,13 @@ from typing import Annotated
 import typer
 
 from holdfast import __version__
+from holdfast.cli.chaos import chaos
 from holdfast.cli.compare import compare
 from holdfast.cli.demo import demo
 from holdfast.cli.keys import keys
 from holdfast.cli.run import run
 from holdfast.cli.serve import serve
+from holdfast.cli.simulate import simulate
 from holdfast.errors import HoldfastError
 from holdfast.runtime.command_line import wants_json
 
@@ -47,7 +49,9 @@ app.command(
     },
 )(serve)
 app.command(short_help="See a cloud and a robot killed, and no decision change.")(demo)
+app.command(short_help="Strike real runs with real faults, and compare them.")(chaos)
 app.command(no_args_is_help=True, short_help="Tell whether two runs decided the same.")(compare)
+app.command(short_help="Search for faults that change a decision.")(simulate)
 app.command(no_args_is_help=True, short_help="Make keys for robots and services.")(keys)
 
 

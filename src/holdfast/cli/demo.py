@@ -66,10 +66,11 @@ def demo(
 
 
 def _tell(out: Path | None, seed: int, *, quick: bool) -> Findings:
-    from holdfast.cli.story import Plan, Story, claim_directory
+    from holdfast.cli.story import Plan, Story
     from holdfast.cli.timeline import make_show
+    from holdfast.files import claim_directory
 
-    directory = claim_directory(out, _RUNS)
+    directory = claim_directory(out, _RUNS, "demo")
     show = make_show()
     sys.stderr.write(_INTRODUCTION)
     sys.stderr.flush()

@@ -74,7 +74,7 @@ def tell_error(error: HoldfastError, arguments: Sequence[str]) -> None:
         fields["details"] = details
     if isinstance(error, ResumableError):
         fields["resume_command"] = error.command
-    component = "service" if arguments[:1] == ["serve"] else "robot"
+    component = {"serve": "service", "chaos": "chaos"}.get(arguments[0], "robot")
     tell_event(component, "error", **fields)
 
 

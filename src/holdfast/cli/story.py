@@ -12,7 +12,6 @@ limit. Nothing here writes to a terminal: whoever shows the story gets a :class:
 
 from __future__ import annotations
 
-import contextlib
 import os
 import shutil
 import signal
@@ -27,9 +26,7 @@ from typing import Any, Literal, NamedTuple, Self
 
 import msgspec
 
-from holdfast.cli.chronicle import Audience, Change, Chronicle, Line, Mark, Row, State
-from holdfast.cli.terminal import counted
-from holdfast.cli.witness import (
+from holdfast.chaos.processes import (
     ChildProcess,
     Decision,
     DecisionTable,
@@ -38,13 +35,15 @@ from holdfast.cli.witness import (
     free_port,
     time_of,
 )
+from holdfast.chaos.twin import keep_undisturbed, run_undisturbed
+from holdfast.cli.chronicle import Audience, Change, Chronicle, Line, Mark, Row, State
+from holdfast.cli.terminal import counted
 from holdfast.configuration import load
 from holdfast.errors import HoldfastError
-from holdfast.files import OutputError, write_atomically
+from holdfast.files import write_atomically
 from holdfast.recording.compare import Comparison, compare_runs
-from holdfast.recording.run_directory import TIMINGS_NAME, RunDirectory
+from holdfast.recording.run_directory import TIMINGS_NAME
 from holdfast.runtime.links import RECOVERY_SERVICE
-from holdfast.runtime.trial import run_trial
 from holdfast.session.status import Status
 
 __all__ = [
@@ -55,7 +54,6 @@ __all__ = [
     "Plan",
     "Story",
     "StoryError",
-    "claim_directory",
 ]
 
 CONFIGURATION_NAME = "demo.yaml"
@@ -92,7 +90,6 @@ _PATIENCE_S = 30.0
 
 _FRAME_S = 0.08
 _ORDERLY_END_S = 3.0
-_MAX_DEFAULT_DIRECTORIES = 10_000
 
 
 class StoryError(HoldfastError):
@@ -175,40 +172,6 @@ class Plan(NamedTuple):
 
     min_steps: int = 400
     duration_s: float = 16.0
-
-
-def claim_directory(out: Path | None, parent: Path) -> Path:
-    """Make the directory of a demo.
-
-    Parameters
-    ----------
-    out : Path or None
-        It may be there already if it is empty. None: ``demo`` in the parent, numbered if taken.
-    parent : Path
-        Made if it is not there.
-
-    Raises
-    ------
-    OutputError
-        If it holds something, or cannot be made.
-    """
-    try:
-        if out is not None:
-            out.mkdir(parents=True, exist_ok=True)
-            if any(out.iterdir()):
-                raise OutputError(
-                    f"{out}: holds files already; remove it, or choose another directory (--out)"
-                )
-            return out
-        parent.mkdir(parents=True, exist_ok=True)
-        for number in range(1, _MAX_DEFAULT_DIRECTORIES):
-            path = parent / (f"demo-{number}" if number > 1 else "demo")
-            with contextlib.suppress(FileExistsError):
-                path.mkdir()
-                return path
-    except OSError as error:
-        raise OutputError(f"{out or parent}: cannot be made: {error.strerror}") from error
-    raise OutputError(f"{parent}: more than {_MAX_DEFAULT_DIRECTORIES} demos; give --out")
 
 
 # -- the story -------------------------------------------------------------------------------------
@@ -321,23 +284,11 @@ class Story:
         """Run it without services, and see how long it is."""
         path = self._directory / CONFIGURATION_NAME
         self._write_configuration(path, _MAX_TRIALS)
-        began = time.perf_counter()
         configuration = load(path)
-        results = []
-        for trial in range(_MAX_TRIALS):
-            result = run_trial(
-                configuration.problem, configuration.planning, configuration.simulator, trial
-            )
-            results.append(result)
-            self._steps_of_trials.append(result.steps)
-            if sum(self._steps_of_trials) >= self._plan.min_steps:
-                break
+        results, took_s = run_undisturbed(configuration, self._plan.min_steps)
+        self._steps_of_trials = [result.steps for result in results]
         self._write_configuration(path, len(results))
-        took_s = time.perf_counter() - began
-        with RunDirectory.create(self._directory / UNDISTURBED_RUN_NAME, load(path)) as directory:
-            for result in results:
-                directory.add(result)
-            directory.write_tables(took_s)
+        keep_undisturbed(self._directory / UNDISTURBED_RUN_NAME, load(path), results, took_s)
         steps = sum(self._steps_of_trials)
         self.chronicle.title = (
             f"{configuration.problem_name}, seed {self._seed}: {counted(len(results), 'trial')}, "

@@ -19,14 +19,16 @@ if TYPE_CHECKING:
     from holdfast.recording.tables import RunSummary
 
 __all__ = [
-    "LiveDisplay",
-    "PlainDisplay",
-    "QuietDisplay",
+    "LiveProgress",
+    "PlainProgress",
+    "ProgressLine",
+    "QuietProgress",
     "RunDisplay",
     "counted",
     "duration",
     "print_files",
     "print_summary",
+    "progress_line",
     "run_display",
 ]
 
@@ -34,15 +36,19 @@ _PLAIN_INTERVAL_S = 5.0
 """Without a terminal, at most one line of progress in this time: logs stay short."""
 
 
-class RunDisplay(Protocol):
-    """Shows how far a run is."""
+class ProgressLine(Protocol):
+    """Shows how many trials are finished, how fast, and how long the rest will take."""
 
-    def start(self, finished: int, successes: int, directory: Path) -> None:
-        """Begin, with what an earlier part of the run has finished."""
+    def start(self, title: str, finished: int, note: str) -> None:
+        """Begin, with what an earlier part has finished."""
         ...
 
-    def show(self, result: TrialResult) -> None:
-        """Count one more finished trial."""
+    def show(self, finished: int, note: str) -> None:
+        """Show how many are finished now, and what is to be said of them."""
+        ...
+
+    def say(self, text: str) -> None:
+        """Show a line that stays."""
         ...
 
     def stop(self) -> None:
@@ -50,124 +56,123 @@ class RunDisplay(Protocol):
         ...
 
 
-def run_display(configuration: Configuration, *, quiet: bool) -> RunDisplay:
+def progress_line(total: int, *, quiet: bool, noun: str = "trial") -> ProgressLine:
     """Return what suits the standard error: a moving line, a line now and then, or nothing.
 
     Parameters
     ----------
-    configuration : Configuration
-        Of the run.
+    total : int
+        Trials.
     quiet : bool
         Whether to show nothing.
+    noun : str
+        What the trials are called.
     """
     if quiet:
-        return QuietDisplay()
+        return QuietProgress()
     if sys.stderr.isatty():
         from rich.console import Console
 
-        return LiveDisplay(configuration, Console(stderr=True))
-    return PlainDisplay(configuration)
+        return LiveProgress(total, Console(stderr=True), noun)
+    return PlainProgress(total, noun)
 
 
-class QuietDisplay:
+class QuietProgress:
     """Shows nothing."""
 
-    def start(self, finished: int, successes: int, directory: Path) -> None:
-        """Begin, with what an earlier part of the run has finished."""
-        del finished, successes, directory
+    def start(self, title: str, finished: int, note: str) -> None:
+        """Do nothing."""
 
-    def show(self, result: TrialResult) -> None:
-        """Count one more finished trial."""
-        del result
+    def show(self, finished: int, note: str) -> None:
+        """Do nothing."""
+
+    def say(self, text: str) -> None:
+        """Do nothing."""
 
     def stop(self) -> None:
         """Do nothing."""
 
 
-class _Counter:
-    """How many trials are finished, and how fast."""
+class _Speed:
+    """How many trials are finished in a second."""
 
-    def __init__(self, configuration: Configuration) -> None:
-        self.name = configuration.problem_name
-        self.seed = configuration.simulator.seed
-        self.total = configuration.simulator.num_trials
-        self.finished = 0
-        self.successes = 0
-        self.finished_before = 0
-        self.started = 0.0
+    def __init__(self, finished_before: int, noun: str) -> None:
+        self._finished_before = finished_before
+        self._noun = noun
+        self._started = perf_counter()
 
-    def start(self, finished: int, successes: int) -> None:
-        self.finished = self.finished_before = finished
-        self.successes = successes
-        self.started = perf_counter()
-
-    def count(self, result: TrialResult) -> None:
-        self.finished += 1
-        self.successes += result.success
-
-    def title(self, directory: Path) -> str:
-        text = f"{self.name}, {counted(self.total, 'trial')}, seed {self.seed}"
-        if self.finished_before:
-            text += f", {self.finished_before} finished before"
-        return f"{text}; results in {directory}"
-
-    def rate(self) -> float | None:
-        elapsed_s = perf_counter() - self.started
-        new = self.finished - self.finished_before
+    def rate(self, finished: int) -> float | None:
+        elapsed_s = perf_counter() - self._started
+        new = finished - self._finished_before
         return new / elapsed_s if new and elapsed_s > 0.0 else None
 
-    def success_text(self) -> str:
-        return f"{100.0 * self.successes / self.finished:.1f} %" if self.finished else "-"
-
-    def rate_text(self) -> str:
-        rate = self.rate()
-        return "-" if rate is None else f"{rate:.3g} trials/s"
+    def text(self, finished: int) -> str:
+        rate = self.rate(finished)
+        return "-" if rate is None else f"{rate:.3g} {self._noun}s/s"
 
 
-class PlainDisplay:
-    """A line now and then, for logs."""
+class PlainProgress:
+    """A line now and then, for logs.
 
-    def __init__(self, configuration: Configuration) -> None:
-        self._counter = _Counter(configuration)
+    Parameters
+    ----------
+    total : int
+    noun : str
+    """
+
+    def __init__(self, total: int, noun: str) -> None:
+        self._total = total
+        self._noun = noun
+        self._speed = _Speed(0, noun)
         self._last = 0.0
 
-    def start(self, finished: int, successes: int, directory: Path) -> None:
-        """Begin, with what an earlier part of the run has finished."""
-        self._counter.start(finished, successes)
+    def start(self, title: str, finished: int, note: str) -> None:
+        """Begin, with what an earlier part has finished."""
+        del note
+        self._speed = _Speed(finished, self._noun)
         self._last = perf_counter()
-        sys.stderr.write(self._counter.title(directory) + "\n")
-        sys.stderr.flush()
+        self.say(title)
 
-    def show(self, result: TrialResult) -> None:
-        """Count one more finished trial."""
-        counter = self._counter
-        counter.count(result)
+    def show(self, finished: int, note: str) -> None:
+        """Write a line, if it is time to."""
         now = perf_counter()
-        if now - self._last < _PLAIN_INTERVAL_S or counter.finished == counter.total:
+        if now - self._last < _PLAIN_INTERVAL_S or finished == self._total:
             return
         self._last = now
-        rate = counter.rate()
-        left = "" if rate is None else f", {duration((counter.total - counter.finished) / rate)}"
-        sys.stderr.write(
-            f"{counter.finished}/{counter.total} trials, success {counter.success_text()}, "
-            f"{counter.rate_text()}{left} left\n"
-        )
+        rate = self._speed.rate(finished)
+        left = "" if rate is None else f", {duration((self._total - finished) / rate)}"
+        speed = self._speed.text(finished)
+        self.say(f"{finished}/{self._total} {self._noun}s, {note}, {speed}{left} left")
+
+    def say(self, text: str) -> None:
+        """Write a line."""
+        sys.stderr.write(f"{text}\n")
         sys.stderr.flush()
 
     def stop(self) -> None:
         """Do nothing."""
 
 
-class LiveDisplay:
-    """A line that moves, for people."""
+class LiveProgress:
+    """A line that moves, for people.
 
-    def __init__(self, configuration: Configuration, console: Console) -> None:
-        self._counter = _Counter(configuration)
+    Parameters
+    ----------
+    total : int
+    console : Console
+        Of rich, on a terminal.
+    noun : str
+    """
+
+    def __init__(self, total: int, console: Console, noun: str) -> None:
+        self._total = total
         self._console = console
+        self._noun = noun
+        self._speed = _Speed(0, noun)
         self._progress: Progress | None = None
 
-    def start(self, finished: int, successes: int, directory: Path) -> None:
-        """Begin, with what an earlier part of the run has finished."""
+    def start(self, title: str, finished: int, note: str) -> None:
+        """Begin, with what an earlier part has finished."""
         from rich.progress import (
             BarColumn,
             MofNCompleteColumn,
@@ -177,13 +182,13 @@ class LiveDisplay:
             TimeRemainingColumn,
         )
 
-        self._counter.start(finished, successes)
-        self._console.print(self._counter.title(directory), highlight=False)
+        self._speed = _Speed(finished, self._noun)
+        self.say(title)
         self._progress = Progress(
             BarColumn(bar_width=None),
             MofNCompleteColumn(),
-            TextColumn("trials"),
-            TextColumn("success {task.fields[success]}", style="green"),
+            TextColumn(f"{self._noun}s"),
+            TextColumn("{task.fields[note]}", style="green"),
             TextColumn("{task.fields[rate]}", style="cyan"),
             TimeElapsedColumn(),
             TextColumn("left", style="dim"),
@@ -193,29 +198,81 @@ class LiveDisplay:
             expand=True,
         )
         self._task = self._progress.add_task(
-            "trials",
-            total=self._counter.total,
-            completed=finished,
-            success=self._counter.success_text(),
-            rate="-",
+            "trials", total=self._total, completed=finished, note=note, rate="-"
         )
         self._progress.start()
 
-    def show(self, result: TrialResult) -> None:
-        """Count one more finished trial."""
-        self._counter.count(result)
+    def show(self, finished: int, note: str) -> None:
+        """Move the line."""
         if self._progress is not None:
-            self._progress.update(
-                self._task,
-                completed=self._counter.finished,
-                success=self._counter.success_text(),
-                rate=self._counter.rate_text(),
-            )
+            rate = self._speed.text(finished)
+            self._progress.update(self._task, completed=finished, note=note, rate=rate)
+
+    def say(self, text: str) -> None:
+        """Print a line above it."""
+        self._console.print(text, highlight=False, markup=False, soft_wrap=True)
 
     def stop(self) -> None:
         """Take the line away."""
         if self._progress is not None:
             self._progress.stop()
+
+
+class RunDisplay:
+    """Shows how far a run is.
+
+    Parameters
+    ----------
+    configuration : Configuration
+        Of the run.
+    line : ProgressLine
+    """
+
+    def __init__(self, configuration: Configuration, line: ProgressLine) -> None:
+        self._configuration = configuration
+        self._line = line
+        self._finished = 0
+        self._successes = 0
+
+    def start(self, finished: int, successes: int, directory: Path) -> None:
+        """Begin, with what an earlier part of the run has finished."""
+        self._finished, self._successes = finished, successes
+        simulator = self._configuration.simulator
+        title = (
+            f"{self._configuration.problem_name}, {counted(simulator.num_trials, 'trial')}, "
+            f"seed {simulator.seed}"
+        )
+        if finished:
+            title += f", {finished} finished before"
+        self._line.start(f"{title}; results in {directory}", finished, self._note())
+
+    def show(self, result: TrialResult) -> None:
+        """Count one more finished trial."""
+        self._finished += 1
+        self._successes += result.success
+        self._line.show(self._finished, self._note())
+
+    def stop(self) -> None:
+        """End, and leave the terminal as it was."""
+        self._line.stop()
+
+    def _note(self) -> str:
+        share = f"{100.0 * self._successes / self._finished:.1f} %" if self._finished else "-"
+        return f"success {share}"
+
+
+def run_display(configuration: Configuration, *, quiet: bool) -> RunDisplay:
+    """Return what shows how far a run is.
+
+    Parameters
+    ----------
+    configuration : Configuration
+        Of the run.
+    quiet : bool
+        Whether to show nothing.
+    """
+    line = progress_line(configuration.simulator.num_trials, quiet=quiet)
+    return RunDisplay(configuration, line)
 
 
 def print_summary(summary: RunSummary) -> None:

@@ -34,7 +34,7 @@ from holdfast.files import write_atomically
 from holdfast.problems.problem import FloatArray, Problem, Scene
 from holdfast.recording.recorder import SensingRecord, TrialRecord
 
-__all__ = ["trial_figure"]
+__all__ = ["STYLE", "trial_figure"]
 
 _TRUE = "#111111"
 _BELIEF = "#2F6DB3"
@@ -59,7 +59,7 @@ _LABEL_WIDTH = 14
 _DOTS_PER_INCH = 150
 
 # Typed loosely: matplotlib's releases differ in how they type these keys.
-_STYLE: Any = {
+STYLE: Any = {
     "font.family": "sans-serif",
     "font.size": 9.0,
     "axes.titlesize": 10.0,
@@ -99,7 +99,7 @@ def trial_figure(configuration: Configuration, record: TrialRecord, path: Path) 
     scene = problem.scene()
     num_panels = problem.state_size + 2
     height = max(6.2, 1.12 * num_panels + 1.6)
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(STYLE):
         figure = Figure(figsize=(13.0 if scene else 8.0, height), layout="constrained")
         FigureCanvasAgg(figure)
         figure.suptitle(_title(configuration, record), x=0.012, ha="left", fontsize=12.0)

@@ -385,7 +385,9 @@ class Journal:
             for key, value, checksum in self._connection.execute(
                 "SELECT key, value, checksum FROM meta"
             ):
-                if _meta_checksum(key, value) != checksum:
+                # SQLite's types belong to each value, so a damaged row may hold any.
+                whole = isinstance(key, str) and isinstance(value, str)
+                if not whole or _meta_checksum(key, value) != checksum:
                     raise self._damaged(f"its note {key!r} has a wrong checksum")
                 meta[key] = value
         return meta
@@ -509,7 +511,12 @@ class Journal:
             row = self._connection.execute(
                 "SELECT trial FROM steps ORDER BY sequence LIMIT 1"
             ).fetchone()
-        return None if row is None else int(row[0])
+        if row is None:
+            return None
+        trial = row[0]
+        if not isinstance(trial, int):
+            raise self._damaged(f"its unfinished trial is {trial!r}, no number")
+        return trial
 
     def unfinished(self) -> UnfinishedTrial | None:
         """Return the records of the trial that is not finished, None if there is none.

@@ -14,10 +14,10 @@ Names of events in use. By the robot: status, launch, launched, launch_failed, r
 retry, hedge, restore, restored, service_appeared, service_vanished, service_suspected, unreachable,
 waiting, holding, resumed, busy, refused, malformed_reply, disagreement, prefetch_unused,
 resumed_trial, performed_unseen, trial, missed_ticks, stopped, note, interrupted. By a service:
-ready, session_opened, session_taken_over, restored, refused, busy, evicted, stopping. By a command
-that ends with an error: error. Fields with a
-place of their own in the text form: ``from`` and ``to`` (of a change), ``service``, ``reason``,
-``duration_ms``.
+ready, session_opened, session_taken_over, restored, refused, busy, evicted, stopping. By ``holdfast
+chaos``: chaos_trial, left_out, note, interrupted. By a command that ends with an error: error.
+Fields with a place of their own in the text form: ``from`` and ``to`` (of a change), ``service``,
+``reason``, ``duration_ms``.
 """
 
 from __future__ import annotations

@@ -21,6 +21,7 @@ from typing import NamedTuple, Protocol, TypeAlias
 from holdfast.configuration import Configuration
 from holdfast.errors import HoldfastError, TrialError
 from holdfast.outcome import TrialResult
+from holdfast.planning import Planner
 from holdfast.runtime.diagnosis import MissingServices
 from holdfast.runtime.environment import EnvironmentMaker
 from holdfast.runtime.logs import EventSink
@@ -199,7 +200,8 @@ class RobotProcess:
             problem.action_size,
             len(problem.sensing_actions),
         )
-        self._robot = Robot(problem, configuration.planning, simulator, dispatcher, rate_hz)
+        self._planner = Planner(problem, configuration.planning)
+        self._robot = Robot(self._planner, simulator, dispatcher, rate_hz)
 
     @property
     def missed_ticks(self) -> int:
@@ -383,15 +385,9 @@ class RobotProcess:
                 self._ended = True
                 return
             trial, records, tail_is_certain = following, (), True
-        configuration = self._configuration
         self._replayed = trial
-        history = replay(
-            configuration.problem,
-            configuration.planning,
-            configuration.simulator.seed,
-            trial,
-            records,
-        )
+        seed = self._configuration.simulator.seed
+        history = replay(self._planner, seed, trial, records)
         self._replayed = None
         self._starting = (trial, history, tail_is_certain)
         self._performer = make_performer(

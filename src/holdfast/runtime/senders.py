@@ -3,6 +3,10 @@
 To send can block, if the other end does not read, for as long as a link can be silent. So what is
 to be sent is put into *lanes*, one for each addressee; of a lane one thread sends at a time, and
 whenever the last free thread begins to send, one more is started.
+
+Few of them send at the same time, as long as none is held up: all threads of a process take turns
+with the interpreter, and thirty that send a hundred bytes each leave next to nothing of it to the
+one that decides what to send.
 """
 
 from __future__ import annotations
@@ -21,6 +25,12 @@ NOBODY = b""
 
 _MAX_THREADS = 32
 """So many addressees can be blocked, and the others notice nothing."""
+
+_AT_ONCE = 2
+"""Threads that send, besides those that are held up."""
+
+_HELD_UP_S = 0.02
+"""A thread that has sent for so long is held up by whoever is to receive it."""
 
 _SENT_AT_A_TIME = 16
 """Calls of a lane that are sent to before it is another one's turn."""
@@ -58,6 +68,9 @@ class Senders:
         self._lanes: dict[bytes, deque[Sendable]] = {}
         self._turns: SimpleQueue[bytes | None] = SimpleQueue()
         self._by_itself = threading.Lock()
+        # When each thread that sends, and does not count as held up, has begun to.
+        self._sending: dict[threading.Thread, float] = {}
+        self._turn_is_over = threading.Condition(self._lock)
         self._threads: list[threading.Thread] = []
         self._free = 0
         self._closed = False
@@ -132,6 +145,22 @@ class Senders:
         self._threads.append(thread)
         thread.start()
 
+    def _wait_for_turn(self) -> None:
+        """Wait until few others send, not counting those that are held up; the lock is held."""
+        while len(self._sending) >= _AT_ONCE:
+            slowest = min(self._sending, key=lambda thread: self._sending[thread])
+            patience_s = self._sending[slowest] + _HELD_UP_S - monotonic()
+            if patience_s <= 0.0:
+                del self._sending[slowest]
+            else:
+                self._turn_is_over.wait(patience_s)
+        self._sending[threading.current_thread()] = monotonic()
+
+    def _end_turn(self) -> None:
+        """Let another thread send; the lock is held."""
+        if self._sending.pop(threading.current_thread(), None) is not None:
+            self._turn_is_over.notify()
+
     def _run(self) -> None:
         try:
             while (lane := self._turns.get()) is not None:
@@ -140,9 +169,11 @@ class Senders:
                     if not self._free:
                         # This one may be held up; somebody has to be there for the next lane.
                         self._add_thread()
+                    self._wait_for_turn()
                 self._send(lane)
                 with self._lock:
                     self._free += 1
+                    self._end_turn()
         except BaseException:
             if self._failed is None:
                 raise

@@ -79,7 +79,9 @@ _STAYS_AWAKE_S = 1.0
 """After a call the timekeeper goes on ticking for this long: to wake it costs the next call."""
 
 _LOGGED_AT_MOST_EVERY_S = 1.0
-_RARELY_LOGGED = frozenset({"busy", "refused", "session_opened", "restored", "evicted"})
+_RARELY_LOGGED = frozenset(
+    {"busy", "refused", "session_opened", "session_taken_over", "restored", "evicted"}
+)
 _WAKE = b"\0"
 
 
@@ -110,6 +112,7 @@ class KnownProblems:
         self._classes = {
             name: registry.problem_class(name, search_directory=directory) for name in names
         }
+        self._names: frozenset[str] | None = None
         # msgspec (0.22) finds out about a struct's fields when the first one is made, and crashes
         # if a second thread makes one meanwhile.
         self._lock = threading.Lock()
@@ -141,10 +144,16 @@ class KnownProblems:
         return build_problem(name, found, opening.model, opening.state_space_planner)
 
     def _registered(self, name: str) -> type[Any]:
-        if ":" not in name:
+        if name in registry.BUILT_IN:
+            return registry.problem_class(name)
+        if self._names is None:
+            # Once: to look through all that is installed takes longer than a decision, and a robot
+            # can ask for a name that nobody knows as often as it likes.
+            self._names = frozenset(registry.names())
+        if name in self._names:
             with contextlib.suppress(UnknownProblemError):
                 return registry.problem_class(name)
-        known = ", ".join(sorted({*registry.names(), *self._classes}))
+        known = ", ".join(sorted({*self._names, *self._classes}))
         hint = "; a class in a file must be named when the service is started (--problem)"
         raise UnknownProblemError(
             f"problem {name}: is not known to this service{hint if ':' in name else ''}; known are "

@@ -20,6 +20,11 @@ __all__ = ["Call", "Calls"]
 _MAX_CALLS = 4
 """Bound on the calls to one service that may be open at a time."""
 
+_NUMBERS_OF_EPOCH = 1 << 20
+_EPOCHS = 1 << 11
+"""So many requests until the numbers of the next epoch begin, and epochs until those begin again; a
+number fits into 32 bits even if a process makes two thousand times as many."""
+
 
 class Call:
     """One request that is on its way.
@@ -27,6 +32,10 @@ class Call:
     Attributes
     ----------
     number : int
+        Names it in effects and events.
+    request_number : int
+        Of its request. A reply repeats it, and might come late and go astray; so no two requests
+        of a run have the same, even if other processes of the robot have made them.
     service : KnownService
     question : Question
     sent_at : float
@@ -36,11 +45,22 @@ class Call:
         Whether that part of the answer has come.
     """
 
-    __slots__ = ("number", "opens", "question", "restores", "sensing", "sent_at", "service", "task")
+    __slots__ = (
+        "number",
+        "opens",
+        "question",
+        "request_number",
+        "restores",
+        "sensing",
+        "sent_at",
+        "service",
+        "task",
+    )
 
     def __init__(
         self,
         number: int,
+        request_number: int,
         service: KnownService,
         question: Question,
         sent_at: float,
@@ -49,6 +69,7 @@ class Call:
         restores: bool,
     ) -> None:
         self.number = number
+        self.request_number = request_number
         self.service = service
         self.question = question
         self.sent_at = sent_at
@@ -90,10 +111,14 @@ class Calls:
         self._effects = effects
         self._open: dict[int, Call] = {}
         self._number = 0
+        self._first_request = epoch % _EPOCHS * _NUMBERS_OF_EPOCH
 
     def __iter__(self) -> Iterator[Call]:
         # Of a copy, so that they can be given up on the way.
         return iter(list(self._open.values()))
+
+    def __len__(self) -> int:
+        return len(self._open)
 
     def get(self, number: int) -> Call | None:
         """Return an open call; None if it is not open any more."""
@@ -116,9 +141,9 @@ class Calls:
         times = [call.sent_at for call in self.about(question) if call.service is service]
         return max(times, default=None)
 
-    def first_sent_at(self) -> float | None:
-        """Return when the oldest call was sent; None if none is open."""
-        return min((call.sent_at for call in self._open.values()), default=None)
+    def first_sent_at(self) -> float:
+        """Return when the oldest of the open calls was sent."""
+        return min(call.sent_at for call in self._open.values())
 
     def settle(self, call: Call) -> None:
         """Take note that nothing is awaited of a call any more."""
@@ -158,11 +183,12 @@ class Calls:
         lack = service.lacks(question, whole_state=whole_state)
         self._number += 1
         number = self._number
+        request_number = self._first_request + number
         request = Request(
             PROTOCOL_VERSION,
             self._session,
             self._epoch,
-            number,
+            request_number,
             state.trial,
             state.step,
             state.sensed,
@@ -173,6 +199,7 @@ class Calls:
         )
         self._open[number] = Call(
             number,
+            request_number,
             service,
             question,
             now,

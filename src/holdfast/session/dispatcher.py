@@ -202,9 +202,12 @@ class Dispatcher:
     def next_wakeup(self) -> float | None:
         """Return when :meth:`wake` must be called if nothing happens before."""
         services, question = self._services, self.question
-        due: list[float | None] = [service.detector.deadline() for service in services]
+        due: list[float | None] = []
+        if self._calls:
+            due += [service.detector.deadline() for service in services]
+            due.append(self._calls.first_sent_at() + self._limit_s)
         if question is not None and not question.complete:
-            if not self._is_being_asked(question):
+            if not self._is_being_asked(question, self._worked_at):
                 due += [
                     self._ask_again_at(service, question)
                     for service in services
@@ -212,11 +215,11 @@ class Dispatcher:
                 ]
                 if self._is_starting():
                     due.append(self._startup_until)
+            elif question.needed_at is not None:
+                due += [self._try_at(service, question) for service in services.cloud]
+                due.append(question.needed_at + self._timeout_s)
             due.append(self._standstill.waiting_at(question))
             due.append(self._hedge_at(question))
-        sent_at = self._calls.first_sent_at()
-        if sent_at is not None:
-            due.append(sent_at + self._limit_s)
         local = services.local
         if local is not None:
             due.append(self._launches.next_wakeup(present=local.detector.present))
@@ -309,8 +312,11 @@ class Dispatcher:
             self._standstill.let_go(now)
             self._note_lost_cloud(now)
             return
-        if self._is_being_asked(question):
+        if self._is_being_asked(question, now):
             self._hedge(question, now)
+            if question.needed_at is not None:
+                # Whoever is being asked may be silent for long, and the robot stands still.
+                self._try_others(now)
             if self._standstill.waits_long(question, now):
                 asked = {call.service.name for call in self._calls.about(question)}
                 self._standstill.tell_waiting(question, asked, now)
@@ -319,6 +325,8 @@ class Dispatcher:
             self._choose(question, now)
 
     def _look_for_silence(self, now: float) -> None:
+        if not self._calls:
+            return  # nothing is awaited
         for service in self._services:
             if service.detector.fell_silent(now):
                 self._report_suspected(service)
@@ -337,8 +345,13 @@ class Dispatcher:
                 )
                 self._report_suspected(service)
 
-    def _is_being_asked(self, question: Question) -> bool:
-        return any(call.service.detector.trusted for call in self._calls.about(question))
+    def _is_being_asked(self, question: Question, now: float) -> bool:
+        """Tell whether somebody is asked who can be counted on."""
+        calls = self._calls.about(question)
+        if self.status is Status.LOCAL_RECOVERY and self._local_usable(now):
+            # The cloud is only tried: it may say for long that it is at work.
+            return any(call.service is self._services.local for call in calls)
+        return any(call.service.detector.trusted for call in calls)
 
     def _is_starting(self) -> bool:
         """Tell whether a service may still be on its way up."""
@@ -404,15 +417,29 @@ class Dispatcher:
         question = self.question
         if question is None:
             return
+        needed_at = question.needed_at
+        is_late = needed_at is not None and now >= needed_at + self._timeout_s
         for service in self._services.cloud:
             if service.usable(now) and self.status is not Status.LOCAL_RECOVERY:
+                if is_late and not self._calls.is_asked(service, question):
+                    # It has come back while one that is less preferred takes its time.
+                    self._send(service, question, now, also=True)
                 break
-            if not service.detector.present or service.refused is not None:
-                continue
-            # One try at a time, so that a service further away than a turn is long can answer.
-            tries = [call.sent_at for call in self._calls.to(service) if not call.answered]
-            if service.retry_at <= now and max(tries, default=-1e9) + self._timeout_s <= now:
+            at = self._try_at(service, question)
+            if at is not None and at <= now:
+                if self._calls.is_asked(service, question):
+                    service.delay(now)
                 self._send(service, question, now, also=True)
+
+    def _try_at(self, service: KnownService, question: Question) -> float | None:
+        """Return when a service that was given up may be asked; None if it need not be."""
+        if not service.detector.present or service.refused is not None:
+            return None
+        if service.detector.trusted and self._calls.is_asked(service, question):
+            return None  # it is at work, and says so
+        # One try at a time, so that a service further away than a turn is long can answer.
+        tries = [call.sent_at for call in self._calls.to(service) if not call.answered]
+        return max(service.retry_at, max(tries, default=-1e9) + self._timeout_s)
 
     def _note_lost_cloud(self, now: float) -> None:
         """Notice that the cloud died while nothing was asked of it: recovery can start now."""
@@ -454,7 +481,7 @@ class Dispatcher:
         waited_s = launches.overdue_s(now, present=local.detector.present)
         if waited_s is not None:
             self._report("launch_failed", reason=f"not seen after {1e3 * waited_s:.0f} ms")
-            launches.failed(now)
+            launches.gave_up(now)
         if launches.is_due(now):
             if local.detector.boot is not None:
                 local.detector.vanished(local.detector.boot)

@@ -39,7 +39,9 @@ class FailureDetector:
     """
 
     def __init__(self, detection_timeout_s: float) -> None:
+        self._usual_timeout_s = detection_timeout_s
         self._timeout_s = detection_timeout_s
+        self._longest_silence_s = 0.0
         self._awaited = 0
         self._last_sign = 0.0
         self.boot: str | None = None
@@ -84,12 +86,24 @@ class FailureDetector:
 
     def heard(self, now: float) -> None:
         """Something came: it lives and makes progress."""
+        if self._awaited:
+            self._longest_silence_s = max(self._longest_silence_s, now - self._last_sign)
         self._last_sign = now
         self.suspicion = None
 
     def extend_patience(self, factor: float, limit_s: float) -> None:
         """Allow a longer silence from now on, up to a limit."""
         self._timeout_s = min(factor * self._timeout_s, max(limit_s, self._timeout_s))
+
+    def answered(self) -> None:
+        """Take note of a whole answer: how long it was silent meanwhile is what it needs.
+
+        What was allowed beyond that, because it seemed to be slow and was not, is taken back.
+        """
+        needed_s = 2.0 * self._longest_silence_s
+        shorter_s = max(0.5 * self._timeout_s, needed_s, self._usual_timeout_s)
+        self._timeout_s = min(self._timeout_s, shorter_s)
+        self._longest_silence_s = 0.0
 
     def excuse(self, seconds: float) -> None:
         """Take note that for this long nothing could be heard."""

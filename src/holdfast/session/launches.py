@@ -4,6 +4,10 @@ It is not launched before it is wanted. Then it may not come up, or end, or hang
 follows at once the first time, for most failures happen once, and ever more rarely after that, for
 one that has failed often is likely to fail again. An answer, or a life of some length, makes up for
 all failures before.
+
+One that was not seen in time may hang, or its machine may be so busy that it is only slow. To end
+it then is to throw away all that it has done, so each time the next one is given more time; else no
+local service would ever come up on such a machine.
 """
 
 from __future__ import annotations
@@ -14,6 +18,9 @@ __all__ = ["Launches"]
 
 _LONG_LIFE_S = 1.0
 """A process that has lived for longer has not failed at its start."""
+
+_MOST_TIME = 8
+"""How many times as long as the first one a later launch may take."""
 
 
 class Launches:
@@ -35,6 +42,7 @@ class Launches:
         self._launched_at: float | None = None
         self._launch_after: float | None = None
         self._failures = 0
+        self._late = 0
         self.number = 0
 
     @property
@@ -74,7 +82,12 @@ class Launches:
         if self._launched_at is None or self._launch_after is not None or present:
             return None
         # The same sum as in next_wakeup: the difference may be rounded to less than the limit.
-        return now - self._launched_at if now >= self._launched_at + self._timeout_s else None
+        return now - self._launched_at if now >= self._launched_at + self._allowed_s else None
+
+    def gave_up(self, now: float) -> None:
+        """Launch again because it was not seen in time; the next one may take longer."""
+        self._late += 1
+        self.failed(now)
 
     def failed(self, now: float) -> None:
         """Launch again: at once the first time, then ever more rarely."""
@@ -91,13 +104,20 @@ class Launches:
         self.failed(now)
 
     def succeeded(self) -> None:
-        """Take note that it does what it is for."""
+        """Take note that it does what it is for: it is not to be replaced any more."""
         self._failures = 0
+        self._late = 0
+        self._launch_after = None
 
     def next_wakeup(self, *, present: bool) -> float | None:
         """Return when there is something to be done; None if there is nothing to wait for."""
         if self._launch_after is not None:
             return self._launch_after
         if self._launched_at is not None and not present:
-            return self._launched_at + self._timeout_s
+            return self._launched_at + self._allowed_s
         return None
+
+    @property
+    def _allowed_s(self) -> float:
+        factor: int = min(2**self._late, _MOST_TIME)
+        return self._timeout_s * factor

@@ -115,5 +115,5 @@ def decode_record(data: bytes) -> Record:
     """
     try:
         return _DECODER.decode(data)
-    except msgspec.DecodeError as error:
+    except (msgspec.DecodeError, RecursionError, UnicodeDecodeError) as error:
         raise RecordError(f"{len(data)} bytes are no record of a journal: {error}") from error

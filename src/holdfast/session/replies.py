@@ -104,7 +104,7 @@ class Replies:
         service = call.service
         try:
             reply = decode_reply(payload)
-            _check_number(reply, call.number)
+            _check_number(reply, call.request_number)
             if isinstance(reply, TaskAnswer | SensingAnswer):
                 self._take_answer(call, reply, now)
                 return self._was_answered(call, reply, now)
@@ -153,12 +153,17 @@ class Replies:
         else:
             call.sensing = True
         service.note_answer(question, now, restored=call.restores)
+        for earlier in self._calls.to(service):
+            if earlier.number < call.number:
+                # Whatever became of it, nothing is awaited of it any more.
+                self._calls.abandon(earlier)
         if first and call.opens and (call.restores or question.state.step > 0):
             restore_ms = 1e3 * (now - call.sent_at)
             self._report(
                 "restored", service=service.name, step=question.state.step, restore_ms=restore_ms
             )
         if call.finished:
+            service.detector.answered()
             self._calls.settle(call)
         return News.ANSWERED if first else News.ANSWERED_MORE
 
@@ -192,8 +197,11 @@ class Replies:
                 f"{service.name}: {reply.text}; another process has resumed this run, "
                 "so this one stops"
             )
-        service.note_lost_state(differs=False)
         service.delay(now)
+        if reply.code == "damaged":
+            self._report("damaged_request", service=service.name, reason=reply.text)
+            return
+        service.note_lost_state(differs=False)
         self._refusal(service, reply.code, reply.text)
 
     def _refusal(self, service: KnownService, code: str, text: str) -> None:

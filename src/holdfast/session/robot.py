@@ -20,17 +20,9 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from holdfast.errors import HoldfastError
+from holdfast.errors import HoldfastError, InvalidValueError
 from holdfast.outcome import DecisionLog, TrialResult
-from holdfast.planning import (
-    PlanningState,
-    advance,
-    digest,
-    initial_state,
-    needs_sensing,
-    observe,
-)
-from holdfast.problems.problem import Problem
+from holdfast.planning import Planner, PlanningState, digest
 from holdfast.session.dispatcher import Dispatcher
 from holdfast.session.effects import (
     Act,
@@ -70,7 +62,7 @@ from holdfast.session.records import (
     RecoveredRecord,
 )
 from holdfast.session.status import Status
-from holdfast.settings import PlanningSettings, SimulatorSettings
+from holdfast.settings import SimulatorSettings
 
 __all__ = ["HeldError", "History", "Robot", "UnknownPerformanceError", "replay"]
 
@@ -117,11 +109,11 @@ class History:
         Times that another service took over.
     """
 
-    def __init__(self, problem: Problem, settings: PlanningSettings, seed: int, trial: int) -> None:
-        self.state = initial_state(problem, settings, seed, trial)
+    def __init__(self, planner: Planner, seed: int, trial: int) -> None:
+        self.state = planner.initial_state(seed, trial)
         self.observations: tuple[Observed, ...] = ()
         self.num_observations = 0
-        self.log = DecisionLog(problem.action_size)
+        self.log = DecisionLog(planner.problem.action_size)
         self.actions: list[FloatArray] = []
         self.total_reward = 0.0
         self.pending: FloatArray | None = None
@@ -145,28 +137,21 @@ class History:
         self.log.sensed(record.step, record.sensing_action, record.digest)
         self.state = after
 
-    def performed(self, problem: Problem, settings: PlanningSettings, reward: float | None) -> None:
+    def performed(self, planner: Planner, reward: float | None) -> None:
         """Fold in that the pending task action has been performed."""
         assert self.pending is not None
         self.log.acted(self.state.step, self.pending)
-        self.state = advance(problem, settings, self.state, self.pending)
+        self.state = planner.advance(self.state, self.pending)
         self.total_reward += 0.0 if reward is None else reward
         self.pending = None
 
 
-def replay(
-    problem: Problem,
-    settings: PlanningSettings,
-    seed: int,
-    trial: int,
-    records: Sequence[Record],
-) -> History:
+def replay(planner: Planner, seed: int, trial: int, records: Sequence[Record]) -> History:
     """Fold the records of an unfinished trial.
 
     Parameters
     ----------
-    problem : Problem
-    settings : PlanningSettings
+    planner : Planner
     seed, trial : int
     records : sequence of Record
         In the order in which they were written.
@@ -180,19 +165,17 @@ def replay(
     RecordError
         If a record does not follow from those before it, or leads to another state than it did.
     """
-    history = History(problem, settings, seed, trial)
+    history = History(planner, seed, trial)
     for position, record in enumerate(records):
         history.paused = isinstance(record, PausedRecord)
         try:
-            _replay_record(problem, settings, history, record)
-        except (RecordError, MessageError) as error:
+            _replay_record(planner, history, record)
+        except (RecordError, MessageError, InvalidValueError) as error:
             raise RecordError(f"trial {trial}: record {position} of its journal {error}") from error
     return history
 
 
-def _replay_record(
-    problem: Problem, settings: PlanningSettings, history: History, record: Record
-) -> None:
+def _replay_record(planner: Planner, history: History, record: Record) -> None:
     if isinstance(record, PausedRecord):
         return
     if isinstance(record, RecoveredRecord):
@@ -204,26 +187,24 @@ def _replay_record(
     if record.step != state.step:
         raise RecordError(f"is of step {record.step}, where step {state.step} is due")
     if isinstance(record, ObservedRecord):
-        _replay_observation(problem, settings, history, record)
+        _replay_observation(planner, history, record)
     elif isinstance(record, ActingRecord):
-        if needs_sensing(settings, state):
+        if planner.needs_sensing(state):
             raise RecordError("is a task action where an observation is due")
-        history.pending = numbers_from(record.action, problem.action_size)
+        history.pending = numbers_from(record.action, planner.problem.action_size)
     elif history.pending is None:
         raise RecordError("is of a performance of which no action was written down")
     else:
         history.actions.append(history.pending)
-        history.performed(problem, settings, record.reward)
+        history.performed(planner, record.reward)
 
 
-def _replay_observation(
-    problem: Problem, settings: PlanningSettings, history: History, record: ObservedRecord
-) -> None:
+def _replay_observation(planner: Planner, history: History, record: ObservedRecord) -> None:
     state = history.state
-    if not needs_sensing(settings, state):
+    if not planner.needs_sensing(state):
         raise RecordError("is an observation where a task action is due")
     observation = numbers_from(record.observation, len(record.observation) // 8)
-    after, info = observe(problem, settings, state, record.sensing_action, observation)
+    after, info = planner.observe(state, record.sensing_action, observation)
     reached = digest(after)
     if reached != record.digest:
         raise RecordError(
@@ -238,8 +219,7 @@ class Robot:
 
     Parameters
     ----------
-    problem : Problem
-    planning : PlanningSettings
+    planner : Planner
     simulator : SimulatorSettings
         Seed, and the number of steps after which a trial has failed.
     dispatcher : Dispatcher
@@ -255,14 +235,12 @@ class Robot:
 
     def __init__(
         self,
-        problem: Problem,
-        planning: PlanningSettings,
+        planner: Planner,
         simulator: SimulatorSettings,
         dispatcher: Dispatcher,
         rate_hz: float | None = None,
     ) -> None:
-        self._problem = problem
-        self._planning = planning
+        self._planner = planner
         self._simulator = simulator
         self._dispatcher = dispatcher
         self._period_s = None if rate_hz is None else 1.0 / rate_hz
@@ -367,7 +345,7 @@ class Robot:
         if history.pending is not None and performed == known + 1:
             self._unwritten.append(PerformedRecord(known, None))
             self._report("performed_unseen", trial=self._trial, step=known)
-            history.performed(self._problem, self._planning, None)
+            history.performed(self._planner, None)
             return None
         if performed != known:
             raise UnknownPerformanceError(
@@ -448,9 +426,7 @@ class Robot:
         assert history is not None
         state = history.state
         try:
-            after, info = observe(
-                self._problem, self._planning, state, self._sensing_action, event.observation
-            )
+            after, info = self._planner.observe(state, self._sensing_action, event.observation)
         except HoldfastError as error:
             self._stop(error)
             return
@@ -473,7 +449,7 @@ class Robot:
         self._unwritten.append(PerformedRecord(history.state.step, event.reward))
         self._done = event.done
         try:
-            history.performed(self._problem, self._planning, event.reward)
+            history.performed(self._planner, event.reward)
         except HoldfastError as error:
             self._stop(error)
 
@@ -511,7 +487,7 @@ class Robot:
         if self._done or state.step >= self._simulator.max_steps:
             self._end_trial(now)
             return
-        if needs_sensing(self._planning, state):
+        if self._planner.needs_sensing(state):
             self._next_sensing(state, now)
         else:
             self._next_action(state, now)
@@ -571,7 +547,7 @@ class Robot:
         assert history is not None
         self._write()
         question = Question(
-            self._planning,
+            self._planner.settings,
             history.state,
             state_digest,
             history.observations,

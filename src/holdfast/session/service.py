@@ -28,6 +28,8 @@ import enum
 import math
 from collections.abc import Callable
 
+import msgspec
+
 from holdfast.errors import InvalidValueError
 from holdfast.planning import needs_sensing
 from holdfast.problems.problem import Problem
@@ -262,19 +264,20 @@ class Service:
             )
             self._calls.refuse(call, request.number, "invalid", text)
             return None
-        room = self._sessions.has_room or self._sessions.unused() is not None
-        if not room:
-            # It is free once another robot has left, not once the next decision is computed.
-            self._turn_away(call, request.number, request.session, now, _NO_ROOM_RETRY_MS)
-            return None
-        if self._lines.is_overloaded(now):
+        if self._lines.is_overloaded(now, newcomer=True):
+            self._sessions.note_epoch(request.session, request.epoch)
             self._turn_away(call, request.number, request.session, now)
             return None
         times = ExpectedTimes(_INERTIA_OF_ONE, self._times.task_s, self._times.sensing_s)
         session = Session(request, opening, limits.max_threads, times)
         session.used_at = now
-        unused = self._sessions.unused()
-        if unused is not None and not self._sessions.has_room:
+        while not self._sessions.has_room_for(session):
+            unused = self._sessions.unused(for_newcomer=True)
+            if unused is None:
+                # It is free once another robot has left, not once the next decision is computed.
+                self._sessions.note_epoch(request.session, request.epoch)
+                self._turn_away(call, request.number, request.session, now, _NO_ROOM_RETRY_MS)
+                return None
             self._forget(unused, "room needed")
         self._sessions.add(session)
         self._statistics.sessions_opened += 1
@@ -338,6 +341,9 @@ class Service:
         self, session: Session, call: int, request: Request, size: int, now: float
     ) -> Work | _Fate:
         """Queue a request for what is not known yet, or turn it away."""
+        if request.opening is not None:
+            # The session has it; one copy for each request that waits would count nowhere.
+            request = msgspec.structs.replace(request, opening=None)
         interval = session.planning.sensing_interval + 1
         sensing = not request.sensed and request.step % interval == 0
         waiting = next(
@@ -348,8 +354,9 @@ class Service:
             ),
             None,
         )
-        if waiting is None and self._lines.is_overloaded(now):
-            self._turn_away(call, request.number, request.session, now)
+        newcomer = not session.served
+        if waiting is None and self._lines.is_overloaded(now, newcomer=newcomer):
+            self._turn_away(call, request.number, request.session, now, newcomer=newcomer)
             return _Fate.TURNED_AWAY
         if waiting is not None:
             # It keeps the turn of the request that it replaces, and adds nothing to the backlog.
@@ -456,6 +463,7 @@ class Service:
 
     def _succeeded(self, work: Work, outcome: Outcome, now: float) -> None:
         session, statistics = work.session, self._statistics
+        self._sessions.serve(session)
         most = self._limits.answers_per_session
         computed_s = now - work.started_at
         computed_us = min(MAX_WORD, max(0, round(1e6 * computed_s)))
@@ -504,10 +512,17 @@ class Service:
             self._calls.tell_sensing(record.call, record.number, digest, part)
 
     def _turn_away(
-        self, call: int, number: int, key: bytes, now: float, least_ms: float = 1.0
+        self,
+        call: int,
+        number: int,
+        key: bytes,
+        now: float,
+        least_ms: float = 1.0,
+        *,
+        newcomer: bool = True,
     ) -> None:
         lines = self._lines
-        wait_ms = max(least_ms, 1e3 * lines.wait_s(now))
+        wait_ms = max(least_ms, 1e3 * lines.wait_s(now, newcomer=newcomer))
         self._calls.turn_away(call, number, key, wait_ms, lines.num_waiting)
 
     # -- sessions --------------------------------------------------------------------------------

@@ -162,6 +162,22 @@ class Job:
         """What the problem is called in the opening."""
         return self._opening.problem
 
+    @property
+    def identity(self) -> tuple[object, ...]:
+        """What the outcome is a function of, besides the problem and the settings of the run."""
+        request, state = self._request, self._state
+        named = None
+        if request is not None:
+            named = (
+                request.trial,
+                request.step,
+                request.sensed,
+                request.digest,
+                request.observations,
+                request.checkpoint,
+            )
+        return self.kind, self._seed, named, None if state is None else digest(state)
+
     def run(self) -> Outcome:
         """Compute; whatever goes wrong in the problem's functions is part of the outcome.
 

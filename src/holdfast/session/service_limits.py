@@ -19,15 +19,18 @@ class ServiceLimits(msgspec.Struct, frozen=True, kw_only=True):
     Attributes
     ----------
     max_sessions : int
-        Robots remembered; the one unused the longest is forgotten first.
+        Robots remembered; the one unused the longest is forgotten first, but for newcomers one
+        that was never served if these are half of them.
     max_state_bytes : int
         Of all states remembered.
+    max_opening_bytes : int
+        Of all openings remembered, as they are in memory (by estimate).
     max_idle_s : float
         A robot that was not heard for this long is forgotten.
     max_waiting : int
-        Requests that wait for a worker.
+        Requests that wait for a worker; robots that were never served have half of it at most.
     max_waiting_bytes : int
-        Of these requests.
+        Of these requests, likewise.
     max_wait_ms : float
         A request that would wait longer than this, by estimate, is turned away. (Not as long as
         fewer requests wait than there are workers: a service is never too small for one robot.)
@@ -53,6 +56,7 @@ class ServiceLimits(msgspec.Struct, frozen=True, kw_only=True):
 
     max_sessions: int = 1000
     max_state_bytes: int = 256 << 20
+    max_opening_bytes: int = 64 << 20
     max_idle_s: float = 600.0
     max_waiting: int = 1000
     max_waiting_bytes: int = 64 << 20

@@ -1,12 +1,15 @@
-"""Who is next: two lines of works that wait for a worker, and how long the wait is.
+"""Who is next: three lines of works that wait for a worker, and how long the wait is.
 
-In one line are the works for which a robot stands still, in the other those that are ahead of their
-robots. The first go before the second, but not for ever. Each session has one work in each line at
-most; the one after it is held back until that has run. So a line is a row of turns, and a robot
-that asks much waits for itself, not others for it.
+In one line are the works for which a robot stands still, in another those of robots that were never
+served before, in the third those that are ahead of their robots. The first go before the others,
+but not for ever. Each session has one work in each line at most; the one after it is held back
+until that has run. So a line is a row of turns, and a robot that asks much waits for itself, not
+others for it.
 
 How long a request that came now would wait follows from what the works in the lines are expected to
-take. A service that would be too slow says so at once, so that the robot can ask elsewhere.
+take. A service that would be too slow says so at once, so that the robot can ask elsewhere. Whoever
+it has served before does not wait for newcomers, however many come, and is not turned away because
+of them: to be somebody new costs nothing, so one client can be thousands of them.
 """
 
 from __future__ import annotations
@@ -39,12 +42,17 @@ class Lines:
     def __init__(self, workers: int, limits: ServiceLimits) -> None:
         self._workers = workers
         self._limits = limits
-        self._patience_s = 1e-3 * limits.prefetch_patience_ms
         self._urgent: OrderedDict[Work, None] = OrderedDict()
+        self._newcomers: OrderedDict[Work, None] = OrderedDict()
         self._later: OrderedDict[Work, None] = OrderedDict()
+        self._patience_s = 1e-3 * limits.prefetch_patience_ms
+        self._patience_of_newcomers_s = 1e-3 * limits.max_wait_ms
         self._running: dict[Job, Work] = {}
         self._waiting_bytes = 0
+        self._bytes_of_newcomers = 0
+        self._num_newcomers = 0
         self._backlog_s = 0.0
+        self._backlog_of_newcomers_s = 0.0
         self.num_waiting = 0
 
     @property
@@ -74,8 +82,7 @@ class Lines:
         if session.held[work.slot] is work:
             session.held[work.slot] = None
         else:
-            self._urgent.pop(work, None)
-            self._later.pop(work, None)
+            self._leave(work)
         self._count(work, -1)
 
     def hasten(self, work: Work) -> None:
@@ -86,13 +93,25 @@ class Lines:
             self._urgent[work] = None
 
     def _line_of(self, work: Work) -> OrderedDict[Work, None]:
-        return self._urgent if work.urgent else self._later
+        if not work.urgent:
+            return self._later
+        return self._newcomers if work.newcomer else self._urgent
+
+    def _leave(self, work: Work) -> None:
+        for line in (self._urgent, self._newcomers, self._later):
+            line.pop(work, None)
 
     def _count(self, work: Work, sign: int) -> None:
         self.num_waiting += sign
         self._waiting_bytes += sign * work.size
         # Sums of floating-point numbers drift; an empty line is exactly empty.
         self._backlog_s = self._backlog_s + sign * work.cost_s if self.num_waiting else 0.0
+        if work.newcomer:
+            self._num_newcomers += sign
+            self._bytes_of_newcomers += sign * work.size
+            self._backlog_of_newcomers_s += sign * work.cost_s
+        if not self._num_newcomers:
+            self._backlog_of_newcomers_s = 0.0
 
     # -- running ---------------------------------------------------------------------------------
 
@@ -102,17 +121,16 @@ class Lines:
             return None
         work = self._next()
         if work is not None:
-            self._urgent.pop(work, None)
-            self._later.pop(work, None)
+            self._leave(work)
             self._count(work, -1)
         return work
 
     def _next(self) -> Work | None:
         urgent = next(iter(self._urgent), None)
+        newcomer = next(iter(self._newcomers), None)
         later = next(iter(self._later), None)
-        if urgent is None or later is None:
-            return urgent or later
-        return urgent if urgent.since <= later.since + self._patience_s else later
+        first = _first(urgent, newcomer, self._patience_of_newcomers_s)
+        return _first(first, later, self._patience_s)
 
     def begin(self, work: Work, job: Job, now: float) -> None:
         """Take note that a worker has a work that was taken."""
@@ -141,20 +159,31 @@ class Lines:
 
     # -- the wait --------------------------------------------------------------------------------
 
-    def is_overloaded(self, now: float) -> bool:
+    def is_overloaded(self, now: float, *, newcomer: bool) -> bool:
         """Tell whether a request that came now is to be turned away."""
         limits = self._limits
-        if self.num_waiting < self._workers:
+        ahead = self.num_waiting - (0 if newcomer else self._num_newcomers)
+        if ahead < self._workers:
             return False
         return (
             self.num_waiting >= limits.max_waiting
             or self._waiting_bytes >= limits.max_waiting_bytes
-            or 1e3 * self.wait_s(now) > limits.max_wait_ms
+            # Half of the room is kept for those that were served before.
+            or (newcomer and 2 * self._num_newcomers >= limits.max_waiting)
+            or (newcomer and 2 * self._bytes_of_newcomers >= limits.max_waiting_bytes)
+            or 1e3 * self.wait_s(now, newcomer=newcomer) > limits.max_wait_ms
         )
 
-    def wait_s(self, now: float) -> float:
+    def wait_s(self, now: float, *, newcomer: bool) -> float:
         """Estimate how long a request that came now would wait for its answer to be begun."""
-        ahead_s = self._backlog_s
+        ahead_s = self._backlog_s - (0.0 if newcomer else self._backlog_of_newcomers_s)
         for work in self._running.values():
             ahead_s += max(0.0, work.cost_s - (now - work.started_at))
         return ahead_s / self._workers
+
+
+def _first(work: Work | None, patient: Work | None, patience_s: float) -> Work | None:
+    """Return the first of two works, of which one lets the other go first for so long."""
+    if work is None or patient is None:
+        return work or patient
+    return work if work.since <= patient.since + patience_s else patient

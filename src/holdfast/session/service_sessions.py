@@ -20,7 +20,7 @@ from typing import NamedTuple
 import msgspec
 
 from holdfast.planning import PlanningState
-from holdfast.session.messages import Opening, Request
+from holdfast.session.messages import Opening, Request, count_values
 from holdfast.session.service_limits import ServiceLimits
 
 __all__ = [
@@ -34,6 +34,12 @@ __all__ = [
     "Work",
     "key_of",
 ]
+
+_LEAST_EPOCHS = 4096
+"""Epochs of forgotten robots that are remembered, however few sessions there may be."""
+
+_BYTES_PER_VALUE = 64
+"""Of Python's objects for plain data, with their places in lists and mappings."""
 
 REQUESTED, PREFETCHED = 0, 1
 """The slots of a session: a robot stands still for the first, the second is ahead of it."""
@@ -133,6 +139,7 @@ class Work:
         "calls",
         "cost_s",
         "digest",
+        "newcomer",
         "request",
         "running",
         "sensing",
@@ -165,6 +172,7 @@ class Work:
         self.since = since
         self.slot = PREFETCHED if request is None else REQUESTED
         self.urgent = request is not None
+        self.newcomer = not session.served
         self.calls: dict[int, WaitingCall] = {}
         self.cost_s = session.expected_s(task=not sensing)
         self.running = False
@@ -204,12 +212,14 @@ class Session:
         "num_bytes",
         "number",
         "opening",
+        "opening_bytes",
         "opening_key",
         "planning",
         "planning_single",
         "problem_key",
         "running",
         "seed",
+        "served",
         "times",
         "used_at",
         "works",
@@ -223,6 +233,7 @@ class Session:
         self.number = -1
         self.opening = opening
         self.opening_key = key_of(opening)
+        self.opening_bytes = size_of_opening(opening)
         self.problem_key = key_of((opening.problem, opening.model, opening.state_space_planner))
         self.built = False
         # The number of threads changes no result, so the service may choose it.
@@ -236,6 +247,7 @@ class Session:
             for num_cores in (most, 1)
         )
         self.seed = opening.seed
+        self.served = False
         self.acknowledged: PlanningState | None = None
         self.ahead: PlanningState | None = None
         self.ahead_digest = b""
@@ -291,6 +303,8 @@ class Sessions:
     ----------
     state_bytes : int
         Of all states and answers, as they were weighed last.
+    opening_bytes : int
+        Of all openings, by estimate.
     """
 
     def __init__(self, limits: ServiceLimits) -> None:
@@ -298,7 +312,9 @@ class Sessions:
         self._sessions: OrderedDict[bytes, Session] = OrderedDict()
         # Of sessions that were forgotten: a robot that was replaced stays replaced.
         self._epochs: OrderedDict[bytes, int] = OrderedDict()
+        self._num_newcomers = 0
         self.state_bytes = 0
+        self.opening_bytes = 0
 
     def __len__(self) -> int:
         return len(self._sessions)
@@ -312,18 +328,40 @@ class Sessions:
         session = self._sessions.get(key)
         return session.epoch if session is not None else self._epochs.get(key, 0)
 
-    def unused(self) -> Session | None:
-        """Return the session without work that was unused the longest."""
-        return next((each for each in self._sessions.values() if not each.works), None)
+    def unused(self, *, for_newcomer: bool = False) -> Session | None:
+        """Return the session without work that was unused the longest.
 
-    @property
-    def has_room(self) -> bool:
-        """Whether one more fits without forgetting another."""
-        return len(self._sessions) < self._limits.max_sessions
+        For a newcomer, one of those that were never served, if these have half of the room already:
+        so however many come, they do not drive all others out.
+        """
+        among_newcomers = for_newcomer and 2 * self._num_newcomers >= self._limits.max_sessions
+        return next(
+            (
+                each
+                for each in self._sessions.values()
+                if not each.works and not (among_newcomers and each.served)
+            ),
+            None,
+        )
+
+    def serve(self, session: Session) -> None:
+        """Take note that a robot has got an answer."""
+        self._num_newcomers -= not session.served
+        session.served = True
+
+    def has_room_for(self, session: Session) -> bool:
+        """Tell whether one more fits without forgetting another; the only one always does."""
+        limits = self._limits
+        return not self._sessions or (
+            len(self._sessions) < limits.max_sessions
+            and self.opening_bytes + session.opening_bytes <= limits.max_opening_bytes
+        )
 
     def add(self, session: Session) -> None:
         """Remember a robot from now on."""
         self._sessions[session.key] = session
+        self._num_newcomers += 1
+        self.opening_bytes += session.opening_bytes
         self._epochs.pop(session.key, None)
 
     def use(self, session: Session, now: float) -> None:
@@ -335,10 +373,16 @@ class Sessions:
         """Forget all but the epoch of a robot for which nothing waits."""
         session.closed = True
         del self._sessions[session.key]
+        self._num_newcomers -= not session.served
         self.state_bytes -= session.num_bytes
-        self._epochs[session.key] = session.epoch
-        self._epochs.move_to_end(session.key)
-        while len(self._epochs) > 4 * self._limits.max_sessions:
+        self.opening_bytes -= session.opening_bytes
+        self.note_epoch(session.key, session.epoch)
+
+    def note_epoch(self, key: bytes, epoch: int) -> None:
+        """Remember the epoch of a robot that has no session: its processes before are replaced."""
+        self._epochs[key] = epoch
+        self._epochs.move_to_end(key)
+        while len(self._epochs) > max(4 * self._limits.max_sessions, _LEAST_EPOCHS):
             self._epochs.popitem(last=False)
 
     # -- what was not heard for long -------------------------------------------------------------
@@ -379,6 +423,12 @@ class Sessions:
 def key_of(data: object) -> bytes:
     """Return a short name of plain data, equal for equal data."""
     return hashlib.blake2b(msgspec.msgpack.encode(data), digest_size=16).digest()
+
+
+def size_of_opening(opening: Opening) -> int:
+    """Estimate what an opening takes in memory: far more than its bytes on the wire."""
+    num_bytes = len(msgspec.msgpack.encode(opening))
+    return num_bytes + _BYTES_PER_VALUE * count_values(opening)
 
 
 def _size_of(state: PlanningState | None) -> int:

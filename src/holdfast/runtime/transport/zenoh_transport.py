@@ -101,7 +101,7 @@ _BATCHES_QUEUED = 16
 """Zenoh's upper bound; enough that the parts which are on their way never block."""
 
 _SMALLEST_PART_BYTES = 1000
-"""Bound on how many parts a request may have, which take memory each."""
+"""Of all parts but the last: each takes memory besides its bytes, and only these are counted."""
 
 _LARGEST_MESSAGE_BYTES = 1_000_000
 """What a service takes in one message; a robot that plays by the rules sends no such message."""
@@ -593,13 +593,15 @@ class _Assembly:
         """Take a part; return the request if this was the last one and all are there."""
         incoming = self._incoming.pop(name, None) or _Incoming(count)
         self._size_bytes -= incoming.size_bytes
-        if index < incoming.count and index not in incoming.parts:
-            incoming.parts[index] = part
-            incoming.size_bytes += len(part)
+        parts = incoming.parts
         if index == incoming.count - 1:
-            if len(incoming.parts) < incoming.count:
+            if len(parts) < index:
                 return None
-            return b"".join(part for _, part in sorted(incoming.parts.items()))
+            return b"".join((*(parts[number] for number in range(index)), part))
+        # By the upload's own count, which a part that claims another one cannot change.
+        if index < incoming.count and index not in parts and len(part) >= _SMALLEST_PART_BYTES:
+            parts[index] = part
+            incoming.size_bytes += len(part)
         self._incoming[name] = incoming  # the newest now
         self._size_bytes += incoming.size_bytes
         while self._size_bytes > self._max_bytes or len(self._incoming) > _UPLOADS:

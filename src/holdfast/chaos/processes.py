@@ -1,4 +1,4 @@
-"""Processes of the demo, and what can be seen of them from outside.
+"""Processes of holdfast's own commands, and what can be seen of them from outside.
 
 Whoever shows that nothing is lost must not look into what it shows. A process is known here by what
 it writes for everybody, and by its end.
@@ -8,6 +8,9 @@ from __future__ import annotations
 
 import contextlib
 import csv
+import os
+import random
+import signal
 import socket
 import subprocess
 import sys
@@ -29,11 +32,18 @@ __all__ = [
     "Ended",
     "Written",
     "free_port",
+    "local_services_of",
+    "marked_processes",
     "time_of",
 ]
 
 _SHOWN_CHARACTERS = 300
 _LAST_LINES = 20
+
+_LOWEST_PORT = 20_000
+_OUTGOING_PORTS = Path("/proc/sys/net/ipv4/ip_local_port_range")
+_USUAL_FIRST_OUTGOING_PORT = 32_768
+_PORT_ATTEMPTS = 1000
 
 
 class CannotStartError(HoldfastError):
@@ -66,6 +76,8 @@ class ChildProcess:
     environment : dict of str to str
     deliver : callable
         Gets each line that it writes, and its end; called from a thread.
+    prefix : sequence of str
+        A command that becomes this one, in another namespace say.
 
     Attributes
     ----------
@@ -88,6 +100,7 @@ class ChildProcess:
         log_path: Path,
         environment: dict[str, str],
         deliver: Callable[[Written | Ended], None],
+        prefix: Sequence[str] = (),
     ) -> None:
         self._deliver = deliver
         self._log_path = log_path
@@ -96,21 +109,23 @@ class ChildProcess:
         self.spawned_at = time.time()
         try:
             self.process: subprocess.Popen[bytes] = subprocess.Popen(
-                [sys.executable, "-m", "holdfast", *arguments],
-                # Never written to: a service sees by its end that the demo itself has died.
+                [*prefix, sys.executable, "-m", "holdfast", *arguments],
+                # Never written to: a service sees by its end that whoever started it has died.
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.STDOUT,
                 env=environment,
-                # Ctrl-C is the demo's to answer, which then ends its processes in order.
-                start_new_session=True,
+                # Ctrl-C is answered by whoever started it, who then ends its processes in order. A
+                # group and no session of its own: if this process is killed, the system itself
+                # wakes those that are stopped and hangs up on them.
+                process_group=0,
             )
         except OSError as error:
             raise CannotStartError(
                 f"holdfast {arguments[0]} cannot be started: {error.strerror}"
             ) from error
         self._reader = threading.Thread(
-            target=self._read, name=f"demo-{self.process.pid}", daemon=True
+            target=self._read, name=f"output-{self.process.pid}", daemon=True
         )
         self._reader.start()
 
@@ -124,6 +139,18 @@ class ChildProcess:
         self.killed_at = time.time()
         self.process.kill()
         return self.killed_at
+
+    def stop(self) -> float:
+        """Let it stand still, with SIGSTOP; return when."""
+        stopped_at = time.time()
+        self.process.send_signal(signal.SIGSTOP)
+        return stopped_at
+
+    def resume(self) -> float:
+        """Let it go on, with SIGCONT; return when."""
+        resumed_at = time.time()
+        self.process.send_signal(signal.SIGCONT)
+        return resumed_at
 
     def terminate(self) -> None:
         """Ask it to end in order, if it has not ended."""
@@ -247,8 +274,65 @@ def time_of(text: str) -> float:
 
 
 def free_port() -> int:
-    """Return a port of this machine that nobody uses at the moment."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
+    """Return a port of this machine that nobody uses at the moment.
+
+    It is none of those that the system gives to connections: while a service is away, the next
+    attempt to reach it could be given its port, and so be connected to itself.
+
+    Raises
+    ------
+    CannotStartError
+        If there is none.
+    """
+    try:
+        end = int(_OUTGOING_PORTS.read_text().split()[0])
+    except (OSError, ValueError, IndexError):
+        end = _USUAL_FIRST_OUTGOING_PORT
+    if end <= _LOWEST_PORT:
+        end = _USUAL_FIRST_OUTGOING_PORT
+    chance = random.SystemRandom()
+    for _ in range(_PORT_ATTEMPTS):
+        port = chance.randrange(_LOWEST_PORT, end)
+        with contextlib.suppress(OSError), socket.socket() as probe:
+            probe.bind(("127.0.0.1", port))
+            return port
+    raise CannotStartError(f"no port of 127.0.0.1 from {_LOWEST_PORT} to {end - 1} is free")
+
+
+def local_services_of(robot: int) -> list[int]:
+    """Return the processes of the local services that a robot has launched (Linux).
+
+    Parameters
+    ----------
+    robot : int
+        The robot's process.
+    """
+    found = []
+    for folder in Path("/proc").glob("[0-9]*"):
+        with contextlib.suppress(OSError):
+            # The name, in parentheses, may hold anything.
+            fields = (folder / "stat").read_text().rpartition(")")[2].split()
+            if int(fields[1]) == robot and fields[0] != "Z":
+                arguments = (folder / "cmdline").read_bytes().split(b"\0")
+                if b"--until-stdin-closes" in arguments:
+                    found.append(int(folder.name))
+    return found
+
+
+def marked_processes(name: str, value: str) -> list[int]:
+    """Return all processes with a variable in their environment that have not ended (Linux).
+
+    Parameters
+    ----------
+    name, value : str
+        Of the variable. What a marked process starts is marked as well.
+    """
+    needle = os.fsencode(f"{name}={value}")
+    found = []
+    for folder in Path("/proc").glob("[0-9]*"):
+        with contextlib.suppress(OSError):
+            if needle in (folder / "environ").read_bytes().split(b"\0"):
+                state = (folder / "stat").read_text().rpartition(")")[2].split()[0]
+                if state != "Z":
+                    found.append(int(folder.name))
+    return found

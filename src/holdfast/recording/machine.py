@@ -1,4 +1,7 @@
-"""What the numbers were measured on."""
+"""What numbers were measured on: the machine and the software, by name.
+
+A time says something only together with this.
+"""
 
 from __future__ import annotations
 
@@ -11,15 +14,16 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
-import scipy
 
 import holdfast
 from holdfast import _kernel
 from holdfast.runtime.trials import available_cores
 
-__all__ = ["describe", "kernel_hash"]
+__all__ = ["commit", "describe", "kernel_hash"]
 
-ROOT = Path(__file__).resolve().parents[1]
+_HERE = Path(__file__).resolve().parent
+_GIT_TIMEOUT_S = 10.0
+_SOURCES = ("src", "cpp", "CMakeLists.txt")
 
 
 def describe() -> dict[str, str]:
@@ -30,10 +34,10 @@ def describe() -> dict[str, str]:
         "memory": _memory(),
         "system": f"{platform.system()} {_major_version(platform.release())}, {platform.machine()}",
         "Python": f"{platform.python_implementation()} {platform.python_version()}",
-        "NumPy, SciPy": f"{np.__version__}, {scipy.__version__}",
+        "NumPy": np.__version__,
         "compiler of the kernel": _compiler(),
         "instruction set": _kernel.simd(),
-        "holdfast": f"{holdfast.__version__}, {_commit()}",
+        "holdfast": f"{holdfast.__version__}, {commit()}",
         "date": f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC",
     }
 
@@ -74,18 +78,28 @@ def _compiler() -> str:
     return ", ".join(sorted({name.decode() for name in found})) or "unknown"
 
 
-def _commit() -> str:
+def commit() -> str:
+    """Return the commit of the sources that run here, and whether they were changed since."""
+
     def git(*arguments: str) -> str:
         return subprocess.run(
-            ["git", *arguments], cwd=ROOT, check=True, capture_output=True, text=True
+            ["git", *arguments],
+            cwd=_HERE,
+            check=True,
+            capture_output=True,
+            text=True,
+            timeout=_GIT_TIMEOUT_S,
         ).stdout.strip()
 
     try:
-        commit = git("rev-parse", "--short", "HEAD")
-        changed = git("status", "--porcelain", "--", "src", "cpp", "CMakeLists.txt")
-    except (OSError, subprocess.CalledProcessError):
+        top = Path(git("rev-parse", "--show-toplevel"))
+        if not _HERE.is_relative_to(top / "src"):
+            return "commit unknown"  # installed somewhere within another repository
+        name = git("rev-parse", "--short", "HEAD")
+        changed = git("status", "--porcelain", "--", *(str(top / each) for each in _SOURCES))
+    except (OSError, subprocess.SubprocessError):
         return "commit unknown"
-    return f"commit {commit}" + (" with uncommitted changes" if changed else "")
+    return f"commit {name}" + (" with uncommitted changes" if changed else "")
 
 
 def _major_version(release: str) -> str:

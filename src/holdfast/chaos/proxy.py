@@ -1,0 +1,311 @@
+"""A bad line on demand: a TCP proxy that delays, loses, falls silent and cuts.
+
+It stands between one robot and one service, and whatever it does, it never changes, reorders or
+drops a byte of a stream that lives on, for neither does TCP. A packet that is lost on a real line
+is sent again after a timeout, and everything behind it waits; so loss is a late piece here. A line
+that swallows everything is one on which all pieces are late until it is healed, and no end of a
+connection gets through either. Only a cut breaks connections: both ends are reset, and new ones are
+refused.
+
+Several impairments may be on at the same time; a piece suffers from all of them. What waits is
+bounded: if it is more, the sender is no longer read from, as with a full window.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import random
+import socket
+import struct
+import threading
+from collections.abc import Callable, Coroutine
+from concurrent.futures import Future
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any, Literal, Self, TypeAlias
+
+from holdfast.chaos.processes import CannotStartError
+
+__all__ = ["Direction", "Impairment", "Proxy"]
+
+Direction: TypeAlias = Literal["both", "to_service", "to_robot"]
+
+_PIECE_BYTES = 65_536
+_PIECES_WAITING = 64
+_START_TIMEOUT_S = 10.0
+_RETRANSMISSION_S = 0.2
+"""Linux sends a lost packet again after this time or longer, on a line that is short."""
+
+_RESET_ON_CLOSE = struct.pack("ii", 1, 0)
+_BACKLOG = 16
+
+
+@dataclass(frozen=True, kw_only=True)
+class Impairment:
+    """What is wrong with the line for a while.
+
+    Attributes
+    ----------
+    direction : {"both", "to_service", "to_robot"}
+        Whose pieces suffer. A cut has no direction.
+    latency_s, jitter_s : float
+        Each piece comes later by the latency and by up to the jitter.
+    loss : float
+        Share of pieces that come later by the time after which TCP sends again.
+    silent : bool
+        Nothing comes through.
+    cut : bool
+        Connections are reset and refused.
+    """
+
+    direction: Direction = "both"
+    latency_s: float = 0.0
+    jitter_s: float = 0.0
+    loss: float = 0.0
+    silent: bool = False
+    cut: bool = False
+
+
+class Proxy:
+    """A line to a service on this machine; to be used in a ``with`` statement.
+
+    Parameters
+    ----------
+    port : int
+        Where it listens, on 127.0.0.1.
+    target : int
+        The port of the service. If nothing listens there, connections are closed at once.
+    seed : str
+        Of the jitter and the losses.
+
+    Raises
+    ------
+    CannotStartError
+        If it cannot listen.
+    """
+
+    def __init__(self, port: int, target: int, seed: str) -> None:
+        self._port = port
+        self._target = target
+        self._chance = random.Random(seed)
+        self._impairments: dict[int, Impairment] = {}
+        self._numbers = 0
+        self._listener: socket.socket | None = None
+        self._connections: set[asyncio.Task[None]] = set()
+        self._sockets: set[socket.socket] = set()
+        self._loop = asyncio.new_event_loop()
+        self._changed = asyncio.Event()
+        self._thread = threading.Thread(target=self._run, name=f"proxy-{port}", daemon=True)
+        self._thread.start()
+        try:
+            self._call(self._listen())
+        except OSError as error:
+            self.close()
+            raise CannotStartError(
+                f"the proxy cannot listen on 127.0.0.1:{port}: {error.strerror}"
+            ) from error
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def impair(self, impairment: Impairment) -> Callable[[], None]:
+        """Put an impairment on the line.
+
+        Returns
+        -------
+        callable
+            Takes it away again; may be called more than once.
+        """
+        number = self._numbers
+        self._numbers += 1
+        self._call(self._add(number, impairment))
+        return lambda: self._call(self._remove(number))
+
+    def close(self) -> None:
+        """Reset all connections, and listen no more; may be repeated."""
+        if not self._thread.is_alive():
+            return
+        self._call(self._end())
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join()
+        self._loop.close()
+
+    # -- on the thread of the loop -------------------------------------------------------------
+
+    def _run(self) -> None:
+        asyncio.set_event_loop(self._loop)
+        self._loop.run_forever()
+
+    def _call(self, coroutine: Coroutine[Any, Any, None]) -> None:
+        if self._loop.is_closed():
+            coroutine.close()
+            return
+        future: Future[None] = asyncio.run_coroutine_threadsafe(coroutine, self._loop)
+        future.result(_START_TIMEOUT_S)
+
+    async def _listen(self) -> None:
+        self._listener = self._bound()
+        self._open(self._listener)
+
+    def _open(self, listener: socket.socket) -> None:
+        listener.listen(_BACKLOG)
+        self._loop.add_reader(listener, self._accept, listener)
+
+    def _bound(self) -> socket.socket:
+        listener = socket.socket()
+        try:
+            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            listener.bind(("127.0.0.1", self._port))
+            listener.setblocking(False)
+        except BaseException:
+            listener.close()
+            raise
+        return listener
+
+    async def _add(self, number: int, impairment: Impairment) -> None:
+        was_cut = self._is_cut()
+        self._impairments[number] = impairment
+        self._tell()
+        if impairment.cut and not was_cut:
+            await self._hang_up()
+            # Whoever knocks at a port that is bound, but not listened on, is refused; and nobody
+            # else can have it.
+            self._listener = self._bound()
+
+    async def _remove(self, number: int) -> None:
+        was_cut = self._is_cut()
+        self._impairments.pop(number, None)
+        self._tell()
+        if was_cut and not self._is_cut():
+            assert self._listener is not None
+            self._open(self._listener)
+
+    async def _end(self) -> None:
+        self._impairments.clear()
+        self._tell()
+        await self._hang_up()
+
+    async def _hang_up(self) -> None:
+        """Stop listening, and reset all connections."""
+        if self._listener is not None:
+            self._loop.remove_reader(self._listener)
+        tasks = list(self._connections)
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+        for each in self._sockets:
+            each.close()
+        self._sockets.clear()
+        if self._listener is not None:
+            self._listener.close()
+            self._listener = None
+
+    def _tell(self) -> None:
+        """Wake those who wait for the line to be otherwise."""
+        self._changed.set()
+        self._changed = asyncio.Event()
+
+    def _is_cut(self) -> bool:
+        return any(each.cut for each in self._impairments.values())
+
+    def _is_silent(self, direction: Direction) -> bool:
+        return any(
+            each.silent and each.direction in ("both", direction)
+            for each in self._impairments.values()
+        )
+
+    def _delay_s(self, direction: Direction) -> float:
+        delay_s = 0.0
+        for each in self._impairments.values():
+            if each.direction in ("both", direction):
+                delay_s += each.latency_s + each.jitter_s * self._chance.random()
+                if each.loss and self._chance.random() < each.loss:
+                    delay_s += _RETRANSMISSION_S
+        return delay_s
+
+    async def _until_heard(self, direction: Direction) -> None:
+        while self._is_silent(direction):
+            await self._changed.wait()
+
+    def _accept(self, listener: socket.socket) -> None:
+        try:
+            robot, _ = listener.accept()
+        except OSError:
+            return  # whoever came has gone again
+        self._take(robot)
+        task = self._loop.create_task(self._connect(robot))
+        self._connections.add(task)
+        task.add_done_callback(self._connections.discard)
+
+    def _take(self, each: socket.socket) -> None:
+        each.setblocking(False)
+        each.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        # Until an end comes in order, whatever closes it resets it.
+        each.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET_ON_CLOSE)
+        self._sockets.add(each)
+
+    async def _connect(self, robot: socket.socket) -> None:
+        """Carry one connection from its beginning to its end."""
+        service = socket.socket()
+        try:
+            self._take(service)
+            # On a silent line not even the first packet of a connection comes through.
+            await self._until_heard("to_service")
+            await self._until_heard("to_robot")
+            await self._loop.sock_connect(service, ("127.0.0.1", self._target))
+            async with asyncio.TaskGroup() as group:
+                group.create_task(self._carry(robot, service, "to_service"))
+                group.create_task(self._carry(service, robot, "to_robot"))
+        except* OSError:
+            pass  # reset by one end: so the other is reset as well, now
+        finally:
+            for each in (robot, service):
+                self._sockets.discard(each)
+                each.close()
+
+    async def _carry(
+        self, source: socket.socket, sink: socket.socket, direction: Direction
+    ) -> None:
+        pieces: asyncio.Queue[tuple[float, bytes]] = asyncio.Queue(_PIECES_WAITING)
+        reader = self._loop.create_task(self._read(source, pieces, direction))
+        try:
+            while True:
+                due, piece = await pieces.get()
+                await asyncio.sleep(max(0.0, due - self._loop.time()))
+                await self._until_heard(direction)
+                if not piece:
+                    break
+                await self._loop.sock_sendall(sink, piece)
+            with contextlib.suppress(OSError):
+                sink.shutdown(socket.SHUT_WR)
+        finally:
+            reader.cancel()
+        await reader
+
+    async def _read(
+        self,
+        source: socket.socket,
+        pieces: asyncio.Queue[tuple[float, bytes]],
+        direction: Direction,
+    ) -> None:
+        """Queue what comes, with the time at which it is due; the last piece is empty."""
+        due = 0.0
+        while True:
+            try:
+                piece = await self._loop.sock_recv(source, _PIECE_BYTES)
+            except OSError:
+                piece = b""
+            # No piece overtakes another.
+            due = max(due, self._loop.time() + self._delay_s(direction))
+            await pieces.put((due, piece))
+            if not piece:
+                return

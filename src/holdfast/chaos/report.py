@@ -1,0 +1,217 @@
+"""What a series came to: a row for each kind of fault, a row for each fault, and a summary.
+
+Times of faults that overlap belong to none of them, so those of combinations stand in the table of
+all faults and nowhere else; what they are there for is the comparison with the twin.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import msgspec
+
+from holdfast.chaos.measures import FaultTimes, Spread, spread_of
+from holdfast.chaos.schedule import FaultKind
+from holdfast.chaos.series import SeriesPlan
+from holdfast.chaos.trial import TrialOutcome
+from holdfast.files import write_atomically
+from holdfast.recording.machine import describe
+
+__all__ = [
+    "FAULTS_NAME",
+    "SUMMARY_NAME",
+    "ChaosSummary",
+    "KindRow",
+    "kind_rows",
+    "summarise",
+    "write_tables",
+]
+
+FAULTS_NAME = "chaos.csv"
+SUMMARY_NAME = "summary.json"
+
+_TRIAL_COLUMNS = ("trial", "trial_kind", "verdict", "launch", "fault")
+
+
+class KindRow(msgspec.Struct, frozen=True, kw_only=True):
+    """What the trials of one kind came to.
+
+    Attributes
+    ----------
+    kind : FaultKind
+    trials : int
+    faults : int
+        Those that struck.
+    unnoticed : int
+        Faults after which the robot has lost nothing and waited for nothing new.
+    wrong : int
+        Trials that are not identical with their twins.
+    detection, recovery, launch, failback : Spread or None
+        None where nothing was measured; always for combinations.
+    longest_wait_ms : float or None
+        Longest time that a robot stood still for a decision.
+    """
+
+    kind: FaultKind
+    trials: int
+    faults: int
+    unnoticed: int
+    wrong: int
+    detection: Spread | None
+    recovery: Spread | None
+    launch: Spread | None
+    failback: Spread | None
+    longest_wait_ms: float | None
+
+
+class ChaosSummary(msgspec.Struct, frozen=True, kw_only=True):
+    """The content of ``summary.json``.
+
+    Attributes
+    ----------
+    seed, first, trials, finished : int
+    identical, diverged, failed, timed_out : int
+        Trials by their verdicts.
+    faults, robot_processes : int
+        In all of them.
+    steps, sensing_actions : int
+        Compared with those of the twins and found the same.
+    jobs : int
+        Trials at a time.
+    kinds : tuple of KindRow
+    left_out : dict of str to str
+        Kinds that this machine cannot do, and why.
+    holdfast_version, commit : str
+        As they were when the series began.
+    machine : dict of str to str
+    trials_took_s : float
+        Of all trials added up, whatever ran at the same time.
+    """
+
+    seed: int
+    first: int
+    trials: int
+    finished: int
+    identical: int
+    diverged: int
+    failed: int
+    timed_out: int
+    faults: int
+    robot_processes: int
+    steps: int
+    sensing_actions: int
+    jobs: int
+    kinds: tuple[KindRow, ...]
+    left_out: dict[str, str]
+    holdfast_version: str
+    commit: str
+    machine: dict[str, str]
+    trials_took_s: float
+
+
+def kind_rows(outcomes: Sequence[TrialOutcome]) -> tuple[KindRow, ...]:
+    """Return a row for each kind that has trials, in the order of the kinds."""
+    return tuple(
+        _row(kind, of_kind)
+        for kind in FaultKind
+        if (of_kind := [outcome for outcome in outcomes if outcome.kind is kind])
+    )
+
+
+def _row(kind: FaultKind, outcomes: Sequence[TrialOutcome]) -> KindRow:
+    faults = [fault for outcome in outcomes for fault in outcome.faults]
+    measured = [] if kind is FaultKind.COMBINATION else faults
+
+    def spread(name: str) -> Spread | None:
+        times = [getattr(fault, name) for fault in measured]
+        return spread_of([time for time in times if time is not None])
+
+    waits = [fault.longest_wait_ms for fault in faults if fault.longest_wait_ms is not None]
+    return KindRow(
+        kind=kind,
+        trials=len(outcomes),
+        faults=len(faults),
+        unnoticed=sum(
+            fault.detection_ms is None and fault.recovery_ms is None for fault in measured
+        ),
+        wrong=sum(outcome.verdict != "identical" for outcome in outcomes),
+        detection=spread("detection_ms"),
+        recovery=spread("recovery_ms"),
+        launch=spread("launch_ms"),
+        failback=spread("failback_ms"),
+        longest_wait_ms=max(waits, default=None),
+    )
+
+
+def summarise(
+    plan: SeriesPlan,
+    outcomes: Sequence[TrialOutcome],
+    *,
+    trials: int,
+    jobs: int,
+    left_out: Mapping[FaultKind, str],
+) -> ChaosSummary:
+    """Return the summary of a series.
+
+    Parameters
+    ----------
+    plan : SeriesPlan
+    outcomes : sequence of TrialOutcome
+    trials : int
+        How many there are to be.
+    jobs : int
+    left_out : mapping of FaultKind to str
+    """
+    verdicts = [outcome.verdict for outcome in outcomes]
+    return ChaosSummary(
+        seed=plan.seed,
+        first=plan.first,
+        trials=trials,
+        finished=len(outcomes),
+        identical=verdicts.count("identical"),
+        diverged=verdicts.count("diverged"),
+        failed=verdicts.count("failed"),
+        timed_out=verdicts.count("timed_out"),
+        faults=sum(len(outcome.faults) for outcome in outcomes),
+        robot_processes=sum(outcome.robots for outcome in outcomes),
+        steps=sum(outcome.steps for outcome in outcomes),
+        sensing_actions=sum(outcome.sensing_actions for outcome in outcomes),
+        jobs=jobs,
+        kinds=kind_rows(outcomes),
+        left_out={kind.value: reason for kind, reason in left_out.items()},
+        holdfast_version=plan.holdfast_version,
+        commit=plan.commit,
+        machine=describe(),
+        trials_took_s=round(sum(outcome.took_s for outcome in outcomes), 1),
+    )
+
+
+def write_tables(directory: Path, summary: ChaosSummary, outcomes: Sequence[TrialOutcome]) -> None:
+    """Write ``chaos.csv`` and ``summary.json``.
+
+    Raises
+    ------
+    OutputError
+        If they cannot be written.
+    """
+    write_atomically(directory / FAULTS_NAME, _fault_table(outcomes))
+    text = msgspec.json.format(msgspec.json.encode(summary), indent=2)
+    write_atomically(directory / SUMMARY_NAME, text + b"\n")
+
+
+def _fault_table(outcomes: Sequence[TrialOutcome]) -> str:
+    text = io.StringIO(newline="")
+    writer = csv.writer(text, lineterminator="\n")
+    columns = FaultTimes.__struct_fields__
+    writer.writerow((*_TRIAL_COLUMNS, *columns))
+    for outcome in sorted(outcomes, key=lambda outcome: outcome.trial):
+        head = (outcome.trial, outcome.kind.value, outcome.verdict, outcome.launch)
+        for number, fault in enumerate(outcome.faults):
+            values = (getattr(fault, column) for column in columns)
+            writer.writerow(
+                (*head, number, *(int(v) if isinstance(v, bool) else v for v in values))
+            )
+    return text.getvalue()

@@ -1,0 +1,46 @@
+"""A run as a person reads it: one line for each thing that happened, and no more than is needed."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator
+
+from holdfast.simulation.world import Outcome, Told
+
+__all__ = ["story_lines"]
+
+_ACTION = re.compile(r"performs task action (\d+)")
+
+
+def story_lines(outcome: Outcome) -> list[str]:
+    """Return the lines of a run that was told, with their times in seconds.
+
+    Task actions that follow each other with nothing in between are one line.
+    """
+    return [f"{told.time:9.4f}  {told.actor:8s} {told.text}" for told in _folded(outcome.story)]
+
+
+def _folded(story: Iterable[Told]) -> Iterator[Told]:
+    first: Told | None = None
+    begin = end = 0
+    for told in story:
+        action = _ACTION.fullmatch(told.text)
+        number = int(action[1]) if action else -1
+        if first is not None and number == end + 1:
+            end = number
+            continue
+        if first is not None:
+            yield _actions(first, begin, end)
+            first = None
+        if action:
+            first, begin, end = told, number, number
+        else:
+            yield told
+    if first is not None:
+        yield _actions(first, begin, end)
+
+
+def _actions(first: Told, begin: int, end: int) -> Told:
+    if begin == end:
+        return first
+    return first._replace(text=f"performs task actions {begin} to {end}")

@@ -1,0 +1,187 @@
+"""One valid specimen of everything that is decoded, made by code: what fuzzing begins from."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from holdfast.planning import (
+    PlanningState,
+    advance,
+    choose_sensing_action,
+    choose_task_action,
+    digest,
+    encode_checkpoint,
+    initial_state,
+    needs_sensing,
+    observe,
+)
+from holdfast.problems import registry
+from holdfast.problems.problem import Problem
+from holdfast.runtime.environment import SimulatedEnvironment
+from holdfast.session.messages import (
+    CHECKSUM_SIZE,
+    DIGEST_SIZE,
+    PROTOCOL_VERSION,
+    Busy,
+    NeedState,
+    Observed,
+    Opening,
+    Progress,
+    Refused,
+    Reply,
+    Request,
+    SensingAnswer,
+    TaskAnswer,
+    encode,
+    numbers_to,
+)
+from holdfast.session.records import (
+    ActingRecord,
+    ObservedRecord,
+    PausedRecord,
+    PerformedRecord,
+    Record,
+    RecoveredRecord,
+)
+from holdfast.settings import ActiveSensingSettings, ParticleFilterSettings, PlanningSettings
+
+__all__ = [
+    "PLANNING",
+    "PROBLEM",
+    "SEED",
+    "Turn",
+    "checkpoints",
+    "configurations",
+    "content_of",
+    "opening_of",
+    "records",
+    "replies",
+    "requests",
+    "turns",
+]
+
+PROBLEM = "capsule_robot"
+"""Whose decisions are the cheapest: what is fuzzed is the way to them."""
+
+SEED = 5
+
+PLANNING = PlanningSettings(
+    particle_filter=ParticleFilterSettings(num_particles=12),
+    active_sensing=ActiveSensingSettings(
+        num_observation_samples=2, num_nearest_neighbors=3, num_cores=1
+    ),
+    sensing_interval=2,
+)
+
+_EXAMPLES = Path(__file__).parents[2] / "examples"
+
+
+def content_of(message: Request | Reply) -> bytes:
+    """Return a message as it is sent, without its checksum: nothing spoilt would get past that."""
+    return encode(message)[:-CHECKSUM_SIZE]
+
+
+class Turn(NamedTuple):
+    """A robot that has sensed so often: its state, and the observations that led to it."""
+
+    state: PlanningState
+    observed: tuple[Observed, ...]
+
+
+def opening_of(name: str = PROBLEM, seed: int = SEED) -> Opening:
+    """Return what a robot says of its run."""
+    return Opening(name, {}, {}, PLANNING, seed)
+
+
+def problem_of(opening: Opening) -> Problem:
+    """Build the problem that an opening names."""
+    built: Problem = registry.problem_class(opening.problem).from_settings(
+        opening.model, opening.state_space_planner
+    )
+    return built
+
+
+@cache
+def turns(name: str = PROBLEM, count: int = 6, trial: int = 0) -> tuple[Turn, ...]:
+    """Return the states of a robot's first turns, as the planner itself goes through them."""
+    problem = problem_of(opening_of(name))
+    state = initial_state(problem, PLANNING, SEED, trial)
+    environment = SimulatedEnvironment(problem, SEED, trial)
+    observed: tuple[Observed, ...] = ()
+    found = [Turn(state, observed)]
+    while len(found) < count:
+        if needs_sensing(PLANNING, state):
+            action, _ = choose_sensing_action(problem, PLANNING, state)
+            shown = environment.perform_sensing(action)
+            observed = (*observed, Observed(state.step, action, numbers_to(shown)))
+            state, _ = observe(problem, PLANNING, state, action, shown)
+            found.append(Turn(state, observed))
+        else:
+            task, _ = choose_task_action(problem, PLANNING, state)
+            environment.perform(task)
+            state = advance(problem, PLANNING, state, task)
+    return tuple(found)
+
+
+def requests(session: bytes = b"s" * 16, epoch: int = 1) -> list[Request]:
+    """Return requests of every shape, each of which a service can answer."""
+    found: list[Request] = []
+    for name in (PROBLEM, "peg_in_hole_2d"):
+        opening = opening_of(name)
+        for turn in turns(name):
+            state = turn.state
+            for told, restored in ((False, False), (True, False), (True, True), (False, True)):
+                found.append(
+                    Request(
+                        PROTOCOL_VERSION,
+                        session,
+                        epoch,
+                        len(found) + 1,
+                        state.trial,
+                        state.step,
+                        state.sensed,
+                        digest(state)[:DIGEST_SIZE],
+                        () if restored else turn.observed,
+                        opening if told else None,
+                        encode_checkpoint(state) if restored else None,
+                    )
+                )
+    return found
+
+
+def replies() -> list[Reply]:
+    """Return a reply of each kind."""
+    return [
+        TaskAnswer(17, 2, numbers_to(np.arange(6.0)), 250),
+        SensingAnswer(17, 44, 2, b"e" * DIGEST_SIZE, 80),
+        Progress(17, True),
+        NeedState(17, False),
+        Busy(17, 30),
+        Refused(17, "stale_epoch", "epoch 1: epoch 2 was seen"),
+    ]
+
+
+def records() -> list[Record]:
+    """Return a record of each kind."""
+    return [
+        ObservedRecord(8, 1, numbers_to([0.5]), bytes(range(32)), 1.5),
+        ActingRecord(8, numbers_to([0.25, -0.5])),
+        PerformedRecord(8, -1.0),
+        PerformedRecord(9, None),
+        PausedRecord(),
+        RecoveredRecord(2),
+    ]
+
+
+def checkpoints() -> list[bytes]:
+    """Return states as they are encoded."""
+    return [encode_checkpoint(turn.state) for turn in turns()]
+
+
+def configurations() -> list[bytes]:
+    """Return the configurations that come with holdfast."""
+    return [path.read_bytes() for path in sorted(_EXAMPLES.glob("*.yaml"))]

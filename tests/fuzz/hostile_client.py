@@ -1,0 +1,375 @@
+"""A client that means harm: it speaks Zenoh, and says whatever it likes.
+
+    python -m tests.fuzz.hostile_client ENDPOINT --messages 10000 --seed 1
+
+What it sends is drawn by seed; when each message arrives is not. It reports as one line of JSON.
+With ``--deaf`` it now and then stops reading what it is sent.
+"""
+
+from __future__ import annotations
+
+import argparse
+import collections
+import contextlib
+import itertools
+import json
+import os
+import random
+import struct
+import threading
+import time
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+import msgspec
+import zenoh
+from tests.fuzz import corpus
+from tests.fuzz.mutations import Mutator
+
+from holdfast.session.messages import (
+    MAX_OBSERVATIONS,
+    MessageError,
+    Observed,
+    Opening,
+    Refused,
+    Request,
+    decode_reply,
+    encode,
+    sealed,
+)
+from holdfast.settings import ActiveSensingSettings, ParticleFilterSettings, PlanningSettings
+
+__all__ = ["HostileMessages", "Message", "main"]
+
+_OWN_SESSIONS = 60
+_COSTLY_SHARE = 0.0002
+_PATIENCE_S = 30.0
+_TIMEOUT_S = 10.0
+_PART_BYTES = 36_000
+_PART = struct.Struct("<16sQII")
+"""As the transport describes a part: request, its size, number of this part, number of parts."""
+
+_WORDS = (0, 1, 2, 3, 7, 64, 2**16, 2**31, 2**32 - 1)
+
+
+class Message(NamedTuple):
+    """A payload, an attachment if it is a part, and whether the call is given up at once."""
+
+    kind: str
+    payload: bytes
+    attachment: bytes | None = None
+    abandoned: bool = False
+
+
+class HostileMessages:
+    """An endless row of messages that mean harm; the same seed gives the same row."""
+
+    def __init__(self, seed: int) -> None:
+        self._chance = random.Random(seed)
+        # Its own sessions, each with the epoch of its last process.
+        self._epochs = {self._chance.randbytes(16): 1 for _ in range(_OWN_SESSIONS)}
+        self._numbers = itertools.count(1)
+        self._requests = corpus.requests()
+        self._mutator = Mutator(self._chance, [corpus.content_of(each) for each in self._requests])
+        self._sent: collections.deque[bytes] = collections.deque(maxlen=500)
+        self._ways: tuple[tuple[int, str, Callable[[], bytes]], ...] = (
+            (15, "random", self._random),
+            (33, "spoilt", self._spoilt),
+            (14, "own", self._own),
+            (10, "wrong", self._wrong),
+            (4, "epoch", self._epoch),
+            (6, "replayed", self._replayed),
+            (10, "new session", self._new_session),
+            (1, "unusual", self._unusual),
+        )
+        self._weights = [weight for weight, _, _ in self._ways]
+
+    def __iter__(self) -> Iterator[Message]:
+        chance = self._chance
+        while True:
+            draw = chance.random()
+            if draw < 0.05:
+                yield from self._upload()
+            elif draw < 0.05 + _COSTLY_SHARE:
+                yield Message("costly", self._costly())
+            elif draw < 0.051:
+                yield Message("large", chance.randbytes(chance.choice((50_000, 300_000))))
+            else:
+                _, kind, way = chance.choices(self._ways, self._weights)[0]
+                payload = way()
+                self._sent.append(payload)
+                yield Message(kind, payload, None, chance.random() < 0.05)
+
+    def _random(self) -> bytes:
+        return self._sealed(
+            self._chance.randbytes(self._chance.choice((0, 1, 2, 16, 75, 300, 2000)))
+        )
+
+    def _spoilt(self) -> bytes:
+        return self._sealed(self._mutator.spoilt())
+
+    def _sealed(self, content: bytes) -> bytes:
+        """Return it with its checksum, mostly: without, no more of it is looked at."""
+        return sealed(content) if self._chance.random() < 0.8 else content
+
+    def _request(self, key: bytes) -> Request:
+        request = self._chance.choice(self._requests)
+        return msgspec.structs.replace(
+            request, session=key, number=next(self._numbers), epoch=self._epochs.get(key, 1)
+        )
+
+    def _key(self) -> bytes:
+        return self._chance.choice(list(self._epochs))
+
+    def _own(self) -> bytes:
+        """Return what an honest robot would ask, of one of this client's sessions."""
+        return encode(self._request(self._key()))
+
+    def _wrong(self) -> bytes:
+        """Return a request with wrong numbers, digests or observations."""
+        chance = self._chance
+        request = self._request(self._key())
+        field = chance.choice(("number", "trial", "step", "digest", "observations"))
+        if field == "digest":
+            return encode(msgspec.structs.replace(request, digest=chance.randbytes(16)))
+        if field == "observations" and request.checkpoint is None:
+            shown = chance.choice((b"", b"\0" * 8, b"\xff" * 8, bytes(8 * 4096)))
+            false = Observed(chance.choice(_WORDS), chance.choice((0, 1, 99)), shown)
+            count = chance.choice((1, 2, MAX_OBSERVATIONS - len(request.observations)))
+            if len(shown) > 100:
+                count = 1
+            observations = (*request.observations, *[false] * count)
+            return encode(msgspec.structs.replace(request, observations=observations))
+        field = "step" if field == "observations" else field
+        return encode(msgspec.structs.replace(request, **{field: chance.choice(_WORDS)}))
+
+    def _epoch(self) -> bytes:
+        """Return a request of a process that was replaced, or that replaces the one before."""
+        key = self._key()
+        request = self._request(key)
+        epoch = self._epochs[key] + self._chance.choice((-1, -1, 1))
+        self._epochs[key] = max(self._epochs[key], epoch)
+        if self._chance.random() < 0.02:
+            del self._epochs[key]
+            self._epochs[self._chance.randbytes(16)] = 1
+            epoch = 2**32 - 1  # after which nobody can take this session over
+        return encode(msgspec.structs.replace(request, epoch=epoch))
+
+    def _replayed(self) -> bytes:
+        return self._chance.choice(self._sent) if self._sent else b""
+
+    def _new_session(self) -> bytes:
+        return encode(self._request(self._chance.randbytes(16)))
+
+    def _unusual(self) -> bytes:
+        """Return a request with another problem, more work than allowed, or a large opening."""
+        chance = self._chance
+        request = self._request(chance.randbytes(16))
+        planning = PlanningSettings(
+            particle_filter=ParticleFilterSettings(num_particles=chance.choice((1, 300))),
+            active_sensing=ActiveSensingSettings(
+                num_observation_samples=chance.choice((1, 30, 10**6)), num_cores=0
+            ),
+            sensing_interval=chance.choice((0, 8, 10**6)),
+        )
+        name = chance.choice((corpus.PROBLEM, "multitier_peg_in_hole_2d", "no_such", "os:system"))
+        model: dict[str, object] = {}
+        if name.startswith("multitier"):
+            holes = [{"center": [4.0, 6.0 - 0.01 * number], "depth": 0.01} for number in range(900)]
+            model = {"holes": holes}
+        opening = Opening(name, model, {}, planning, chance.randrange(2**63))
+        return encode(msgspec.structs.replace(request, opening=opening, checkpoint=None))
+
+    def _costly(self) -> bytes:
+        """Return a question that keeps a worker busy for some tenths of a second."""
+        planning = PlanningSettings(
+            particle_filter=ParticleFilterSettings(num_particles=30_000),
+            active_sensing=ActiveSensingSettings(num_observation_samples=10, num_cores=0),
+        )
+        opening = Opening(corpus.PROBLEM, {}, {}, planning, self._chance.randrange(2**63))
+        request = self._request(self._chance.randbytes(16))
+        changes = {"opening": opening, "checkpoint": None, "observations": ()}
+        return encode(msgspec.structs.replace(request, **changes))
+
+    def _upload(self) -> Iterator[Message]:
+        """Yield parts of a large request: some, all, spoilt, or of none at all."""
+        chance = self._chance
+        name = chance.randbytes(16)
+        size = chance.choice((1000, 1000, 4000, _PART_BYTES))
+        count = chance.randint(2, 8)
+        payload = self._mutator.spoilt().ljust(size * count - size // 2, b"\0")
+        for index in range(count):
+            if chance.random() < 0.15:
+                continue  # it never comes
+            lies = chance.random() < 0.1
+            attachment = _PART.pack(
+                name,
+                chance.choice((0, 2**26, 2**63)) if lies else len(payload),
+                chance.choice(_WORDS) if lies else index,
+                chance.choice(_WORDS) if lies else count,
+            )
+            if chance.random() < 0.02:
+                attachment = chance.randbytes(chance.choice((0, 1, 31, 33)))
+            part = b"" if chance.random() < 0.2 else payload[index * size : (index + 1) * size]
+            yield Message("part", part, attachment, chance.random() < 0.05)
+
+
+class _Client:
+    """Sends messages, so many at a time, and counts what comes back.
+
+    Parameters
+    ----------
+    endpoint : str
+    outstanding : int
+        Calls that may be open at a time.
+    deaf_s : float
+        Now and then nothing is read for this long.
+    """
+
+    def __init__(self, endpoint: str, outstanding: int, deaf_s: float, seed: int) -> None:
+        self._room = threading.Semaphore(outstanding)
+        self._outstanding = outstanding
+        self._endpoint = endpoint
+        self._deaf_s = deaf_s
+        self._chance = random.Random(seed)
+        self.kinds: collections.Counter[str] = collections.Counter()
+        self.replies: collections.Counter[str] = collections.Counter()
+        self.ended = 0
+        self.links = 0
+        self._lock = threading.Lock()
+        self._session: zenoh.Session | None = None
+        self._key = ""
+
+    def connect(self) -> None:
+        """Connect, as often as it takes, and find out how the service is called now."""
+        deadline = time.monotonic() + _PATIENCE_S
+        self.close()
+        configuration = zenoh.Config.from_json5(
+            json.dumps(
+                {
+                    "mode": "client",
+                    "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
+                    "connect": {"endpoints": [self._endpoint], "timeout_ms": 5000},
+                    "transport": {"shared_memory": {"enabled": False}},
+                }
+            )
+        )
+        while True:
+            try:
+                self._session = zenoh.open(configuration)
+                self.links += 1
+                for reply in self._session.liveliness().get("holdfast/**/alive", timeout=5.0):
+                    if reply.ok is not None:
+                        self._key = str(reply.ok.key_expr).removesuffix("alive") + "decide"
+                        return
+            except zenoh.ZError:
+                pass
+            assert time.monotonic() < deadline, "no service is there"
+            self.close()
+            time.sleep(0.05)
+
+    def close(self) -> None:
+        session, self._session = self._session, None
+        if session is not None:
+            with contextlib.suppress(zenoh.ZError):
+                session.close()
+
+    def send(self, message: Message) -> None:
+        self._room.acquire()
+        self.kinds[message.kind] += 1
+        token = zenoh.CancellationToken() if message.abandoned else None
+        try:
+            assert self._session is not None
+            self._session.get(
+                self._key,
+                zenoh.handlers.Callback(self._replied, self._ended, indirect=False),
+                payload=message.payload,
+                attachment=message.attachment,
+                consolidation=zenoh.ConsolidationMode.NONE,
+                timeout=_TIMEOUT_S,
+                express=False,
+                cancellation_token=token,
+            )
+        except zenoh.ZError:
+            self._room.release()
+            self.replies["link lost"] += 1
+            self.connect()
+            return
+        if token is not None:
+            token.cancel()
+
+    def wait(self) -> None:
+        """Wait for the calls that are open."""
+        deadline = time.monotonic() + _TIMEOUT_S + 5.0
+        for _ in range(self._outstanding):
+            self._room.acquire(timeout=max(0.0, deadline - time.monotonic()))
+
+    def _replied(self, reply: zenoh.Reply) -> None:
+        sample = reply.ok
+        if sample is None:
+            what = "timeout"
+        else:
+            payload = sample.payload.to_bytes()
+            what = "acknowledged"
+            if payload:
+                try:
+                    decoded = decode_reply(payload)
+                    what = type(decoded).__name__
+                    if isinstance(decoded, Refused):
+                        what = f"Refused {decoded.code}"
+                except MessageError:
+                    what = "MALFORMED REPLY"
+        with self._lock:
+            self.replies[what] += 1
+        if self._deaf_s and self._chance.random() < 0.01:
+            time.sleep(self._deaf_s)  # on the thread that reads
+
+    def _ended(self) -> None:
+        with self._lock:
+            self.ended += 1
+        self._room.release()
+
+
+def main() -> None:
+    """Send messages to a service and report what came of them."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("endpoint")
+    parser.add_argument("--messages", type=int, default=10_000)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--outstanding", type=int, default=48)
+    parser.add_argument("--deaf", type=float, default=0.0, metavar="SECONDS")
+    options = parser.parse_args()
+    if options.deaf:
+        # One thread that sees and reads, so that all of the link goes unread.
+        os.environ["ZENOH_RUNTIME"] = (
+            "(acc: (handover: app), net: (handover: app), rx: (handover: app), "
+            "app: (worker_threads: 1))"
+        )
+    client = _Client(options.endpoint, options.outstanding, options.deaf, options.seed)
+    began = time.monotonic()
+    client.connect()
+    messages = iter(HostileMessages(options.seed))
+    for number in range(1, options.messages + 1):
+        client.send(next(messages))
+        if number % 1000 == 0:
+            print(json.dumps({"sent": number}), flush=True)
+        if number % 50_000 == 0:
+            client.connect()  # comes and goes
+    client.wait()
+    client.close()
+    report = {
+        "seed": options.seed,
+        "sent": sum(client.kinds.values()),
+        "ended": client.ended,
+        "links": client.links,
+        "seconds": round(time.monotonic() - began, 1),
+        "kinds": dict(client.kinds.most_common()),
+        "replies": dict(client.replies.most_common()),
+    }
+    print(json.dumps(report), flush=True)
+    # Zenoh's threads may be in a callback yet.
+    os._exit(0)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,248 @@
+"""Sessions come and go for a long time, and nothing grows.
+
+    python -m tests.fuzz.soak --minutes 10 --seed 1
+
+Two services, one that may remember eight robots and one that may remember a thousand, have visitors
+without end: thousands of short sessions, and robots (`holdfast run`) that are killed in the middle
+of a call and resumed, or not. Beside them one robot runs all the time, and its two services are
+killed and started again. What the processes hold is measured from outside; when it counts as flat
+is said in ``measuring.py``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import random
+import signal
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import msgspec
+from tests.fuzz.measuring import Watch, flatness
+from tests.processes.faults import PROBLEMS, Robot, Service, Site, document_of, events_of
+
+from holdfast.configuration import load
+from holdfast.recording.journal import Journal
+from holdfast.runtime.trial import run_trial
+
+__all__ = ["main", "run_soak"]
+
+_SMALL, _BIG = "8", "1000"
+_LIVES_S = (1.5, 6.0)
+"""How long a service of the long-lived robot lives."""
+
+
+def _compare(file: Path, out: Path, most: int = 200) -> tuple[int, list[str]]:
+    """Compare the last trials of a run with the planner by itself; return how many, and which."""
+    configuration = load(file)
+    findings = []
+    with Journal.read(out / "journal.sqlite") as journal:
+        results = list(journal.results())[-most:]
+    for result in results:
+        expected = run_trial(
+            configuration.problem,
+            configuration.planning,
+            configuration.simulator,
+            result.trial,
+        )
+        if (result.digest, result.reward) != (expected.digest, expected.reward):
+            findings.append(f"{out.name}, trial {result.trial}: other decisions")
+    return len(results), findings
+
+
+class _Passers:
+    """Robots that begin, are killed or not, are resumed or not, one after another."""
+
+    def __init__(self, site: Site, services: list[Service], seed: int) -> None:
+        self._site = site
+        self._services = services
+        self._chance = random.Random(seed)
+        self._stopped = threading.Event()
+        self.killed = self.finished = self.trials = 0
+        self.findings: list[str] = []
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def stop(self) -> None:
+        self._stopped.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        count = 0
+        while not self._stopped.is_set() and not self.findings:
+            count += 1
+            document = document_of(self._chance.choice(PROBLEMS), max_steps=60, seed=count)
+            file = self._site.configure(document, f"passer-{count}", recovery={"launch": "never"})
+            service = self._chance.choice(self._services)
+            robot = self._start(file, service, count, resume=False)
+            if self._chance.random() < 0.6:
+                # Long enough to have asked, usually.
+                self._stopped.wait(self._chance.uniform(0.4, 1.6))
+                robot.process.kill()
+                robot.wait()
+                self.killed += 1
+                if self._chance.random() < 0.5 or not (robot.out / "journal.sqlite").exists():
+                    continue
+                robot = self._start(file, service, count, resume=True)
+            if robot.wait() != 0:
+                self.findings.append(robot.account()[-2000:])
+                return
+            trials, findings = _compare(file, robot.out)
+            self.finished += 1
+            self.trials += trials
+            self.findings += findings
+
+    def _start(self, file: Path, service: Service, count: int, *, resume: bool) -> Robot:
+        return self._site.run(
+            file, "--rate", "100", services=[service], out=f"passer-{count}-out", resume=resume
+        )
+
+
+class _ComeAndGo:
+    """Kills services and starts them again, one at a time."""
+
+    def __init__(self, services: list[Service], seed: int) -> None:
+        self._services = services
+        self._chance = random.Random(seed)
+        self._stopped = threading.Event()
+        self.kills = 0
+        self.failures: list[str] = []
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def stop(self) -> None:
+        self._stopped.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        try:
+            while not self._stopped.wait(self._chance.uniform(*_LIVES_S)):
+                service = self._chance.choice(self._services)
+                service.kill()
+                self.kills += 1
+                self._stopped.wait(self._chance.choice((0.0, 0.2, 1.0)))
+                service.start()
+        except AssertionError as error:
+            self.failures.append(str(error)[-2000:])
+
+
+def run_soak(
+    seconds: float,
+    seed: int,
+    *,
+    directory: Path,
+    tell: Callable[[str], None] = lambda _: None,
+) -> tuple[dict[str, Any], list[str]]:
+    """Let sessions come and go for so long; return the figures, and what was found."""
+    findings: list[str] = []
+    with Site(directory) as site:
+        visited = {
+            "small": site.service("--max-sessions", _SMALL, lease_ms=400.0).start(),
+            "big": site.service("--max-sessions", _BIG, lease_ms=400.0).start(),
+        }
+        own = [site.service(lease_ms=400.0).start() for _ in range(2)]
+        document = document_of("peg_in_hole_2d", trials=1_000_000, max_steps=40, seed=seed)
+        file = site.configure(document, "long-lived")
+        robot = site.run(file, "--rate", "100", services=own, out="long-lived-out")
+        robot.wait_for("trial")
+        watches = {name: Watch(service.process.pid) for name, service in visited.items()}
+        watches["robot"] = Watch(robot.pid)
+        visitors = [
+            site.process(
+                sys.executable,
+                *("-m", "tests.fuzz.visitors", service.endpoint),
+                *("--seconds", str(seconds), "--seed", str(seed + index)),
+                variables={"PYTHONPATH": str(Path(__file__).parents[2])},
+            )
+            for index, service in enumerate(visited.values())
+        ]
+        passers = _Passers(site, list(visited.values()), seed)
+        coming = _ComeAndGo(own, seed)
+        until = time.monotonic() + seconds
+        while (left := until - time.monotonic()) > 0.0:
+            time.sleep(min(15.0, left))
+            memory = {
+                name: round(watch.samples[-1].memory_bytes / 2**20, 1)
+                for name, watch in watches.items()
+                if watch.samples
+            }
+            tell(f"{left:.0f} s to go, MB held: {memory}")
+        samples = {name: watch.stop() for name, watch in watches.items()}
+        passers.stop()
+        coming.stop()
+        reports = []
+        for visitor in visitors:
+            visitor.wait()
+            lines = [line for line in visitor.output.splitlines() if line.startswith("{")]
+            if not lines:
+                findings.append(f"a visitor says: {visitor.output[-2000:]}")
+                continue
+            reports.append(json.loads(lines[-1]))
+            findings += reports[-1].pop("wrong")
+        findings += passers.findings + coming.failures
+        robot.signal(signal.SIGTERM)
+        code = robot.wait()
+        if code not in (-signal.SIGTERM, 128 + signal.SIGTERM):
+            findings.append(f"the robot ends with {code}: {robot.account()[-2000:]}")
+        trials, others = _compare(file, robot.out)
+        findings += others
+        for name, service in visited.items():
+            said = service.process.output
+            if service.process.process.poll() is not None or "Traceback" in said:
+                findings.append(f"{name}: {service.process.account()[-2000:]}")
+        figures: dict[str, Any] = {"visitors": reports}
+        for name, held in samples.items():
+            figures[name], faults = flatness(held)
+            findings += [f"{name}: {fault}" for fault in faults]
+        events = events_of(robot.out)
+        figures |= {
+            "passers": {
+                "killed": passers.killed,
+                "finished": passers.finished,
+                "trials_compared": passers.trials,
+            },
+            "long_lived_robot": {
+                "trials": sum(event["event"] == "trial" for event in events),
+                "trials_compared": trials,
+                "services_killed": coming.kills,
+                "recoveries": sum(
+                    event["event"] == "status" and event["to"] == "local_recovery"
+                    for event in events
+                ),
+            },
+        }
+    return figures, findings
+
+
+def main() -> int:
+    """Run it, and print the figures as JSON and what was found."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--minutes", type=float, default=1.0)
+    parser.add_argument("--seed", type=int, default=1)
+    options = parser.parse_args()
+
+    def tell(text: str) -> None:
+        print(f"{time.strftime('%H:%M:%S')} {text}", file=sys.stderr, flush=True)
+
+    with tempfile.TemporaryDirectory(prefix="holdfast-soak-") as directory:
+        figures, findings = run_soak(
+            60.0 * options.minutes, options.seed, directory=Path(directory), tell=tell
+        )
+    print(msgspec.json.format(msgspec.json.encode(figures), indent=2).decode())
+    for finding in findings:
+        print(f"FOUND: {finding}")
+    print("nothing was found" if not findings else f"{len(findings)} findings")
+    return min(1, len(findings))
+
+
+if __name__ == "__main__":
+    code = main()
+    sys.stdout.flush()
+    os._exit(code)

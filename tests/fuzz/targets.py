@@ -1,0 +1,137 @@
+"""What must hold of any bytes that reach a decoder; for Hypothesis and for coverage alike.
+
+Each target takes bytes, decodes them, and asserts that they were either refused with the error
+that the decoder documents, or are a message within its bounds which survives another journey.
+Anything else, another exception above all, is a finding.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Mapping
+
+import numpy as np
+from tests.fuzz import corpus
+
+from holdfast import yaml_document
+from holdfast.errors import CheckpointError, ConfigurationError, InvalidValueError
+from holdfast.planning import check_state, decode_checkpoint, digest, encode_checkpoint
+from holdfast.problems.problem import Problem
+from holdfast.session.messages import (
+    MAX_OBSERVATIONS,
+    MAX_TASK_ACTIONS,
+    PROTOCOL_VERSION,
+    MessageError,
+    decode_reply,
+    decode_request,
+    encode,
+    sealed,
+)
+from holdfast.session.records import RecordError, decode_record, encode_record
+
+__all__ = ["SPECIMENS", "TARGETS"]
+
+_CODES = ("malformed", "version", "too_large")
+
+
+def check_request(data: bytes) -> None:
+    """Check ``decode_request``, of what stands before the checksum."""
+    if not data:
+        return
+    try:
+        decoded = decode_request(sealed(data))
+    except MessageError as error:
+        assert error.code in _CODES
+        assert len(str(error)) < 2000
+        return
+    assert decoded.version == PROTOCOL_VERSION
+    assert len(decoded.session) == 16
+    assert len(decoded.observations) <= MAX_OBSERVATIONS
+    assert not (decoded.observations and decoded.checkpoint is not None)
+    again = encode(decoded)
+    assert encode(decode_request(again)) == again
+
+
+def check_reply(data: bytes) -> None:
+    """Check ``decode_reply``, of what stands before the checksum."""
+    if not data:
+        return
+    try:
+        decoded = decode_reply(sealed(data))
+    except MessageError as error:
+        assert error.code == "malformed"
+        assert len(str(error)) < 2000
+        return
+    assert 0 <= decoded.number < 2**32
+    assert getattr(decoded, "count", 1) <= MAX_TASK_ACTIONS
+    again = encode(decoded)
+    assert encode(decode_reply(again)) == again
+
+
+def check_record(data: bytes) -> None:
+    """Check ``decode_record``."""
+    try:
+        decoded = decode_record(data)
+    except RecordError:
+        return
+    again = encode_record(decoded)
+    assert encode_record(decode_record(again)) == again
+
+
+@functools.cache
+def _problem() -> Problem:
+    return corpus.problem_of(corpus.opening_of())
+
+
+def check_checkpoint(data: bytes) -> None:
+    """Check ``decode_checkpoint``, and ``check_state`` of what it lets through."""
+    try:
+        state = decode_checkpoint(data)
+    except CheckpointError:
+        return
+    states, weights = state.belief
+    assert np.isfinite(states).all()
+    assert (weights >= 0.0).all()
+    assert abs(float(weights.sum()) - 1.0) < 1e-6
+    assert not states.flags.writeable
+    assert digest(decode_checkpoint(encode_checkpoint(state))) == digest(state)
+    try:
+        check_state(_problem(), corpus.PLANNING, state)
+    except InvalidValueError:
+        return
+    assert states.shape == (corpus.PLANNING.particle_filter.num_particles, _problem().state_size)
+
+
+def check_configuration(data: bytes) -> None:
+    """Check the reader of configurations: what it takes, it can write and read again."""
+    try:
+        document = yaml_document.read(data, "fuzzed.yaml")
+    except ConfigurationError as error:
+        assert "fuzzed.yaml" in str(error)
+        assert len(str(error)) < 2000
+        return
+    written = yaml_document.write(document.data)
+    assert yaml_document.read(written.encode(), "written.yaml").data == document.data
+
+
+TARGETS: Mapping[str, Callable[[bytes], None]] = {
+    "request": check_request,
+    "reply": check_reply,
+    "record": check_record,
+    "checkpoint": check_checkpoint,
+    "configuration": check_configuration,
+}
+
+
+def _specimens() -> dict[str, list[bytes]]:
+    return {
+        "request": [corpus.content_of(each) for each in corpus.requests()],
+        "reply": [corpus.content_of(each) for each in corpus.replies()],
+        "record": [encode_record(each) for each in corpus.records()],
+        "checkpoint": corpus.checkpoints(),
+        "configuration": corpus.configurations(),
+    }
+
+
+SPECIMENS: Mapping[str, list[bytes]] = _specimens()
+"""Of each target, what it must let through."""

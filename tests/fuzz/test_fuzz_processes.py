@@ -1,0 +1,89 @@
+"""The fuzzers as programs, for a bounded time; `make fuzz` and `make soak` run them at length."""
+
+from __future__ import annotations
+
+import importlib.util
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from tests.fuzz.hostile_client import HostileMessages
+from tests.fuzz.live import run_live
+from tests.fuzz.measuring import Held, flatness
+from tests.fuzz.soak import run_soak
+from tests.fuzz.targets import TARGETS
+
+ROOT = Path(__file__).parents[2]
+RUNS = 20_000
+LIVE_MESSAGES = 20_000
+SOAK_S = 75.0
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(
+    importlib.util.find_spec("atheris") is None, reason="atheris is not there for this platform"
+)
+@pytest.mark.parametrize("target", sorted(TARGETS))
+def test_decoders_guided_by_coverage(target: str, tmp_path: Path) -> None:
+    # PyYAML parses in Python: a configuration takes a hundred times as long as a message.
+    runs = RUNS // 10 if target == "configuration" else RUNS
+    done = subprocess.run(
+        [
+            sys.executable,
+            *("-m", "tests.fuzz.decoders", target),
+            *("--runs", str(runs), "--seed", "1", "--crashes", str(tmp_path)),
+        ],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=600,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert f"Done {runs} runs" in done.stderr
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_same_seed_sends_the_same_messages() -> None:
+    one, same, other = (iter(HostileMessages(seed)) for seed in (5, 5, 6))
+    messages = [next(one) for _ in range(500)]
+    assert messages == [next(same) for _ in range(500)]
+    assert messages != [next(other) for _ in range(500)]
+
+
+@pytest.mark.slow
+def test_a_service_under_fire_disturbs_no_robot(tmp_path: Path) -> None:
+    figures, findings = run_live(LIVE_MESSAGES, 1, directory=tmp_path, trials=2)
+    # So short a run ends before the tables are full; that nothing grows is for `make fuzz`.
+    assert not [finding for finding in findings if "grew" not in finding], (findings, figures)
+    robots = figures["robots"]
+    assert isinstance(robots, dict)
+    assert robots["trials"] >= 8
+
+
+@pytest.mark.slow
+def test_nothing_grows_while_sessions_come_and_go(tmp_path: Path) -> None:
+    figures, findings = run_soak(SOAK_S, 1, directory=tmp_path)
+    assert not findings, (findings, figures)
+
+
+def _held(at_s: int, memory_mb: float) -> Held:
+    return Held(at_s, int(memory_mb * 2**20), 10, 10)
+
+
+@pytest.mark.parametrize(
+    ("memory", "flat"),
+    [
+        (lambda _: 100.0, True),
+        (lambda at: min(at, 40) + 60.0, True),
+        (lambda at: 60.0 + at % 10, True),
+        (lambda at: 60.0 + at / 2, False),
+        (lambda at: 600.0 if at > 90 else 60.0, False),
+    ],
+    ids=["constant", "filled", "coming and going", "leaking", "leaping"],
+)
+def test_what_counts_as_flat(memory: object, flat: bool) -> None:
+    assert callable(memory)
+    _, faults = flatness([_held(at, memory(at)) for at in range(120)])
+    assert (not faults) == flat

@@ -1,0 +1,171 @@
+"""A robot whose services send it anything at all: it decides what it would have decided.
+
+What a service computes cannot be told from what it makes up, except where the answer names the
+state that it is for. So a service that answers well-formed and wrong is believed in the task
+actions (`Refused` is how it says that it cannot); everything else that is not the answer must have
+no effect but on time.
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable
+
+import msgspec
+from hypothesis import strategies as st
+from tests.fuzz import corpus
+from tests.fuzz.examples import always, examples
+from tests.fuzz.mutations import Mutator
+from tests.unit.test_session_robot import LOCAL, World
+
+from holdfast.session.effects import Effect, Send, Stop
+from holdfast.session.events import Appeared, Ended, Replied, Vanished
+from holdfast.session.messages import (
+    Busy,
+    NeedState,
+    Progress,
+    Refused,
+    Reply,
+    SensingAnswer,
+    TaskAnswer,
+    encode,
+    numbers_to,
+    sealed,
+)
+from holdfast.settings import SimulatorSettings
+
+ONE_TRIAL = SimulatorSettings(num_trials=1, max_steps=14, seed=11)
+
+
+class HostileWorld(World):
+    """Beside each honest reply come others; nobody but the honest service is ever believed."""
+
+    def __init__(self, seed: int, share: float) -> None:
+        chance = random.Random(seed)
+        services = ("first", "second")[: chance.randint(1, 2)]
+        launch = chance.choice(("on_failure", "never"))
+        super().__init__(services=services, launch=launch, simulator=ONE_TRIAL)
+        self.chance = chance
+        self.share = share
+        self.specimens = [corpus.content_of(reply) for reply in corpus.replies()]
+        self.mutator = Mutator(chance, self.specimens)
+        self.seen: list[bytes] = []
+
+    def send(self, effect: Send) -> None:
+        super().send(effect)
+        if self.chance.random() < self.share:
+            for _ in range(self.chance.randint(1, 4)):
+                self.after(self.chance.uniform(0.0, 0.02), self.hostile(effect.call))
+
+    def reply(self, call: int, reply: Reply) -> list[Effect]:
+        self.seen.append(corpus.content_of(reply))
+        return super().reply(call, reply)
+
+    def hostile(self, call: int) -> Callable[[], list[Effect]]:
+        """Return what delivers something, to this call or to any."""
+
+        def deliver() -> list[Effect]:
+            any_call = self.chance.choice((call, call, call + 1, call - 1, 0, -1, 2**63))
+            if self.chance.random() < 0.1:
+                return self.robot.handle(Ended(any_call), self.now)
+            if self.chance.random() < 0.1:
+                name = self.chance.choice((*self.services, "nobody"))
+                boot = self.chance.choice(("", "0", "1", "other"))
+                event = self.chance.choice((Appeared, Vanished))
+                if name in self.services:
+                    # A transport that erred finds that out.
+                    self.after(0.05, lambda: self.truth(name))
+                return self.robot.handle(event(name, boot), self.now)
+            return self.robot.handle(Replied(any_call, self.payload(any_call)), self.now)
+
+        return deliver
+
+    def truth(self, name: str) -> list[Effect]:
+        service = self.services[name]
+        event = Appeared if service.up else Vanished
+        return self.robot.handle(event(name, str(service.boot)), self.now)
+
+    def payload(self, call: int) -> bytes:
+        """Return anything but a good answer to that call, and but a word that ends the run."""
+        match self.chance.choice(("spoilt", "nonsense", "late", "shapeless", "mild")):
+            case "late" if self.seen:
+                return self.other_number(self.chance.choice(self.seen), call)
+            case "nonsense":
+                nonsense = self.chance.randbytes(self.chance.choice((0, 1, 20, 300)))
+                return sealed(nonsense) if self.chance.random() < 0.5 else nonsense
+            case "shapeless":
+                return encode(self.chance.choice(self.impossible(call)))
+            case "mild":
+                number = call % 2**32
+                return encode(
+                    self.chance.choice(
+                        (
+                            Progress(number, self.chance.random() < 0.5),
+                            NeedState(number, self.chance.random() < 0.5),
+                            Busy(number, self.chance.choice((0, 1, 30))),
+                            Busy(0, 1),
+                            Refused(number, "malformed", "spoilt on its way"),
+                        )
+                    )
+                )
+            case _:
+                return self.other_number(self.mutator.spoilt(), call)
+
+    def other_number(self, content: bytes, call: int) -> bytes:
+        """Return a reply as that to another request, so that it cannot pass for an answer."""
+        try:
+            fields = msgspec.msgpack.decode(content)
+        except (msgspec.DecodeError, RecursionError, UnicodeDecodeError, ValueError):
+            return sealed(content)
+        if isinstance(fields, list) and len(fields) > 1 and fields[0] in (1, 2, 6):
+            fields[1] = (call + 1) % 2**32 or 1
+            return sealed(msgspec.msgpack.encode(fields))
+        return sealed(content)
+
+    def impossible(self, call: int) -> list[Reply]:
+        """Return answers of that number which cannot be answers to any question of this robot."""
+        number = call % 2**32
+        nothing, long = numbers_to([]), numbers_to([0.1] * 3 * 64)
+        return [
+            TaskAnswer(number, 64, long, 1),
+            TaskAnswer(number, 4, nothing, 1),
+            TaskAnswer(number, 4, numbers_to([float("nan")] * 12), 1),
+            TaskAnswer(number, 4, numbers_to([0.0] * 12)[:-1], 1),
+            SensingAnswer(number, 0, 2**32 - 1, bytes(16), 1),
+            SensingAnswer(number, 2**32 - 1, 0, bytes(16), 1),
+            SensingAnswer(number, 5, 0, bytes(16), 1),
+        ]
+
+
+@examples(quick=15, slow=800)
+def test_whatever_comes_the_decisions_are_the_same(examples: int) -> None:
+    def check(seed: int) -> None:
+        world = HostileWorld(seed, share=0.7)
+        world.start()
+        world.run(until_s=600.0)
+        assert world.stopped is None, world.stopped
+        world.assert_same_as_without_faults()
+        calls = world.robot._dispatcher._calls._open
+        assert len(calls) <= 4 * len(world.services)
+
+    always(examples, check, st.integers(0, 2**48))
+
+
+@examples(quick=15, slow=800)
+def test_a_service_that_is_nothing_but_hostile(examples: int) -> None:
+    """The robot holds still, goes on with its local service, or says that all refuse."""
+
+    def check(seed: int) -> None:
+        world = HostileWorld(seed, share=1.0)
+        for name in world.offload.services:
+            world.services[name].rule = lambda _: []
+        world.start()
+        world.after(10.0, list)  # a robot without any service waits for nothing else
+        world.run(until_s=5.0)
+        assert not [effect for _, effect in world.trace if isinstance(effect, Stop)]
+        for result in world.results:
+            assert LOCAL in world.services
+            world.assert_same_as_without_faults()
+            assert result.steps > 0
+
+    always(examples, check, st.integers(0, 2**48))

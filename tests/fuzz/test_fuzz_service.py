@@ -1,0 +1,250 @@
+"""The service's machine among hostile robots: it keeps its limits, and serves the honest ones.
+
+Rules send whatever may come, in any order, and let jobs end in any order. After each of them all
+that the machine holds is measured, not only what it says of itself.
+"""
+
+from __future__ import annotations
+
+import random
+from typing import Any
+
+import msgspec
+import pytest
+from hypothesis import HealthCheck, settings
+from hypothesis import strategies as st
+from hypothesis.stateful import (
+    RuleBasedStateMachine,
+    initialize,
+    invariant,
+    precondition,
+    rule,
+    run_state_machine_as_test,
+)
+from tests.fuzz import corpus, strategies
+from tests.fuzz.targets import SPECIMENS
+from tests.unit.test_session_service import Bench, Robot, content, planning_of
+
+from holdfast.session.messages import Observed, Opening, Request, encode, sealed
+from holdfast.session.service_calls import MAX_WORD
+from holdfast.session.service_sessions import Session, Work
+
+HONEST = (1, 2)
+KEYS = st.integers(100, 115)
+"""Sessions of the hostile ones: an honest robot's is 16 random bytes that nobody else knows."""
+
+WORDS = st.sampled_from((0, 1, 2, 3, 64, 2**31, 2**32 - 1))
+
+
+class HostileRobots(RuleBasedStateMachine):
+    """Two honest robots, and whoever else there is."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.chance = random.Random(0)
+        self.robots = [Robot(key=key, planning=planning_of(2, 12)) for key in HONEST]
+        self.asked: dict[int, tuple[int, list[tuple[Any, ...]]]] = {}
+        self.turns = [0, 0]
+        self.sent: list[bytes] = []
+
+    @initialize(
+        workers=st.integers(1, 3),
+        max_sessions=st.sampled_from((2, 3, 12)),
+        max_waiting=st.sampled_from((1, 3, 100)),
+        max_state_bytes=st.sampled_from((100, 2000, 1 << 20)),
+        max_opening_bytes=st.sampled_from((1000, 1 << 20)),
+        answers_per_session=st.integers(1, 8),
+        max_calls_per_request=st.integers(1, 3),
+    )
+    def begin(self, workers: int, **limits: Any) -> None:
+        self.limits = limits
+        self.bench = Bench(
+            workers=workers, max_particles=200, max_work=100_000, max_steps=200, **limits
+        )
+
+    # -- the honest ones -------------------------------------------------------------------------
+
+    @rule(index=st.integers(0, 1), whole=st.booleans())
+    def an_honest_robot_asks(self, index: int, whole: bool) -> None:
+        robot = self.robots[index]
+        call = self.bench.send(robot.restore() if whole else robot.request())
+        self.asked[call] = (index, robot.right_answer())
+
+    @rule(times=st.integers(1, 4), which=st.integers(0, 2))
+    def jobs_end(self, times: int, which: int) -> None:
+        for _ in range(times):
+            if self.bench.jobs:
+                self.bench.now += 0.001
+                self.bench.run(which % len(self.bench.jobs))
+
+    @rule(seconds=st.sampled_from((0.0, 0.02, 0.05, 1.0, 601.0)))
+    def time_passes(self, seconds: float) -> None:
+        self.bench.now += seconds
+        self.bench.apply(self.bench.service.tick(self.bench.now))
+
+    # -- the others ------------------------------------------------------------------------------
+
+    def hostile(self, payload: bytes) -> None:
+        self.sent.append(payload)
+        self.bench.send(payload)
+
+    @rule(payload=strategies.spoilt(SPECIMENS["request"]), seals=st.booleans())
+    def spoilt_bytes(self, payload: bytes, seals: bool) -> None:
+        self.hostile(sealed(payload) if seals else payload)
+
+    @rule(request=strategies.requests)
+    def a_request_of_any_content(self, request: Request) -> None:
+        self.hostile(encode(request))
+
+    @rule(key=KEYS, seed=st.integers(0, 2**32), changes=st.integers(1, 4))
+    def a_request_that_is_nearly_right(self, key: int, seed: int, changes: int) -> None:
+        chance = random.Random(seed)
+        request = chance.choice(corpus.requests(key.to_bytes(16, "big"), chance.choice((1, 2, 3))))
+        words = (0, 1, 2, 7, 64, 2**31, MAX_WORD)
+        for _ in range(changes):
+            match chance.choice(("number", "trial", "step", "sensed", "digest", "observed", "own")):
+                case "sensed":
+                    request = msgspec.structs.replace(request, sensed=not request.sensed)
+                case "digest":
+                    request = msgspec.structs.replace(request, digest=chance.randbytes(16))
+                case "observed" if request.checkpoint is None:
+                    kept = list(request.observations)
+                    chance.shuffle(kept)
+                    shown = chance.choice((b"", b"\0" * 8, b"\xff" * 8, bytes(8 * 4096)))
+                    kept.append(Observed(chance.choice(words), chance.choice((0, 1, 99)), shown))
+                    request = msgspec.structs.replace(request, observations=tuple(kept))
+                case "own":
+                    planning = planning_of(chance.choice((0, 5, 10**6)), chance.choice((1, 4, 150)))
+                    opening = Opening("capsule_robot", {}, {}, planning, chance.randrange(3))
+                    request = msgspec.structs.replace(request, opening=opening)
+                case "number" | "trial" | "step" as field:
+                    request = msgspec.structs.replace(request, **{field: chance.choice(words)})
+                case _:
+                    pass
+        self.hostile(encode(request))
+
+    @rule(key=KEYS, epoch=WORDS, index=st.integers(0, 1000))
+    def a_valid_request_of_any_epoch(self, key: int, epoch: int, index: int) -> None:
+        requests = corpus.requests(key.to_bytes(16, "big"), epoch)
+        self.hostile(encode(requests[index % len(requests)]))
+
+    @precondition(lambda self: self.sent)
+    @rule(index=st.integers(0, 10**6), times=st.integers(1, 6))
+    def a_replay(self, index: int, times: int) -> None:
+        for _ in range(times):
+            self.bench.send(self.sent[index % len(self.sent)])
+
+    @rule(start=st.integers(0, 10**6), count=st.integers(1, 30))
+    def a_flood_of_new_sessions(self, start: int, count: int) -> None:
+        for key in range(start, start + count):
+            request = corpus.requests((key + 10**6).to_bytes(16, "big"))[1]
+            self.bench.send(encode(request))
+
+    # -- what must hold --------------------------------------------------------------------------
+
+    @invariant()
+    def the_honest_are_told_what_is_right(self) -> None:
+        if not hasattr(self, "bench"):
+            return
+        for call in sorted(set(self.asked) & self.bench.ended):
+            index, right = self.asked.pop(call)
+            told = content(self.bench.replies[call])
+            if told and isinstance(told[0][0], str):
+                assert told == right[: len(told)]
+            robot = self.robots[index]
+            if told == right == robot.right_answer():
+                self.turns[index] += 1
+                robot.act_until_sensing()
+                robot.sense()
+
+    @invariant()
+    def all_limits_are_kept(self) -> None:
+        if hasattr(self, "bench"):
+            check_limits(self.bench, self.limits)
+
+    def teardown(self) -> None:
+        if not hasattr(self, "bench"):
+            return
+        self.bench.run_all()
+        self.the_honest_are_told_what_is_right()
+        statistics = self.bench.service.statistics
+        assert (statistics.waiting, statistics.running, statistics.calls) == (0, 0, 0)
+        # Every call has had its end, whoever made it.
+        assert self.bench.ended == set(self.bench.replies)
+        check_limits(self.bench, self.limits)
+        for robot in self.robots:
+            assert content(self.bench.ask(robot.restore())) == robot.right_answer()
+
+
+def works_of(session: Session) -> list[Work]:
+    return list(session.works.values())
+
+
+def check_limits(bench: Bench, limits: dict[str, Any]) -> None:
+    """Measure all that a service holds."""
+    service, statistics = bench.service, bench.service.statistics
+    sessions, lines, calls = service._sessions, service._lines, service._calls
+    kept = list(sessions._sessions.values())
+    assert statistics.sessions == len(kept) <= limits["max_sessions"]
+    assert len(sessions._epochs) <= max(4 * limits["max_sessions"], 4096)
+    assert not set(sessions._epochs) & set(sessions._sessions)
+    # States.
+    assert sum(session.num_bytes for session in kept) == sessions.state_bytes
+    assert sum(session.size() for session in kept) <= sessions.state_bytes
+    assert sessions.state_bytes <= limits["max_state_bytes"]
+    assert sum(session.opening_bytes for session in kept) == sessions.opening_bytes
+    assert sessions.opening_bytes <= limits["max_opening_bytes"] or len(kept) == 1
+    assert all(len(session.answers) <= limits["answers_per_session"] for session in kept)
+    # Works.
+    works = [work for session in kept for work in works_of(session)]
+    running = list(lines._running.values())
+    waiting = [work for work in works if not work.running]
+    assert statistics.running == len(running) == len(bench.jobs) <= bench.workers
+    assert statistics.waiting == len(waiting)
+    lined_up = [*lines._urgent, *lines._newcomers, *lines._later]
+    held = [work for session in kept for work in session.held if work is not None]
+    assert {id(work) for work in waiting} == {id(work) for work in (*lined_up, *held)}
+    assert lines._waiting_bytes == sum(work.size for work in waiting)
+    assert abs(lines._backlog_s - sum(work.cost_s for work in waiting)) < 1e-6
+    new = [work for work in waiting if work.newcomer]
+    assert lines._num_newcomers == len(new)
+    assert abs(lines._backlog_of_newcomers_s - sum(work.cost_s for work in new)) < 1e-6
+    requested = [work for work in waiting if work.request is not None]
+    assert len(requested) <= max(limits["max_waiting"], bench.workers)
+    for session in kept:
+        assert sum(not work.running for work in works_of(session)) <= 2
+        assert len(session.works) <= 4
+        assert not session.closed
+    for work in works:
+        assert work.request is None or work.request.opening is None
+    # Calls: each waits for one work that is still to be done.
+    attached = [record for work in works for record in work.calls.values()]
+    assert len(attached) == len(calls) == statistics.calls
+    assert all(calls._calls[record.call] is record for record in attached)
+    most = 2 * limits["max_calls_per_request"]
+    assert all(len(work.calls) <= most for work in works)
+    assert set(calls._calls) == set(bench.replies) - bench.ended
+    # Problems.
+    pool = service._problems._idle
+    assert len(pool) <= 32
+    assert sum(map(len, pool.values())) <= 32 * bench.workers
+
+
+@pytest.mark.parametrize(
+    ("runs", "steps"),
+    [
+        pytest.param(6, 30, id="quick"),
+        pytest.param(250, 80, marks=pytest.mark.slow, id="slow"),
+    ],
+)
+def test_hostile_robots_break_no_limit_and_disturb_nobody(runs: int, steps: int) -> None:
+    run_state_machine_as_test(
+        HostileRobots,
+        settings=settings(
+            max_examples=runs,
+            stateful_step_count=steps,
+            deadline=None,
+            derandomize=True,
+            suppress_health_check=list(HealthCheck),
+        ),
+    )

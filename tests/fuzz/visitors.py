@@ -1,0 +1,155 @@
+"""Robots that come, ask a few times, and are never heard of again.
+
+    python -m tests.fuzz.visitors ENDPOINT --seconds 60 --seed 1
+
+Each has a session of its own, asks what an honest robot asks, checks what it is told, and goes:
+sometimes in the middle of a call, sometimes with its link. It reports as one line of JSON.
+"""
+
+from __future__ import annotations
+
+import argparse
+import collections
+import json
+import os
+import random
+import time
+from queue import Empty, SimpleQueue
+from typing import Any
+
+from tests.fuzz import corpus
+from tests.unit.test_session_service import Robot as ReferenceRobot
+from tests.unit.test_session_service import content
+
+from holdfast.planning import digest, encode_checkpoint
+from holdfast.runtime.endpoints import ServiceAddress
+from holdfast.runtime.transport.zenoh_transport import ZenohRobotTransport
+from holdfast.session.events import Appeared, Ended, Replied, TransportEvent
+from holdfast.session.messages import (
+    DIGEST_SIZE,
+    PROTOCOL_VERSION,
+    NeedState,
+    Reply,
+    Request,
+    decode_reply,
+    encode,
+)
+
+__all__ = ["main"]
+
+_PATIENCE_S = 30.0
+_ROBOTS_OF_A_LINK = 40
+_PROBLEMS = (corpus.PROBLEM, "peg_in_hole_2d")
+
+
+def _right_answers() -> dict[str, list[list[tuple[Any, ...]]]]:
+    """Return, of each problem, what is the answer in each turn."""
+    found: dict[str, list[list[tuple[Any, ...]]]] = {}
+    for name in _PROBLEMS:
+        robot = ReferenceRobot(name, corpus.PLANNING, seed=corpus.SEED)
+        found[name] = []
+        for turn in corpus.turns(name):
+            robot.state = turn.state
+            found[name].append(robot.right_answer())
+    return found
+
+
+class _Link:
+    """A robot's end of the wire."""
+
+    def __init__(self, endpoint: str) -> None:
+        self.events: SimpleQueue[TransportEvent] = SimpleQueue()
+        self.transport = ZenohRobotTransport({"cloud": ServiceAddress(endpoint)})
+        self.transport.start(self.events.put)
+        self._calls = 0
+        while not isinstance(self.events.get(timeout=_PATIENCE_S), Appeared):
+            pass
+
+    def send(self, request: Request) -> int:
+        self._calls += 1
+        self.transport.call("cloud", self._calls, encode(request))
+        return self._calls
+
+    def ask(self, request: Request) -> list[Reply]:
+        call = self.send(request)
+        replies = []
+        while True:
+            event = self.events.get(timeout=_PATIENCE_S)
+            if isinstance(event, Replied) and event.call == call:
+                replies.append(decode_reply(event.payload))
+            elif isinstance(event, Ended) and event.call == call:
+                return replies
+
+
+def main() -> None:
+    """Come and go for so long."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("endpoint")
+    parser.add_argument("--seconds", type=float, default=10.0)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--pause", type=float, default=0.004, help="between two robots")
+    options = parser.parse_args()
+    chance = random.Random(options.seed)
+    right = _right_answers()
+    counts: collections.Counter[str] = collections.Counter()
+    wrong: list[str] = []
+    until = time.monotonic() + options.seconds
+    link = _Link(options.endpoint)
+    while time.monotonic() < until and not wrong:
+        if counts["robots"] % _ROBOTS_OF_A_LINK == _ROBOTS_OF_A_LINK - 1:
+            link.transport.close()
+            link = _Link(options.endpoint)
+            counts["links"] += 1
+        counts["robots"] += 1
+        time.sleep(options.pause * 2 * chance.random())
+        name = chance.choice(_PROBLEMS)
+        session = chance.randbytes(16)
+        opening = corpus.opening_of(name)
+        last = chance.randint(1, len(corpus.turns(name)))
+        leaves = chance.random() < 0.3
+        for number, turn in enumerate(corpus.turns(name)[:last]):
+            state = turn.state
+            restored = number > 0 and chance.random() < 0.1
+            request = Request(
+                PROTOCOL_VERSION,
+                session,
+                1,
+                number + 1,
+                state.trial,
+                state.step,
+                state.sensed,
+                digest(state)[:DIGEST_SIZE],
+                () if restored else turn.observed,
+                opening,
+                encode_checkpoint(state) if restored else None,
+            )
+            if leaves and number == last - 1:
+                # It was killed in the middle of its call.
+                call = link.send(request)
+                if chance.random() < 0.5:
+                    link.transport.abandon(call)
+                counts["left"] += 1
+                break
+            try:
+                replies = link.ask(request)
+            except Empty:
+                wrong.append(f"no answer within {_PATIENCE_S} s")
+                break
+            told = content(replies)
+            expected = right[name][number]
+            if told == expected:
+                counts["answers"] += 1
+            elif told and isinstance(told[0][0], str):
+                wrong.append(f"{name}, turn {number}: {told} instead of {expected}")
+            else:
+                kind = type(told[0][0]).__name__ if told else "nothing"
+                counts[kind] += 1
+                if told and not isinstance(told[0][0], NeedState):
+                    break  # it is busy
+    print(json.dumps({"seed": options.seed, **counts, "wrong": wrong}), flush=True)
+    # Zenoh's threads may be in a callback yet.
+    os._exit(0 if not wrong else 1)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,353 @@
+"""``holdfast chaos`` with real processes: what it finds, what it leaves, and how it ends."""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import json
+import os
+import re
+import shlex
+import signal
+import sqlite3
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import pytest
+
+from holdfast.chaos.processes import marked_processes
+from holdfast.chaos.schedule import NEEDS_NAMESPACE, Fault, FaultKind, Schedule, draw_schedule
+from holdfast.chaos.trial import Pace, TrialOutcome, run_chaos_trial
+from holdfast.chaos.twin import keep_undisturbed
+from holdfast.chaos.world import performances
+from holdfast.configuration import Configuration, load
+
+PATIENCE_S = 240.0
+COMMAND = (sys.executable, "-m", "holdfast", "chaos")
+BRIEF = Pace(min_steps=60, rate_hz=60.0)
+
+
+def schedule_of(*faults: Fault, kind: FaultKind, num_clouds: int = 1) -> Schedule:
+    return Schedule(
+        seed=0,
+        trial=0,
+        kind=kind,
+        world_seed=11,
+        num_particles=30,
+        num_clouds=num_clouds,
+        launch="on_failure",
+        decision_deadline_ms=None,
+        faults=faults,
+    )
+
+
+def run(schedule: Schedule, directory: Path, pace: Pace = BRIEF) -> TrialOutcome:
+    return run_chaos_trial(schedule, directory, pace, threading.Event())
+
+
+def test_a_cloud_and_a_robot_are_killed(tmp_path: Path) -> None:
+    """Both in one run; the robot goes on in a new process, and nothing is done twice."""
+    schedule = schedule_of(
+        Fault(kind=FaultKind.CLOUD_KILLED, at=0.1, duration_s=0.3),
+        Fault(kind=FaultKind.ROBOT_KILLED, at=0.3, duration_s=0.0),
+        kind=FaultKind.COMBINATION,
+    )
+    outcome = run(schedule, tmp_path)
+    assert outcome.verdict == "identical", outcome.reason
+    assert outcome.reason == ""
+    assert [fault.kind for fault in outcome.faults] == ["cloud_killed", "robot_killed"]
+    assert outcome.faults[0].detection_ms is not None
+    assert outcome.faults[1].recovery_ms is not None
+    assert outcome.robots == 2
+    assert outcome.steps >= 60
+    performed = list(performances(tmp_path / "performed-disturbed.txt"))
+    assert len(performed) == outcome.steps
+    assert len({each.process for each in performed}) == 2
+
+
+@pytest.mark.slow
+def test_what_the_world_tells_is_believed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The twin is made to do one step less: so the robot has done one too many."""
+
+    def shorten(path: Path, *arguments: object) -> None:
+        keep_undisturbed(path, *arguments)  # type: ignore[arg-type]
+        performed = tmp_path / "performed-undisturbed.txt"
+        lines = performed.read_text().splitlines(keepends=True)
+        performed.write_text("".join(lines[:-1]))
+
+    monkeypatch.setattr("holdfast.chaos.trial.keep_undisturbed", shorten)
+    outcome = run(schedule_of(kind=FaultKind.COMBINATION), tmp_path)
+    assert outcome.verdict == "diverged"
+    assert "the world was acted on otherwise" in outcome.reason
+    assert "expected nothing, found trial" in outcome.reason
+
+
+@pytest.mark.slow
+def test_what_the_journals_tell_is_believed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def keep_another(path: Path, configuration: Configuration, *arguments: object) -> None:
+        other = load(configuration.path, seed=12)
+        keep_undisturbed(path, other, *arguments)  # type: ignore[arg-type]
+
+    monkeypatch.setattr("holdfast.chaos.trial.keep_undisturbed", keep_another)
+    outcome = run(schedule_of(kind=FaultKind.COMBINATION), tmp_path)
+    assert outcome.verdict == "diverged"
+    assert outcome.reason.startswith("different: seed")
+
+
+@pytest.mark.slow
+def test_a_journal_that_is_damaged_has_failed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def damage(path: Path, *arguments: object) -> None:
+        keep_undisturbed(path, *arguments)  # type: ignore[arg-type]
+        with contextlib.closing(sqlite3.connect(path / "journal.sqlite")) as journal, journal:
+            journal.execute("UPDATE meta SET value = value || ' ' WHERE key = 'configuration'")
+
+    monkeypatch.setattr("holdfast.chaos.trial.keep_undisturbed", damage)
+    outcome = run(schedule_of(kind=FaultKind.COMBINATION), tmp_path)
+    assert outcome.verdict == "failed"
+    assert "journal.sqlite: the journal is damaged" in outcome.reason
+
+
+@pytest.mark.slow
+def test_a_robot_that_ends_by_itself_has_failed(tmp_path: Path) -> None:
+    def kill_the_robot() -> None:
+        path = tmp_path / "performed-disturbed.txt"
+        deadline = time.monotonic() + PATIENCE_S
+        while not path.exists() or not path.stat().st_size:
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+        os.kill(next(performances(path)).process, signal.SIGKILL)
+
+    killer = threading.Thread(target=kill_the_robot)
+    killer.start()
+    outcome = run(schedule_of(kind=FaultKind.COMBINATION), tmp_path, Pace(200, 40.0))
+    killer.join()
+    assert outcome.verdict == "failed"
+    assert outcome.reason.startswith("the robot ended with SIGKILL")
+
+
+@pytest.mark.slow
+def test_a_run_that_does_not_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("holdfast.chaos.trial._STANDSTILL_S", 8.0)
+    stop = Fault(kind=FaultKind.ROBOT_STOPPED, at=0.1, duration_s=1000.0)
+    outcome = run(schedule_of(stop, kind=FaultKind.ROBOT_STOPPED), tmp_path)
+    assert outcome.verdict == "timed_out"
+    assert "steps did not go on within 8 s" in outcome.reason
+    # Stopped or not, nothing is left.
+    mark = next(iter(performances(tmp_path / "performed-disturbed.txt"))).process
+    assert not Path(f"/proc/{mark}").exists()
+
+
+class Chaos:
+    """The command, as a process that is the leader of nothing but itself."""
+
+    def __init__(self, directory: Path, *arguments: str, program: str | None = None) -> None:
+        self.out = directory / "out"
+        self._mark = f"{directory}"
+        command = COMMAND if program is None else (sys.executable, "-c", program, "chaos")
+        self.process = subprocess.Popen(
+            [*command, "--out", str(self.out), *arguments],
+            cwd=directory,
+            env={**os.environ, "HOLDFAST_TEST_CHAOS": self._mark},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+        )
+
+    def others(self) -> list[int]:
+        found = marked_processes("HOLDFAST_TEST_CHAOS", self._mark)
+        return [pid for pid in found if pid != self.process.pid]
+
+    def wait_until(self, what: str, *, present: bool) -> None:
+        """Wait until a command line has something in it, or no process is left."""
+        deadline = time.monotonic() + PATIENCE_S
+        while any(what in _command_of(pid) for pid in self.others()) != present:
+            assert time.monotonic() < deadline, f"{what}: {self.others()}"
+            time.sleep(0.02)
+
+    def end(self) -> tuple[str, str]:
+        return self.process.communicate(timeout=PATIENCE_S)
+
+    def close(self) -> None:
+        self.process.kill()
+        self.process.communicate()
+        for pid in self.others():
+            os.kill(pid, signal.SIGKILL)
+
+
+def _command_of(pid: int) -> str:
+    try:
+        return Path(f"/proc/{pid}/cmdline").read_bytes().replace(b"\0", b" ").decode()
+    except OSError:
+        return ""
+
+
+@pytest.fixture
+def started(tmp_path: Path) -> Iterator[list[Chaos]]:
+    chaoses: list[Chaos] = []
+    yield chaoses
+    for chaos in chaoses:
+        chaos.close()
+
+
+def only(kinds: Sequence[FaultKind]) -> list[str]:
+    return [word for kind in kinds for word in ("--only", kind.value)]
+
+
+@pytest.mark.slow
+def test_every_kind_of_fault(tmp_path: Path, started: list[Chaos]) -> None:
+    chaos = Chaos(tmp_path, "--trials", str(len(FaultKind)), "--seed", "3", "--jobs", "2")
+    started.append(chaos)
+    output, errors = chaos.end()
+    assert chaos.process.returncode == 0, output + errors
+    assert chaos.others() == []
+    assert sorted(path.name for path in chaos.out.iterdir()) == [
+        "chaos.csv",
+        "failback.png",
+        "failback.svg",
+        "launch.png",
+        "launch.svg",
+        "series.json",
+        "summary.json",
+        "table.txt",
+        "trials.jsonl",
+    ]
+    summary = json.loads((chaos.out / "summary.json").read_text())
+    assert summary["identical"] == summary["finished"] == len(FaultKind)
+    left_out = set(summary["left_out"])
+    assert left_out in (set(), set(NEEDS_NAMESPACE))
+    assert {row["kind"] for row in summary["kinds"]} == {*FaultKind} - left_out
+    for kind in left_out:
+        assert kind in errors  # and why
+    with (chaos.out / "chaos.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    struck = {row["kind"] for row in rows}
+    assert struck >= {*FaultKind} - left_out - {"combination"}
+    for row in rows:
+        if row["kind"] in ("cloud_killed", "link_cut") and row["trial_kind"] == row["kind"]:
+            assert float(row["detection_ms"]) > 0.0
+    assert "no divergence" in output
+    assert re.search(r"^cloud_killed +\d", output, re.MULTILINE)
+    assert (chaos.out / "table.txt").read_text() in output
+    assert "\x1b" not in output + errors
+
+
+@pytest.mark.slow
+def test_a_divergence_is_shown_and_kept(tmp_path: Path, started: list[Chaos]) -> None:
+    program = """
+import msgspec, holdfast.chaos.trial as trial
+compare = trial.compare_runs
+def differently(*runs):
+    found = compare(*runs)
+    difference = trial.Difference(what="an invention", first="1", second="2")
+    return msgspec.structs.replace(found, identical=False, difference=difference)
+from holdfast.recording.compare import Difference
+trial.Difference = Difference
+trial.compare_runs = differently
+from holdfast.cli import main
+main()
+"""
+    chaos = Chaos(tmp_path, "--trials", "1", *only([FaultKind.LINK_CUT]), program=program)
+    started.append(chaos)
+    output, _ = chaos.end()
+    assert chaos.process.returncode == 1
+    assert "trial 0 (link_cut): diverged: different: an invention" in output
+    assert "1 of 1 trial went wrong (1 diverged" in output
+    kept = chaos.out / "trial-00000"
+    assert f"its files: {kept}" in output
+    assert (kept / "disturbed" / "journal.sqlite").exists()
+    again = re.search(r"again: (holdfast chaos .*)", output)
+    assert again is not None
+    options = shlex.split(again[1])[2:]
+    assert options == [
+        *("--trials", "1", "--first", "0", "--seed", "0", "--only", "link_cut", "--keep")
+    ]
+    schedule = json.loads((kept / "schedule.json").read_text())
+    drawn = draw_schedule(0, 0, FaultKind.LINK_CUT, tuple(FaultKind))
+    assert schedule["world_seed"] == drawn.world_seed
+
+
+@pytest.mark.slow
+def test_an_interruption_ends_all_processes_and_the_series_goes_on(
+    tmp_path: Path, started: list[Chaos]
+) -> None:
+    options = ["--trials", "3", *only([FaultKind.CLOUD_STOPPED, FaultKind.LINK_SILENT])]
+    chaos = Chaos(tmp_path, *options)
+    started.append(chaos)
+    lines = chaos.out / "trials.jsonl"
+    deadline = time.monotonic() + PATIENCE_S
+    while not lines.exists():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    chaos.wait_until("holdfast run", present=True)
+    chaos.process.send_signal(signal.SIGINT)
+    _, errors = chaos.end()
+    assert chaos.process.returncode == 130
+    assert chaos.others() == []
+    assert "Interrupted; all processes are ended. 1 of 3 trials are finished" in errors
+    again = re.search(r"Go on with: (holdfast chaos .*)", errors)
+    assert again is not None
+    assert not list(chaos.out.glob("trial-*"))
+    assert (chaos.out / "chaos.csv").exists()
+
+    words = shlex.split(again[1])[2:]
+    done = subprocess.run(
+        [*COMMAND, *words], cwd=tmp_path, capture_output=True, text=True, timeout=PATIENCE_S
+    )
+    assert done.returncode == 0, done.stderr
+    assert "1 finished before" in done.stderr
+    finished = [json.loads(line)["trial"] for line in lines.read_text().splitlines()]
+    assert finished == [0, 1, 2]
+
+
+@pytest.mark.slow
+def test_nothing_is_left_of_it_even_if_it_is_killed(tmp_path: Path, started: list[Chaos]) -> None:
+    """The system itself wakes what is stopped, and hangs up on it."""
+    chaos = Chaos(tmp_path, "--trials", "2", "--jobs", "2", *only([FaultKind.ROBOT_STOPPED]))
+    started.append(chaos)
+    deadline = time.monotonic() + PATIENCE_S
+    while not any(_state_of(pid) == "T" for pid in chaos.others()):
+        assert time.monotonic() < deadline
+        time.sleep(0.002)
+    chaos.process.kill()
+    chaos.end()
+    chaos.wait_until("", present=False)
+
+
+def _state_of(pid: int) -> str:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except OSError:
+        return ""
+
+
+@pytest.mark.slow
+def test_events_instead_of_a_bar(tmp_path: Path, started: list[Chaos]) -> None:
+    chaos = Chaos(tmp_path, "--trials", "1", *only([FaultKind.CLOUD_KILLED]), "--log", "json")
+    started.append(chaos)
+    output, errors = chaos.end()
+    assert chaos.process.returncode == 0
+    (event,) = (json.loads(line) for line in errors.splitlines())
+    assert (event["component"], event["event"], event["verdict"]) == (
+        "chaos",
+        "chaos_trial",
+        "identical",
+    )
+    assert output == ""
+
+
+def test_what_is_no_kind_is_refused(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [*COMMAND, "--only", "earthquake"], cwd=tmp_path, capture_output=True, text=True
+    )
+    assert done.returncode == 2
+    assert "--only is 'earthquake'; allowed are cloud_killed, " in done.stderr
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,62 @@
+# Sixty other robots ask the cloud at once. The robot, which was served before, does not wait for all
+# of them.
+run sensing_s=0.03
+crowd service=cloud-1 at=0.18 robots=60
+----
+   0.0000  cloud-1  starts, process 1
+   0.0010  robot    begins trial 0 at step 0
+   0.0100  robot    service_appeared service=cloud-1
+   0.0100  robot    asks cloud-1, call 1
+   0.0420  robot    hears of call 1: SensingAnswer
+   0.0420  robot    performs sensing action 0 of step 0
+   0.0420  robot    hears of call 1: its end
+   0.0430  robot    asks cloud-1, call 2
+   0.0460  robot    hears of call 2: TaskAnswer
+   0.0460  robot    performs task actions 0 to 2
+   0.0760  robot    hears of call 2: SensingAnswer
+   0.0760  robot    hears of call 2: its end
+   0.0766  robot    performs task actions 3 to 8
+   0.1378  robot    performs sensing action 0 of step 9
+   0.1388  robot    asks cloud-1, call 3
+   0.1418  robot    hears of call 3: TaskAnswer
+   0.1418  robot    performs task actions 9 to 11
+   0.1718  robot    hears of call 3: SensingAnswer
+   0.1718  robot    hears of call 3: its end
+   0.1724  robot    performs task action 12
+   0.1800  cloud-1  is asked by 60 other robots
+   0.1826  robot    performs task actions 13 to 17
+   0.2336  robot    performs sensing action 0 of step 18
+   0.2346  robot    asks cloud-1, call 4
+   0.2420  robot    hears of call 4: TaskAnswer
+   0.2420  robot    performs task actions 18 to 22
+   0.2920  robot    hears of call 4: Progress
+   0.2930  robot    performs task actions 23 to 26
+   0.3420  robot    hears of call 4: Progress
+   0.3920  robot    hears of call 4: Progress
+   0.4420  robot    hears of call 4: Progress
+   0.4920  robot    hears of call 4: Progress
+   0.5420  robot    hears of call 4: Progress
+   0.5920  robot    hears of call 4: Progress
+   0.6420  robot    hears of call 4: Progress
+   0.6920  robot    hears of call 4: Progress
+   0.7420  robot    hears of call 4: Progress
+   0.7920  robot    hears of call 4: Progress
+   0.8410  robot    hears of call 4: SensingAnswer
+   0.8410  robot    performs sensing action 0 of step 27
+   0.8410  robot    hears of call 4: its end
+   0.8420  robot    asks cloud-1, call 5
+   0.8450  robot    hears of call 5: TaskAnswer
+   0.8450  robot    performs task actions 27 to 29
+   0.8750  robot    hears of call 5: SensingAnswer
+   0.8750  robot    hears of call 5: its end
+   0.8756  robot    performs task actions 30 to 35
+   0.9368  robot    performs sensing action 2 of step 36
+   0.9378  robot    asks cloud-1, call 6
+   0.9408  robot    hears of call 6: TaskAnswer
+   0.9408  robot    performs task actions 36 to 38
+   0.9708  robot    hears of call 6: SensingAnswer
+   0.9708  robot    hears of call 6: its end
+   0.9714  robot    performs task action 39
+   0.9816  robot    ends trial 0 after 40 steps
+
+decided as without faults

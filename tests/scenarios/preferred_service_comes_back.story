@@ -1,0 +1,78 @@
+# The first of two services dies and comes back while the second takes very long, and says that it
+# is at work. The robot, which stands still, asks the first one again; once it waited for the second.
+run replicas=2 launch=never
+crash service=cloud-1 at=0.09 down_s=0.03
+slow service=cloud-2 at=0 for_s=5 factor=1500
+----
+   0.0000  cloud-1  starts, process 1
+   0.0000  cloud-2  starts, process 1
+   0.0000  cloud-2  computes 1500 times as long
+   0.0010  robot    begins trial 0 at step 0
+   0.0100  robot    service_appeared service=cloud-1
+   0.0100  robot    asks cloud-1, call 1
+   0.0100  robot    service_appeared service=cloud-2
+   0.0150  robot    hears of call 1: SensingAnswer
+   0.0150  robot    performs sensing action 0 of step 0
+   0.0150  robot    hears of call 1: its end
+   0.0160  robot    asks cloud-1, call 2
+   0.0190  robot    hears of call 2: TaskAnswer
+   0.0190  robot    performs task action 0
+   0.0220  robot    hears of call 2: SensingAnswer
+   0.0220  robot    hears of call 2: its end
+   0.0292  robot    performs task actions 1 to 6
+   0.0900  cloud-1  is killed
+   0.0904  robot    performs task action 7
+   0.0920  robot    service_vanished service=cloud-1
+   0.1006  robot    performs task action 8
+   0.1108  robot    performs sensing action 0 of step 9
+   0.1118  robot    restore service=cloud-2 step=9 bytes=1343
+   0.1118  robot    asks cloud-2, call 3
+   0.1200  cloud-1  starts, process 2
+   0.1300  robot    service_appeared service=cloud-1
+   0.1638  robot    hears of call 3: Progress
+   0.2138  robot    hears of call 3: Progress
+   0.2638  robot    hears of call 3: Progress
+   0.3138  robot    hears of call 3: Progress
+   0.3618  robot    restore service=cloud-1 step=9 bytes=1343
+   0.3618  robot    asks cloud-1, call 4
+   0.3638  robot    hears of call 3: Progress
+   0.3648  robot    hears of call 4: TaskAnswer
+   0.3648  robot    restored service=cloud-1 step=9 restore_ms=3
+   0.3648  robot    performs task action 9
+   0.3678  robot    hears of call 4: SensingAnswer
+   0.3678  robot    hears of call 4: its end
+   0.3750  robot    performs task actions 10 to 13
+   0.4138  robot    hears of call 3: Progress
+   0.4158  robot    performs task actions 14 to 17
+   0.4566  robot    performs sensing action 0 of step 18
+   0.4576  robot    asks cloud-1, call 5
+   0.4606  robot    hears of call 5: TaskAnswer
+   0.4606  robot    performs task action 18
+   0.4636  robot    hears of call 5: SensingAnswer
+   0.4636  robot    hears of call 5: its end
+   0.4638  robot    hears of call 3: Progress
+   0.4708  robot    performs task actions 19 to 23
+   0.5138  robot    hears of call 3: Progress
+   0.5218  robot    performs task actions 24 to 26
+   0.5524  robot    performs sensing action 0 of step 27
+   0.5534  robot    asks cloud-1, call 6
+   0.5564  robot    hears of call 6: TaskAnswer
+   0.5564  robot    performs task action 27
+   0.5594  robot    hears of call 6: SensingAnswer
+   0.5594  robot    hears of call 6: its end
+   0.5638  robot    hears of call 3: Progress
+   0.5666  robot    performs task actions 28 to 32
+   0.6138  robot    hears of call 3: Progress
+   0.6176  robot    performs task actions 33 to 35
+   0.6482  robot    performs sensing action 2 of step 36
+   0.6492  robot    asks cloud-1, call 7
+   0.6522  robot    hears of call 7: TaskAnswer
+   0.6522  robot    performs task action 36
+   0.6552  robot    hears of call 7: SensingAnswer
+   0.6552  robot    hears of call 7: its end
+   0.6624  robot    performs task action 37
+   0.6638  robot    hears of call 3: Progress
+   0.6726  robot    performs task actions 38 to 39
+   0.6930  robot    ends trial 0 after 40 steps
+
+decided as without faults

@@ -1,0 +1,576 @@
+"""Deliberate defects: what a careless engineer might have written, for the simulator to find.
+
+A checker that never fails shows nothing. So here are small changes of the production code, each of
+which leaves a run without faults as it was, and most of which need one particular fault to do harm:
+a reply that goes astray, a process that dies between two effects, a clock whose rounding is
+unlucky. Each is written as the lines that are replaced, so it is seen at once what is wrong, and a
+change of the production code that makes a defect meaningless is an error and not a silence.
+
+``python -m tests.simulation.defects`` prints a table of how many seeds each takes.
+"""
+
+from __future__ import annotations
+import __future__
+
+import argparse
+import inspect
+import multiprocessing
+import textwrap
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from typing import Any, NamedTuple, TypeAlias
+from unittest import mock
+
+from holdfast.session import replies, service
+from holdfast.session.dispatcher import Dispatcher
+from holdfast.session.failure_detector import FailureDetector
+from holdfast.session.launches import Launches
+from holdfast.session.messages import Opening
+from holdfast.session.question import Question
+from holdfast.session.robot import Robot
+from holdfast.session.service import Service
+from holdfast.session.service_jobs import Job
+from holdfast.session.service_sessions import Sessions
+from holdfast.simulation.schedule import RunSettings, Schedule, draw_schedule
+from holdfast.simulation.world import Simulator
+
+__all__ = [
+    "DEFECTS",
+    "LIMIT",
+    "Defect",
+    "Finding",
+    "applied",
+    "seeds_needed",
+    "violation_of",
+    "without_faults",
+]
+
+LIMIT = 2000
+"""Seeds within which each defect is to be found."""
+
+
+class Edit(NamedTuple):
+    """Lines of a function that are replaced.
+
+    Attributes
+    ----------
+    owner : class or module
+        Where the function is looked up when it is called.
+    function : str
+    before, after : str
+        ``before`` stands in its source exactly once. Both are indented as the line is on which
+        that begins.
+    """
+
+    owner: Any
+    function: str
+    before: str
+    after: str
+
+
+class Replacement(NamedTuple):
+    """A name that stands for something else."""
+
+    owner: Any
+    name: str
+    by: object
+
+
+Change: TypeAlias = Edit | Replacement
+
+
+class Defect(NamedTuple):
+    """Something wrong.
+
+    Attributes
+    ----------
+    name : str
+    story : str
+        What a careless engineer would have done.
+    changes : tuple of Change
+    """
+
+    name: str
+    story: str
+    changes: tuple[Change, ...]
+
+
+class Finding(NamedTuple):
+    """Where a defect was found.
+
+    Attributes
+    ----------
+    seed : int
+        The first, counted from 0, whose run has a violation.
+    violation : str
+    """
+
+    seed: int
+    violation: str
+
+
+@contextmanager
+def applied(defect: Defect) -> Iterator[None]:
+    """Let the production code have a defect for a while.
+
+    Raises
+    ------
+    ValueError
+        If the code to be replaced is not there any more.
+    """
+    sources: dict[tuple[Any, str], str] = {}
+    with ExitStack() as stack:
+        for change in defect.changes:
+            if isinstance(change, Replacement):
+                stack.enter_context(mock.patch.object(change.owner, change.name, change.by))
+                continue
+            key = change.owner, change.function
+            if key not in sources:
+                function = inspect.getattr_static(*key)
+                sources[key] = textwrap.dedent(inspect.getsource(function))
+            try:
+                sources[key] = _edited(sources[key], change.before, change.after)
+            except ValueError as error:
+                raise ValueError(f"{defect.name}: {change.function} {error}") from None
+        for (owner, name), source in sources.items():
+            stack.enter_context(mock.patch.object(owner, name, _compiled(owner, name, source)))
+        yield
+
+
+def _edited(source: str, before: str, after: str) -> str:
+    first = before.splitlines()[0]
+    at = source.find(first)
+    line = source[source.rfind("\n", 0, at) + 1 :]
+    indentation = line[: len(line) - len(line.lstrip())]
+    before, after = (text.replace("\n", f"\n{indentation}") for text in (before, after))
+    if source.count(before) != 1:
+        raise ValueError(f"has {source.count(before)} times, not once: {before!r}")
+    return source.replace(before, after)
+
+
+def _compiled(owner: object, name: str, source: str) -> object:
+    flags = __future__.annotations.compiler_flag
+    code = compile(source, f"<defect in {name}>", "exec", flags)
+    defined: dict[str, object] = {}
+    exec(code, inspect.getattr_static(owner, name).__globals__, defined)
+    return defined[name]
+
+
+def without_faults(defect: Defect, trials: range) -> str | None:
+    """Return what runs without faults show of a defect, which is to be nothing."""
+    with applied(defect):
+        simulator = Simulator()
+        for trial in trials:
+            violation = simulator.run(Schedule(RunSettings(trial=trial))).violation
+            if violation is not None:
+                return violation
+    return None
+
+
+def seeds_needed(defect: Defect, limit: int = LIMIT) -> Finding | None:
+    """Return the first seed whose run shows a defect; None if none below the limit does."""
+    with applied(defect):
+        # One of its own, for what it remembers was computed with the defect.
+        simulator = Simulator()
+        for seed in range(limit):
+            violation = simulator.run(draw_schedule(seed)).violation
+            if violation is not None:
+                return Finding(seed, violation)
+    return None
+
+
+def violation_of(defect: Defect, schedule: Schedule) -> str | None:
+    """Return what one schedule shows of a defect."""
+    with applied(defect):
+        return Simulator().run(schedule).violation
+
+
+class _DrawingJob(Job):
+    """Takes the random numbers of a sensing decision from a generator that its session keeps.
+
+    A generator goes wrong by how often it was asked before; so the position is counted, and the
+    numbers are those of the sensing step that would be at this position in a run without faults.
+    """
+
+    __slots__ = ("position",)
+
+    # By session, which its opening stands for: it is kept, so its identity is not another one's.
+    drawn: dict[int, tuple[Opening, dict[int, int]]] = {}  # noqa: RUF012
+
+    def __init__(self, *arguments: Any) -> None:
+        super().__init__(*arguments)
+        self.position = 0
+        named = self._request or self._state
+        assert named is not None
+        if self.kind == "sensing":
+            _, positions = self.drawn.setdefault(id(self._opening), (self._opening, {}))
+            self.position = positions.get(named.trial, 0)
+            positions[named.trial] = self.position + 1
+
+    @property
+    def identity(self) -> tuple[object, ...]:
+        return (*super().identity, self.position)
+
+
+DEFECTS: dict[str, Defect] = {}
+
+
+def _defect(name: str, story: str, *changes: Change) -> None:
+    DEFECTS[name] = Defect(name, story, changes)
+
+
+# -- the service -----------------------------------------------------------------------------------
+
+_defect(
+    "stale_epoch_accepted",
+    "The service answers whoever asks, also a process of the robot that has been replaced.",
+    Edit(Service, "_received", "if request.epoch < epoch:", "if False:"),
+)
+_defect(
+    "new_epoch_not_noted",
+    "The service drops what a robot's last process waited for, but does not note the epoch of the "
+    "next one.",
+    Edit(Service, "_take_over", "session.epoch = epoch", "pass"),
+)
+_defect(
+    "old_process_still_served",
+    "The service notes that a robot's process was replaced, but still answers what that one had "
+    "asked before.",
+    Edit(Service, "_take_over", "self._supersede(session, None)", "pass"),
+)
+_defect(
+    "epoch_forgotten_with_session",
+    "A service that forgets a robot's session also forgets which of its processes was the last.",
+    Edit(Sessions, "forget", "self.note_epoch(session.key, session.epoch)", "pass"),
+)
+_defect(
+    "draws_by_position",
+    "The service draws from one generator for each session, instead of by the name of the step.",
+    Replacement(service, "Job", _DrawingJob),
+    Edit(
+        Job,
+        "_computed",
+        "choose_sensing_action(problem, planning, self._state)",
+        "choose_sensing_action(\n"
+        "    problem, planning, self._state._replace(\n"
+        "        step=self.position * (planning.sensing_interval + 1)))",
+    ),
+    Edit(
+        Job,
+        "_computed",
+        "choose_sensing_action(problem, planning, state)",
+        "choose_sensing_action(\n"
+        "    problem, planning, state._replace(\n"
+        "        step=self.position * (planning.sensing_interval + 1)))",
+    ),
+)
+_defect(
+    "no_reply_cache",
+    "The service remembers which states it has answered, but not the answers: who asks again is "
+    "told that the call is over.",
+    Edit(
+        Service,
+        "_answer_known",
+        "following = part.following",
+        "self._effects.append(End(call))\nreturn _Fate.ANSWERED\nfollowing = part.following",
+    ),
+)
+_defect(
+    "half_an_answer_cached",
+    "A task part that is answered from memory ends the call; the sensing part is not thought of.",
+    Edit(
+        Service,
+        "_answer_known",
+        "if rest is not None:\n    self._calls.attach(",
+        "if part.num_actions:\n"
+        "    self._effects.append(End(call))\n"
+        "    return _Fate.ANSWERED\n"
+        "if rest is not None:\n"
+        "    self._calls.attach(",
+    ),
+)
+_defect(
+    "answers_by_step",
+    "Answers are remembered by step, not by the digest of the state.",
+    Edit(
+        Service,
+        "_answer_known",
+        "part = session.answers.get(request.digest)",
+        "asked = request.step, request.sensed\n"
+        "part = next((kept for kept in session.answers.values()\n"
+        "             if (kept.step, kept.sensed) == asked), None)",
+    ),
+    Edit(
+        Service,
+        "_answer_known",
+        "if (part.trial, part.step, part.sensed) != (request.trial, request.step, request.sensed):",
+        "if False:",
+    ),
+)
+_defect(
+    "restored_unverified",
+    "A checkpoint is restored without looking at the digest, nor at the checksum of its request.",
+    Edit(service, "decode_request", "_unsealed(payload)", "memoryview(payload)[:-CHECKSUM_SIZE]"),
+    Edit(Job, "_restored", "if digest(state)[:DIGEST_SIZE] != request.digest:", "if False:"),
+)
+_defect(
+    "held_work_left",
+    "A request that waited for the robot's one before is not lined up when that has run.",
+    Edit(Service, "finished", "self._lines.let_go_on(session)", "pass"),
+)
+_defect(
+    "forgotten_at_work",
+    "A robot that was not heard is forgotten even while something is computed for it.",
+    Edit(Sessions, "idle_at", "if session is None or session.works:", "if session is None:"),
+)
+_defect(
+    "idle_by_difference",
+    "Whether a robot was not heard for too long is told by a difference of times, when to look by "
+    "a sum.",
+    Edit(
+        Sessions,
+        "idle",
+        "due > now",
+        "now - next(iter(self._sessions.values())).used_at < self._limits.max_idle_s",
+    ),
+)
+_defect(
+    "superseded_calls_left",
+    "The calls of a request that a newer one has replaced are dropped instead of ended.",
+    Edit(Service, "_supersede", "self._calls.end(work)", "self._calls.released(work)"),
+)
+_defect(
+    "late_calls_left",
+    "The call of a request that comes after a newer one is dropped instead of ended.",
+    Edit(Service, "_received", "self._effects.append(End(call))", "pass"),
+)
+
+# -- messages --------------------------------------------------------------------------------------
+
+_defect(
+    "reply_checksum_ignored",
+    "The robot leaves it to TCP to find damaged replies.",
+    Edit(replies, "decode_reply", "_unsealed(payload)", "memoryview(payload)[:-CHECKSUM_SIZE]"),
+)
+_defect(
+    "request_checksum_ignored",
+    "The service leaves it to TCP to find damaged requests.",
+    Edit(service, "decode_request", "_unsealed(payload)", "memoryview(payload)[:-CHECKSUM_SIZE]"),
+)
+_defect(
+    "reply_number_ignored",
+    "A reply is taken for the answer to the call that it comes in, whatever number it repeats.",
+    Edit(replies, "_check_number", "if reply.number != asked and not unread:", "if False:"),
+)
+_defect(
+    "reply_matched_by_kind",
+    "Any sensing answer is taken for the one that is waited for; its number, its step and its "
+    "state are not looked at.",
+    Edit(
+        replies,
+        "_check_number",
+        "if reply.number != asked and not unread:",
+        "if reply.number != asked and not unread and not isinstance(reply, SensingAnswer):",
+    ),
+    Edit(
+        Question,
+        "take_sensing",
+        "if self.task_count == 0 and reply.digest != self.digest:",
+        "if False:",
+    ),
+    Edit(Question, "take_sensing", "if reply.step != self.sensing_step:", "if False:"),
+    Edit(
+        Robot,
+        "_next_sensing",
+        "if question.state is not state and answer.digest != digest(state)[:DIGEST_SIZE]:",
+        "if False:",
+    ),
+)
+
+# -- the robot and its journal ---------------------------------------------------------------------
+
+_defect(
+    "act_before_journal",
+    "A task action is ordered first and written down then.",
+    Edit(
+        Robot,
+        "_next_action",
+        "self._write(ActingRecord(",
+        "self._effects.append(Act(state.step, action))\nself._write(ActingRecord(",
+    ),
+    Edit(
+        Robot,
+        "_next_action",
+        "self._in_environment = True\nself._effects.append(Act(state.step, action))",
+        "self._in_environment = True",
+    ),
+)
+_defect(
+    "observation_not_written",
+    "What was sensed is used, but only the task actions are written down.",
+    Edit(Robot, "_sensed", "self._write(record)", "pass"),
+)
+_defect(
+    "performance_not_written",
+    "That an action was performed is not written down, as the next one says so.",
+    Edit(
+        Robot,
+        "_acted",
+        "self._unwritten.append(PerformedRecord(history.state.step, event.reward))",
+        "pass",
+    ),
+)
+_defect(
+    "pending_action_assumed_done",
+    "A restarted robot takes the action that it last wrote down as performed.",
+    Edit(
+        Robot,
+        "_settle_performance",
+        "if history.pending is not None and performed == known + 1:",
+        "if history.pending is not None:",
+    ),
+)
+_defect(
+    "pending_action_repeated",
+    "A restarted robot performs the action that it last wrote down, without asking whether it was "
+    "performed.",
+    Edit(
+        Robot,
+        "_settle_performance",
+        "if performed is None:",
+        "if history.pending is not None:\n    return history.pending\nif performed is None:",
+    ),
+)
+_defect(
+    "unknown_performance_guessed",
+    "Where the environment cannot tell whether the last action was performed, it is performed.",
+    Edit(
+        Robot,
+        "_settle_performance",
+        "if not resumed or (",
+        "if history.pending is not None:\n    return history.pending\nif not resumed or (",
+    ),
+)
+_defect(
+    "journal_tail_trusted",
+    "After a power cut the journal is taken for complete.",
+    Edit(Robot, "_settle_performance", "(history.paused or tail_is_certain)", "True"),
+)
+_defect(
+    "paused_while_performing",
+    "A robot that is asked to end does not wait for the action that it is performing.",
+    Edit(
+        Robot,
+        "_go_on",
+        "if history is None or self._in_environment or self._stopped:",
+        "if history is None or (self._in_environment and not self._pausing) or self._stopped:",
+    ),
+)
+
+# -- the robot and its services --------------------------------------------------------------------
+
+_defect(
+    "both_answers_performed",
+    "An answer that comes is performed, also the second one to a question that was asked twice.",
+    Edit(
+        Robot,
+        "handle",
+        "self._dispatcher.handle(event, now)",
+        "self._dispatcher.handle(event, now)\n"
+        "question = self._dispatcher.question\n"
+        "tasks_come = getattr(event, 'payload', b'..')[1] == 1\n"
+        "if tasks_come and question is not None and question.tasks is not None:\n"
+        "    self._in_environment = False",
+    ),
+)
+_defect(
+    "suspected_never_asked",
+    "A service that is suspected is asked nothing, so it can never show that it lives.",
+    Edit(Dispatcher, "_hold_and_retry", "service.detector.present\n", "service.detector.trusted\n"),
+    Edit(Dispatcher, "_try_at", "not service.detector.present", "not service.detector.trusted"),
+)
+_defect(
+    "old_process_taken_for_new",
+    "The news that a service's process is gone is believed of the process that took its place.",
+    Edit(FailureDetector, "vanished", "if boot != self.boot:", "if self.boot is None:"),
+)
+_defect(
+    "launch_tried_once",
+    "A local service that could not be started is not started again.",
+    Edit(Launches, "failed", "if self._launch_after is not None:", "if True:"),
+)
+_defect(
+    "silence_not_timed",
+    "No alarm is set while a service is being asked, for sooner or later it will answer.",
+    Edit(
+        Dispatcher,
+        "next_wakeup",
+        "due += [service.detector.deadline() for service in services]",
+        "pass",
+    ),
+    Edit(Dispatcher, "next_wakeup", "elif question.needed_at is not None:", "elif False:"),
+)
+_defect(
+    "retry_not_timed",
+    "No alarm is set for when a service may be asked again.",
+    Edit(
+        Dispatcher,
+        "next_wakeup",
+        "if service.detector.present and service.refused is None",
+        "if False",
+    ),
+)
+_defect(
+    "cloud_back_when_seen",
+    "The status says that the cloud decides again as soon as it is seen, before it has answered.",
+    Edit(
+        Dispatcher,
+        "_appeared",
+        "# It need not wait for the next turn",
+        "self._change_status(Cause.CLOUD_ANSWERED, 'seen', now)\n# It need not wait",
+    ),
+)
+_defect(
+    "any_answer_ends_recovery",
+    "The answer of the local service, too, is taken for the cloud's return.",
+    Edit(
+        Dispatcher,
+        "_replied",
+        "elif news is News.ANSWERED and",
+        "if news is News.ANSWERED and",
+    ),
+)
+_defect(
+    "cloud_lost_twice",
+    "That the cloud is lost is noticed whatever the status is.",
+    Edit(Dispatcher, "_note_lost_cloud", "and self.status is not Status.LOCAL_RECOVERY", ""),
+)
+
+
+def _row(name: str, limit: int) -> str:
+    defect = DEFECTS[name]
+    before = without_faults(defect, range(4))
+    if before is not None:
+        raise ValueError(f"{name} shows without any fault, and so proves nothing: {before}")
+    finding = seeds_needed(defect, limit)
+    seeds, found = ("none", "") if finding is None else (finding.seed + 1, finding.violation)
+    return f"| `{name}` | {defect.story} | {seeds} | {found} |"
+
+
+def main() -> None:
+    """Print how many seeds each defect takes."""
+    parser = argparse.ArgumentParser(description=main.__doc__)
+    parser.add_argument("--only", metavar="NAME", nargs="*", choices=DEFECTS, default=DEFECTS)
+    parser.add_argument("--limit", type=int, default=LIMIT, help="seeds for each (%(default)s)")
+    parser.add_argument("--jobs", type=int, default=2, help="processes (%(default)s)")
+    options = parser.parse_args()
+    print("| defect | what it is | seeds needed | what was found |")
+    print("|---|---|---:|---|")
+    with multiprocessing.get_context("spawn").Pool(options.jobs) as pool:
+        arguments = [(name, options.limit) for name in options.only]
+        for row in pool.starmap(_row, arguments, chunksize=1):
+            print(row)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,95 @@
+from __future__ import annotations
+
+import pytest
+from tests.simulation.defects import (
+    DEFECTS,
+    Defect,
+    Edit,
+    applied,
+    seeds_needed,
+    violation_of,
+    without_faults,
+)
+
+from holdfast.session import calls
+from holdfast.simulation.schedule import parse_schedule
+from holdfast.simulation.world import Simulator
+
+# The moments that it takes, as the simulator found them, made small.
+FOUND_AT_ONCE = [
+    (
+        "act_before_journal",
+        "run\nkill_robot boundary=33 before=journal down_s=0.05 body_goes_on=true",
+        "do not belong together",
+    ),
+    (
+        "both_answers_performed",
+        "run latency_s=0.04 sensing_s=0.03\nstop node=cloud-1 at=0.1 for_s=0.3",
+        "performed again",
+    ),
+    (
+        "draws_by_position",
+        "run\ncrash service=cloud-1 at=0.15 down_s=0.05",
+        "the undisturbed run has",
+    ),
+    (
+        "no_reply_cache",
+        "run launch=never\nkill_robot boundary=41 before=sense down_s=0.001",
+        "stuck",
+    ),
+    (
+        "reply_checksum_ignored",
+        "run\nmessage service=cloud-1 direction=from number=2 what=corrupt bit=100",
+        "the undisturbed run has",
+    ),
+    (
+        "idle_by_difference",
+        "run forgets_after_s=0.03 services_clock_offset_s=205448.849812",
+        "no time passes",
+    ),
+]
+
+
+@pytest.mark.parametrize(("name", "text", "says"), FOUND_AT_ONCE)
+def test_a_defect_is_found(name: str, text: str, says: str) -> None:
+    schedule = parse_schedule(text)
+    assert without_faults(DEFECTS[name], range(2)) is None
+    violation = violation_of(DEFECTS[name], schedule)
+    assert violation is not None
+    assert says in violation
+    assert Simulator().run(schedule).violation is None, "it has been taken back"
+
+
+@pytest.mark.parametrize("name", DEFECTS)
+def test_a_defect_is_where_it_says(name: str) -> None:
+    with applied(DEFECTS[name]):
+        pass
+
+
+def test_a_defect_that_says_nothing_is_an_error() -> None:
+    gone = Defect("gone", "", (Edit(calls.Calls, "send", "no such line", "pass"),))
+    with pytest.raises(ValueError, match="gone: send has 0 times"), applied(gone):
+        pass
+
+
+def test_a_reply_to_another_process_of_the_robot_is_not_taken() -> None:
+    """No seed found this: a late reply has the number of the call that it goes astray to."""
+    schedule = parse_schedule(
+        "run trial=1 latency_s=0.04\n"
+        "message service=cloud-1 direction=from number=2 what=misroute seconds=0.21\n"
+        "pause_robot at=0.2 down_s=0.001\n"
+    )
+    assert Simulator().run(schedule).violation is None
+    numbers = Edit(calls.Calls, "__init__", "epoch % _EPOCHS * _NUMBERS_OF_EPOCH", "0")
+    with applied(Defect("numbers_begin_anew", "", (numbers,))):
+        violation = Simulator().run(schedule).violation
+    assert violation is not None
+    assert "the undisturbed run has" in violation
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", DEFECTS)
+def test_every_defect_is_found(name: str) -> None:
+    assert len(DEFECTS) >= 15
+    assert without_faults(DEFECTS[name], range(8)) is None
+    assert seeds_needed(DEFECTS[name]) is not None

@@ -1,0 +1,122 @@
+"""The production machines under drawn schedules: whatever happens, the decisions are the same."""
+
+from __future__ import annotations
+
+import pytest
+
+from holdfast.simulation.exploration import Tally, explore
+from holdfast.simulation.schedule import (
+    NUM_TRIALS,
+    Crash,
+    KillRobot,
+    RunSettings,
+    Schedule,
+    draw_schedule,
+)
+from holdfast.simulation.world import Outcome, Simulator
+
+
+@pytest.fixture(scope="module")
+def simulator() -> Simulator:
+    return Simulator()
+
+
+def fine(outcome: Outcome) -> bool:
+    return outcome.violation is None and outcome.held is None
+
+
+@pytest.mark.parametrize("trial", range(0, NUM_TRIALS, 7))
+@pytest.mark.parametrize("num_trials", [1, 2])
+def test_without_faults(trial: int, num_trials: int, simulator: Simulator) -> None:
+    run = RunSettings(trial=trial, num_trials=num_trials)
+    outcome = simulator.run(Schedule(run))
+    assert fine(outcome)
+    # One request and two parts of an answer for each turn, and one for the first sensing action.
+    assert outcome.messages < 30
+
+
+def test_a_schedule_goes_one_way_only(simulator: Simulator) -> None:
+    for seed in range(40):
+        schedule = draw_schedule(seed)
+        first = simulator.run(schedule, tell=True)
+        # Neither on what was computed before nor on whether it is told does anything depend.
+        assert Simulator().run(schedule, tell=True) == first
+        assert simulator.run(schedule) == first._replace(story=[])
+
+
+@pytest.mark.parametrize("boundary", range(0, 100, 3))
+def test_the_robot_is_killed_between_any_two_effects(boundary: int, simulator: Simulator) -> None:
+    kill = KillRobot(boundary=boundary, down_s=0.01)
+    for environment in ("counting", "simulated"):
+        run = RunSettings(trial=boundary % NUM_TRIALS, environment=environment)
+        assert fine(simulator.run(Schedule(run, (kill,))))
+
+
+@pytest.mark.parametrize("lost", [0, 1, 2, 100])
+def test_power_is_cut(lost: int, simulator: Simulator) -> None:
+    for boundary in range(10, 90, 11):
+        kill = KillRobot(boundary=boundary, power_cut=True, lost_appends=lost)
+        careful = RunSettings(journal_survives="power_cut")
+        assert fine(simulator.run(Schedule(careful, (kill,))))
+        outcome = simulator.run(Schedule(RunSettings(), (kill,)))
+        assert outcome.violation is None
+        if lost > 1:
+            # It can only say that it does not know.
+            assert outcome.held is None or "do not belong together" in outcome.held
+
+
+def test_without_a_local_service_it_waits_for_the_cloud(simulator: Simulator) -> None:
+    gone = Crash(service="cloud-1", at=0.1, down_s=0.2)
+    run = RunSettings(launch="never")
+    assert fine(simulator.run(Schedule(run, (gone,))))
+
+
+@pytest.mark.parametrize("first", range(0, 400, 100))
+def test_seeds(first: int, simulator: Simulator) -> None:
+    for seed in range(first, first + 100):
+        outcome = simulator.run(draw_schedule(seed))
+        assert outcome.violation is None, f"holdfast simulate --story --seeds {seed}:{seed + 1}"
+
+
+def test_several_processes_see_what_one_sees() -> None:
+    tallies = []
+    for jobs in (1, 2):
+        tally = Tally()
+
+        def on_batch(seeds: range, seen: Tally, tally: Tally = tally) -> bool:
+            assert len(seeds) == seen.runs == 20
+            tally.add(seen)
+            return True
+
+        explore(range(1000, 1060), jobs, on_batch, batch=20)
+        tallies.append(tally)
+    assert tallies[0] == tallies[1]
+    assert tallies[0].runs == 60
+    assert tallies[0].findings == []
+
+
+def test_the_first_finding_is_the_first() -> None:
+    """Whichever process is done sooner."""
+    seen = []
+
+    def on_batch(seeds: range, tally: Tally) -> bool:
+        assert tally.runs == len(seeds)
+        seen.append(seeds.start)
+        return len(seen) < 4
+
+    explore(range(2000, 2090), 2, on_batch, batch=10)
+    assert seen == [2000, 2010, 2020, 2030]
+
+
+@pytest.mark.slow
+def test_ten_thousand_seeds() -> None:
+    tally = Tally()
+
+    def on_batch(seeds: range, seen: Tally) -> bool:
+        tally.add(seen)
+        return not tally.findings
+
+    explore(range(10_000), 2, on_batch)
+    assert tally.findings == []
+    assert tally.runs == 10_000
+    assert all(count > 100 for count in tally.faults.values())

@@ -1,0 +1,235 @@
+"""The bad line: what it does to bytes, and what it never does. No time is asserted."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import threading
+from collections.abc import Iterator
+
+import pytest
+
+from holdfast.chaos.processes import CannotStartError, free_port
+from holdfast.chaos.proxy import Impairment, Proxy
+
+PATIENCE_S = 20.0
+BRIEFLY_S = 0.15
+"""Long enough for what comes through to come; if a machine is slower, a test only sees less."""
+
+
+class Echo:
+    """A service that sends back what it gets."""
+
+    def __init__(self) -> None:
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self.port: int = self._listener.getsockname()[1]
+        self.accepted: list[socket.socket] = []
+        self._threads = [threading.Thread(target=self._accept)]
+        self._threads[0].start()
+
+    def _accept(self) -> None:
+        with contextlib.suppress(OSError):
+            while True:
+                accepted, _ = self._listener.accept()
+                self.accepted.append(accepted)
+                self._threads.append(threading.Thread(target=self._serve, args=(accepted,)))
+                self._threads[-1].start()
+
+    @staticmethod
+    def _serve(accepted: socket.socket) -> None:
+        with contextlib.suppress(OSError), accepted:
+            while data := accepted.recv(65536):
+                accepted.sendall(data)
+
+    def close(self) -> None:
+        self._listener.shutdown(socket.SHUT_RDWR)
+        self._listener.close()
+        for accepted in self.accepted:
+            with contextlib.suppress(OSError):
+                accepted.shutdown(socket.SHUT_RDWR)
+            accepted.close()
+        for thread in self._threads:
+            thread.join(PATIENCE_S)
+
+
+@pytest.fixture
+def echo() -> Iterator[Echo]:
+    with contextlib.closing(Echo()) as echo:
+        yield echo
+
+
+@pytest.fixture
+def proxy(echo: Echo) -> Iterator[tuple[Proxy, int]]:
+    port = free_port()
+    with Proxy(port, echo.port, "seed") as proxy:
+        yield proxy, port
+
+
+def connect(port: int) -> socket.socket:
+    connection = socket.create_connection(("127.0.0.1", port), PATIENCE_S)
+    connection.settimeout(PATIENCE_S)
+    return connection
+
+
+def received(connection: socket.socket, size: int) -> bytes:
+    data = b""
+    while len(data) < size and (piece := connection.recv(65536)):
+        data += piece
+    return data
+
+
+def comes_briefly(connection: socket.socket) -> bool:
+    """Tell whether something comes, if it comes soon."""
+    connection.settimeout(BRIEFLY_S)
+    try:
+        return bool(connection.recv(65536))
+    except TimeoutError:
+        return False
+    finally:
+        connection.settimeout(PATIENCE_S)
+
+
+def test_it_carries_all_bytes_in_order(proxy: tuple[Proxy, int]) -> None:
+    _, port = proxy
+    data = bytes(range(256)) * 20_000  # more than it holds at a time
+    with connect(port) as connection:
+        sender = threading.Thread(target=connection.sendall, args=(data,))
+        sender.start()
+        assert received(connection, len(data)) == data
+        sender.join()
+
+
+@pytest.mark.parametrize(
+    "impairment",
+    [
+        Impairment(latency_s=0.002, jitter_s=0.01),
+        Impairment(loss=0.05),
+        Impairment(direction="to_robot", jitter_s=0.02),
+    ],
+    ids=["jitter", "loss", "one way"],
+)
+def test_what_is_late_is_whole_and_in_order(
+    proxy: tuple[Proxy, int], impairment: Impairment
+) -> None:
+    line, port = proxy
+    heal = line.impair(impairment)
+    expected = b""
+    with connect(port) as connection:
+        for number in range(40):
+            piece = number.to_bytes(2, "big") * 50
+            connection.sendall(piece)
+            expected += piece
+        heal()
+        assert received(connection, len(expected)) == expected
+
+
+def test_an_end_in_order_is_passed_on(proxy: tuple[Proxy, int]) -> None:
+    _, port = proxy
+    with connect(port) as connection:
+        connection.sendall(b"last")
+        connection.shutdown(socket.SHUT_WR)
+        assert received(connection, 100) == b"last"
+
+
+@pytest.mark.parametrize("direction", ["both", "to_service", "to_robot"])
+def test_silence_keeps_connections_and_loses_nothing(
+    proxy: tuple[Proxy, int], direction: str
+) -> None:
+    line, port = proxy
+    with connect(port) as connection:
+        connection.sendall(b"a")
+        assert received(connection, 1) == b"a"
+        heal = line.impair(Impairment(silent=True, direction=direction))  # type: ignore[arg-type]
+        connection.sendall(b"b")
+        assert not comes_briefly(connection)
+        connection.sendall(b"c")
+        heal()
+        assert received(connection, 2) == b"bc"
+
+
+def test_a_new_connection_waits_for_the_end_of_silence(
+    proxy: tuple[Proxy, int], echo: Echo
+) -> None:
+    line, port = proxy
+    heal = line.impair(Impairment(silent=True))
+    with connect(port) as connection:
+        connection.sendall(b"a")
+        assert not comes_briefly(connection)
+        assert echo.accepted == []
+        heal()
+        assert received(connection, 1) == b"a"
+
+
+def test_a_cut_resets_and_refuses_until_it_is_healed(proxy: tuple[Proxy, int]) -> None:
+    line, port = proxy
+    with connect(port) as connection:
+        connection.sendall(b"a")
+        assert received(connection, 1) == b"a"
+        heal = line.impair(Impairment(cut=True))
+        with pytest.raises(ConnectionResetError):
+            connection.recv(1)
+    for _ in range(3):
+        with pytest.raises(ConnectionRefusedError):
+            connect(port)
+    # Meanwhile nobody else can have the port.
+    with socket.socket() as other, pytest.raises(OSError, match="in use"):
+        other.bind(("127.0.0.1", port))
+    heal()
+    heal()  # may be repeated
+    with connect(port) as connection:
+        connection.sendall(b"b")
+        assert received(connection, 1) == b"b"
+
+
+def test_impairments_add_up(proxy: tuple[Proxy, int]) -> None:
+    line, port = proxy
+    cut, cut_again = line.impair(Impairment(cut=True)), line.impair(Impairment(cut=True))
+    silent = line.impair(Impairment(silent=True))
+    cut()
+    with pytest.raises(ConnectionRefusedError):
+        connect(port)
+    cut_again()
+    with connect(port) as connection:
+        connection.sendall(b"a")
+        assert not comes_briefly(connection)
+        silent()
+        assert received(connection, 1) == b"a"
+
+
+def test_without_a_service_connections_end(echo: Echo) -> None:
+    port = free_port()
+    with (
+        Proxy(port, free_port(), "seed"),
+        contextlib.suppress(ConnectionResetError),  # perhaps as soon as it is made
+        connect(port) as connection,
+    ):
+        assert connection.recv(1) == b""
+
+
+def test_a_service_that_dies_is_heard_of(proxy: tuple[Proxy, int], echo: Echo) -> None:
+    _, port = proxy
+    with connect(port) as connection:
+        connection.sendall(b"a")
+        assert received(connection, 1) == b"a"
+        echo.accepted[0].shutdown(socket.SHUT_RDWR)
+        with contextlib.suppress(ConnectionResetError):
+            assert connection.recv(1) == b""
+
+
+def test_it_closes_with_everything_open(echo: Echo) -> None:
+    port = free_port()
+    proxy = Proxy(port, echo.port, "seed")
+    proxy.impair(Impairment(silent=True))
+    connections = [connect(port) for _ in range(3)]
+    proxy.close()
+    proxy.close()  # may be repeated
+    for connection in connections:
+        with connection, contextlib.suppress(ConnectionResetError):
+            assert connection.recv(1) == b""
+    with pytest.raises(ConnectionRefusedError):
+        connect(port)
+
+
+def test_a_port_that_is_taken(echo: Echo) -> None:
+    with pytest.raises(CannotStartError, match=rf"cannot listen on 127.0.0.1:{echo.port}"):
+        Proxy(echo.port, free_port(), "seed")
