@@ -210,7 +210,10 @@ def check_limits(bench: Bench, limits: dict[str, Any]) -> None:
     assert lines._num_newcomers == len(new)
     assert abs(lines._backlog_of_newcomers_s - sum(work.cost_s for work in new)) < 1e-6
     requested = [work for work in waiting if work.request is not None]
-    assert len(requested) <= max(limits["max_waiting"], bench.workers)
+    # Whoever was served before finds room, if newcomers have taken that of all.
+    assert len(requested) <= max(limits["max_waiting"], 2 * bench.workers)
+    newcomers = sum(work.newcomer for work in requested)
+    assert newcomers <= max((limits["max_waiting"] + 1) // 2, bench.workers)
     for session in kept:
         assert sum(not work.running for work in works_of(session)) <= 2
         assert len(session.works) <= 4

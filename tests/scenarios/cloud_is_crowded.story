@@ -30,33 +30,23 @@ crowd service=cloud-1 at=0.18 robots=60
    0.2420  robot    hears of call 4: TaskAnswer
    0.2420  robot    performs task actions 18 to 22
    0.2920  robot    hears of call 4: Progress
-   0.2930  robot    performs task actions 23 to 26
-   0.3420  robot    hears of call 4: Progress
-   0.3920  robot    hears of call 4: Progress
-   0.4420  robot    hears of call 4: Progress
-   0.4920  robot    hears of call 4: Progress
-   0.5420  robot    hears of call 4: Progress
-   0.5920  robot    hears of call 4: Progress
-   0.6420  robot    hears of call 4: Progress
-   0.6920  robot    hears of call 4: Progress
-   0.7420  robot    hears of call 4: Progress
-   0.7920  robot    hears of call 4: Progress
-   0.8410  robot    hears of call 4: SensingAnswer
-   0.8410  robot    performs sensing action 0 of step 27
-   0.8410  robot    hears of call 4: its end
-   0.8420  robot    asks cloud-1, call 5
-   0.8450  robot    hears of call 5: TaskAnswer
-   0.8450  robot    performs task actions 27 to 29
-   0.8750  robot    hears of call 5: SensingAnswer
-   0.8750  robot    hears of call 5: its end
-   0.8756  robot    performs task actions 30 to 35
-   0.9368  robot    performs sensing action 2 of step 36
-   0.9378  robot    asks cloud-1, call 6
-   0.9408  robot    hears of call 6: TaskAnswer
-   0.9408  robot    performs task actions 36 to 38
-   0.9708  robot    hears of call 6: SensingAnswer
-   0.9708  robot    hears of call 6: its end
-   0.9714  robot    performs task action 39
-   0.9816  robot    ends trial 0 after 40 steps
+   0.2930  robot    performs task action 23
+   0.3010  robot    hears of call 4: SensingAnswer
+   0.3010  robot    hears of call 4: its end
+   0.3032  robot    performs task actions 24 to 26
+   0.3338  robot    performs sensing action 0 of step 27
+   0.3348  robot    asks cloud-1, call 5
+   0.3630  robot    hears of call 5: TaskAnswer
+   0.3630  robot    performs task actions 27 to 31
+   0.4130  robot    hears of call 5: Progress
+   0.4140  robot    performs task action 32
+   0.4210  robot    hears of call 5: SensingAnswer
+   0.4210  robot    hears of call 5: its end
+   0.4242  robot    performs task actions 33 to 35
+   0.4548  robot    performs sensing action 2 of step 36
+   0.4558  robot    asks cloud-1, call 6
+   0.4840  robot    hears of call 6: TaskAnswer
+   0.4840  robot    performs task actions 36 to 39
+   0.5248  robot    ends trial 0 after 40 steps
 
 decided as without faults

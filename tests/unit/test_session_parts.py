@@ -93,6 +93,7 @@ class TestLines:
 
     def setup_method(self) -> None:
         self.lines = Lines(1, ServiceLimits(prefetch_patience_ms=20.0))
+        self.now = 0.0
 
     def session(self, key: int) -> Session:
         robot = Robot(key=key)
@@ -103,10 +104,11 @@ class TestLines:
         request: Request | None = None if prefetched else Robot().request()
         work = Work(session, name, sensing=True, request=request, state=None, size=10, since=since)
         self.lines.line_up(work)
+        self.now = max(self.now, since)
         return work
 
     def run_one(self) -> tuple[bytes, Job]:
-        work = self.lines.take()
+        work = self.lines.take(self.now)
         assert work is not None
         robot = Robot()
         job = Job(
@@ -168,7 +170,7 @@ class TestLines:
         for key in range(3):
             self.work(self.session(key), b"%d" % key, 0.0, prefetched=False)
         _, job = self.run_one()
-        assert self.lines.take() is None
+        assert self.lines.take(self.now) is None
         assert self.lines.num_waiting == 2
         self.finish(job)
         assert self.run_one()[0] == b"1"

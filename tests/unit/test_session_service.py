@@ -974,6 +974,44 @@ class TestCapacity:
         bench.run_all()
         assert set(calls) <= bench.ended
 
+    def test_a_robot_that_was_served_waits_for_one_newcomer_at_most(self) -> None:
+        """However many there are, and however long they have waited."""
+        bench = Bench(max_wait_ms=100.0)
+        known = Robot(key=1)
+        bench.ask(known.request())
+        known.sense()
+        for key in range(2, 60):
+            bench.send(Robot(key=key).request())
+        bench.now += 10.0
+        for _ in range(3):
+            right = known.right_answer()
+            call = bench.send(known.request())
+            jobs = 0
+            while not bench.replies[call]:
+                bench.run()
+                jobs += 1
+            assert jobs <= 3, "what ran, one newcomer, and this one"
+            assert content(bench.replies[call]) == right[:1]
+            known.act_until_sensing()
+            known.sense()
+
+    def test_prefetches_do_not_starve_behind_newcomers(self) -> None:
+        bench = Bench(max_wait_ms=100.0, prefetch_patience_ms=20.0)
+        known = Robot(key=1)
+        bench.ask(known.request())
+        known.sense()
+        call = bench.send(known.request())
+        for key in range(2, 60):
+            bench.send(Robot(key=key).request())
+        bench.run()  # the task part; the sensing part is ahead of its robot
+        assert len(bench.replies[call]) == 1
+        jobs = 0
+        while call not in bench.ended:
+            bench.now += 0.005
+            bench.run()
+            jobs += 1
+        assert jobs <= 20 / 5 + 3
+
     def test_one_job_that_was_held_up_turns_nobody_away(self) -> None:
         bench = Bench(max_wait_ms=100.0)
         first = Robot(key=1)

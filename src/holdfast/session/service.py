@@ -409,7 +409,7 @@ class Service:
 
     def _dispatch(self, now: float) -> None:
         """Hand out jobs as long as workers are free."""
-        while (work := self._lines.take()) is not None:
+        while (work := self._lines.take(now)) is not None:
             self._start(work, now)
 
     def _start(self, work: Work, now: float) -> None:

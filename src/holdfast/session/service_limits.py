@@ -29,11 +29,13 @@ class ServiceLimits(msgspec.Struct, frozen=True, kw_only=True):
         A robot that was not heard for this long is forgotten.
     max_waiting : int
         Requests that wait for a worker; robots that were never served have half of it at most.
+        (Or of these, and of those that were served, as many each as there are workers, if that is
+        more: a service is never too small for one robot.)
     max_waiting_bytes : int
         Of these requests, likewise.
     max_wait_ms : float
-        A request that would wait longer than this, by estimate, is turned away. (Not as long as
-        fewer requests wait than there are workers: a service is never too small for one robot.)
+        A request that would wait longer than this, by estimate, is turned away; not as
+        long as fewer wait than there are workers.
     max_calls_per_request : int
         Calls that wait for the same answer; the oldest is ended.
     progress_interval_ms : float

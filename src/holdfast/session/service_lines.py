@@ -2,14 +2,14 @@
 
 In one line are the works for which a robot stands still, in another those of robots that were never
 served before, in the third those that are ahead of their robots. The first go before the others,
-but not for ever. Each session has one work in each line at most; the one after it is held back
-until that has run. So a line is a row of turns, and a robot that asks much waits for itself, not
-others for it.
+but not for ever: a work that has let others go first for long enough has its turn. To be somebody
+new costs nothing, so one client can be thousands of robots; however long their line is, they have
+every second turn at most while anybody else waits. Each session has one work in each line at most;
+the one after it is held back until that has run. So a line is a row of turns, and a robot that asks
+much waits for itself, not others for it.
 
 How long a request that came now would wait follows from what the works in the lines are expected to
-take. A service that would be too slow says so at once, so that the robot can ask elsewhere. Whoever
-it has served before does not wait for newcomers, however many come, and is not turned away because
-of them: to be somebody new costs nothing, so one client can be thousands of them.
+take. A service that would be too slow says so at once, so that the robot can ask elsewhere.
 """
 
 from __future__ import annotations
@@ -47,6 +47,8 @@ class Lines:
         self._later: OrderedDict[Work, None] = OrderedDict()
         self._patience_s = 1e-3 * limits.prefetch_patience_ms
         self._patience_of_newcomers_s = 1e-3 * limits.max_wait_ms
+        # Whether a newcomer had the last turn for which others waited too.
+        self._newcomer_went_first = False
         self._running: dict[Job, Work] = {}
         self._waiting_bytes = 0
         self._bytes_of_newcomers = 0
@@ -115,22 +117,40 @@ class Lines:
 
     # -- running ---------------------------------------------------------------------------------
 
-    def take(self) -> Work | None:
+    def take(self, now: float) -> Work | None:
         """Take the next work out of its line; None if none waits there or no worker is free."""
         if len(self._running) >= self._workers:
             return None
-        work = self._next()
+        known = self._next_of_known()
+        newcomer = next(iter(self._newcomers), None)
+        if known is None or newcomer is None:
+            work = known or newcomer
+        elif self._goes_first(newcomer, known, now):
+            work, self._newcomer_went_first = newcomer, True
+        else:
+            work, self._newcomer_went_first = known, False
         if work is not None:
             self._leave(work)
             self._count(work, -1)
         return work
 
-    def _next(self) -> Work | None:
+    def _next_of_known(self) -> Work | None:
+        """Return the next work of the robots that were served before; None if none waits."""
         urgent = next(iter(self._urgent), None)
-        newcomer = next(iter(self._newcomers), None)
         later = next(iter(self._later), None)
-        first = _first(urgent, newcomer, self._patience_of_newcomers_s)
-        return _first(first, later, self._patience_s)
+        if urgent is None or later is None:
+            return urgent or later
+        return urgent if urgent.since <= later.since + self._patience_s else later
+
+    def _goes_first(self, newcomer: Work, known: Work, now: float) -> bool:
+        """Tell whether a newcomer goes before a robot that was served before."""
+        if known.urgent:
+            return not self._newcomer_went_first and (
+                known.since > newcomer.since + self._patience_of_newcomers_s
+            )
+        if now <= known.since + self._patience_s:
+            return True
+        return not self._newcomer_went_first and newcomer.since <= known.since + self._patience_s
 
     def begin(self, work: Work, job: Job, now: float) -> None:
         """Take note that a worker has a work that was taken."""
@@ -176,14 +196,11 @@ class Lines:
 
     def wait_s(self, now: float, *, newcomer: bool) -> float:
         """Estimate how long a request that came now would wait for its answer to be begun."""
-        ahead_s = self._backlog_s - (0.0 if newcomer else self._backlog_of_newcomers_s)
+        ahead_s = self._backlog_s
+        if not newcomer:
+            # Of the newcomers as many at most are ahead as of the others: they go by turns.
+            ahead_s -= self._backlog_of_newcomers_s
+            ahead_s += min(ahead_s, self._backlog_of_newcomers_s)
         for work in self._running.values():
             ahead_s += max(0.0, work.cost_s - (now - work.started_at))
         return ahead_s / self._workers
-
-
-def _first(work: Work | None, patient: Work | None, patience_s: float) -> Work | None:
-    """Return the first of two works, of which one lets the other go first for so long."""
-    if work is None or patient is None:
-        return work or patient
-    return work if work.since <= patient.since + patience_s else patient
