@@ -2,7 +2,7 @@
 
 The rows are those that the logs of 2017 end with: of 1,000 trials the number of successes, and the
 mean reward over the successful ones. Emulated are the filter's defects
-(:mod:`tests.oracles.emulation_2017`); the worlds and policies are holdfast's own.
+(:mod:`holdfast.experiments.emulation_2017`); the worlds and policies are holdfast's own.
 
 Two tests per row, both two-sided: Fisher's exact test of the numbers of successes, and a comparison
 of the mean rewards as normal variables. The table has no standard deviations, so that of 2017 is
@@ -83,8 +83,8 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 from scipy import stats
-from tests.oracles.emulation_2017 import Emulation, drawn_particle, emulate, likelihoods
 
+from holdfast.experiments.emulation_2017 import Emulation, drawn_particle, emulate, likelihoods
 from holdfast.problems.capsule_robot import CapsuleRobot
 from holdfast.problems.multitier_peg_in_hole_2d import (
     Hole,
@@ -93,6 +93,7 @@ from holdfast.problems.multitier_peg_in_hole_2d import (
 )
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.problems.problem import FloatArray, Problem
+from holdfast.settings import ParticleFilterSettings, PlanningSettings, SelectorSettings
 
 SEED = 2017
 FAMILY_WISE_LEVEL = 0.001
@@ -172,13 +173,13 @@ def problem_of(row: Row) -> Problem:
 
 @functools.cache
 def emulated(row: Row, num_trials: int) -> Emulation:
-    return emulate(
-        problem_of(row),
+    planning = PlanningSettings(
+        particle_filter=ParticleFilterSettings(num_particles=row.num_particles),
+        selector=SelectorSettings(method="random"),
         sensing_interval=row.sensing_interval,
-        max_steps=row.max_steps,
-        num_trials=num_trials,
-        num_particles=row.num_particles,
-        seed=SEED,
+    )
+    return emulate(
+        problem_of(row), planning, max_steps=row.max_steps, num_trials=num_trials, seed=SEED
     )
 
 

@@ -15,6 +15,7 @@ from holdfast import __version__
 from holdfast.cli.chaos import chaos
 from holdfast.cli.compare import compare
 from holdfast.cli.demo import demo
+from holdfast.cli.experiment import experiment
 from holdfast.cli.keys import keys
 from holdfast.cli.run import run
 from holdfast.cli.serve import serve
@@ -50,6 +51,7 @@ app.command(
 )(serve)
 app.command(short_help="See a cloud and a robot killed, and no decision change.")(demo)
 app.command(short_help="Strike real runs with real faults, and compare them.")(chaos)
+app.command(no_args_is_help=True, short_help="Regenerate the tables and figures.")(experiment)
 app.command(no_args_is_help=True, short_help="Tell whether two runs decided the same.")(compare)
 app.command(short_help="Search for faults that change a decision.")(simulate)
 app.command(no_args_is_help=True, short_help="Make keys for robots and services.")(keys)

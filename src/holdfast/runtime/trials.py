@@ -43,7 +43,14 @@ from holdfast.runtime.trial import (
 from holdfast.settings import PlanningSettings
 from holdfast.user_code import account_of_user_error
 
-__all__ = ["TrialCrashError", "TrialError", "WorkerDiedError", "available_cores", "run_trials"]
+__all__ = [
+    "TrialCrashError",
+    "TrialError",
+    "WorkerDiedError",
+    "available_cores",
+    "inherited_by_children",
+    "run_trials",
+]
 
 MAX_JOBS = 1024
 """Bound on the number of worker processes."""
@@ -283,7 +290,7 @@ def _start_workers(workers: list[_Worker], configuration: Configuration, count: 
     plain = configuration.plain()
     # Its start would undo the mask set below, so it must have been started before.
     resource_tracker.ensure_running()
-    with _inherited_by_children(threads):
+    with inherited_by_children(threads):
         for number in range(count):
             ours, theirs = context.Pipe()
             process = context.Process(
@@ -299,7 +306,7 @@ def _start_workers(workers: list[_Worker], configuration: Configuration, count: 
 
 
 @contextlib.contextmanager
-def _inherited_by_children(threads: int) -> Iterator[None]:
+def inherited_by_children(threads: int) -> Iterator[None]:
     """Let children start with few threads and with the signals blocked that end a run.
 
     Ctrl-C, a terminal that is closed and a batch system's SIGTERM reach every process of the group;

@@ -1,0 +1,149 @@
+"""``holdfast experiment``: the tables and figures behind what the project claims."""
+
+from __future__ import annotations
+
+import contextlib
+import shlex
+import signal
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from holdfast.cli.endings import ResumableError, ended_by_signals, signal_of
+from holdfast.errors import HoldfastError, InvalidValueError
+
+if TYPE_CHECKING:
+    from holdfast.experiments.executors import Executor
+    from holdfast.experiments.running import Workload
+    from holdfast.experiments.study import Scale, Study
+
+__all__ = ["experiment"]
+
+_DEFAULT_DIRECTORY = Path("runs") / "experiments"
+
+
+def experiment(
+    names: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="NAME...", show_default=False, help="Which, or all; see --list."),
+    ] = None,
+    quick: Annotated[
+        bool,
+        typer.Option(
+            "--quick", help="Few trials: minutes, to see that everything works. No evidence."
+        ),
+    ] = False,
+    out: Annotated[
+        Path, typer.Option("--out", "-o", metavar="DIR", help="Directory for the results.")
+    ] = _DEFAULT_DIRECTORY,
+    seed: Annotated[
+        int, typer.Option("--seed", metavar="S", min=0, help="Seed of all trials.")
+    ] = 2017,
+    jobs: Annotated[
+        int,
+        typer.Option(
+            "--jobs",
+            "-j",
+            metavar="N",
+            help="Processes; 0: one for each core. Changes time only.",
+        ),
+    ] = 0,
+    executor: Annotated[
+        str,
+        typer.Option(
+            metavar="WHERE", help="local, ray (this machine's cluster) or ray://HOST:PORT."
+        ),
+    ] = "local",
+    list_names: Annotated[
+        bool, typer.Option("--list", help="List the experiments and end.")
+    ] = False,
+) -> None:
+    """Regenerate tables and figures: run what is not known yet, and draw.
+
+    What was computed is kept in DIR/cache under the digest of everything that it depends on, code
+    included. So the same command goes on after Ctrl-C, and draws at once what is complete. Each
+    experiment has a directory in DIR with its tables (CSV), figures (PNG and SVG), every trial, and
+    where it all comes from.
+    """
+    from holdfast.experiments.registry import studies_of
+    from holdfast.experiments.study import Scale
+
+    if list_names:
+        for study in studies_of(["all"]):
+            sys.stdout.write(f"{study.name:18} {study.title}\n")
+        sys.stdout.flush()
+        return
+    if not names:
+        raise InvalidValueError("which experiment? Say all, or names that --list shows")
+    studies = studies_of(names)
+    words = ["holdfast", "experiment", *names]
+    words += ["--quick"] if quick else []
+    words += ["--seed", str(seed), "--executor", executor]
+    words += ["--jobs", str(jobs)] if jobs else []
+    again = shlex.join([*words, "--out", str(out)])
+    with ended_by_signals():
+        _run(studies, Scale(quick=quick, seed=seed), out, _executor_of(executor, jobs), again)
+
+
+def _executor_of(name: str, jobs: int) -> Executor:
+    from holdfast.experiments.executors import executor_of
+    from holdfast.runtime.trials import available_cores
+
+    if jobs < 0:
+        raise InvalidValueError(f"--jobs {jobs}: must be 0 (one for each core) or more")
+    return executor_of(name, available_cores() if name == "local" and jobs == 0 else jobs)
+
+
+def _run(
+    studies: list[Study], scale: Scale, directory: Path, executor: Executor, again: str
+) -> None:
+    from holdfast.experiments.running import Workload
+
+    workload = Workload(studies, scale, directory)
+    try:
+        _compute(workload, directory, executor)
+    except KeyboardInterrupt as interruption:
+        ended = signal_of(interruption)
+        how = "Interrupted" if ended == signal.SIGINT else f"Ended by {ended.name}"
+        with contextlib.suppress(OSError):
+            sys.stderr.write(
+                f"\n{how}; {workload.finished_units:,} of {workload.units:,} trials are kept.\n"
+                f"Go on with: {again}\n"
+            )
+        raise
+    except HoldfastError as error:
+        raise ResumableError(error, again) from error
+    for study in studies:
+        _report(study, scale, workload, directory / study.name)
+
+
+def _compute(workload: Workload, directory: Path, executor: Executor) -> None:
+    from holdfast.cli.terminal import counted, progress_line
+    from holdfast.experiments.running import compute
+
+    if not workload.pending:
+        return
+    line = progress_line(workload.units, quiet=False)
+    title = f"{counted(workload.units, 'trial')} in {executor.description}"
+    if workload.finished_units:
+        title += f", {workload.finished_units:,} known before"
+    line.start(f"{title}; results in {directory}", workload.finished_units, "")
+    try:
+        compute(workload, executor, lambda finished: line.show(finished, ""))
+    finally:
+        with contextlib.suppress(OSError):
+            line.stop()
+
+
+def _report(study: Study, scale: Scale, workload: Workload, directory: Path) -> None:
+    from holdfast.experiments.running import write_report
+
+    report = study.report(scale, workload.results)
+    names = write_report(study, scale, report, directory)
+    sys.stdout.write(f"\n{study.title}\n\n")
+    for finding in report.findings:
+        sys.stdout.write(f"- {finding}\n")
+    sys.stdout.write(f"\n{directory}/\n  {'  '.join(names)}\n")
+    sys.stdout.flush()

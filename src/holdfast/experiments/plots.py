@@ -1,0 +1,124 @@
+"""What the experiments' figures have in common: sizes, marks that read in grey, intervals.
+
+This module imports matplotlib; import it only where a figure is wanted.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import matplotlib as mpl
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from holdfast.files import write_atomically
+from holdfast.recording.figure import STYLE
+
+__all__ = ["COLORS", "LINES", "MARKERS", "Dots", "dot_rows", "figure_of", "save", "stacked_panels"]
+
+# Ordered so that neighbours differ in lightness, too.
+COLORS = ("#1D3C78", "#E8A317", "#B5342B", "#54B5A6", "#7D3C98", "#9AA05A", "#4A4F57", "#D98CA6")
+MARKERS = ("s", "o", "D", "^", "v", "P", "X", "*")
+LINES = ("-", "--", "-.", ":", (0, (5, 1)), (0, (3, 1, 1, 1)), (0, (1, 1)), (0, (8, 2)))
+
+_ROW_INCHES = 0.26
+_DOTS_PER_INCH = 150
+
+
+class Dots(NamedTuple):
+    """A value with its interval in each row.
+
+    Attributes
+    ----------
+    label : str
+    values, lows, highs : sequence of float
+    """
+
+    label: str
+    values: Sequence[float]
+    lows: Sequence[float]
+    highs: Sequence[float]
+
+
+def figure_of(width: float, height: float, title: str) -> Figure:
+    """Return an empty figure of some inches."""
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(width, height), layout="constrained")
+        FigureCanvasAgg(figure)
+        figure.suptitle(title, x=0.012, ha="left", fontsize=12.0)
+    return figure
+
+
+def stacked_panels(
+    rows_of_each: Sequence[int], *, title: str, width: float
+) -> tuple[Figure, list[Axes]]:
+    """Return a figure with panels one above the other, each as high as its rows need."""
+    heights = [_ROW_INCHES * rows + 0.5 for rows in rows_of_each]
+    figure = figure_of(width, sum(heights) + 0.7, title)
+    with mpl.rc_context(STYLE):
+        panels = figure.subplots(len(heights), 1, sharex=True, squeeze=False, height_ratios=heights)
+    return figure, list(panels[:, 0])
+
+
+def dot_rows(panel: Axes, labels: Sequence[str], kinds: Sequence[Dots]) -> None:
+    """Draw rows of values with intervals, a mark for each kind, the first row on top.
+
+    Parameters
+    ----------
+    panel : Axes
+    labels : sequence of str
+        Of the rows.
+    kinds : sequence of Dots
+        The first one's marks are hollow.
+    """
+    step = 0.7 / len(kinds)
+    for number, kind in enumerate(kinds):
+        offset = step * (number - 0.5 * (len(kinds) - 1))
+        color = COLORS[number]
+        places = [row + offset for row in range(len(labels))]
+        below = [value - low for value, low in zip(kind.values, kind.lows, strict=True)]
+        above = [high - value for value, high in zip(kind.values, kind.highs, strict=True)]
+        panel.errorbar(
+            kind.values,
+            places,
+            xerr=[below, above],
+            fmt=MARKERS[number],
+            color=color,
+            markerfacecolor="white" if number == 0 else color,
+            markersize=4.2,
+            elinewidth=1.0,
+            label=kind.label,
+        )
+    panel.set_yticks(range(len(labels)), labels)
+    panel.set_ylim(len(labels) - 0.4, -0.6)
+    panel.grid(axis="x")
+    panel.tick_params(axis="y", length=0)
+    panel.legend(loc="best", handletextpad=0.3)
+
+
+def save(figure: Figure, directory: Path, name: str) -> list[str]:
+    """Write a figure as PNG and as SVG.
+
+    Returns
+    -------
+    list of str
+        The names of the files.
+
+    Raises
+    ------
+    OutputError
+        If one cannot be written.
+    """
+    names = []
+    # Without a date and with fixed ids the same results give the same file.
+    with mpl.rc_context({**STYLE, "svg.hashsalt": "holdfast", "svg.fonttype": "path"}):
+        for ending, metadata in (("png", {"Software": None}), ("svg", {"Date": None})):
+            content = io.BytesIO()
+            figure.savefig(content, format=ending, dpi=_DOTS_PER_INCH, metadata=metadata)
+            write_atomically(directory / f"{name}.{ending}", content.getvalue())
+            names.append(f"{name}.{ending}")
+    return names

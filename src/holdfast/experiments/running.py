@@ -1,0 +1,163 @@
+"""Running studies: what is known already, what is computed, what is written."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import msgspec
+
+from holdfast import __version__
+from holdfast.errors import HoldfastError
+from holdfast.experiments.executors import Executor, LocalExecutor
+from holdfast.experiments.result_cache import ResultCache
+from holdfast.experiments.study import Report, Results, Scale, Study
+from holdfast.experiments.tables import Table
+from holdfast.experiments.tasks import Task, task_key
+from holdfast.files import OutputError, write_atomically
+from holdfast.recording.machine import describe
+
+__all__ = ["Workload", "compute", "write_report"]
+
+_CACHE = "cache"
+
+
+class Workload:
+    """The tasks of some studies, and what of them is known already.
+
+    Parameters
+    ----------
+    studies : sequence of Study
+    scale : Scale
+    directory : Path
+        Where results are kept.
+
+    Attributes
+    ----------
+    tasks : list of Task
+        Each once, although several studies may have it.
+    pending : list of Task
+        Of these, those that are still to be computed.
+    units, finished_units : int
+        How much work they are, and how much of it is done.
+    """
+
+    def __init__(self, studies: Sequence[Study], scale: Scale, directory: Path) -> None:
+        self._cache = ResultCache(directory / _CACHE)
+        self._tables: dict[str, Table] = {}
+        tasks = {task_key(task): task for study in studies for task in study.tasks(scale)}
+        self.tasks = list(tasks.values())
+        self.pending: list[Task] = []
+        for key, task in tasks.items():
+            table = self._cache.load(task)
+            if table is None:
+                self.pending.append(task)
+            else:
+                self._tables[key] = table
+        self.units = sum(task.units for task in self.tasks)
+        self.finished_units = self.units - sum(task.units for task in self.pending)
+
+    def keep(self, task: Task, table: Table) -> None:
+        """Take what a task came to."""
+        self._cache.store(task, table)
+        self._tables[task_key(task)] = table
+        self.finished_units += task.units
+
+    @property
+    def results(self) -> Results:
+        """What all tasks came to, once none is pending."""
+        return Results(self._tables, task_key)
+
+
+def compute(workload: Workload, executor: Executor, on_progress: Callable[[int], None]) -> None:
+    """Compute what is still to be computed, and keep it.
+
+    Parameters
+    ----------
+    workload : Workload
+    executor : Executor
+    on_progress : callable
+        Gets how many units of work are finished.
+
+    Raises
+    ------
+    HoldfastError
+        If a task fails; what was finished before is kept.
+    KeyboardInterrupt
+        After everything that was started has been ended; what was finished is kept.
+    """
+
+    def keep(task: Task, table: Table) -> None:
+        workload.keep(task, table)
+        on_progress(workload.finished_units)
+
+    executor.run([task for task in workload.pending if not task.exclusive], keep)
+    # What measures times has this machine to itself.
+    LocalExecutor(1).run([task for task in workload.pending if task.exclusive], keep)
+
+
+class _Origin(msgspec.Struct, kw_only=True):
+    """Where numbers come from; the content of ``origin.json``."""
+
+    study: str
+    quick: bool
+    seed: int
+    holdfast_version: str
+    machine: dict[str, str]
+    findings: list[str]
+
+
+def write_report(study: Study, scale: Scale, report: Report, directory: Path) -> list[str]:
+    """Write a study's tables, figures and findings.
+
+    Parameters
+    ----------
+    study : Study
+    scale : Scale
+    report : Report
+    directory : Path
+        Of this study; made if it is not there.
+
+    Returns
+    -------
+    list of str
+        The names of the files.
+
+    Raises
+    ------
+    OutputError
+        If one cannot be written.
+    """
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"{directory}: cannot be made: {error.strerror}") from error
+    names = []
+    for name, table in report.summary.items():
+        write_atomically(directory / f"{name}.csv", table.to_csv().encode())
+        names.append(f"{name}.csv")
+    for name, table in report.raw.items():
+        write_atomically(directory / f"{name}_trials.csv", table.to_csv().encode())
+        names.append(f"{name}_trials.csv")
+    origin = _Origin(
+        study=study.name,
+        quick=scale.quick,
+        seed=scale.seed,
+        holdfast_version=__version__,
+        machine=describe(),
+        findings=report.findings,
+    )
+    text = msgspec.json.format(msgspec.json.encode(origin), indent=2)
+    write_atomically(directory / "origin.json", text + b"\n")
+    names.append("origin.json")
+    try:
+        from holdfast.experiments import plots
+    except ImportError as error:
+        if error.name is None or error.name.split(".")[0] != "matplotlib":
+            raise
+        raise HoldfastError(
+            "figures need matplotlib, which is not installed: pip install 'holdfast[experiments]'"
+        ) from error
+    for name, draw in report.figures.items():
+        names += plots.save(draw(), directory, name)
+    return names

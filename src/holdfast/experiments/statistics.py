@@ -1,0 +1,146 @@
+"""How sure a number is, and whether two differ: what each sentence about results rests on.
+
+Runs are compared *paired*: two ways of choosing see the same worlds, because every random number is
+named by seed and trial. A difference of two means over the same trials has a far smaller interval
+than the means themselves.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from scipy import stats
+
+from holdfast.errors import InvalidValueError
+
+__all__ = [
+    "Interval",
+    "agreement_of_means",
+    "agreement_of_rates",
+    "mean_interval",
+    "paired_difference",
+    "paired_rates",
+    "smallest_levels",
+]
+
+FloatArray = npt.NDArray[np.float64]
+BoolArray = npt.NDArray[np.bool_]
+
+_LEVEL = 0.95
+
+
+class Interval(NamedTuple):
+    """An estimate with its 95 % interval."""
+
+    value: float
+    low: float
+    high: float
+
+    def __str__(self) -> str:
+        return f"{self.value:.3g} [{self.low:.3g}, {self.high:.3g}]"
+
+
+def mean_interval(values: FloatArray) -> Interval:
+    """Return the mean of independent values with Student's interval.
+
+    Parameters
+    ----------
+    values : array
+        NaN for none, which is left out.
+
+    Returns
+    -------
+    Interval
+        NaN where there are no values; without bounds for a single one.
+    """
+    values = values[~np.isnan(values)]
+    if values.size == 0:
+        return Interval(math.nan, math.nan, math.nan)
+    mean = float(values.mean())
+    if values.size == 1:
+        return Interval(mean, -math.inf, math.inf)
+    error = float(values.std(ddof=1)) / math.sqrt(values.size)
+    half = float(stats.t.ppf(0.5 + 0.5 * _LEVEL, values.size - 1)) * error
+    return Interval(mean, mean - half, mean + half)
+
+
+def paired_difference(first: FloatArray, second: FloatArray) -> tuple[Interval, float]:
+    """Return the mean of ``first - second`` over the same trials, and how likely it is by chance.
+
+    Parameters
+    ----------
+    first, second : array of shape (trials,)
+
+    Returns
+    -------
+    Interval
+    p_value : float
+        Of Student's paired test, two-sided; 1 if all differences are zero.
+
+    Raises
+    ------
+    InvalidValueError
+        If they are not as many.
+    """
+    if first.shape != second.shape:
+        raise InvalidValueError(f"{first.size} and {second.size} trials cannot be paired")
+    difference = first - second
+    interval = mean_interval(difference)
+    if not np.any(difference):
+        return Interval(0.0, 0.0, 0.0), 1.0
+    return interval, float(stats.ttest_1samp(difference, 0.0).pvalue)
+
+
+def paired_rates(first: BoolArray, second: BoolArray) -> tuple[Interval, float]:
+    """Return the difference of two rates over the same trials, and how likely it is by chance.
+
+    Returns
+    -------
+    Interval
+        By Student's interval of the differences of single trials.
+    p_value : float
+        Of McNemar's exact test: of the trials in which one alone succeeded, each is as likely to be
+        the first's as the second's.
+    """
+    interval, _ = paired_difference(first.astype(np.float64), second.astype(np.float64))
+    first_alone = int(np.count_nonzero(first & ~second))
+    either_alone = int(np.count_nonzero(first != second))
+    if either_alone == 0:
+        return interval, 1.0
+    return interval, float(stats.binomtest(first_alone, either_alone).pvalue)
+
+
+def agreement_of_rates(successes: int, trials: int, others: int, other_trials: int) -> float:
+    """Return the p-value of Fisher's exact test that two rates are the same."""
+    table = [[successes, trials - successes], [others, other_trials - others]]
+    return float(stats.fisher_exact(table).pvalue)
+
+
+def agreement_of_means(values: FloatArray, other_mean: float, other_count: int) -> float:
+    """Return the p-value that a mean is one of which only the number of values is known.
+
+    Both are taken as normal, with the standard deviation of our values.
+    """
+    if values.size < 2 or other_count < 1:
+        return math.nan
+    error = float(np.std(values, ddof=1)) * math.sqrt(1 / values.size + 1 / other_count)
+    return math.erfc(abs(float(np.mean(values)) - other_mean) / error / math.sqrt(2.0))
+
+
+def smallest_levels(p_values: FloatArray) -> FloatArray:
+    """Return p-values that are adjusted for being many, by Holm's method.
+
+    To call significant what is below a level here errs in no case at all with a probability of at
+    most that level, whatever the tests' dependence.
+
+    Source: S. Holm, "A simple sequentially rejective multiple test procedure", 1979.
+    """
+    order = np.argsort(p_values)
+    count = p_values.size
+    stepped = p_values[order] * (count - np.arange(count))
+    adjusted = np.empty(count)
+    adjusted[order] = np.minimum(np.maximum.accumulate(stepped), 1.0)
+    return adjusted

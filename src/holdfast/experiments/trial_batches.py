@@ -1,0 +1,136 @@
+"""Batches of trials, run in process: what most studies are made of."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import msgspec
+
+from holdfast.configuration import build_problem
+from holdfast.errors import HoldfastError
+from holdfast.experiments.tables import Table
+from holdfast.experiments.tasks import Task, TaskError
+from holdfast.problems.problem import Problem
+from holdfast.problems.registry import problem_class
+from holdfast.runtime.trial import run_trial
+from holdfast.settings import PlanningSettings, SimulatorSettings
+
+__all__ = ["COLUMNS", "TrialSeries", "problem_of", "run_trials_of", "trial_tasks"]
+
+COLUMNS = (
+    "trial",
+    "success",
+    "steps",
+    "reward",
+    "sensing_decisions",
+    "mean_sensing_ms",
+    "unexplained_observations",
+    "digest",
+)
+"""Of the table of a batch: a row for each trial."""
+
+_DIGEST_CHARACTERS = 16
+"""Enough to tell that two runs decided the same, at a quarter of the size."""
+
+
+class TrialSeries(msgspec.Struct, frozen=True, kw_only=True):
+    """Trials that differ in their number alone.
+
+    Attributes
+    ----------
+    problem : str
+        Its name.
+    model, state_space_planner : dict
+        Its two sections; what is left out has its default.
+    planning : PlanningSettings
+    max_steps : int
+    seed : int
+    num_trials : int
+    """
+
+    problem: str
+    model: dict[str, Any] = msgspec.field(default_factory=dict)
+    state_space_planner: dict[str, Any] = msgspec.field(default_factory=dict)
+    planning: PlanningSettings = msgspec.field(default_factory=PlanningSettings)
+    max_steps: int = 500
+    seed: int = 0
+    num_trials: int = 1000
+
+
+def trial_tasks(series: TrialSeries, trials_in_each: int) -> Iterator[Task]:
+    """Yield the tasks of a series, in the order of its trials.
+
+    Parameters
+    ----------
+    series : TrialSeries
+    trials_in_each : int
+        Trials of a task: what is lost when a process is killed, and what is done twice when a
+        series is made longer.
+    """
+    common = msgspec.to_builtins(series)
+    del common["num_trials"]
+    for first in range(0, series.num_trials, trials_in_each):
+        count = min(trials_in_each, series.num_trials - first)
+        parameters = {**common, "first_trial": first, "num_trials": count}
+        yield Task(kind="trials", parameters=parameters, units=count)
+
+
+def run_trials_of(first_trial: int, **series: Any) -> Table:
+    """Run some trials of a series in this process; the function of tasks of the kind ``trials``.
+
+    Parameters
+    ----------
+    first_trial : int
+    **series
+        The fields of :class:`TrialSeries`.
+
+    Returns
+    -------
+    Table
+        With the columns of :data:`COLUMNS`. All but the times are the same wherever it is run.
+    """
+    wanted = msgspec.convert(series, TrialSeries)
+    problem = problem_of(wanted.problem, wanted.model, wanted.state_space_planner)
+    simulator = SimulatorSettings(
+        num_trials=first_trial + wanted.num_trials,
+        max_steps=wanted.max_steps,
+        sensing_intervals=wanted.planning.sensing_interval,
+        seed=wanted.seed,
+    )
+    rows = []
+    for trial in range(first_trial, first_trial + wanted.num_trials):
+        try:
+            result = run_trial(problem, wanted.planning, simulator, trial)
+        except HoldfastError as error:
+            raise TaskError(
+                f"trial {trial} (seed {wanted.seed}) of {wanted.problem}: {error}"
+            ) from error
+        rows.append(
+            (
+                trial,
+                result.success,
+                result.steps,
+                result.reward,
+                result.sensing_decisions,
+                result.mean_sensing_ms,
+                result.unexplained_observations,
+                result.digest[:_DIGEST_CHARACTERS],
+            )
+        )
+    return Table.of_rows(COLUMNS, rows)
+
+
+def problem_of(
+    name: str, model: Mapping[str, Any], state_space_planner: Mapping[str, Any]
+) -> Problem:
+    """Build a problem from plain data.
+
+    Raises
+    ------
+    UnknownProblemError
+        If it is neither registered nor importable.
+    ConfigurationError
+        If the data does not fit it.
+    """
+    return build_problem(name, problem_class(name), model, state_space_planner)
