@@ -414,10 +414,10 @@ class Robot:
 
     def next_wakeup(self) -> float | None:
         """Return when :meth:`wake` must be called if nothing happens before."""
-        times = [
-            due for due in (self._asleep_until, self._dispatcher.next_wakeup()) if due is not None
-        ]
-        return min(times, default=None)
+        asleep_until, due = self._asleep_until, self._dispatcher.next_wakeup()
+        if asleep_until is None or due is None:
+            return due if asleep_until is None else asleep_until
+        return min(asleep_until, due)
 
     # -- the environment -------------------------------------------------------------------------
 
@@ -531,7 +531,7 @@ class Robot:
         if offset == 0 and question.task_source is not None:
             self._timed("task", question, question.task_source, now)
             question.task_source = None
-            question.needed_at = None
+            self._dispatcher.go_on()
         if not self._is_due(now):
             return
         action = question.tasks[offset]

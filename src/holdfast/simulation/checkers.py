@@ -9,6 +9,8 @@ that shared code with what it checks would share its errors.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterable
+from functools import cache
 
 import msgspec
 
@@ -46,7 +48,8 @@ _FOLLOWS = {
 }
 
 
-_ATOMS = (int, float, str, bytes, type(None))
+_TABLES = (dict, list, tuple, set, deque)
+_ATOMS = frozenset({int, float, bool, str, bytes, type(None)})
 
 _MAX_ITEMS = 512
 """Of any one table of a machine; a trial has 40 steps, and a service remembers a hundred robots."""
@@ -67,19 +70,23 @@ def check_size(name: str, machine: object) -> None:
         if id(found) in seen:
             continue
         seen.add(id(found))
-        parts: list[object] = []
-        if isinstance(found, dict | list | tuple | set | deque):
+        kind = type(found)
+        parts: Iterable[object]
+        if isinstance(found, _TABLES):
             if len(found) > _MAX_ITEMS:
-                raise Violation(f"{name} holds a {type(found).__name__} of {len(found)} entries")
-            parts += found.values() if isinstance(found, dict) else found
-        elif type(found).__module__.startswith("holdfast.session"):
+                raise Violation(f"{name} holds a {kind.__name__} of {len(found)} entries")
+            parts = found.values() if isinstance(found, dict) else found
+        elif kind.__module__.startswith("holdfast.session"):
+            parts = [getattr(found, slot, None) for slot in _slots_of(kind)]
             parts += vars(found).values() if hasattr(found, "__dict__") else ()
-            parts += (
-                getattr(found, slot, None)
-                for kind in type(found).__mro__
-                for slot in getattr(kind, "__slots__", ())
-            )
-        left += (part for part in parts if not isinstance(part, _ATOMS))
+        else:
+            continue
+        left += [part for part in parts if type(part) not in _ATOMS]
+
+
+@cache
+def _slots_of(kind: type) -> tuple[str, ...]:
+    return tuple(slot for each in kind.__mro__ for slot in getattr(each, "__slots__", ()))
 
 
 class StatusChecker:
