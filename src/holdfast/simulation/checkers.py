@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable
 from functools import cache
+from typing import Any
 
 import msgspec
 
@@ -70,7 +71,7 @@ def check_size(name: str, machine: object) -> None:
         if id(found) in seen:
             continue
         seen.add(id(found))
-        kind = type(found)
+        kind: type[Any] = type(found)
         parts: Iterable[object]
         if isinstance(found, _TABLES):
             if len(found) > _MAX_ITEMS:
@@ -85,7 +86,7 @@ def check_size(name: str, machine: object) -> None:
 
 
 @cache
-def _slots_of(kind: type) -> tuple[str, ...]:
+def _slots_of(kind: type[Any]) -> tuple[str, ...]:
     return tuple(slot for each in kind.__mro__ for slot in getattr(each, "__slots__", ()))
 
 
