@@ -10,8 +10,6 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable
-from functools import cache
-from typing import Any
 
 import msgspec
 
@@ -71,23 +69,29 @@ def check_size(name: str, machine: object) -> None:
         if id(found) in seen:
             continue
         seen.add(id(found))
-        kind: type[Any] = type(found)
         parts: Iterable[object]
         if isinstance(found, _TABLES):
             if len(found) > _MAX_ITEMS:
-                raise Violation(f"{name} holds a {kind.__name__} of {len(found)} entries")
+                raise Violation(f"{name} holds a {type(found).__name__} of {len(found)} entries")
             parts = found.values() if isinstance(found, dict) else found
-        elif kind.__module__.startswith("holdfast.session"):
-            parts = [getattr(found, slot, None) for slot in _slots_of(kind)]
-            parts += vars(found).values() if hasattr(found, "__dict__") else ()
         else:
-            continue
+            parts = [getattr(found, slot, None) for slot in _PLACES[type(found)]]
         left += [part for part in parts if type(part) not in _ATOMS]
 
 
-@cache
-def _slots_of(kind: type[Any]) -> tuple[str, ...]:
-    return tuple(slot for each in kind.__mro__ for slot in getattr(each, "__slots__", ()))
+class _Places(dict[type, tuple[str, ...]]):
+    """Where the instances of each type hold something; only the machines' own types count."""
+
+    def __missing__(self, kind: type) -> tuple[str, ...]:
+        places: list[str] = []
+        if kind.__module__.startswith("holdfast.session"):
+            places = [slot for each in kind.__mro__ for slot in getattr(each, "__slots__", ())]
+            places.append("__dict__")
+        self[kind] = tuple(places)
+        return self[kind]
+
+
+_PLACES = _Places()
 
 
 class StatusChecker:

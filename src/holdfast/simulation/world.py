@@ -298,6 +298,8 @@ class _World:
 
     def _arrange(self, schedule: Schedule) -> None:
         for fault in schedule.faults:
+            if isinstance(fault, MessageFault):
+                continue  # most are; the network has them
             if isinstance(fault, Crash):
                 self._agenda.at(fault.at, self._crash, fault)
             elif isinstance(fault, Stop):
