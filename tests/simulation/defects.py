@@ -382,8 +382,8 @@ _defect(
     Edit(
         Robot,
         "_next_sensing",
-        "if question.state is not state and answer.digest != digest(state)[:DIGEST_SIZE]:",
-        "if False:",
+        "answer.digest != self._planner.digest(state)[:DIGEST_SIZE]",
+        "False",
     ),
 )
 
@@ -504,18 +504,18 @@ _defect(
     "No alarm is set while a service is being asked, for sooner or later it will answer.",
     Edit(
         Dispatcher,
-        "next_wakeup",
+        "_next_wakeup",
         "due += [service.detector.deadline() for service in services]",
         "pass",
     ),
-    Edit(Dispatcher, "next_wakeup", "elif question.needed_at is not None:", "elif False:"),
+    Edit(Dispatcher, "_next_wakeup", "elif question.needed_at is not None:", "elif False:"),
 )
 _defect(
     "retry_not_timed",
     "No alarm is set for when a service may be asked again.",
     Edit(
         Dispatcher,
-        "next_wakeup",
+        "_next_wakeup",
         "if service.detector.present and service.refused is None",
         "if False",
     ),

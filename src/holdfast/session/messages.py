@@ -321,6 +321,7 @@ _REQUEST_DECODER = msgspec.msgpack.Decoder(_SentRequest)
 _OPENING_DECODER = msgspec.msgpack.Decoder(Opening)
 _REPLY_DECODER: msgspec.msgpack.Decoder[Reply] = msgspec.msgpack.Decoder(Reply)
 
+_CONTAINERS = (dict, list, tuple)
 _ARRAY_HEADERS = {0xDC: 3, 0xDD: 5}
 _WORDS = {0xCC: 1, 0xCD: 2, 0xCE: 4}
 """Of MessagePack: sizes of the longer headers of an array, and of the longer words."""
@@ -491,12 +492,12 @@ def count_values(opening: Opening) -> int:
     count = 0
     while containers:
         container = containers.pop()
-        assert isinstance(container, dict | list | tuple)
+        assert isinstance(container, _CONTAINERS)
         count += len(container) * (2 if isinstance(container, dict) else 1)
         if count > MAX_OPENING_VALUES:
             break
         parts = (*container, *container.values()) if isinstance(container, dict) else container
-        containers += (part for part in parts if isinstance(part, dict | list | tuple))
+        containers += [part for part in parts if isinstance(part, _CONTAINERS)]
     return count
 
 

@@ -163,9 +163,14 @@ class Job:
         return self._opening.problem
 
     @property
+    def state(self) -> PlanningState | None:
+        """From where it begins."""
+        return self._state
+
+    @property
     def identity(self) -> tuple[object, ...]:
-        """What the outcome is a function of, besides the problem and the settings of the run."""
-        request, state = self._request, self._state
+        """What the outcome is a function of, besides that state, the problem and the settings."""
+        request = self._request
         named = None
         if request is not None:
             named = (
@@ -176,7 +181,7 @@ class Job:
                 request.observations,
                 request.checkpoint,
             )
-        return self.kind, self._seed, named, None if state is None else digest(state)
+        return self.kind, self._seed, named
 
     def run(self) -> Outcome:
         """Compute; whatever goes wrong in the problem's functions is part of the outcome.

@@ -15,6 +15,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections import OrderedDict
+from functools import lru_cache
 from typing import NamedTuple
 
 import msgspec
@@ -22,6 +23,7 @@ import msgspec
 from holdfast.planning import PlanningState
 from holdfast.session.messages import Opening, Request, count_values
 from holdfast.session.service_limits import ServiceLimits
+from holdfast.settings import PlanningSettings
 
 __all__ = [
     "PREFETCHED",
@@ -40,6 +42,9 @@ _LEAST_EPOCHS = 4096
 
 _BYTES_PER_VALUE = 64
 """Of Python's objects for plain data, with their places in lists and mappings."""
+
+_SETTINGS_KEPT = 128
+"""Settings that are shared by all robots that have the same."""
 
 REQUESTED, PREFETCHED = 0, 1
 """The slots of a session: a robot stands still for the first, the second is ahead of it."""
@@ -232,20 +237,16 @@ class Session:
         self.epoch = request.epoch
         self.number = -1
         self.opening = opening
-        self.opening_key = key_of(opening)
-        self.opening_bytes = size_of_opening(opening)
+        encoded = msgspec.msgpack.encode(opening)
+        self.opening_key = _name_of(encoded)
+        # In memory it takes far more than its bytes on the wire.
+        self.opening_bytes = len(encoded) + _BYTES_PER_VALUE * count_values(opening)
         self.problem_key = key_of((opening.problem, opening.model, opening.state_space_planner))
         self.built = False
         # The number of threads changes no result, so the service may choose it.
-        sensing = opening.planning.active_sensing
-        most = min(sensing.num_cores, max_threads)
-        self.planning, self.planning_single = (
-            msgspec.structs.replace(
-                opening.planning,
-                active_sensing=msgspec.structs.replace(sensing, num_cores=num_cores),
-            )
-            for num_cores in (most, 1)
-        )
+        most = min(opening.planning.active_sensing.num_cores, max_threads)
+        self.planning = _with_cores(opening.planning, most)
+        self.planning_single = _with_cores(opening.planning, 1)
         self.seed = opening.seed
         self.served = False
         self.acknowledged: PlanningState | None = None
@@ -422,13 +423,18 @@ class Sessions:
 
 def key_of(data: object) -> bytes:
     """Return a short name of plain data, equal for equal data."""
-    return hashlib.blake2b(msgspec.msgpack.encode(data), digest_size=16).digest()
+    return _name_of(msgspec.msgpack.encode(data))
 
 
-def size_of_opening(opening: Opening) -> int:
-    """Estimate what an opening takes in memory: far more than its bytes on the wire."""
-    num_bytes = len(msgspec.msgpack.encode(opening))
-    return num_bytes + _BYTES_PER_VALUE * count_values(opening)
+def _name_of(encoded: bytes) -> bytes:
+    return hashlib.blake2b(encoded, digest_size=16).digest()
+
+
+@lru_cache(maxsize=_SETTINGS_KEPT)
+def _with_cores(planning: PlanningSettings, num_cores: int) -> PlanningSettings:
+    """Return settings with another number of threads, one copy for all robots that have them."""
+    sensing = msgspec.structs.replace(planning.active_sensing, num_cores=num_cores)
+    return msgspec.structs.replace(planning, active_sensing=sensing)
 
 
 def _size_of(state: PlanningState | None) -> int:

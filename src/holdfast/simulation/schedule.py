@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import random
 from collections.abc import Callable, Iterable
+from functools import cached_property
 from typing import Annotated, ClassVar, Literal, TypeAlias, TypeVar, get_args
 
 import msgspec
@@ -447,10 +448,21 @@ class _Draw:
     def __init__(self, seed: int) -> None:
         # Another generator than the planning's: the world must not be of one mind with the robot.
         self._chance = random.Random(f"holdfast simulation {seed}")
-        # Each by a name of its own, so that the other draws of a seed are what they were before.
-        self._losses = random.Random(f"holdfast simulation {seed}: losses")
-        self._bodies = random.Random(f"holdfast simulation {seed}: bodies")
-        self._aims = random.Random(f"holdfast simulation {seed}: aims")
+        self._seed = seed
+
+    # Each by a name of its own, so that the other draws of a seed are what they were before.
+
+    @cached_property
+    def _losses(self) -> random.Random:
+        return random.Random(f"holdfast simulation {self._seed}: losses")
+
+    @cached_property
+    def _bodies(self) -> random.Random:
+        return random.Random(f"holdfast simulation {self._seed}: bodies")
+
+    @cached_property
+    def _aims(self) -> random.Random:
+        return random.Random(f"holdfast simulation {self._seed}: aims")
 
     def schedule(self) -> Schedule:
         run = self._run()

@@ -11,18 +11,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from holdfast.errors import HoldfastError
-from holdfast.planning import Planner, digest
+from holdfast.planning import Planner
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.session.effects import Effect
 from holdfast.session.events import Ended, Replied, TransportEvent
-from holdfast.session.messages import (
-    DIGEST_SIZE,
-    PROTOCOL_VERSION,
-    MessageError,
-    Request,
-    decode_reply,
-    encode,
-)
+from holdfast.session.messages import MessageError, decode_reply
 from holdfast.session.status import IllegalTransitionError
 from holdfast.settings import ParticleFilterSettings, PlanningSettings
 from holdfast.simulation.agenda import Agenda, Clock
@@ -30,6 +23,7 @@ from holdfast.simulation.checkers import WireChecker, check_size
 from holdfast.simulation.disk import Disk
 from holdfast.simulation.memory import RememberedJobs, RememberingPlanner
 from holdfast.simulation.network import Network
+from holdfast.simulation.other_robots import OtherRobots
 from holdfast.simulation.robot_node import RobotNode, Task
 from holdfast.simulation.schedule import (
     LOCAL_SERVICE,
@@ -129,6 +123,7 @@ class Simulator:
         self._twins = Twins(problem, planning, _SEED)
         self._planner = RememberingPlanner(Planner(problem, planning))
         self._jobs = RememberedJobs()
+        self._others = OtherRobots(self._planner, _SEED)
 
     def run(self, schedule: Schedule, *, tell: bool = False) -> Outcome:
         """Run a schedule.
@@ -140,18 +135,25 @@ class Simulator:
             Whether the story is wanted.
         """
         task = Task(self._planner, schedule.run, _SEED, _MAX_STEPS)
-        return _World(schedule, task, self._twins, self._jobs, tell=tell).run()
+        return _World(schedule, task, self._twins, self._jobs, self._others, tell=tell).run()
 
 
 class _World:
     """See :class:`Simulator`."""
 
     def __init__(
-        self, schedule: Schedule, task: Task, twins: Twins, jobs: RememberedJobs, *, tell: bool
+        self,
+        schedule: Schedule,
+        task: Task,
+        twins: Twins,
+        jobs: RememberedJobs,
+        others: OtherRobots,
+        *,
+        tell: bool,
     ) -> None:
         run = schedule.run
         self._run = run
-        self._task = task
+        self._others = others
         self._tell = tell
         self._story: list[Told] = []
         self._agenda = agenda = Agenda()
@@ -296,6 +298,8 @@ class _World:
 
     def _arrange(self, schedule: Schedule) -> None:
         for fault in schedule.faults:
+            if isinstance(fault, MessageFault):
+                continue  # most are; the network has them
             if isinstance(fault, Crash):
                 self._agenda.at(fault.at, self._crash, fault)
             elif isinstance(fault, Stop):
@@ -417,23 +421,10 @@ class _World:
         self._happened(fault, fault.robots * service.slowness * self._run.sensing_s + 1.0)
         self.noted(fault.service, "is asked by %s other robots", fault.robots)
         self._checker.crowded(fault.robots)
-        task, planner = self._task, self._task.planner
         for number in range(fault.robots):
-            trial = number % NUM_TRIALS
-            state = planner.initial_state(task.simulator.seed, trial)
             self._crowds += 1
-            request = Request(
-                PROTOCOL_VERSION,
-                self._crowds.to_bytes(16, "big"),
-                1,
-                1,
-                trial,
-                0,
-                False,
-                digest(state)[:DIGEST_SIZE],
-                opening=task.opening,
-            )
-            self._network.call_of_another(service, encode(request))
+            payload = self._others.first_request(self._crowds, number % NUM_TRIALS)
+            self._network.call_of_another(service, payload)
 
     def _pause(self, fault: PauseRobot) -> None:
         if self._robot.process:
