@@ -344,10 +344,16 @@ def test_events_instead_of_a_bar(tmp_path: Path, started: list[Chaos]) -> None:
     assert output == ""
 
 
-def test_what_is_no_kind_is_refused(tmp_path: Path) -> None:
-    done = subprocess.run(
-        [*COMMAND, "--only", "earthquake"], cwd=tmp_path, capture_output=True, text=True
-    )
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("--only", "earthquake"), "--only is 'earthquake'; allowed are cloud_killed, "),
+        (("--only", "link-slient"), "--only is 'link-slient' (did you mean link_silent?); allowed"),
+        (("--kinds", "cloud_killed"), "No such option: --kinds (Possible options: --kind"),
+    ],
+)
+def test_what_is_no_kind_is_refused(tmp_path: Path, arguments: tuple[str, ...], says: str) -> None:
+    done = subprocess.run([*COMMAND, *arguments], cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 2
-    assert "--only is 'earthquake'; allowed are cloud_killed, " in done.stderr
+    assert says in done.stderr
     assert list(tmp_path.iterdir()) == []

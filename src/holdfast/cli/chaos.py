@@ -57,6 +57,7 @@ def chaos(
         list[str] | None,
         typer.Option(
             "--only",
+            "--kind",
             metavar="KIND",
             help=(
                 "Only trials of this kind, as --list names them; may be repeated (default: all "
@@ -154,11 +155,15 @@ def _chosen_kinds(
     only: Sequence[str], impossible: dict[FaultKind, str]
 ) -> tuple[tuple[FaultKind, ...], dict[FaultKind, str]]:
     """Return the kinds of a series, and those of the wanted ones that are left out."""
+    from difflib import get_close_matches
+
     from holdfast.chaos.schedule import FaultKind
 
     for name in only:
         if name not in list(FaultKind):
-            raise InvalidValueError(f"--only is {name!r}; allowed are {', '.join(FaultKind)}")
+            near = get_close_matches(name.lower().replace("-", "_"), list(FaultKind), n=1)
+            hint = f" (did you mean {near[0]}?)" if near else ""
+            raise InvalidValueError(f"--only is {name!r}{hint}; allowed are {', '.join(FaultKind)}")
     wanted = [kind for kind in FaultKind if kind in only] if only else list(FaultKind)
     kinds = tuple(kind for kind in wanted if kind not in impossible)
     if not kinds:
