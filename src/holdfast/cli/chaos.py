@@ -120,7 +120,7 @@ def chaos(
     if list_kinds:
         _list_kinds()
         return
-    with ended_by_signals():
+    with ended_by_signals(once=True):
         good = _run(
             trials=trials,
             seed=seed,
