@@ -277,9 +277,7 @@ class KnownServices:
     def __init__(self, cloud: Sequence[str], local: str | None, detection_timeout_s: float) -> None:
         timeout_s = detection_timeout_s
         self.cloud = [KnownService(name, timeout_s, late_after_s=timeout_s) for name in cloud]
-        self.local = (
-            None if local is None else KnownService(local, _LOCAL_PATIENCE * timeout_s)
-        )
+        self.local = None if local is None else KnownService(local, _LOCAL_PATIENCE * timeout_s)
         self._by_name = {service.name: service for service in self.cloud}
         if self.local is not None:
             self._by_name[self.local.name] = self.local
