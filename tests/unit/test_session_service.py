@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tests.questions import request_of
 
 from holdfast.errors import ConfigurationError, ProblemError, UnknownProblemError
 from holdfast.planning import (
@@ -38,7 +39,6 @@ from holdfast.runtime.environment import SimulatedEnvironment
 from holdfast.session.messages import (
     DIGEST_SIZE,
     MAX_TASK_ACTIONS,
-    PROTOCOL_VERSION,
     Busy,
     MessageError,
     NeedState,
@@ -177,18 +177,13 @@ class Robot:
     def request(self, *, opening: bool = True, since: int = 0, **changes: Any) -> Request:
         """Return the question of now; ``since`` counts the observations that are known already."""
         self.number += 1
-        state = self.state
-        request = Request(
-            PROTOCOL_VERSION,
+        request = request_of(
+            self.state,
             self.session,
-            self.epoch,
             self.number,
-            state.trial,
-            state.step,
-            state.sensed,
-            digest(state)[:DIGEST_SIZE],
-            tuple(self.observed[since:]),
-            self.opening if opening else None,
+            epoch=self.epoch,
+            observations=tuple(self.observed[since:]),
+            opening=self.opening if opening else None,
         )
         return msgspec.structs.replace(request, **changes)
 

@@ -43,6 +43,7 @@ __all__ = [
     "Stop",
     "cloud_service",
     "draw_schedule",
+    "line_of",
     "parse_schedule",
 ]
 
@@ -350,7 +351,7 @@ class Schedule(msgspec.Struct, frozen=True):
 
     def text(self) -> str:
         """Return it as lines of text; :func:`parse_schedule` reads them."""
-        return "".join(f"{_line(item)}\n" for item in (self.run, *self.faults))
+        return "".join(f"{line_of(item)}\n" for item in (self.run, *self.faults))
 
 
 # -- text ------------------------------------------------------------------------------------------
@@ -358,7 +359,8 @@ class Schedule(msgspec.Struct, frozen=True):
 _WORDS = {"true": True, "false": False, "none": None}
 
 
-def _line(item: RunSettings | Fault) -> str:
+def line_of(item: RunSettings | Fault) -> str:
+    """Return an item as one line of a schedule."""
     words = [str(item.__struct_config__.tag)]
     for field in msgspec.structs.fields(type(item)):
         value = getattr(item, field.name)
@@ -420,7 +422,7 @@ def parse_schedule(text: str) -> Schedule:
         node = getattr(fault, "service", getattr(fault, "node", "robot"))
         if node not in named:
             raise ScheduleError(
-                f"{_line(fault)!r}: there is no {node} in a run with {run.replicas} replicas"
+                f"{line_of(fault)!r}: there is no {node} in a run with {run.replicas} replicas"
             )
     return Schedule(run, faults)
 

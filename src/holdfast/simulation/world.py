@@ -63,6 +63,9 @@ _MAX_STEPS = 40
 _MAX_MESSAGES = 5_000
 """Of a run; one without faults has about fifty."""
 
+_CROWD_IS_FELT_S = 1.0
+"""So long after its end our robot may still wait, because it was told to come back later."""
+
 _LAUNCH_TIMEOUT_S = 5.0
 _SIZES_EACH = 500
 """Happenings between two looks at all tables."""
@@ -100,6 +103,9 @@ class Outcome(NamedTuple):
         By kind, how many have happened.
     story : list of Told
         What happened, if it was to be told.
+    never_happened : tuple of Fault
+        Those of the schedule's faults, if the story was to be told: the run had ended before, or
+        what they would have struck was not there.
     """
 
     violation: str | None
@@ -110,6 +116,7 @@ class Outcome(NamedTuple):
     messages: int
     faults: dict[str, int]
     story: list[Told]
+    never_happened: tuple[Fault, ...]
 
 
 class Simulator:
@@ -152,6 +159,7 @@ class _World:
         tell: bool,
     ) -> None:
         run = schedule.run
+        self._schedule = schedule
         self._run = run
         self._others = others
         self._tell = tell
@@ -181,7 +189,9 @@ class _World:
         self._stalls: list[DiskStall] = []
         self._gone: set[str] = set()
         self._faults: dict[str, int] = {}
+        self._struck: set[int] = set()
         self._crowds = 0
+        self._crowded_until: dict[str, float] = {}
         self._silent_launches = 0
         self._stopped_until: dict[str, float] = {}
         self._slownesses: dict[str, list[float]] = {}
@@ -224,6 +234,7 @@ class _World:
             self._network.messages,
             self._faults,
             self._story,
+            self._never_happened(),
         )
 
     def _go(self) -> None:
@@ -325,7 +336,13 @@ class _World:
     def _happened(self, fault: Fault, seconds: float) -> None:
         """Take note of a fault that is not over before some time has passed."""
         self._faults[fault.kind] = self._faults.get(fault.kind, 0) + 1
+        self._struck.add(id(fault))
         self._lasts(seconds)
+
+    def _never_happened(self) -> tuple[Fault, ...]:
+        if not self._tell:
+            return ()
+        return tuple(fault for fault in self._schedule.faults if id(fault) not in self._struck)
 
     def _lasts(self, seconds: float) -> None:
         self._faults_end_at = max(self._faults_end_at, self._agenda.now + seconds)
@@ -343,6 +360,8 @@ class _World:
         if fault.for_good and not local:
             self._gone.add(fault.service)
         if not service.up:
+            if fault.for_good and not local:
+                self._struck.add(id(fault))  # it is not started again
             return
         self.noted(fault.service, "is killed" + (" for good" if fault.for_good else ""))
         self._happened(fault, self._run.lease_s + (0.0 if local else fault.down_s))
@@ -370,6 +389,7 @@ class _World:
             self._agenda.at(until, self._robot_goes_on, self._robot.process)
             return
         service = self._services[fault.node]
+        self._crowd_takes_longer(service, fault.for_s)
         service.stop()
         self._network.review(service)
         self._agenda.at(until, self._service_goes_on, service, service.boot)
@@ -397,7 +417,10 @@ class _World:
         self.noted(fault.service, "computes %g times as long", fault.factor)
         slownesses = self._slownesses.setdefault(fault.service, [])
         slownesses.append(fault.factor)
+        slower = max(slownesses) / service.slowness
         service.slowness = max(slownesses)
+        left_s = self._crowded_until.get(service.name, 0.0) - self._agenda.now
+        self._crowd_takes_longer(service, (slower - 1.0) * left_s)
         self._agenda.after(fault.for_s, self._quicken, service, fault.factor)
 
     def _quicken(self, service: ServiceNode, factor: float) -> None:
@@ -417,14 +440,24 @@ class _World:
         service = self._services[fault.service]
         if not service.up:
             return
-        # Each of them is served in turn; meanwhile our robot may be told to come back later.
-        self._happened(fault, fault.robots * service.slowness * self._run.sensing_s + 1.0)
+        # Each of them is served in turn, after those of an earlier crowd that still wait.
+        begin = max(self._agenda.now, self._crowded_until.get(service.name, 0.0))
+        end = begin + fault.robots * service.slowness * self._run.sensing_s
+        self._crowded_until[service.name] = end
+        self._happened(fault, end - self._agenda.now + _CROWD_IS_FELT_S)
         self.noted(fault.service, "is asked by %s other robots", fault.robots)
         self._checker.crowded(fault.robots)
         for number in range(fault.robots):
             self._crowds += 1
             payload = self._others.first_request(self._crowds, number % NUM_TRIALS)
             self._network.call_of_another(service, payload)
+
+    def _crowd_takes_longer(self, service: ServiceNode, seconds: float) -> None:
+        """Take note that what is left of a crowd is served later, if anything is."""
+        end = self._crowded_until.get(service.name, 0.0)
+        if seconds > 0.0 and end > self._agenda.now:
+            self._crowded_until[service.name] = end + seconds
+            self._lasts(end + seconds - self._agenda.now + _CROWD_IS_FELT_S)
 
     def _pause(self, fault: PauseRobot) -> None:
         if self._robot.process:
