@@ -101,6 +101,14 @@ class MessageError(HoldfastError):
         super().__init__(text)
         self.code = code
 
+    def retold(self) -> MessageError:
+        """Return the same error without the story of how it was raised.
+
+        To be kept beyond where it was caught: its story holds that place with all that is known
+        there, the message and the error itself among it, until the collector comes by.
+        """
+        return MessageError(self.code, str(self))
+
 
 class Observed(msgspec.Struct, array_like=True, frozen=True, forbid_unknown_fields=True):
     """An observation that the robot has folded into its belief.

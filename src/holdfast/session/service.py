@@ -141,7 +141,7 @@ class Service:
         try:
             request = decode_request(payload)
         except MessageError as error:
-            request = error
+            request = error.retold()
         return self.receive_request(call, request, len(payload), now)
 
     def receive_request(
