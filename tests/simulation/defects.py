@@ -25,7 +25,6 @@ from holdfast.session import replies, service
 from holdfast.session.dispatcher import Dispatcher
 from holdfast.session.failure_detector import FailureDetector
 from holdfast.session.launches import Launches
-from holdfast.session.messages import Opening
 from holdfast.session.question import Question
 from holdfast.session.robot import Robot
 from holdfast.session.service import Service
@@ -195,7 +194,7 @@ class _DrawingJob(Job):
     __slots__ = ("position",)
 
     # By session, which its opening stands for: it is kept, so its identity is not another one's.
-    drawn: dict[int, tuple[Opening, dict[int, int]]] = {}  # noqa: RUF012
+    drawn: dict[int, tuple[bytes, dict[int, int]]] = {}  # noqa: RUF012
 
     def __init__(self, *arguments: Any) -> None:
         super().__init__(*arguments)

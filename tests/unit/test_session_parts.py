@@ -9,7 +9,7 @@ from tests.unit.test_session_service import Robot, make_problem
 
 from holdfast.session.known_services import KnownService, KnownServices
 from holdfast.session.launches import Launches
-from holdfast.session.messages import Request
+from holdfast.session.messages import Request, pack_opening
 from holdfast.session.service_jobs import Job
 from holdfast.session.service_limits import ServiceLimits
 from holdfast.session.service_lines import Lines
@@ -146,7 +146,7 @@ class TestLines:
             None,
             make_problem,
             str,
-            robot.opening,
+            pack_opening(robot.opening),
             robot.opening.planning,
             5,
             ServiceLimits(),

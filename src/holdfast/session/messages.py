@@ -47,13 +47,14 @@ __all__ = [
     "Request",
     "SensingAnswer",
     "TaskAnswer",
-    "count_values",
     "decode_reply",
     "decode_request",
     "encode",
     "numbers_from",
     "numbers_to",
+    "pack_opening",
     "sealed",
+    "unpack_opening",
 ]
 
 FloatArray = npt.NDArray[np.float64]
@@ -99,6 +100,14 @@ class MessageError(HoldfastError):
     def __init__(self, code: str, text: str) -> None:
         super().__init__(text)
         self.code = code
+
+    def retold(self) -> MessageError:
+        """Return the same error without the story of how it was raised.
+
+        To be kept beyond where it was caught: its story holds that place with all that is known
+        there, the message and the error itself among it, until the collector comes by.
+        """
+        return MessageError(self.code, str(self))
 
 
 class Observed(msgspec.Struct, array_like=True, frozen=True, forbid_unknown_fields=True):
@@ -331,8 +340,18 @@ def encode(message: Request | Reply) -> bytes:
     """Encode a message."""
     if isinstance(message, Request) and message.opening is not None:
         # Without an opening both forms are the same bytes.
-        return sealed(_ENCODER.encode(_sent(message, _ENCODER.encode(message.opening))))
+        return sealed(_ENCODER.encode(_sent(message, pack_opening(message.opening))))
     return sealed(_ENCODER.encode(message))
+
+
+def pack_opening(opening: Opening) -> bytes:
+    """Return an opening as it is sent: in memory it takes twenty times as much."""
+    return _ENCODER.encode(opening)
+
+
+def unpack_opening(packed: bytes) -> Opening:
+    """Return an opening that was packed here, and checked before."""
+    return _OPENING_DECODER.decode(packed)
 
 
 def sealed(content: bytes) -> bytes:
@@ -467,7 +486,7 @@ def _opening_of(data: bytes) -> Opening:
             f"state_space_planner among them: at most {MAX_OPENING_BYTES} are allowed",
         )
     opening = _OPENING_DECODER.decode(data)
-    if count_values(opening) > MAX_OPENING_VALUES:
+    if _count_values(opening) > MAX_OPENING_VALUES:
         raise MessageError(
             "too_large",
             f"problem {opening.problem}: more than {MAX_OPENING_VALUES} values in the sections "
@@ -476,7 +495,7 @@ def _opening_of(data: bytes) -> Opening:
     return opening
 
 
-def count_values(opening: Opening) -> int:
+def _count_values(opening: Opening) -> int:
     """Count the values in the problem's sections, however they are nested.
 
     Parameters

@@ -42,6 +42,7 @@ from holdfast.session.messages import (
     Request,
     numbers_from,
     numbers_to,
+    unpack_opening,
 )
 from holdfast.session.service_limits import ServiceLimits
 from holdfast.settings import PlanningSettings
@@ -110,7 +111,8 @@ class Job:
     problem : Problem or None
         None if it is still to be built.
     make_problem, describe_error : callable
-    opening : Opening
+    opening : bytes
+        Packed (:func:`~holdfast.session.messages.pack_opening`).
     planning : PlanningSettings
     seed : int
     limits : ServiceLimits
@@ -139,7 +141,7 @@ class Job:
         problem: Problem | None,
         make_problem: Callable[[Opening], Problem],
         describe_error: Callable[[BaseException], str],
-        opening: Opening,
+        opening: bytes,
         planning: PlanningSettings,
         seed: int,
         limits: ServiceLimits,
@@ -156,11 +158,6 @@ class Job:
         self._limits = limits
         self._request = request
         self._state = state
-
-    @property
-    def problem_name(self) -> str:
-        """What the problem is called in the opening."""
-        return self._opening.problem
 
     @property
     def state(self) -> PlanningState | None:
@@ -193,7 +190,7 @@ class Job:
         problem = self._problem
         try:
             if problem is None:
-                problem = self._make_problem(self._opening)
+                problem = self._make_problem(unpack_opening(self._opening))
             _check_work(problem, self._planning, self._limits)
             return self._computed(problem)
         except _LacksStateError as lack:

@@ -21,7 +21,7 @@ from typing import NamedTuple
 import msgspec
 
 from holdfast.planning import PlanningState
-from holdfast.session.messages import Opening, Request, count_values
+from holdfast.session.messages import Opening, Request, pack_opening
 from holdfast.session.service_limits import ServiceLimits
 from holdfast.settings import PlanningSettings
 
@@ -34,14 +34,10 @@ __all__ = [
     "Sessions",
     "WaitingCall",
     "Work",
-    "key_of",
 ]
 
 _LEAST_EPOCHS = 4096
 """Epochs of forgotten robots that are remembered, however few sessions there may be."""
-
-_BYTES_PER_VALUE = 64
-"""Of Python's objects for plain data, with their places in lists and mappings."""
 
 _SETTINGS_KEPT = 128
 """Settings that are shared by all robots that have the same."""
@@ -217,8 +213,6 @@ class Session:
         "num_bytes",
         "number",
         "opening",
-        "opening_bytes",
-        "opening_key",
         "planning",
         "planning_single",
         "problem_key",
@@ -236,12 +230,10 @@ class Session:
         self.key = request.session
         self.epoch = request.epoch
         self.number = -1
-        self.opening = opening
-        encoded = msgspec.msgpack.encode(opening)
-        self.opening_key = _name_of(encoded)
-        # In memory it takes far more than its bytes on the wire.
-        self.opening_bytes = len(encoded) + _BYTES_PER_VALUE * count_values(opening)
-        self.problem_key = key_of((opening.problem, opening.model, opening.state_space_planner))
+        # Packed, it is one object instead of thousands, all of which the collector would look at
+        # again and again while nobody else has the interpreter.
+        self.opening = pack_opening(opening)
+        self.problem_key = _key_of((opening.problem, opening.model, opening.state_space_planner))
         self.built = False
         # The number of threads changes no result, so the service may choose it.
         most = min(opening.planning.active_sensing.num_cores, max_threads)
@@ -305,7 +297,7 @@ class Sessions:
     state_bytes : int
         Of all states and answers, as they were weighed last.
     opening_bytes : int
-        Of all openings, by estimate.
+        Of all openings, packed.
     """
 
     def __init__(self, limits: ServiceLimits) -> None:
@@ -355,14 +347,14 @@ class Sessions:
         limits = self._limits
         return not self._sessions or (
             len(self._sessions) < limits.max_sessions
-            and self.opening_bytes + session.opening_bytes <= limits.max_opening_bytes
+            and self.opening_bytes + len(session.opening) <= limits.max_opening_bytes
         )
 
     def add(self, session: Session) -> None:
         """Remember a robot from now on."""
         self._sessions[session.key] = session
         self._num_newcomers += 1
-        self.opening_bytes += session.opening_bytes
+        self.opening_bytes += len(session.opening)
         self._epochs.pop(session.key, None)
 
     def use(self, session: Session, now: float) -> None:
@@ -376,7 +368,7 @@ class Sessions:
         del self._sessions[session.key]
         self._num_newcomers -= not session.served
         self.state_bytes -= session.num_bytes
-        self.opening_bytes -= session.opening_bytes
+        self.opening_bytes -= len(session.opening)
         self.note_epoch(session.key, session.epoch)
 
     def note_epoch(self, key: bytes, epoch: int) -> None:
@@ -421,13 +413,9 @@ class Sessions:
         session.num_bytes = 0
 
 
-def key_of(data: object) -> bytes:
+def _key_of(data: object) -> bytes:
     """Return a short name of plain data, equal for equal data."""
-    return _name_of(msgspec.msgpack.encode(data))
-
-
-def _name_of(encoded: bytes) -> bytes:
-    return hashlib.blake2b(encoded, digest_size=16).digest()
+    return hashlib.blake2b(msgspec.msgpack.encode(data), digest_size=16).digest()
 
 
 @lru_cache(maxsize=_SETTINGS_KEPT)
