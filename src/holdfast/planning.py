@@ -350,6 +350,10 @@ class Planner:
         """Predict the belief and go to the next step; see :func:`advance`."""
         return advance(self.problem, self.settings, state, task_action)
 
+    def digest(self, state: PlanningState) -> bytes:
+        """Return 32 bytes that are equal for equal states only; see :func:`digest`."""
+        return digest(state)
+
 
 def digest(state: PlanningState) -> bytes:
     """Return 32 bytes that are equal exactly when two states are equal, bit for bit.

@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from tests.questions import request_of
 
 from holdfast.planning import (
     PlanningState,
     advance,
     choose_sensing_action,
     choose_task_action,
-    digest,
     encode_checkpoint,
     initial_state,
     needs_sensing,
@@ -25,7 +25,6 @@ from holdfast.runtime.environment import SimulatedEnvironment
 from holdfast.session.messages import (
     CHECKSUM_SIZE,
     DIGEST_SIZE,
-    PROTOCOL_VERSION,
     Busy,
     NeedState,
     Observed,
@@ -136,18 +135,14 @@ def requests(session: bytes = b"s" * 16, epoch: int = 1) -> list[Request]:
             state = turn.state
             for told, restored in ((False, False), (True, False), (True, True), (False, True)):
                 found.append(
-                    Request(
-                        PROTOCOL_VERSION,
+                    request_of(
+                        state,
                         session,
-                        epoch,
                         len(found) + 1,
-                        state.trial,
-                        state.step,
-                        state.sensed,
-                        digest(state)[:DIGEST_SIZE],
-                        () if restored else turn.observed,
-                        opening if told else None,
-                        encode_checkpoint(state) if restored else None,
+                        epoch=epoch,
+                        observations=() if restored else turn.observed,
+                        opening=opening if told else None,
+                        checkpoint=encode_checkpoint(state) if restored else None,
                     )
                 )
     return found

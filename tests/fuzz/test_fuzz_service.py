@@ -192,7 +192,7 @@ def check_limits(bench: Bench, limits: dict[str, Any]) -> None:
     assert sum(session.num_bytes for session in kept) == sessions.state_bytes
     assert sum(session.size() for session in kept) <= sessions.state_bytes
     assert sessions.state_bytes <= limits["max_state_bytes"]
-    assert sum(session.opening_bytes for session in kept) == sessions.opening_bytes
+    assert sum(len(session.opening) for session in kept) == sessions.opening_bytes
     assert sessions.opening_bytes <= limits["max_opening_bytes"] or len(kept) == 1
     assert all(len(session.answers) <= limits["answers_per_session"] for session in kept)
     # Works.

@@ -18,16 +18,15 @@ from queue import Empty, SimpleQueue
 from typing import Any
 
 from tests.fuzz import corpus
+from tests.questions import request_of
 from tests.unit.test_session_service import Robot as ReferenceRobot
 from tests.unit.test_session_service import content
 
-from holdfast.planning import digest, encode_checkpoint
+from holdfast.planning import encode_checkpoint
 from holdfast.runtime.endpoints import ServiceAddress
 from holdfast.runtime.transport.zenoh_transport import ZenohRobotTransport
 from holdfast.session.events import Appeared, Ended, Replied, TransportEvent
 from holdfast.session.messages import (
-    DIGEST_SIZE,
-    PROTOCOL_VERSION,
     NeedState,
     Reply,
     Request,
@@ -110,18 +109,13 @@ def main() -> None:
         for number, turn in enumerate(corpus.turns(name)[:last]):
             state = turn.state
             restored = number > 0 and chance.random() < 0.1
-            request = Request(
-                PROTOCOL_VERSION,
+            request = request_of(
+                state,
                 session,
-                1,
                 number + 1,
-                state.trial,
-                state.step,
-                state.sensed,
-                digest(state)[:DIGEST_SIZE],
-                () if restored else turn.observed,
-                opening,
-                encode_checkpoint(state) if restored else None,
+                observations=() if restored else turn.observed,
+                opening=opening,
+                checkpoint=encode_checkpoint(state) if restored else None,
             )
             if leaves and number == last - 1:
                 # It was killed in the middle of its call.

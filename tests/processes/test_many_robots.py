@@ -24,15 +24,15 @@ from tests.processes.faults import (
     events_of,
     in_order,
 )
+from tests.questions import request_of
 
 from holdfast.configuration import Configuration, load
-from holdfast.planning import digest, initial_state
+from holdfast.planning import initial_state
 from holdfast.runtime.endpoints import ServiceAddress
 from holdfast.runtime.transport.calls import DEFAULT_MAX_MESSAGE_BYTES
 from holdfast.runtime.transport.zenoh_transport import ZenohRobotTransport
 from holdfast.session.events import Appeared, Ended, Replied, TransportEvent
 from holdfast.session.messages import (
-    DIGEST_SIZE,
     PROTOCOL_VERSION,
     Opening,
     Progress,
@@ -109,17 +109,7 @@ def first_request(configuration: Configuration, **changes: Any) -> Request:
         configuration.planning,
         configuration.simulator.seed,
     )
-    request = Request(
-        PROTOCOL_VERSION,
-        session=bytes(range(16)),
-        epoch=1,
-        number=1,
-        trial=0,
-        step=0,
-        sensed=False,
-        digest=digest(state)[:DIGEST_SIZE],
-        opening=opening,
-    )
+    request = request_of(state, bytes(range(16)), 1, opening=opening)
     return msgspec.structs.replace(request, **changes)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import platform
 import signal
 import socket
 import subprocess
@@ -517,6 +518,37 @@ def test_zenoh_has_the_threads_that_were_asked_for() -> None:
         pools = {(task / "comm").read_text().strip().rpartition("-")[0] for task in tasks}
     assert "app" in pools
     assert not pools & {"rx", "net", "acc"}
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="where there are such arenas")
+def test_the_threads_share_arenas() -> None:
+    """Each keeps as much as its threads ever held at the same time (runtime/allocator.py)."""
+    with served(*ANYWHERE) as service, robots_end(service.endpoint) as end:
+        end.appeared()
+        end.ask(encode(Robot().request()))
+        process = Path(f"/proc/{service.process.pid}")
+        threads = len(list((process / "task").iterdir()))
+        heaps = _heaps((process / "maps").read_text())
+    assert threads > 6
+    # The first arena is the process's own heap.
+    assert heaps <= 1
+
+
+def _heaps(maps: str) -> int:
+    """Count what is reserved for arenas: 64 MB at a multiple of it, of which a part is in use."""
+    size = 64 << 20
+    lines = [line.split() for line in maps.splitlines()]
+    spans = [[int(end, 16) for end in line[0].split("-")] for line in lines]
+    return sum(
+        start % size == 0 and permissions == "rw-p" and (rest == "---p" and last == start + size)
+        for (start, _), (_, last), permissions, rest in zip(
+            spans,
+            spans[1:],
+            (line[1] for line in lines),
+            (line[1] for line in lines[1:]),
+            strict=False,
+        )
+    )
 
 
 def test_a_service_is_ready_without_what_it_does_not_need() -> None:

@@ -138,5 +138,7 @@ message service=local direction=from number=22 what=drop
    2.6066  robot    hears of call 13: its end
    2.6138  robot    performs task actions 37 to 39
    2.6444  robot    ends trial 0 after 40 steps
+never happened: message service=local direction=to number=8,9,13
+never happened: message service=local direction=from number=20,22
 
 decided as without faults

@@ -25,7 +25,6 @@ from holdfast.session import replies, service
 from holdfast.session.dispatcher import Dispatcher
 from holdfast.session.failure_detector import FailureDetector
 from holdfast.session.launches import Launches
-from holdfast.session.messages import Opening
 from holdfast.session.question import Question
 from holdfast.session.robot import Robot
 from holdfast.session.service import Service
@@ -195,7 +194,7 @@ class _DrawingJob(Job):
     __slots__ = ("position",)
 
     # By session, which its opening stands for: it is kept, so its identity is not another one's.
-    drawn: dict[int, tuple[Opening, dict[int, int]]] = {}  # noqa: RUF012
+    drawn: dict[int, tuple[bytes, dict[int, int]]] = {}  # noqa: RUF012
 
     def __init__(self, *arguments: Any) -> None:
         super().__init__(*arguments)
@@ -382,8 +381,8 @@ _defect(
     Edit(
         Robot,
         "_next_sensing",
-        "if question.state is not state and answer.digest != digest(state)[:DIGEST_SIZE]:",
-        "if False:",
+        "answer.digest != self._planner.digest(state)[:DIGEST_SIZE]",
+        "False",
     ),
 )
 
@@ -504,18 +503,18 @@ _defect(
     "No alarm is set while a service is being asked, for sooner or later it will answer.",
     Edit(
         Dispatcher,
-        "next_wakeup",
+        "_next_wakeup",
         "due += [service.detector.deadline() for service in services]",
         "pass",
     ),
-    Edit(Dispatcher, "next_wakeup", "elif question.needed_at is not None:", "elif False:"),
+    Edit(Dispatcher, "_next_wakeup", "elif question.needed_at is not None:", "elif False:"),
 )
 _defect(
     "retry_not_timed",
     "No alarm is set for when a service may be asked again.",
     Edit(
         Dispatcher,
-        "next_wakeup",
+        "_next_wakeup",
         "if service.detector.present and service.refused is None",
         "if False",
     ),

@@ -8,11 +8,16 @@ from holdfast.simulation.exploration import Tally, explore
 from holdfast.simulation.schedule import (
     NUM_TRIALS,
     Crash,
+    Crowd,
     KillRobot,
     RunSettings,
     Schedule,
+    Slow,
+    Stop,
     draw_schedule,
+    parse_schedule,
 )
+from holdfast.simulation.story import story_lines
 from holdfast.simulation.world import Outcome, Simulator
 
 
@@ -41,7 +46,7 @@ def test_a_schedule_goes_one_way_only(simulator: Simulator) -> None:
         first = simulator.run(schedule, tell=True)
         # Neither on what was computed before nor on whether it is told does anything depend.
         assert Simulator().run(schedule, tell=True) == first
-        assert simulator.run(schedule) == first._replace(story=[])
+        assert simulator.run(schedule) == first._replace(story=[], never_happened=())
 
 
 @pytest.mark.parametrize("boundary", range(0, 100, 3))
@@ -69,6 +74,70 @@ def test_without_a_local_service_it_waits_for_the_cloud(simulator: Simulator) ->
     gone = Crash(service="cloud-1", at=0.1, down_s=0.2)
     run = RunSettings(launch="never")
     assert fine(simulator.run(Schedule(run, (gone,))))
+
+
+def test_faults_that_never_happened_are_told(simulator: Simulator) -> None:
+    """Each but the first crash and the first message, which strike what is there."""
+    late = "crash service=cloud-1 at=100.0"
+    down = "crash service=cloud-1 at=0.15"
+    again = "kill_robot boundary=3 down_s=0.1"
+    text = f"""
+        crash service=cloud-1 at=0.1
+        {down}
+        {late}
+        kill_robot boundary=3
+        {again}
+        message service=cloud-1 direction=to number=0 what=delay seconds=0.01
+        message service=cloud-1 direction=to number=500 what=drop
+        message service=cloud-1 direction=from number=400 what=drop
+        message service=cloud-1 direction=to number=300 what=drop
+    """
+    outcome = simulator.run(parse_schedule(text), tell=True)
+    assert fine(outcome)
+    assert story_lines(outcome)[-5:] == [
+        f"never happened: {down}",
+        f"never happened: {late}",
+        f"never happened: {again}",
+        "never happened: message service=cloud-1 direction=to number=300,500",
+        "never happened: message service=cloud-1 direction=from number=400",
+    ]
+    assert outcome.faults == {"crash": 1, "kill_robot": 1, "message delay": 1}
+
+
+def test_a_service_that_is_down_and_gone_for_good_is_struck(simulator: Simulator) -> None:
+    text = """
+        run replicas=2
+        crash service=cloud-1 at=0.05
+        crash service=cloud-1 at=0.1 for_good=true
+    """
+    outcome = simulator.run(parse_schedule(text), tell=True)
+    assert fine(outcome)
+    assert outcome.never_happened == ()
+
+
+SIXTY = Crowd(service="cloud-1", at=0.0, robots=60)
+
+
+@pytest.mark.parametrize(
+    ("others", "served_s"),
+    [
+        ((), 1.8),
+        ((SIXTY, SIXTY), 5.4),
+        ((Crowd(service="cloud-1", at=0.9, robots=30),), 2.7),
+        ((Stop(node="cloud-1", at=0.05, for_s=0.5),), 2.3),
+        ((Slow(service="cloud-1", at=0.3, for_s=0.5, factor=2.0),), 3.3),
+        ((Crowd(service="cloud-2", at=0.0, robots=30),), 1.8),
+    ],
+    ids=["one", "three at once", "one during the other", "stopped", "slow", "elsewhere"],
+)
+def test_crowds_last_until_all_of_them_are_served(
+    others: tuple[Crowd | Stop | Slow, ...], served_s: float, simulator: Simulator
+) -> None:
+    """By one worker; and the robot may be told to come back a second later."""
+    run = RunSettings(replicas=2, launch="never", workers=1, sensing_s=0.03, act_s=1.0)
+    outcome = simulator.run(Schedule(run, (SIXTY, *others)))
+    assert fine(outcome)
+    assert outcome.duration_s - outcome.recovery_s == pytest.approx(served_s + 1.0)
 
 
 @pytest.mark.parametrize("first", range(0, 400, 100))

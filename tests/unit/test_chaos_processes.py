@@ -55,6 +55,53 @@ def test_a_command_becomes_another_one(tmp_path: Path) -> None:
         ChildProcess(["serve"], tmp_path / "log", {}, happened.put, prefix=("absent-command",))
 
 
+PARENT = """
+import os, sys, time
+from queue import SimpleQueue
+from holdfast.chaos.processes import ChildProcess, leash
+from pathlib import Path
+prefix = leash() if sys.argv[2] == "leashed" else ()
+listen = ["--listen", sys.argv[3], "--log", "json"]
+put = SimpleQueue().put
+child = ChildProcess(["serve", *listen], Path(sys.argv[1]), {**os.environ}, put, prefix)
+print(child.process.pid, flush=True)
+time.sleep(600)
+"""
+
+
+@pytest.mark.parametrize("how", ["leashed", "free"])
+def test_a_command_on_a_leash_ends_with_whoever_started_it(tmp_path: Path, how: str) -> None:
+    listen = f"tcp/127.0.0.1:{free_port()}"
+    log = tmp_path / "log"
+    program = [sys.executable, "-c", PARENT, str(log), how, listen]
+    with subprocess.Popen(program, stdout=subprocess.PIPE, text=True) as parent:
+        assert parent.stdout is not None
+        pid = int(parent.stdout.readline())
+        deadline = time.monotonic() + PATIENCE_S
+        while not (log.exists() and "ready" in log.read_text()):
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+        parent.kill()
+    try:
+        if how == "free":
+            time.sleep(0.5)
+            assert Path(f"/proc/{pid}/exe").exists()
+            return
+        while _lives(pid):
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+    finally:
+        if _lives(pid):
+            os.kill(pid, signal.SIGKILL)
+
+
+def _lives(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
 def test_a_command_stands_still_and_goes_on(tmp_path: Path) -> None:
     happened: SimpleQueue[Written | Ended] = SimpleQueue()
     listen = f"tcp/127.0.0.1:{free_port()}"

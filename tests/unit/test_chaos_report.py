@@ -14,6 +14,7 @@ from holdfast.chaos.report import ChaosSummary, kind_rows, summarise, write_tabl
 from holdfast.chaos.schedule import FaultKind
 from holdfast.chaos.series import TRIALS_NAME, Series, SeriesPlan
 from holdfast.chaos.trial import CancelledTrialError, Pace, TrialOutcome, Verdict
+from holdfast.cli.chaos import _write_table
 from holdfast.files import OutputError
 
 PLAN = SeriesPlan(
@@ -108,6 +109,20 @@ def test_tables(tmp_path: Path) -> None:
     assert rows[1]["kind"] == "link_cut"
     assert rows[1]["trial_kind"] == "combination"
     assert rows[3]["detection_ms"] == "7.0"
+
+
+def test_the_table_tells_behind_how_many_times_it_stands(tmp_path: Path) -> None:
+    _write_table(summary(), tmp_path / "table.txt")
+    text = (tmp_path / "table.txt").read_text()
+    head, killed, combined = text.splitlines()[1:4]
+    assert head.split()[6:] == ["n", "median", "p95", "max"] * 4
+    # Three faults, of which two were found and two times the cloud came back.
+    assert killed.split()[:8] == ["cloud_killed", "2", "3", "0", "2", "6", "7", "7"]
+    assert killed.split()[12:16] == ["3", "200", "200", "200"]
+    assert combined.split() == ["combination", "1", "1", "1", *"----"]
+    assert "\nn: faults after which this was measured" in text
+    assert "\n-: never measured" in text
+    assert all(len(line) <= 142 for line in text.splitlines())
 
 
 @pytest.mark.slow

@@ -50,6 +50,7 @@ EXAMPLES: dict[str, dict[str, object]] = {
     "service_appeared": {"service": "cloud", "boot": "a1b2"},
     "service_vanished": {"service": "cloud"},
     "service_suspected": {"service": "cloud", "reason": "no progress for 250 ms"},
+    "late_replies": {"service": "cloud", "soonest_ms": 401.0, "reason": "several took longer"},
     "holding": {"step": 9, "reason": "cloud: is not there"},
     "resumed": {"held_ms": 812.0},
     "refused": {"service": "cloud", "code": "stale_epoch", "reason": "epoch 1 < 2", "final": True},

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import subprocess
 import sys
 import threading
@@ -25,6 +26,7 @@ from holdfast.runtime.transport.in_process import InProcessNetwork
 from holdfast.session.events import Appeared, Ended, Replied, TransportEvent
 from holdfast.session.messages import (
     Busy,
+    MessageError,
     Opening,
     Progress,
     Refused,
@@ -33,6 +35,7 @@ from holdfast.session.messages import (
     TaskAnswer,
     decode_reply,
     encode,
+    sealed,
 )
 from holdfast.session.service import Service
 from holdfast.session.service_limits import ServiceLimits
@@ -189,6 +192,26 @@ def test_signs_of_progress_while_a_worker_computes(joined: Joined) -> None:
     joined.held.let_go.set()
     replies = patient.collect({call})[call]
     assert any(isinstance(reply, SensingAnswer) for reply in replies)
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [b"damaged", sealed(b"no request"), sealed(b"\x9b\x7f")],
+    ids=["checksum", "form", "version"],
+)
+def test_what_is_refused_leaves_nothing_for_the_collector(joined: Joined, payload: bytes) -> None:
+    """An error holds the frames that it went through, and would be held by one of them."""
+    robot = Patient(joined.network)
+    gc.collect()
+    gc.disable()
+    try:
+        for _ in range(20):
+            assert isinstance(robot.ask(payload)[0], Refused)
+        kept = sum(type(each) is MessageError for each in gc.get_objects())
+    finally:
+        gc.enable()
+    # The last one's thread may not be done with it.
+    assert kept <= 1
 
 
 def test_calls_are_heard_while_all_workers_compute() -> None:

@@ -1,4 +1,4 @@
-"""The small parts of both machines, each alone: launches, lines of work."""
+"""The small parts of both machines, each alone: launches, late replies, lines of work."""
 
 from __future__ import annotations
 
@@ -7,13 +7,43 @@ import random
 import pytest
 from tests.unit.test_session_service import Robot, make_problem
 
+from holdfast.session.known_services import KnownService, KnownServices
 from holdfast.session.launches import Launches
-from holdfast.session.messages import Request
+from holdfast.session.messages import Request, pack_opening
 from holdfast.session.service_jobs import Job
 from holdfast.session.service_limits import ServiceLimits
 from holdfast.session.service_lines import Lines
 from holdfast.session.service_sessions import ExpectedTimes, Session, Work
 from holdfast.settings import RecoverySettings
+
+
+class TestLateReplies:
+    """Of a service that is further away than the timeout is long."""
+
+    @staticmethod
+    def heard(*calls: tuple[float, float]) -> list[float | None]:
+        service = KnownService("cloud", 0.25, late_after_s=0.25)
+        return [service.note_first_reply(sent_at, now) for sent_at, now in calls]
+
+    def test_the_third_in_a_row_is_told_once(self) -> None:
+        calls = [(float(turn), turn + 0.4 - 0.01 * turn) for turn in range(9)]
+        told = self.heard(*calls)
+        assert told[2] == pytest.approx(0.38)
+        assert [each for each in told if each is not None] == [told[2]]
+
+    def test_one_in_time_begins_anew(self) -> None:
+        late, in_time = [(0.0, 0.4), (1.0, 1.4)], [(2.0, 2.25)]
+        assert self.heard(*late, *in_time, *late) == [None] * 5
+
+    def test_what_waited_for_the_same_thing_counts_once(self) -> None:
+        """A service stood still for a second, and then replies to all that it was asked."""
+        assert self.heard(*((0.25 * call, 1.1) for call in range(4))) == [None] * 4
+
+    def test_the_local_service_is_near(self) -> None:
+        services = KnownServices(["cloud"], "local", 0.25)
+        assert services.cloud[0].late_after_s == 0.25
+        assert services.local is not None
+        assert [services.local.note_first_reply(0.0, 9.0) for _ in range(9)] == [None] * 9
 
 
 class TestLaunches:
@@ -116,7 +146,7 @@ class TestLines:
             None,
             make_problem,
             str,
-            robot.opening,
+            pack_opening(robot.opening),
             robot.opening.planning,
             5,
             ServiceLimits(),

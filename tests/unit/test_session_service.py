@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tests.questions import request_of
 
 from holdfast.errors import ConfigurationError, ProblemError, UnknownProblemError
 from holdfast.planning import (
@@ -38,7 +39,6 @@ from holdfast.runtime.environment import SimulatedEnvironment
 from holdfast.session.messages import (
     DIGEST_SIZE,
     MAX_TASK_ACTIONS,
-    PROTOCOL_VERSION,
     Busy,
     MessageError,
     NeedState,
@@ -54,6 +54,7 @@ from holdfast.session.messages import (
     encode,
     numbers_from,
     numbers_to,
+    unpack_opening,
 )
 from holdfast.session.service import Service
 from holdfast.session.service_effects import Answer, Effect, End, Noted, Run
@@ -177,18 +178,13 @@ class Robot:
     def request(self, *, opening: bool = True, since: int = 0, **changes: Any) -> Request:
         """Return the question of now; ``since`` counts the observations that are known already."""
         self.number += 1
-        state = self.state
-        request = Request(
-            PROTOCOL_VERSION,
+        request = request_of(
+            self.state,
             self.session,
-            self.epoch,
             self.number,
-            state.trial,
-            state.step,
-            state.sensed,
-            digest(state)[:DIGEST_SIZE],
-            tuple(self.observed[since:]),
-            self.opening if opening else None,
+            epoch=self.epoch,
+            observations=tuple(self.observed[since:]),
+            opening=self.opening if opening else None,
         )
         return msgspec.structs.replace(request, **changes)
 
@@ -1128,10 +1124,10 @@ class TestCapacity:
         assert content(bench.ask(robot.restore())) == robot.right_answer()
 
     def test_bytes_of_openings(self) -> None:
-        """A plate with a thousand holes is 24 KB on the wire and half a megabyte in memory."""
+        """A plate with a thousand holes is 24 KB as it is sent, and half a megabyte unpacked."""
         holes = [{"center": [4.0, 6.0 - 0.01 * number], "depth": 0.01} for number in range(900)]
         opening = Opening("multitier_peg_in_hole_2d", {"holes": holes}, {}, planning_of(), 5)
-        bench = Bench(max_opening_bytes=3 << 20)
+        bench = Bench(max_opening_bytes=250_000)
         for key in range(1, 31):
             bench.ask(Robot(key=key).request())
         assert bench.service.statistics.sessions == 30
@@ -1139,7 +1135,8 @@ class TestCapacity:
             request = msgspec.structs.replace(Robot(key=key).request(), opening=opening)
             bench.ask(request)
             held = [session.opening for session in bench.service._sessions._sessions.values()]
-            assert sum(len(str(each.model)) for each in held) < 4 << 20
+            assert sum(map(len, held)) <= 250_000
+            assert unpack_opening(held[-1]) == opening
         assert 4 <= bench.service.statistics.sessions <= 8
         # Each by itself is served, however large it is beside the limit.
         small = Bench(max_opening_bytes=100)

@@ -42,11 +42,25 @@ def test_a_schedule_of_a_file(tmp_path: Path) -> None:
     assert "status from=standard to=local_recovery" in done.output
 
 
-@pytest.mark.parametrize("seeds", ["5", "7:7", "9:3", "-1:4", "a:b", "1:2:3"])
-def test_seeds_that_are_none(seeds: str) -> None:
+@pytest.mark.parametrize(
+    ("seeds", "says"),
+    [
+        ("5", "must be two whole numbers A:B"),
+        ("a:b", "must be two whole numbers A:B"),
+        ("1:2:3", "must be two whole numbers A:B"),
+        ("7:7", "holds no seed; the second number (7) must be above the first (7)"),
+        ("9:3", "holds no seed; the second number (3) must be above the first (9)"),
+        ("-3:2", "-3 is no seed; allowed are 0 to 1,000,000,000,000"),
+        ("3:-2", "-2 is no seed; allowed are 0 to 1,000,000,000,000"),
+        ("0:1000000000001", "1000000000001 is no seed; allowed are 0 to 1,000,000,000,000"),
+        ("0:" + "9" * 5000, "9 is no seed; allowed are 0 to 1,000,000,000,000"),
+    ],
+)
+def test_seeds_that_are_none(seeds: str, says: str) -> None:
     done = simulate("--seeds", seeds)
     assert done.exit_code != 0
-    assert f"--seeds {seeds}: must be two whole numbers A:B" in str(done.exception)
+    assert str(done.exception).startswith(f"--seeds {seeds}: ")
+    assert says in str(done.exception)
 
 
 def test_files_that_are_no_schedule(tmp_path: Path) -> None:

@@ -34,6 +34,7 @@ from holdfast.chaos.processes import (
     Ended,
     Written,
     free_port,
+    leash,
     local_services_of,
     marked_processes,
     time_of,
@@ -416,13 +417,15 @@ class _Trial:
 
     # -- processes -----------------------------------------------------------------------------
 
-    def _start(self, arguments: list[str], log_name: str) -> ChildProcess:
+    def _start(
+        self, arguments: list[str], log_name: str, prefix: tuple[str, ...] = ()
+    ) -> ChildProcess:
         child = ChildProcess(
             arguments,
             self._directory / log_name,
             self._environment,
             self._happened.put,
-            self._prefix,
+            (*self._prefix, *prefix),
         )
         self._children.append(child)
         return child
@@ -444,6 +447,7 @@ class _Trial:
                 *("--out", str(self._directory / _RUN_NAME), *options),
             ],
             _ROBOT_LOG_NAME,
+            leash(),
         )
 
     def _await(

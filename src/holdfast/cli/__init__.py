@@ -2,8 +2,8 @@
 
 Nothing below this package prints or exits. Here an error that holdfast raises on purpose, or that a
 problem's own code raises, becomes one message and exit code 2; Ctrl-C, SIGTERM and a terminal that
-is closed end a run in order, with 128 and the signal's number; and anything else is a defect and
-keeps its traceback.
+is closed end a run in order, with 128 and the signal's number; so does, with SIGPIPE's, a reader of
+the standard output that has ended; and anything else is a defect and keeps its traceback.
 
 There is one module for each command, and libraries that take long to import are imported where they
 are used, so that ``--help`` and a mistyped option answer at once. ``serve`` goes past all of it: a
@@ -20,7 +20,11 @@ __all__ = ["main"]
 
 def main() -> None:
     """Run the command line and exit."""
-    from holdfast.cli.streams import forgive_unwritable_errors, replace_closed_streams
+    from holdfast.cli.streams import (
+        end_with_the_reader,
+        forgive_unwritable_errors,
+        replace_closed_streams,
+    )
     from holdfast.errors import HoldfastError
 
     replace_closed_streams()
@@ -33,7 +37,11 @@ def main() -> None:
             sys.exit(serve(arguments[1:]))
         from holdfast.cli.application import run_application
 
-        run_application(arguments)
+        end_with_the_reader()
+        try:
+            run_application(arguments)
+        finally:
+            sys.stdout.flush()
     except HoldfastError as error:
         from holdfast.cli.endings import EXIT_ERROR, tell_error
 

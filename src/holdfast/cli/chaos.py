@@ -32,8 +32,17 @@ _RUNS = Path("runs")
 _MAX_TRIALS = 100_000
 _DEFAULT_TRIALS = 20
 _TABLE_NAME = "table.txt"
-_WIDE = 122
+_WIDE = 142
 """Characters that the whole table needs; on a narrower terminal a part of it is left out."""
+
+_N_EXPLAINED = (
+    "n: faults after which this was measured. After the others it did not come to it: the robot "
+    "did not need what was struck, or its run was over."
+)
+_DASH_EXPLAINED = (
+    "-: never measured. That it was struck itself no robot tells; to a local service none goes "
+    "back; times of faults that overlap (combination) belong to none of them."
+)
 
 
 def chaos(
@@ -57,6 +66,7 @@ def chaos(
         list[str] | None,
         typer.Option(
             "--only",
+            "--kind",
             metavar="KIND",
             help=(
                 "Only trials of this kind, as --list names them; may be repeated (default: all "
@@ -110,7 +120,7 @@ def chaos(
     if list_kinds:
         _list_kinds()
         return
-    with ended_by_signals():
+    with ended_by_signals(once=True):
         good = _run(
             trials=trials,
             seed=seed,
@@ -154,11 +164,15 @@ def _chosen_kinds(
     only: Sequence[str], impossible: dict[FaultKind, str]
 ) -> tuple[tuple[FaultKind, ...], dict[FaultKind, str]]:
     """Return the kinds of a series, and those of the wanted ones that are left out."""
+    from difflib import get_close_matches
+
     from holdfast.chaos.schedule import FaultKind
 
     for name in only:
         if name not in list(FaultKind):
-            raise InvalidValueError(f"--only is {name!r}; allowed are {', '.join(FaultKind)}")
+            near = get_close_matches(name.lower().replace("-", "_"), list(FaultKind), n=1)
+            hint = f" (did you mean {near[0]}?)" if near else ""
+            raise InvalidValueError(f"--only is {name!r}{hint}; allowed are {', '.join(FaultKind)}")
     wanted = [kind for kind in FaultKind if kind in only] if only else list(FaultKind)
     kinds = tuple(kind for kind in wanted if kind not in impossible)
     if not kinds:
@@ -396,7 +410,7 @@ def _print_table(summary: ChaosSummary, console: Console) -> None:
     for name in ("trials", "faults", "wrong") if wide else ("trials", "wrong"):
         table.add_column(name, justify="right")
     for name in ("detection", "recovery", "launch", "failback"):
-        head = f"{name}, ms\nmedian   p95   max" if wide else f"{name}\nmedian max"
+        head = f"{name}, ms\n   n median   p95   max" if wide else f"{name}\nmedian max"
         table.add_column(head, justify="right", no_wrap=True)
     for row in summary.kinds:
         wrong = Text(str(row.wrong), style="bold red" if row.wrong else "")
@@ -405,6 +419,10 @@ def _print_table(summary: ChaosSummary, console: Console) -> None:
         cells = (_cell(spread, wide=wide) for spread in spreads)
         table.add_row(row.kind.value, *counts, wrong, *cells)
     console.print(table)
+    console.print()
+    if wide:
+        console.print(_N_EXPLAINED)
+    console.print(_DASH_EXPLAINED)
     bad = summary.finished - summary.identical
     if bad:
         verdict = (
@@ -426,5 +444,6 @@ def _cell(spread: Spread | None, *, wide: bool) -> str:
     if spread is None:
         return "-"
     if wide:
-        return f"{spread.median_ms:6.0f} {spread.p95_ms:5.0f} {spread.max_ms:5.0f}"
+        times = f"{spread.median_ms:6.0f} {spread.p95_ms:5.0f} {spread.max_ms:5.0f}"
+        return f"{spread.count:4} {times}"
     return f"{spread.median_ms:.0f} {spread.max_ms:5.0f}"

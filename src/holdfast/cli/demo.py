@@ -59,7 +59,7 @@ def demo(
     Exit code 0: they are. 1: they differ. 2: something did not happen; the message says what was
     awaited and where the logs are. Ctrl-C ends all processes.
     """
-    with ended_by_signals():
+    with ended_by_signals(once=True):
         findings = _tell(out, seed, quick=quick)
     if not findings.comparison.identical:
         raise typer.Exit(EXIT_DIFFERENT)

@@ -79,7 +79,7 @@ def tell_error(error: HoldfastError, arguments: Sequence[str]) -> None:
 
 
 class EndedBySignal(KeyboardInterrupt):
-    """A signal other than Ctrl-C's ended the run."""
+    """A signal ended the run, with a handler of our own: mostly another one than Ctrl-C's."""
 
     def __init__(self, number: int) -> None:
         super().__init__(number)
@@ -87,20 +87,32 @@ class EndedBySignal(KeyboardInterrupt):
 
 
 @contextlib.contextmanager
-def ended_by_signals() -> Iterator[None]:
-    """Let SIGTERM and SIGHUP end what is inside as Ctrl-C does, and exit with their numbers."""
+def ended_by_signals(*, once: bool = False) -> Iterator[None]:
+    """Let SIGTERM and SIGHUP end what is inside as Ctrl-C does, and exit with their numbers.
+
+    Parameters
+    ----------
+    once : bool
+        Whether the first signal is the last one that is heard, up to the end of the process, and
+        Ctrl-C is one of them: for a command that has processes to end, which more of them would
+        keep it from.
+    """
+    ended = False
 
     def end(number: int, frame: object) -> None:
+        nonlocal ended
         del frame
+        ended = True
         # One is enough: another would cut short what the first one began.
         for handled in saved:
             signal.signal(handled, signal.SIG_IGN)
         raise EndedBySignal(number)
 
     # What is ignored from the start stays so: nohup asks for that.
+    numbers = (signal.SIGTERM, signal.SIGHUP, *((signal.SIGINT,) if once else ()))
     saved = {
         number: before
-        for number in (signal.SIGTERM, signal.SIGHUP)
+        for number in numbers
         if (before := signal.getsignal(number)) is not signal.SIG_IGN
     }
     try:
@@ -110,8 +122,9 @@ def ended_by_signals() -> Iterator[None]:
     except KeyboardInterrupt as interruption:
         raise SystemExit(EXIT_SIGNAL + signal_of(interruption)) from None
     finally:
-        for number, before in saved.items():
-            signal.signal(number, before)
+        if not (once and ended):
+            for number, before in saved.items():
+                signal.signal(number, before)
 
 
 def signal_of(interruption: KeyboardInterrupt) -> signal.Signals:

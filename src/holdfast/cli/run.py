@@ -17,6 +17,7 @@ import typer
 from holdfast.cli.endings import ResumableError, ended_by_signals, signal_of
 from holdfast.cli.terminal import duration, print_files, print_summary, run_display
 from holdfast.errors import HoldfastError, InvalidValueError
+from holdfast.runtime.command_line import MAX_JOBS
 
 if TYPE_CHECKING:
     from holdfast.configuration import Configuration
@@ -67,7 +68,7 @@ def run(
             "-j",
             metavar="N",
             min=1,
-            max=1024,
+            max=MAX_JOBS,
             help=(
                 "Largest number of processes (default: one for each core). It changes time only, "
                 "never a result."

@@ -12,6 +12,7 @@ import typer
 
 from holdfast.cli.endings import EXIT_DIFFERENT, ended_by_signals
 from holdfast.errors import HoldfastError
+from holdfast.runtime.command_line import MAX_JOBS
 
 if TYPE_CHECKING:
     from holdfast.simulation.exploration import Tally
@@ -20,8 +21,9 @@ if TYPE_CHECKING:
 
 __all__ = ["simulate"]
 
-_SEEDS = re.compile(r"(\d{1,12}):(\d{1,12})")
-_MAX_JOBS = 1024
+_SEEDS = re.compile(r"([-+]?\d+):([-+]?\d+)", re.ASCII)
+_MAX_SEED = 10**12
+_MAX_DIGITS = 20
 
 
 def simulate(
@@ -66,8 +68,8 @@ def simulate(
     Ends at the first seed under which it does not, and prints its schedule, a smaller one, and the
     command that runs it again. Exit code 0: there was none. 1: there was one.
     """
-    if not 0 <= jobs <= _MAX_JOBS:
-        raise HoldfastError(f"--jobs {jobs}: must be from 0 (one for each core) to {_MAX_JOBS}")
+    if not 0 <= jobs <= MAX_JOBS:
+        raise HoldfastError(f"--jobs {jobs}: must be from 0 (one for each core) to {MAX_JOBS}")
     if schedule is not None:
         if seeds is not None or story:
             raise HoldfastError(
@@ -87,10 +89,18 @@ def simulate(
 
 def _seeds_of(text: str) -> range:
     match = _SEEDS.fullmatch(text)
-    begin, end = map(int, match.groups()) if match else (0, 0)
+    if match is None:
+        raise HoldfastError(f"--seeds {text}: must be two whole numbers A:B, such as 0:1000")
+    for number in match.groups():
+        if len(number) > _MAX_DIGITS or not 0 <= int(number) <= _MAX_SEED:
+            raise HoldfastError(
+                f"--seeds {text}: {number} is no seed; allowed are 0 to {_MAX_SEED:,}"
+            )
+    begin, end = map(int, match.groups())
     if begin >= end:
         raise HoldfastError(
-            f"--seeds {text}: must be two whole numbers A:B, the first one below the second"
+            f"--seeds {text}: holds no seed; the second number ({end}) must be above the first "
+            f"({begin})"
         )
     return range(begin, end)
 

@@ -33,6 +33,7 @@ from holdfast.chaos.processes import (
     Ended,
     Written,
     free_port,
+    leash,
     time_of,
 )
 from holdfast.chaos.twin import keep_undisturbed, run_undisturbed
@@ -438,6 +439,7 @@ class Story:
                 *("--out", str(self._directory / KILLED_RUN_NAME), *options),
             ],
             self._robot_log,
+            leash(),
         )
         self._robot_spawned_at = self._robot.spawned_at
         self._statuses.append([Status.STANDARD.value])
@@ -447,8 +449,10 @@ class Story:
         command = " ".join(["holdfast run CONFIG --service ...", *options])
         self._say("demo", f"starts the robot: {command}", self._robot_spawned_at)
 
-    def _start(self, arguments: list[str], log_path: Path) -> ChildProcess:
-        child = ChildProcess(arguments, log_path, self._environment, self._happened.put)
+    def _start(
+        self, arguments: list[str], log_path: Path, prefix: tuple[str, ...] = ()
+    ) -> ChildProcess:
+        child = ChildProcess(arguments, log_path, self._environment, self._happened.put, prefix)
         self._children.append(child)
         return child
 

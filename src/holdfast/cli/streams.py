@@ -1,19 +1,37 @@
 """The standard streams of the command, which may be closed, full, or read by nobody any more.
 
-What is said there is for whoever looks on. Nobody looking on is no reason to end a run.
+What is said on the standard error is for whoever looks on. Nobody looking on is no reason to end a
+run. What is written to the standard output was asked for: a command whose reader has had enough
+(``holdfast simulate --story | head``) ends as the system's own tools do, without a word.
 """
 
 from __future__ import annotations
 
 import io
 import os
+import signal
 import sys
 from typing import TYPE_CHECKING
+
+from holdfast.errors import HoldfastError
 
 if TYPE_CHECKING:
     from _typeshed import ReadableBuffer
 
-__all__ = ["forgive_unwritable_errors", "replace_closed_streams"]
+__all__ = [
+    "EXIT_UNREAD",
+    "UnwritableOutputError",
+    "end_with_the_reader",
+    "forgive_unwritable_errors",
+    "replace_closed_streams",
+]
+
+EXIT_UNREAD = 128 + signal.SIGPIPE
+"""Nobody reads the standard output any more: 141, as of a program that SIGPIPE has ended."""
+
+
+class UnwritableOutputError(HoldfastError):
+    """The standard output cannot be written, for another reason than that nobody reads it."""
 
 
 def replace_closed_streams() -> None:
@@ -49,6 +67,47 @@ def forgive_unwritable_errors() -> None:
         errors=before.errors,
         line_buffering=True,
     )
+
+
+def end_with_the_reader() -> None:
+    """Let what cannot be written to the standard output end the command.
+
+    Quietly with :data:`EXIT_UNREAD` if nobody reads it, else by an :class:`UnwritableOutputError`;
+    what comes after that, such as what is still buffered, is lost.
+    """
+    before = sys.stdout
+    if before is not sys.__stdout__ or not isinstance(before, io.TextIOWrapper):
+        return  # somebody else's
+    try:
+        descriptor = before.fileno()
+    except (OSError, ValueError):
+        return
+    sys.stdout = io.TextIOWrapper(
+        io.BufferedWriter(_EndingFile(descriptor, "w", closefd=False)),
+        encoding=before.encoding,
+        errors=before.errors,
+        line_buffering=before.line_buffering or before.write_through,
+    )
+
+
+class _EndingFile(io.FileIO):
+    """A file that ends the program, once, when it cannot be written."""
+
+    _ends = False
+
+    def write(self, data: ReadableBuffer, /) -> int:
+        if self._ends:
+            return memoryview(data).nbytes
+        try:
+            return super().write(data)
+        except BrokenPipeError:
+            self._ends = True
+            raise SystemExit(EXIT_UNREAD) from None
+        except OSError as error:
+            self._ends = True
+            raise UnwritableOutputError(
+                f"the standard output cannot be written: {error.strerror}"
+            ) from error
 
 
 class _ForgivingFile(io.FileIO):

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-__all__ = ["wants_json"]
+__all__ = ["MAX_JOBS", "wants_json"]
+
+MAX_JOBS = 1024
+"""Largest number of worker processes that a command can be asked for (``--jobs``)."""
 
 
 def wants_json(arguments: Sequence[str]) -> bool:

@@ -220,11 +220,13 @@ def _serve(options: argparse.Namespace) -> int:
         tls=tls,
     )
 
+    from holdfast.runtime.allocator import limit_arenas
     from holdfast.runtime.logs import EventLog
     from holdfast.runtime.service_shell import KnownProblems, ServiceShell
     from holdfast.session.service import Service
     from holdfast.session.service_limits import ServiceLimits
 
+    limit_arenas()
     limits = ServiceLimits()
     if options.max_sessions is not None:
         limits = ServiceLimits(max_sessions=options.max_sessions)

@@ -483,7 +483,7 @@ class ServiceShell:
             # Large ones take their time; the other threads have the machine meanwhile.
             request = decode_request(incoming.payload)
         except MessageError as error:
-            request = error
+            request = error.retold()
         finally:
             with self._incoming_lock:
                 self._incoming -= 1

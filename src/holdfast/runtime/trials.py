@@ -32,6 +32,7 @@ from holdfast.configuration import Configuration
 from holdfast.errors import HoldfastError, InvalidValueError, TrialError
 from holdfast.outcome import TrialResult
 from holdfast.problems.problem import Problem
+from holdfast.runtime.command_line import MAX_JOBS
 from holdfast.runtime.trial import (
     NULL_OBSERVER,
     NullObserver,
@@ -51,9 +52,6 @@ __all__ = [
     "inherited_by_children",
     "run_trials",
 ]
-
-MAX_JOBS = 1024
-"""Bound on the number of worker processes."""
 
 _WORKER_START_S = 1.0
 """About what it costs to start workers; they must save more than this."""

@@ -39,6 +39,8 @@ class Call:
     service : KnownService
     question : Question
     sent_at : float
+    heard : bool
+        Whether anything has come of it.
     opens, restores : bool
         Whether it carries the opening, and the state.
     task, sensing : bool
@@ -46,6 +48,7 @@ class Call:
     """
 
     __slots__ = (
+        "heard",
         "number",
         "opens",
         "question",
@@ -73,6 +76,7 @@ class Call:
         self.service = service
         self.question = question
         self.sent_at = sent_at
+        self.heard = False
         self.opens = opens
         self.restores = restores
         self.task = False

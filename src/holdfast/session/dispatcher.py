@@ -106,6 +106,10 @@ class Dispatcher:
         self._standstill = Standstill(timeout_s, self.effects)
         self._startup_until: float | None = None
         self._worked_at = float("-inf")
+        # Known as long as nothing happens that could change it; most task actions are performed
+        # without a word to anybody.
+        self._wakeup: float | None = None
+        self._wakeup_is_known = False
         self._lost_at: float | None = None
         self.stopped = False
         self.status = Status.STANDARD
@@ -136,6 +140,7 @@ class Dispatcher:
     def drop(self) -> None:
         """Forget the question: the trial is over."""
         self.question = None
+        self._wakeup_is_known = False
         for call in self._calls:
             if call.answered or call.service is self._services.local:
                 self._calls.abandon(call)
@@ -146,6 +151,12 @@ class Dispatcher:
         if self.question is not None and self.question.needed_at is None:
             self.question.needed_at = now
             self._work(now)
+
+    def go_on(self) -> None:
+        """Say that the robot stands still no more."""
+        if self.question is not None:
+            self.question.needed_at = None
+            self._wakeup_is_known = False
 
     def take(self) -> list[Effect]:
         """Return the effects so far, in order, and forget them."""
@@ -201,6 +212,12 @@ class Dispatcher:
 
     def next_wakeup(self) -> float | None:
         """Return when :meth:`wake` must be called if nothing happens before."""
+        if not self._wakeup_is_known:
+            self._wakeup = self._next_wakeup()
+            self._wakeup_is_known = True
+        return self._wakeup
+
+    def _next_wakeup(self) -> float | None:
         services, question = self._services, self.question
         due: list[float | None] = []
         if self._calls:
@@ -224,10 +241,12 @@ class Dispatcher:
         if local is not None:
             due.append(self._launches.next_wakeup(present=local.detector.present))
         # What was due when we worked last has been looked at; only something new can change it.
-        return min((at for at in due if at is not None and at > self._worked_at), default=None)
+        later = [at for at in due if at is not None and at > self._worked_at]
+        return min(later, default=None)
 
     def was_deaf(self, seconds: float) -> None:
         """Take note that for this long nothing that came could be heard."""
+        self._wakeup_is_known = False
         for service in self._services:
             service.detector.excuse(seconds)
 
@@ -297,6 +316,7 @@ class Dispatcher:
 
     def _work(self, now: float) -> None:
         """Do what the time and the situation ask for."""
+        self._wakeup_is_known = False
         if self.stopped:
             return
         self._worked_at = now

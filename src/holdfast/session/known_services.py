@@ -8,6 +8,7 @@ answered before, else the whole state.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
@@ -16,6 +17,9 @@ from holdfast.session.messages import Observed
 from holdfast.session.question import Question
 
 __all__ = ["KnownService", "KnownServices", "Lack"]
+
+_LATE_IN_A_ROW = 3
+"""So many late replies are no accident: the service is further away than the timeout is long."""
 
 _FIRST_RETRY_S = 0.02
 _LAST_RETRY_S = 1.0
@@ -66,6 +70,8 @@ class KnownService:
     ----------
     name : str
     detection_timeout_s : float
+    late_after_s : float
+        A reply to a call is late if it is the first one and comes after more than this.
 
     Attributes
     ----------
@@ -97,6 +103,10 @@ class KnownService:
         "detector",
         "drifts",
         "last_boot",
+        "late_after_s",
+        "late_at",
+        "late_soonest_s",
+        "late_times",
         "name",
         "num_busy",
         "opened",
@@ -107,10 +117,16 @@ class KnownService:
         "tell_busy_at",
     )
 
-    def __init__(self, name: str, detection_timeout_s: float) -> None:
+    def __init__(
+        self, name: str, detection_timeout_s: float, late_after_s: float = math.inf
+    ) -> None:
         self.name = name
         self.detector = FailureDetector(detection_timeout_s)
         self.last_boot: str | None = None
+        self.late_after_s = late_after_s
+        self.late_at = -math.inf
+        self.late_soonest_s = math.inf
+        self.late_times = 0
         self.forget()
 
     def forget(self) -> None:
@@ -141,6 +157,29 @@ class KnownService:
         self.backoff_s = min(2.0 * self.backoff_s, _LAST_RETRY_S)
 
     # -- what it says ----------------------------------------------------------------------------
+
+    def note_first_reply(self, sent_at: float, now: float) -> float | None:
+        """Take note of when a call was sent and first replied to.
+
+        Returns
+        -------
+        float or None
+            Once, when too many in a row were late: the time in seconds that the soonest took.
+        """
+        after_s = now - sent_at
+        if self.late_times >= _LATE_IN_A_ROW:
+            return None
+        if after_s <= self.late_after_s:
+            self.late_times, self.late_soonest_s = 0, math.inf
+        elif sent_at >= self.late_at:
+            # Calls that were sent meanwhile have waited for the same thing, such as a process that
+            # stood still.
+            self.late_at = now
+            self.late_times += 1
+            self.late_soonest_s = min(self.late_soonest_s, after_s)
+            if self.late_times == _LATE_IN_A_ROW:
+                return self.late_soonest_s
+        return None
 
     def note_answer(self, question: Question, now: float, *, restored: bool) -> None:
         """Take note of an answer: it lives and holds the question's state.
@@ -236,10 +275,9 @@ class KnownServices:
     """
 
     def __init__(self, cloud: Sequence[str], local: str | None, detection_timeout_s: float) -> None:
-        self.cloud = [KnownService(name, detection_timeout_s) for name in cloud]
-        self.local = (
-            None if local is None else KnownService(local, _LOCAL_PATIENCE * detection_timeout_s)
-        )
+        timeout_s = detection_timeout_s
+        self.cloud = [KnownService(name, timeout_s, late_after_s=timeout_s) for name in cloud]
+        self.local = None if local is None else KnownService(local, _LOCAL_PATIENCE * timeout_s)
         self._by_name = {service.name: service for service in self.cloud}
         if self.local is not None:
             self._by_name[self.local.name] = self.local

@@ -47,13 +47,14 @@ __all__ = [
     "Request",
     "SensingAnswer",
     "TaskAnswer",
-    "count_values",
     "decode_reply",
     "decode_request",
     "encode",
     "numbers_from",
     "numbers_to",
+    "pack_opening",
     "sealed",
+    "unpack_opening",
 ]
 
 FloatArray = npt.NDArray[np.float64]
@@ -99,6 +100,14 @@ class MessageError(HoldfastError):
     def __init__(self, code: str, text: str) -> None:
         super().__init__(text)
         self.code = code
+
+    def retold(self) -> MessageError:
+        """Return the same error without the story of how it was raised.
+
+        To be kept beyond where it was caught: its story holds that place with all that is known
+        there, the message and the error itself among it, until the collector comes by.
+        """
+        return MessageError(self.code, str(self))
 
 
 class Observed(msgspec.Struct, array_like=True, frozen=True, forbid_unknown_fields=True):
@@ -321,6 +330,7 @@ _REQUEST_DECODER = msgspec.msgpack.Decoder(_SentRequest)
 _OPENING_DECODER = msgspec.msgpack.Decoder(Opening)
 _REPLY_DECODER: msgspec.msgpack.Decoder[Reply] = msgspec.msgpack.Decoder(Reply)
 
+_CONTAINERS = (dict, list, tuple)
 _ARRAY_HEADERS = {0xDC: 3, 0xDD: 5}
 _WORDS = {0xCC: 1, 0xCD: 2, 0xCE: 4}
 """Of MessagePack: sizes of the longer headers of an array, and of the longer words."""
@@ -330,8 +340,18 @@ def encode(message: Request | Reply) -> bytes:
     """Encode a message."""
     if isinstance(message, Request) and message.opening is not None:
         # Without an opening both forms are the same bytes.
-        return sealed(_ENCODER.encode(_sent(message, _ENCODER.encode(message.opening))))
+        return sealed(_ENCODER.encode(_sent(message, pack_opening(message.opening))))
     return sealed(_ENCODER.encode(message))
+
+
+def pack_opening(opening: Opening) -> bytes:
+    """Return an opening as it is sent: in memory it takes twenty times as much."""
+    return _ENCODER.encode(opening)
+
+
+def unpack_opening(packed: bytes) -> Opening:
+    """Return an opening that was packed here, and checked before."""
+    return _OPENING_DECODER.decode(packed)
 
 
 def sealed(content: bytes) -> bytes:
@@ -466,7 +486,7 @@ def _opening_of(data: bytes) -> Opening:
             f"state_space_planner among them: at most {MAX_OPENING_BYTES} are allowed",
         )
     opening = _OPENING_DECODER.decode(data)
-    if count_values(opening) > MAX_OPENING_VALUES:
+    if _count_values(opening) > MAX_OPENING_VALUES:
         raise MessageError(
             "too_large",
             f"problem {opening.problem}: more than {MAX_OPENING_VALUES} values in the sections "
@@ -475,7 +495,7 @@ def _opening_of(data: bytes) -> Opening:
     return opening
 
 
-def count_values(opening: Opening) -> int:
+def _count_values(opening: Opening) -> int:
     """Count the values in the problem's sections, however they are nested.
 
     Parameters
@@ -491,12 +511,12 @@ def count_values(opening: Opening) -> int:
     count = 0
     while containers:
         container = containers.pop()
-        assert isinstance(container, dict | list | tuple)
+        assert isinstance(container, _CONTAINERS)
         count += len(container) * (2 if isinstance(container, dict) else 1)
         if count > MAX_OPENING_VALUES:
             break
         parts = (*container, *container.values()) if isinstance(container, dict) else container
-        containers += (part for part in parts if isinstance(part, dict | list | tuple))
+        containers += [part for part in parts if isinstance(part, _CONTAINERS)]
     return count
 
 

@@ -105,6 +105,7 @@ class Replies:
         try:
             reply = decode_reply(payload)
             _check_number(reply, call.request_number)
+            self._note_lateness(call, now)
             if isinstance(reply, TaskAnswer | SensingAnswer):
                 self._take_answer(call, reply, now)
                 return self._was_answered(call, reply, now)
@@ -125,6 +126,23 @@ class Replies:
         else:
             self._was_refused(service, reply, now)
         return News.NOTHING
+
+    def _note_lateness(self, call: Call, now: float) -> None:
+        """Say so when a service is too far away for the timeout: each turn would change hands."""
+        if call.heard:
+            return
+        call.heard = True
+        service = call.service
+        soonest_s = service.note_first_reply(call.sent_at, now)
+        if soonest_s is not None:
+            self._report(
+                "late_replies",
+                service=service.name,
+                soonest_ms=1e3 * soonest_s,
+                reason="several in a row took longer than offload.detection_timeout_ms "
+                f"({1e3 * service.late_after_s:g}), so it is given up and tried again with each "
+                "turn; if it is that far away, raise the setting above the way there and back",
+            )
 
     # -- answers ---------------------------------------------------------------------------------
 

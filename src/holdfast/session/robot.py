@@ -22,7 +22,7 @@ import numpy.typing as npt
 
 from holdfast.errors import HoldfastError, InvalidValueError
 from holdfast.outcome import DecisionLog, TrialResult
-from holdfast.planning import Planner, PlanningState, digest
+from holdfast.planning import Planner, PlanningState
 from holdfast.session.dispatcher import Dispatcher
 from holdfast.session.effects import (
     Act,
@@ -68,6 +68,9 @@ __all__ = ["HeldError", "History", "Robot", "UnknownPerformanceError", "replay"]
 
 FloatArray = npt.NDArray[np.float64]
 
+
+_OF_THE_BODY = (Sensed, Acted, EnvironmentFailed)
+"""What comes of an order to the environment."""
 
 _TICKS_INTERVAL_S = 1.0
 """Missed ticks are reported at most this often; all of them are counted."""
@@ -205,7 +208,7 @@ def _replay_observation(planner: Planner, history: History, record: ObservedReco
         raise RecordError("is an observation where a task action is due")
     observation = numbers_from(record.observation, len(record.observation) // 8)
     after, info = planner.observe(state, record.sensing_action, observation)
-    reached = digest(after)
+    reached = planner.digest(after)
     if reached != record.digest:
         raise RecordError(
             "leads to another state than it did when it was written: the problem is not "
@@ -360,7 +363,7 @@ class Robot:
 
     def handle(self, event: TransportEvent | EnvironmentEvent, now: float) -> list[Effect]:
         """Take note of what a transport or the environment delivered."""
-        if isinstance(event, Sensed | Acted | EnvironmentFailed):
+        if isinstance(event, _OF_THE_BODY):
             # Between trials, or after a stop, whatever comes late is of no use.
             if self._history is not None and self._in_environment and not self._stopped:
                 self._in_environment = False
@@ -414,10 +417,10 @@ class Robot:
 
     def next_wakeup(self) -> float | None:
         """Return when :meth:`wake` must be called if nothing happens before."""
-        times = [
-            due for due in (self._asleep_until, self._dispatcher.next_wakeup()) if due is not None
-        ]
-        return min(times, default=None)
+        asleep_until, due = self._asleep_until, self._dispatcher.next_wakeup()
+        if asleep_until is None or due is None:
+            return due if asleep_until is None else asleep_until
+        return min(asleep_until, due)
 
     # -- the environment -------------------------------------------------------------------------
 
@@ -430,7 +433,7 @@ class Robot:
         except HoldfastError as error:
             self._stop(error)
             return
-        reached = digest(after)
+        reached = self._planner.digest(after)
         record = ObservedRecord(
             state.step,
             self._sensing_action,
@@ -495,17 +498,20 @@ class Robot:
     def _next_sensing(self, state: PlanningState, now: float) -> None:
         question = self._dispatcher.question
         if question is None or question.sensing_step != state.step:
-            self._ask(digest(state), now)
+            self._ask(self._planner.digest(state), now)
             question = self._dispatcher.question
             assert question is not None
         answer = question.sensing
         if answer is None:
             self._dispatcher.need(now)
             return
-        if question.state is not state and answer.digest != digest(state)[:DIGEST_SIZE]:
+        if (
+            question.state is not state
+            and answer.digest != self._planner.digest(state)[:DIGEST_SIZE]
+        ):
             # Chosen for another state than this: the service's belief has drifted from ours.
             self._report("prefetch_unused", trial=self._trial, step=state.step)
-            self._ask(digest(state), now)
+            self._ask(self._planner.digest(state), now)
             self._dispatcher.need(now)
             return
         source = question.sensing_source
@@ -521,7 +527,7 @@ class Robot:
         question = self._dispatcher.question
         offset = -1 if question is None else state.step - question.state.step
         if question is None or question.task_count == 0 or not 0 <= offset < question.task_count:
-            self._ask(digest(state), now)
+            self._ask(self._planner.digest(state), now)
             question = self._dispatcher.question
             assert question is not None
             offset = 0
@@ -531,7 +537,7 @@ class Robot:
         if offset == 0 and question.task_source is not None:
             self._timed("task", question, question.task_source, now)
             question.task_source = None
-            question.needed_at = None
+            self._dispatcher.go_on()
         if not self._is_due(now):
             return
         action = question.tasks[offset]
@@ -584,7 +590,7 @@ class Robot:
         assert history is not None
         state = history.state
         self._tell_ticks(now)
-        history.log.ended(state.step, digest(state))
+        history.log.ended(state.step, self._planner.digest(state))
         decisions = history.log.decisions()
         self._count_recoveries()
         sensing_ms = tuple(history.sensing_ms)

@@ -33,7 +33,13 @@ import msgspec
 from holdfast.errors import InvalidValueError
 from holdfast.planning import needs_sensing
 from holdfast.problems.problem import Problem
-from holdfast.session.messages import MessageError, Opening, Request, decode_request
+from holdfast.session.messages import (
+    MessageError,
+    Opening,
+    Request,
+    decode_request,
+    pack_opening,
+)
 from holdfast.session.service_calls import MAX_WORD, Calls
 from holdfast.session.service_effects import Computed, Effect, End, Noted, Run
 from holdfast.session.service_jobs import Job, Outcome, ProblemPool
@@ -46,7 +52,6 @@ from holdfast.session.service_sessions import (
     Session,
     Sessions,
     Work,
-    key_of,
 )
 
 __all__ = ["Service"]
@@ -136,7 +141,7 @@ class Service:
         try:
             request = decode_request(payload)
         except MessageError as error:
-            request = error
+            request = error.retold()
         return self.receive_request(call, request, len(payload), now)
 
     def receive_request(
@@ -220,7 +225,7 @@ class Service:
         if session is not None:
             if request.epoch > epoch:
                 self._take_over(session, request.epoch, now)
-            if opening is not None and key_of(opening) != session.opening_key:
+            if opening is not None and pack_opening(opening) != session.opening:
                 if request.epoch == epoch:
                     text = "this session was opened with another problem, settings or seed"
                     self._calls.refuse(call, request.number, "invalid", text)

@@ -42,6 +42,7 @@ from holdfast.session.messages import (
     Request,
     numbers_from,
     numbers_to,
+    unpack_opening,
 )
 from holdfast.session.service_limits import ServiceLimits
 from holdfast.settings import PlanningSettings
@@ -110,7 +111,8 @@ class Job:
     problem : Problem or None
         None if it is still to be built.
     make_problem, describe_error : callable
-    opening : Opening
+    opening : bytes
+        Packed (:func:`~holdfast.session.messages.pack_opening`).
     planning : PlanningSettings
     seed : int
     limits : ServiceLimits
@@ -139,7 +141,7 @@ class Job:
         problem: Problem | None,
         make_problem: Callable[[Opening], Problem],
         describe_error: Callable[[BaseException], str],
-        opening: Opening,
+        opening: bytes,
         planning: PlanningSettings,
         seed: int,
         limits: ServiceLimits,
@@ -158,14 +160,14 @@ class Job:
         self._state = state
 
     @property
-    def problem_name(self) -> str:
-        """What the problem is called in the opening."""
-        return self._opening.problem
+    def state(self) -> PlanningState | None:
+        """From where it begins."""
+        return self._state
 
     @property
     def identity(self) -> tuple[object, ...]:
-        """What the outcome is a function of, besides the problem and the settings of the run."""
-        request, state = self._request, self._state
+        """What the outcome is a function of, besides that state, the problem and the settings."""
+        request = self._request
         named = None
         if request is not None:
             named = (
@@ -176,7 +178,7 @@ class Job:
                 request.observations,
                 request.checkpoint,
             )
-        return self.kind, self._seed, named, None if state is None else digest(state)
+        return self.kind, self._seed, named
 
     def run(self) -> Outcome:
         """Compute; whatever goes wrong in the problem's functions is part of the outcome.
@@ -188,7 +190,7 @@ class Job:
         problem = self._problem
         try:
             if problem is None:
-                problem = self._make_problem(self._opening)
+                problem = self._make_problem(unpack_opening(self._opening))
             _check_work(problem, self._planning, self._limits)
             return self._computed(problem)
         except _LacksStateError as lack:

@@ -24,7 +24,7 @@ class ServiceLimits(msgspec.Struct, frozen=True, kw_only=True):
     max_state_bytes : int
         Of all states remembered.
     max_opening_bytes : int
-        Of all openings remembered, as they are in memory (by estimate).
+        Of all openings remembered, which are kept as they came.
     max_idle_s : float
         A robot that was not heard for this long is forgotten.
     max_waiting : int

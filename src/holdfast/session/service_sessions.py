@@ -15,13 +15,15 @@ from __future__ import annotations
 import hashlib
 import math
 from collections import OrderedDict
+from functools import lru_cache
 from typing import NamedTuple
 
 import msgspec
 
 from holdfast.planning import PlanningState
-from holdfast.session.messages import Opening, Request, count_values
+from holdfast.session.messages import Opening, Request, pack_opening
 from holdfast.session.service_limits import ServiceLimits
+from holdfast.settings import PlanningSettings
 
 __all__ = [
     "PREFETCHED",
@@ -32,14 +34,13 @@ __all__ = [
     "Sessions",
     "WaitingCall",
     "Work",
-    "key_of",
 ]
 
 _LEAST_EPOCHS = 4096
 """Epochs of forgotten robots that are remembered, however few sessions there may be."""
 
-_BYTES_PER_VALUE = 64
-"""Of Python's objects for plain data, with their places in lists and mappings."""
+_SETTINGS_KEPT = 128
+"""Settings that are shared by all robots that have the same."""
 
 REQUESTED, PREFETCHED = 0, 1
 """The slots of a session: a robot stands still for the first, the second is ahead of it."""
@@ -212,8 +213,6 @@ class Session:
         "num_bytes",
         "number",
         "opening",
-        "opening_bytes",
-        "opening_key",
         "planning",
         "planning_single",
         "problem_key",
@@ -231,21 +230,15 @@ class Session:
         self.key = request.session
         self.epoch = request.epoch
         self.number = -1
-        self.opening = opening
-        self.opening_key = key_of(opening)
-        self.opening_bytes = size_of_opening(opening)
-        self.problem_key = key_of((opening.problem, opening.model, opening.state_space_planner))
+        # Packed, it is one object instead of thousands, all of which the collector would look at
+        # again and again while nobody else has the interpreter.
+        self.opening = pack_opening(opening)
+        self.problem_key = _key_of((opening.problem, opening.model, opening.state_space_planner))
         self.built = False
         # The number of threads changes no result, so the service may choose it.
-        sensing = opening.planning.active_sensing
-        most = min(sensing.num_cores, max_threads)
-        self.planning, self.planning_single = (
-            msgspec.structs.replace(
-                opening.planning,
-                active_sensing=msgspec.structs.replace(sensing, num_cores=num_cores),
-            )
-            for num_cores in (most, 1)
-        )
+        most = min(opening.planning.active_sensing.num_cores, max_threads)
+        self.planning = _with_cores(opening.planning, most)
+        self.planning_single = _with_cores(opening.planning, 1)
         self.seed = opening.seed
         self.served = False
         self.acknowledged: PlanningState | None = None
@@ -304,7 +297,7 @@ class Sessions:
     state_bytes : int
         Of all states and answers, as they were weighed last.
     opening_bytes : int
-        Of all openings, by estimate.
+        Of all openings, packed.
     """
 
     def __init__(self, limits: ServiceLimits) -> None:
@@ -354,14 +347,14 @@ class Sessions:
         limits = self._limits
         return not self._sessions or (
             len(self._sessions) < limits.max_sessions
-            and self.opening_bytes + session.opening_bytes <= limits.max_opening_bytes
+            and self.opening_bytes + len(session.opening) <= limits.max_opening_bytes
         )
 
     def add(self, session: Session) -> None:
         """Remember a robot from now on."""
         self._sessions[session.key] = session
         self._num_newcomers += 1
-        self.opening_bytes += session.opening_bytes
+        self.opening_bytes += len(session.opening)
         self._epochs.pop(session.key, None)
 
     def use(self, session: Session, now: float) -> None:
@@ -375,7 +368,7 @@ class Sessions:
         del self._sessions[session.key]
         self._num_newcomers -= not session.served
         self.state_bytes -= session.num_bytes
-        self.opening_bytes -= session.opening_bytes
+        self.opening_bytes -= len(session.opening)
         self.note_epoch(session.key, session.epoch)
 
     def note_epoch(self, key: bytes, epoch: int) -> None:
@@ -420,15 +413,16 @@ class Sessions:
         session.num_bytes = 0
 
 
-def key_of(data: object) -> bytes:
+def _key_of(data: object) -> bytes:
     """Return a short name of plain data, equal for equal data."""
     return hashlib.blake2b(msgspec.msgpack.encode(data), digest_size=16).digest()
 
 
-def size_of_opening(opening: Opening) -> int:
-    """Estimate what an opening takes in memory: far more than its bytes on the wire."""
-    num_bytes = len(msgspec.msgpack.encode(opening))
-    return num_bytes + _BYTES_PER_VALUE * count_values(opening)
+@lru_cache(maxsize=_SETTINGS_KEPT)
+def _with_cores(planning: PlanningSettings, num_cores: int) -> PlanningSettings:
+    """Return settings with another number of threads, one copy for all robots that have them."""
+    sensing = msgspec.structs.replace(planning.active_sensing, num_cores=num_cores)
+    return msgspec.structs.replace(planning, active_sensing=sensing)
 
 
 def _size_of(state: PlanningState | None) -> int:

@@ -9,6 +9,7 @@ that shared code with what it checks would share its errors.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterable
 
 import msgspec
 
@@ -46,7 +47,8 @@ _FOLLOWS = {
 }
 
 
-_ATOMS = (int, float, str, bytes, type(None))
+_TABLES = (dict, list, tuple, set, deque)
+_ATOMS = frozenset({int, float, bool, str, bytes, type(None)})
 
 _MAX_ITEMS = 512
 """Of any one table of a machine; a trial has 40 steps, and a service remembers a hundred robots."""
@@ -67,19 +69,29 @@ def check_size(name: str, machine: object) -> None:
         if id(found) in seen:
             continue
         seen.add(id(found))
-        parts: list[object] = []
-        if isinstance(found, dict | list | tuple | set | deque):
+        parts: Iterable[object]
+        if isinstance(found, _TABLES):
             if len(found) > _MAX_ITEMS:
                 raise Violation(f"{name} holds a {type(found).__name__} of {len(found)} entries")
-            parts += found.values() if isinstance(found, dict) else found
-        elif type(found).__module__.startswith("holdfast.session"):
-            parts += vars(found).values() if hasattr(found, "__dict__") else ()
-            parts += (
-                getattr(found, slot, None)
-                for kind in type(found).__mro__
-                for slot in getattr(kind, "__slots__", ())
-            )
-        left += (part for part in parts if not isinstance(part, _ATOMS))
+            parts = found.values() if isinstance(found, dict) else found
+        else:
+            parts = [getattr(found, slot, None) for slot in _PLACES[type(found)]]
+        left += [part for part in parts if type(part) not in _ATOMS]
+
+
+class _Places(dict[type, tuple[str, ...]]):
+    """Where the instances of each type hold something; only the machines' own types count."""
+
+    def __missing__(self, kind: type) -> tuple[str, ...]:
+        places: list[str] = []
+        if kind.__module__.startswith("holdfast.session"):
+            places = [slot for each in kind.__mro__ for slot in getattr(each, "__slots__", ())]
+            places.append("__dict__")
+        self[kind] = tuple(places)
+        return self[kind]
+
+
+_PLACES = _Places()
 
 
 class StatusChecker:

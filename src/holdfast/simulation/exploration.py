@@ -12,12 +12,12 @@ from concurrent.futures.process import BrokenProcessPool
 import msgspec
 
 from holdfast.errors import HoldfastError, InvalidValueError
+from holdfast.runtime.command_line import MAX_JOBS
 from holdfast.simulation.schedule import draw_schedule
 from holdfast.simulation.world import Simulator
 
-__all__ = ["MAX_JOBS", "Finding", "SimulationError", "Tally", "explore"]
+__all__ = ["Finding", "SimulationError", "Tally", "explore"]
 
-MAX_JOBS = 1024
 _BATCH = 25
 """Seeds that a process runs between two reports: a fraction of a second's work."""
 

@@ -25,11 +25,28 @@ _COMPUTED_AGAIN = 61
 """One of so many that are known is computed all the same."""
 
 
+class RememberedDigests:
+    """Digests of states, by the identity of the state, which is kept with its own."""
+
+    def __init__(self) -> None:
+        self._digests: dict[int, tuple[PlanningState, bytes]] = {}
+
+    def of(self, state: PlanningState) -> bytes:
+        """Return the digest of a state."""
+        known = self._digests.get(id(state))
+        if known is None:
+            if len(self._digests) >= _MOST:
+                self._digests.clear()
+            known = self._digests[id(state)] = state, digest(state)
+        return known[1]
+
+
 class RememberedJobs:
     """Outcomes of the services' jobs, by what the jobs were made with."""
 
     def __init__(self) -> None:
         self._outcomes: dict[tuple[object, ...], Outcome] = {}
+        self._digests = RememberedDigests()
         self._taken_over = 0
 
     def outcome(self, job: Job) -> Outcome:
@@ -40,7 +57,8 @@ class RememberedJobs:
         Violation
             If it is another one than the last time.
         """
-        identity = job.identity
+        state = job.state
+        identity = job.identity, None if state is None else self._digests.of(state)
         known = self._outcomes.get(identity)
         if known is None:
             if len(self._outcomes) >= _MOST:
@@ -67,6 +85,7 @@ class RememberingPlanner(Planner):
     def __init__(self, planner: Planner) -> None:
         super().__init__(planner.problem, planner.settings)
         self._planner = planner
+        self._digests = RememberedDigests()
         self._initial: dict[tuple[int, int], PlanningState] = {}
         # By the identity of the state, which is kept with it and so cannot be another one's.
         self._observed: dict[
@@ -110,6 +129,10 @@ class RememberingPlanner(Planner):
         if self._is_checked():
             self._compare(known[1], self._planner.advance(state, task_action))
         return known[1]
+
+    def digest(self, state: PlanningState) -> bytes:
+        """Return 32 bytes that are equal for equal states only."""
+        return self._digests.of(state)
 
     def _make_room(self) -> None:
         if len(self._advanced) + len(self._observed) >= _MOST:

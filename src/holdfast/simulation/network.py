@@ -338,10 +338,7 @@ class Network:
         if self._run.bytes_per_s is not None:
             latency_s += len(payload) / self._run.bytes_per_s
         faults = self._faults.get((link.service.name, way, number))
-        if faults is None:
-            self._pass(link, way, latency_s, arrive, (payload, *more))
-            return
-        for fault in faults:
+        for fault in faults or ():
             self._happened(fault, latency_s + fault.seconds)
             if fault.what in ("drop", "misroute") and arrive == self._end_arrives:
                 self._lose_end(more[0])

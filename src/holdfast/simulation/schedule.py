@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import random
 from collections.abc import Callable, Iterable
+from functools import cached_property
 from typing import Annotated, ClassVar, Literal, TypeAlias, TypeVar, get_args
 
 import msgspec
@@ -42,6 +43,7 @@ __all__ = [
     "Stop",
     "cloud_service",
     "draw_schedule",
+    "line_of",
     "parse_schedule",
 ]
 
@@ -349,7 +351,7 @@ class Schedule(msgspec.Struct, frozen=True):
 
     def text(self) -> str:
         """Return it as lines of text; :func:`parse_schedule` reads them."""
-        return "".join(f"{_line(item)}\n" for item in (self.run, *self.faults))
+        return "".join(f"{line_of(item)}\n" for item in (self.run, *self.faults))
 
 
 # -- text ------------------------------------------------------------------------------------------
@@ -357,7 +359,8 @@ class Schedule(msgspec.Struct, frozen=True):
 _WORDS = {"true": True, "false": False, "none": None}
 
 
-def _line(item: RunSettings | Fault) -> str:
+def line_of(item: RunSettings | Fault) -> str:
+    """Return an item as one line of a schedule."""
     words = [str(item.__struct_config__.tag)]
     for field in msgspec.structs.fields(type(item)):
         value = getattr(item, field.name)
@@ -419,7 +422,7 @@ def parse_schedule(text: str) -> Schedule:
         node = getattr(fault, "service", getattr(fault, "node", "robot"))
         if node not in named:
             raise ScheduleError(
-                f"{_line(fault)!r}: there is no {node} in a run with {run.replicas} replicas"
+                f"{line_of(fault)!r}: there is no {node} in a run with {run.replicas} replicas"
             )
     return Schedule(run, faults)
 
@@ -447,10 +450,21 @@ class _Draw:
     def __init__(self, seed: int) -> None:
         # Another generator than the planning's: the world must not be of one mind with the robot.
         self._chance = random.Random(f"holdfast simulation {seed}")
-        # Each by a name of its own, so that the other draws of a seed are what they were before.
-        self._losses = random.Random(f"holdfast simulation {seed}: losses")
-        self._bodies = random.Random(f"holdfast simulation {seed}: bodies")
-        self._aims = random.Random(f"holdfast simulation {seed}: aims")
+        self._seed = seed
+
+    # Each by a name of its own, so that the other draws of a seed are what they were before.
+
+    @cached_property
+    def _losses(self) -> random.Random:
+        return random.Random(f"holdfast simulation {self._seed}: losses")
+
+    @cached_property
+    def _bodies(self) -> random.Random:
+        return random.Random(f"holdfast simulation {self._seed}: bodies")
+
+    @cached_property
+    def _aims(self) -> random.Random:
+        return random.Random(f"holdfast simulation {self._seed}: aims")
 
     def schedule(self) -> Schedule:
         run = self._run()

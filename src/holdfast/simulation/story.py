@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Iterator
 
+from holdfast.simulation.schedule import Fault, MessageFault, line_of
 from holdfast.simulation.world import Outcome, Told
 
 __all__ = ["story_lines"]
@@ -15,9 +16,23 @@ _ACTION = re.compile(r"performs task action (\d+)")
 def story_lines(outcome: Outcome) -> list[str]:
     """Return the lines of a run that was told, with their times in seconds.
 
-    Task actions that follow each other with nothing in between are one line.
+    Task actions that follow each other with nothing in between are one line. The last lines name
+    the faults of the schedule that have not happened, those of messages together.
     """
-    return [f"{told.time:9.4f}  {told.actor:8s} {told.text}" for told in _folded(outcome.story)]
+    happened = [f"{told.time:9.4f}  {told.actor:8s} {told.text}" for told in _folded(outcome.story)]
+    return [*happened, *(f"never happened: {what}" for what in _together(outcome.never_happened))]
+
+
+def _together(faults: Iterable[Fault]) -> Iterator[str]:
+    numbers: dict[tuple[str, str], list[int]] = {}
+    for fault in faults:
+        if isinstance(fault, MessageFault):
+            numbers.setdefault((fault.service, fault.direction), []).append(fault.number)
+        else:
+            yield line_of(fault)
+    for (service, direction), missing in numbers.items():
+        shown = ",".join(map(str, sorted(missing)))
+        yield f"message service={service} direction={direction} number={shown}"
 
 
 def _folded(story: Iterable[Told]) -> Iterator[Told]:

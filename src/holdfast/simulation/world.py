@@ -11,18 +11,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from holdfast.errors import HoldfastError
-from holdfast.planning import Planner, digest
+from holdfast.planning import Planner
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.session.effects import Effect
 from holdfast.session.events import Ended, Replied, TransportEvent
-from holdfast.session.messages import (
-    DIGEST_SIZE,
-    PROTOCOL_VERSION,
-    MessageError,
-    Request,
-    decode_reply,
-    encode,
-)
+from holdfast.session.messages import MessageError, decode_reply
 from holdfast.session.status import IllegalTransitionError
 from holdfast.settings import ParticleFilterSettings, PlanningSettings
 from holdfast.simulation.agenda import Agenda, Clock
@@ -30,6 +23,7 @@ from holdfast.simulation.checkers import WireChecker, check_size
 from holdfast.simulation.disk import Disk
 from holdfast.simulation.memory import RememberedJobs, RememberingPlanner
 from holdfast.simulation.network import Network
+from holdfast.simulation.other_robots import OtherRobots
 from holdfast.simulation.robot_node import RobotNode, Task
 from holdfast.simulation.schedule import (
     LOCAL_SERVICE,
@@ -69,6 +63,9 @@ _MAX_STEPS = 40
 _MAX_MESSAGES = 5_000
 """Of a run; one without faults has about fifty."""
 
+_CROWD_IS_FELT_S = 1.0
+"""So long after its end our robot may still wait, because it was told to come back later."""
+
 _LAUNCH_TIMEOUT_S = 5.0
 _SIZES_EACH = 500
 """Happenings between two looks at all tables."""
@@ -106,6 +103,9 @@ class Outcome(NamedTuple):
         By kind, how many have happened.
     story : list of Told
         What happened, if it was to be told.
+    never_happened : tuple of Fault
+        Those of the schedule's faults, if the story was to be told: the run had ended before, or
+        what they would have struck was not there.
     """
 
     violation: str | None
@@ -116,6 +116,7 @@ class Outcome(NamedTuple):
     messages: int
     faults: dict[str, int]
     story: list[Told]
+    never_happened: tuple[Fault, ...]
 
 
 class Simulator:
@@ -129,6 +130,7 @@ class Simulator:
         self._twins = Twins(problem, planning, _SEED)
         self._planner = RememberingPlanner(Planner(problem, planning))
         self._jobs = RememberedJobs()
+        self._others = OtherRobots(self._planner, _SEED)
 
     def run(self, schedule: Schedule, *, tell: bool = False) -> Outcome:
         """Run a schedule.
@@ -140,18 +142,26 @@ class Simulator:
             Whether the story is wanted.
         """
         task = Task(self._planner, schedule.run, _SEED, _MAX_STEPS)
-        return _World(schedule, task, self._twins, self._jobs, tell=tell).run()
+        return _World(schedule, task, self._twins, self._jobs, self._others, tell=tell).run()
 
 
 class _World:
     """See :class:`Simulator`."""
 
     def __init__(
-        self, schedule: Schedule, task: Task, twins: Twins, jobs: RememberedJobs, *, tell: bool
+        self,
+        schedule: Schedule,
+        task: Task,
+        twins: Twins,
+        jobs: RememberedJobs,
+        others: OtherRobots,
+        *,
+        tell: bool,
     ) -> None:
         run = schedule.run
+        self._schedule = schedule
         self._run = run
-        self._task = task
+        self._others = others
         self._tell = tell
         self._story: list[Told] = []
         self._agenda = agenda = Agenda()
@@ -179,7 +189,9 @@ class _World:
         self._stalls: list[DiskStall] = []
         self._gone: set[str] = set()
         self._faults: dict[str, int] = {}
+        self._struck: set[int] = set()
         self._crowds = 0
+        self._crowded_until: dict[str, float] = {}
         self._silent_launches = 0
         self._stopped_until: dict[str, float] = {}
         self._slownesses: dict[str, list[float]] = {}
@@ -222,6 +234,7 @@ class _World:
             self._network.messages,
             self._faults,
             self._story,
+            self._never_happened(),
         )
 
     def _go(self) -> None:
@@ -296,6 +309,8 @@ class _World:
 
     def _arrange(self, schedule: Schedule) -> None:
         for fault in schedule.faults:
+            if isinstance(fault, MessageFault):
+                continue  # most are; the network has them
             if isinstance(fault, Crash):
                 self._agenda.at(fault.at, self._crash, fault)
             elif isinstance(fault, Stop):
@@ -321,7 +336,13 @@ class _World:
     def _happened(self, fault: Fault, seconds: float) -> None:
         """Take note of a fault that is not over before some time has passed."""
         self._faults[fault.kind] = self._faults.get(fault.kind, 0) + 1
+        self._struck.add(id(fault))
         self._lasts(seconds)
+
+    def _never_happened(self) -> tuple[Fault, ...]:
+        if not self._tell:
+            return ()
+        return tuple(fault for fault in self._schedule.faults if id(fault) not in self._struck)
 
     def _lasts(self, seconds: float) -> None:
         self._faults_end_at = max(self._faults_end_at, self._agenda.now + seconds)
@@ -339,6 +360,8 @@ class _World:
         if fault.for_good and not local:
             self._gone.add(fault.service)
         if not service.up:
+            if fault.for_good and not local:
+                self._struck.add(id(fault))  # it is not started again
             return
         self.noted(fault.service, "is killed" + (" for good" if fault.for_good else ""))
         self._happened(fault, self._run.lease_s + (0.0 if local else fault.down_s))
@@ -366,6 +389,7 @@ class _World:
             self._agenda.at(until, self._robot_goes_on, self._robot.process)
             return
         service = self._services[fault.node]
+        self._crowd_takes_longer(service, fault.for_s)
         service.stop()
         self._network.review(service)
         self._agenda.at(until, self._service_goes_on, service, service.boot)
@@ -393,7 +417,10 @@ class _World:
         self.noted(fault.service, "computes %g times as long", fault.factor)
         slownesses = self._slownesses.setdefault(fault.service, [])
         slownesses.append(fault.factor)
+        slower = max(slownesses) / service.slowness
         service.slowness = max(slownesses)
+        left_s = self._crowded_until.get(service.name, 0.0) - self._agenda.now
+        self._crowd_takes_longer(service, (slower - 1.0) * left_s)
         self._agenda.after(fault.for_s, self._quicken, service, fault.factor)
 
     def _quicken(self, service: ServiceNode, factor: float) -> None:
@@ -413,27 +440,24 @@ class _World:
         service = self._services[fault.service]
         if not service.up:
             return
-        # Each of them is served in turn; meanwhile our robot may be told to come back later.
-        self._happened(fault, fault.robots * service.slowness * self._run.sensing_s + 1.0)
+        # Each of them is served in turn, after those of an earlier crowd that still wait.
+        begin = max(self._agenda.now, self._crowded_until.get(service.name, 0.0))
+        end = begin + fault.robots * service.slowness * self._run.sensing_s
+        self._crowded_until[service.name] = end
+        self._happened(fault, end - self._agenda.now + _CROWD_IS_FELT_S)
         self.noted(fault.service, "is asked by %s other robots", fault.robots)
         self._checker.crowded(fault.robots)
-        task, planner = self._task, self._task.planner
         for number in range(fault.robots):
-            trial = number % NUM_TRIALS
-            state = planner.initial_state(task.simulator.seed, trial)
             self._crowds += 1
-            request = Request(
-                PROTOCOL_VERSION,
-                self._crowds.to_bytes(16, "big"),
-                1,
-                1,
-                trial,
-                0,
-                False,
-                digest(state)[:DIGEST_SIZE],
-                opening=task.opening,
-            )
-            self._network.call_of_another(service, encode(request))
+            payload = self._others.first_request(self._crowds, number % NUM_TRIALS)
+            self._network.call_of_another(service, payload)
+
+    def _crowd_takes_longer(self, service: ServiceNode, seconds: float) -> None:
+        """Take note that what is left of a crowd is served later, if anything is."""
+        end = self._crowded_until.get(service.name, 0.0)
+        if seconds > 0.0 and end > self._agenda.now:
+            self._crowded_until[service.name] = end + seconds
+            self._lasts(end + seconds - self._agenda.now + _CROWD_IS_FELT_S)
 
     def _pause(self, fault: PauseRobot) -> None:
         if self._robot.process:

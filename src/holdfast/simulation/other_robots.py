@@ -1,0 +1,53 @@
+"""Robots beside the one that is looked at: all that they do is ask."""
+
+from __future__ import annotations
+
+from holdfast.planning import Planner
+from holdfast.session.messages import DIGEST_SIZE, PROTOCOL_VERSION, Opening, Request, encode
+
+__all__ = ["OtherRobots"]
+
+_MOST = 5_000
+"""Requests kept; then all are forgotten."""
+
+
+class OtherRobots:
+    """What other robots ask: the same in every run, so it is put into bytes once.
+
+    Parameters
+    ----------
+    planner : Planner
+    seed : int
+    """
+
+    def __init__(self, planner: Planner, seed: int) -> None:
+        self._planner = planner
+        self._seed = seed
+        self._opening = Opening(planner.problem.name, {}, {}, planner.settings, seed)
+        self._requests: dict[tuple[int, int], bytes] = {}
+
+    def first_request(self, robot: int, trial: int) -> bytes:
+        """Return the request of a robot, numbered from 1, for the start of a trial."""
+        key = robot, trial
+        request = self._requests.get(key)
+        if request is None:
+            if len(self._requests) >= _MOST:
+                self._requests.clear()
+            request = self._requests[key] = self._encoded(robot, trial)
+        return request
+
+    def _encoded(self, robot: int, trial: int) -> bytes:
+        state = self._planner.initial_state(self._seed, trial)
+        return encode(
+            Request(
+                PROTOCOL_VERSION,
+                robot.to_bytes(16, "big"),
+                epoch=1,
+                number=1,
+                trial=trial,
+                step=0,
+                sensed=False,
+                digest=self._planner.digest(state)[:DIGEST_SIZE],
+                opening=self._opening,
+            )
+        )
