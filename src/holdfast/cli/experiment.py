@@ -50,12 +50,6 @@ def experiment(
             help="Processes; 0: one for each core. Changes time only.",
         ),
     ] = 0,
-    executor: Annotated[
-        str,
-        typer.Option(
-            metavar="WHERE", help="local, ray (this machine's cluster) or ray://HOST:PORT."
-        ),
-    ] = "local",
     list_names: Annotated[
         bool, typer.Option("--list", help="List the experiments and end.")
     ] = False,
@@ -80,20 +74,20 @@ def experiment(
     studies = studies_of(names)
     words = ["holdfast", "experiment", *names]
     words += ["--quick"] if quick else []
-    words += ["--seed", str(seed), "--executor", executor]
+    words += ["--seed", str(seed)]
     words += ["--jobs", str(jobs)] if jobs else []
     again = shlex.join([*words, "--out", str(out)])
     with ended_by_signals():
-        _run(studies, Scale(quick=quick, seed=seed), out, _executor_of(executor, jobs), again)
+        _run(studies, Scale(quick=quick, seed=seed), out, _executor_of(jobs), again)
 
 
-def _executor_of(name: str, jobs: int) -> Executor:
-    from holdfast.experiments.executors import executor_of
+def _executor_of(jobs: int) -> Executor:
+    from holdfast.experiments.executors import LocalExecutor
     from holdfast.runtime.trials import available_cores
 
     if jobs < 0:
         raise InvalidValueError(f"--jobs {jobs}: must be 0 (one for each core) or more")
-    return executor_of(name, available_cores() if name == "local" and jobs == 0 else jobs)
+    return LocalExecutor(jobs or available_cores())
 
 
 def _run(

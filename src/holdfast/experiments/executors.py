@@ -1,7 +1,7 @@
-"""Where tasks are computed: here, in processes of this machine, or on a Ray cluster.
+"""Where tasks are computed: in this process, or in others.
 
-All give the same results, for a task is a function of its parameters; they differ in time alone.
-A process that is killed takes nothing with it but the tasks that it had: they are computed again
+All places give the same results, for a task is a function of its parameters; they differ in time
+alone. A process that is killed takes nothing with it but the tasks that it had: they are computed again
 elsewhere, and only a task that has cost its process its life several times is given up.
 """
 
@@ -21,11 +21,12 @@ from typing import Protocol
 from holdfast.errors import InvalidValueError
 from holdfast.experiments.tables import Table
 from holdfast.experiments.tasks import Task, TaskError, run_task
+from holdfast.runtime.command_line import MAX_JOBS
 from holdfast.runtime.trials import inherited_by_children
 
-__all__ = ["Executor", "LocalExecutor", "executor_of"]
+__all__ = ["Executor", "LocalExecutor"]
 
-MAX_PROCESSES = 1024
+
 _MOST_ATTEMPTS = 3
 """A task that is lost with its process this often is given up."""
 
@@ -65,32 +66,6 @@ class Executor(Protocol):
         ...
 
 
-def executor_of(name: str, jobs: int) -> Executor:
-    """Return the executor of a name.
-
-    Parameters
-    ----------
-    name : {"local", "ray", "ray://HOST:PORT"}
-        ``ray`` alone joins the cluster of this machine.
-    jobs : int
-        Processes of ``local``; of a cluster, tasks at the same time, 0 for as many as it takes.
-
-    Raises
-    ------
-    InvalidValueError
-        If there is none of that name, or the number is out of bounds.
-    HoldfastError
-        If Ray is not installed, or the cluster cannot be reached.
-    """
-    if name == "local":
-        return LocalExecutor(jobs)
-    if name == "ray" or name.startswith("ray://"):
-        from holdfast.experiments.ray_executor import RayExecutor
-
-        return RayExecutor(None if name == "ray" else name, jobs)
-    raise InvalidValueError(f"--executor {name!r}: allowed are local, ray and ray://HOST:PORT")
-
-
 class LocalExecutor:
     """Computes tasks in processes of this machine.
 
@@ -101,8 +76,8 @@ class LocalExecutor:
     """
 
     def __init__(self, processes: int) -> None:
-        if not 1 <= processes <= MAX_PROCESSES:
-            raise InvalidValueError(f"--jobs {processes}: must be from 1 to {MAX_PROCESSES}")
+        if not 1 <= processes <= MAX_JOBS:
+            raise InvalidValueError(f"--jobs {processes}: must be from 1 to {MAX_JOBS}")
         self._processes = processes
 
     @property

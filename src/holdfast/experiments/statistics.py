@@ -3,6 +3,8 @@
 Runs are compared *paired*: two ways of choosing see the same worlds, because every random number is
 named by seed and trial. A difference of two means over the same trials has a far smaller interval
 than the means themselves.
+
+SciPy takes a second to import, so that is done where it is needed.
 """
 
 from __future__ import annotations
@@ -12,7 +14,6 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy import stats
 
 from holdfast.errors import InvalidValueError
 
@@ -56,6 +57,8 @@ def mean_interval(values: FloatArray) -> Interval:
     Interval
         NaN where there are no values; without bounds for a single one.
     """
+    from scipy import stats
+
     values = values[~np.isnan(values)]
     if values.size == 0:
         return Interval(math.nan, math.nan, math.nan)
@@ -85,6 +88,8 @@ def paired_difference(first: FloatArray, second: FloatArray) -> tuple[Interval, 
     InvalidValueError
         If they are not as many.
     """
+    from scipy import stats
+
     if first.shape != second.shape:
         raise InvalidValueError(f"{first.size} and {second.size} trials cannot be paired")
     difference = first - second
@@ -105,6 +110,8 @@ def paired_rates(first: BoolArray, second: BoolArray) -> tuple[Interval, float]:
         Of McNemar's exact test: of the trials in which one alone succeeded, each is as likely to be
         the first's as the second's.
     """
+    from scipy import stats
+
     interval, _ = paired_difference(first.astype(np.float64), second.astype(np.float64))
     first_alone = int(np.count_nonzero(first & ~second))
     either_alone = int(np.count_nonzero(first != second))
@@ -115,6 +122,8 @@ def paired_rates(first: BoolArray, second: BoolArray) -> tuple[Interval, float]:
 
 def agreement_of_rates(successes: int, trials: int, others: int, other_trials: int) -> float:
     """Return the p-value of Fisher's exact test that two rates are the same."""
+    from scipy import stats
+
     table = [[successes, trials - successes], [others, other_trials - others]]
     return float(stats.fisher_exact(table).pvalue)
 

@@ -1,0 +1,92 @@
+"""``holdfast experiment`` as a person or a program calls it."""
+
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from time import monotonic, sleep
+from typing import Any
+
+import pytest
+
+from holdfast.cli.experiment import experiment
+from holdfast.errors import InvalidValueError
+from holdfast.experiments.published_2017 import published_rows, series_of
+from holdfast.experiments.registry import studies_of, study_names
+from holdfast.experiments.study import Scale
+from holdfast.experiments.trial_batches import problem_of
+
+
+def test_list(capsys: pytest.CaptureFixture[str]) -> None:
+    experiment(list_names=True)
+    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == study_names()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"names": ["published"]}, "experiment 'published': .* did you mean published_2017"),
+        ({"names": None}, "which experiment"),
+        ({"names": ["all"], "jobs": -1}, "--jobs -1: must be 0"),
+    ],
+)
+def test_what_is_wrong_is_said(arguments: dict[str, Any], message: str, tmp_path: Path) -> None:
+    with pytest.raises(InvalidValueError, match=message):
+        experiment(**arguments, out=tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_names() -> None:
+    assert [study.name for study in studies_of(["all"])] == study_names()
+    assert [study.name for study in studies_of(["all", study_names()[0]])] == study_names()
+    with pytest.raises(InvalidValueError, match=r"'al'.* did you mean all"):
+        studies_of(["al"])
+
+
+def test_the_rows_of_2017_are_ours() -> None:
+    rows = published_rows()
+    assert len(rows) == 45
+    assert sum(row.covered for row in rows) == 42
+    for row in rows:
+        series = series_of(row, 1000, seed=1)
+        problem = problem_of(series.problem, series.model, series.state_space_planner)
+        assert problem.name == series.problem
+        assert series.planning.selector.method == row.selector
+        assert series.planning.sensing_interval == row.sensing_interval
+
+
+@pytest.mark.parametrize("name", study_names())
+def test_quick_is_part_of_the_same_work(name: str) -> None:
+    (study,) = studies_of([name])
+    quick = sum(task.units for task in study.tasks(Scale(quick=True)))
+    whole = sum(task.units for task in study.tasks(Scale()))
+    assert 0 < quick < whole / 5
+
+
+@pytest.mark.slow
+def test_interrupted_and_gone_on_with(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "holdfast", "experiment", "published_2017", "--quick"]
+    command += ["--jobs", "2", "--out", str(tmp_path)]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        began = monotonic()
+        while not list(tmp_path.rglob("*.table")) and monotonic() < began + 60:
+            sleep(0.1)
+        process.send_signal(signal.SIGINT)
+        _, said = process.communicate(timeout=30)
+    assert process.returncode == 128 + signal.SIGINT
+    kept = len(list(tmp_path.rglob("*.table")))
+    assert kept >= 1
+    assert "Interrupted; " in said
+    assert "Go on with: holdfast experiment published_2017 --quick" in said
+    done = subprocess.run(command, capture_output=True, text=True, timeout=1200)
+    assert done.returncode == 0, done.stderr
+    assert "known before" in done.stderr
+    names = {path.name for path in (tmp_path / "published_2017").iterdir()}
+    assert names == {
+        "published_2017.csv",
+        "published_2017_trials.csv",
+        "published_2017.png",
+        "published_2017.svg",
+        "origin.json",
+    }
+    assert "rows agree" in done.stdout

@@ -1,0 +1,242 @@
+"""Tasks, where they are computed, and what is kept of them."""
+
+import multiprocessing
+import os
+import signal
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from holdfast.errors import InvalidValueError
+from holdfast.experiments import executors, tasks
+from holdfast.experiments.executors import LocalExecutor
+from holdfast.experiments.result_cache import ResultCache
+from holdfast.experiments.running import Workload, compute, write_report
+from holdfast.experiments.study import Report, Results, Scale
+from holdfast.experiments.tables import Table
+from holdfast.experiments.tasks import Task, TaskError, run_task, task_key
+from holdfast.experiments.trial_batches import TrialSeries, trial_tasks
+from holdfast.files import OutputError
+
+
+def series(**changes: object) -> TrialSeries:
+    plain = {"problem": "peg_in_hole_2d", "max_steps": 20, "seed": 4, "num_trials": 7, **changes}
+    return msgspec.convert(plain, TrialSeries)
+
+
+def outcome(computed: Sequence[Table]) -> list[list[object]]:
+    """Return what does not depend on the time that it took."""
+    return [
+        [cells for name, cells in table.columns.items() if name != "mean_sensing_ms"]
+        for table in computed
+    ]
+
+
+class TestTasks:
+    def test_a_series_is_cut_into_batches(self) -> None:
+        found = list(trial_tasks(series(), 3))
+        assert [task.units for task in found] == [3, 3, 1]
+        whole = run_task(next(trial_tasks(series(), 100)))
+        parts = Table({})
+        for task in found:
+            parts.extend(run_task(task))
+        assert outcome([whole]) == outcome([parts])
+        assert parts.columns["trial"] == list(range(7))
+
+    def test_the_key_names_all_that_matters(self) -> None:
+        def key(**changes: object) -> str:
+            return task_key(next(trial_tasks(series(**changes), 100)))
+
+        assert key() == key()
+        others = {
+            key(seed=5),
+            key(max_steps=21),
+            key(num_trials=8),
+            key(model={"hole_tolerance": 0.2}),
+            key(planning={"selector": {"method": "random"}}),
+        }
+        assert len(others | {key()}) == 6
+
+    def test_the_key_names_the_code(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        task = next(trial_tasks(series(), 100))
+        before = task_key(task)
+        monkeypatch.setattr(tasks, "code_digest", lambda kind: f"another {kind}")
+        assert task_key(task) != before
+
+    def test_unknown_kinds_are_refused(self) -> None:
+        with pytest.raises(TaskError, match="'dance': there are trials"):
+            run_task(Task(kind="dance", parameters={}))
+
+    def test_what_a_trial_is_refused_for_names_it(self) -> None:
+        planning = {"active_sensing": {"num_nearest_neighbors": 100}}
+        task = next(trial_tasks(series(planning=planning), 100))
+        with pytest.raises(TaskError, match=r"trial 0 \(seed 4\) of peg_in_hole_2d: .*neighbors"):
+            run_task(task)
+
+
+class TestCache:
+    def test_what_is_kept_comes_back(self, tmp_path: Path) -> None:
+        cache, task = ResultCache(tmp_path), Task(kind="trials", parameters={"a": 1})
+        assert cache.load(task) is None
+        table = Table({"reward": [1.5, None, float("-inf")]})
+        cache.store(task, table)
+        assert cache.load(task) == table
+        assert cache.load(Task(kind="trials", parameters={"a": 2})) is None
+
+    @pytest.mark.parametrize("damage", [b"", b"\0", b"\xff" * 40])
+    def test_what_is_damaged_is_computed_again(self, tmp_path: Path, damage: bytes) -> None:
+        cache, task = ResultCache(tmp_path), Task(kind="trials", parameters={})
+        cache.store(task, Table({"reward": [1.5]}))
+        (file,) = (path for path in tmp_path.rglob("*") if path.is_file())
+        file.write_bytes(damage or file.read_bytes()[:-9])
+        assert cache.load(task) is None
+
+    def test_what_cannot_be_kept_says_where(self, tmp_path: Path) -> None:
+        (tmp_path / "file").write_text("")
+        with pytest.raises(OutputError, match="file"):
+            ResultCache(tmp_path / "file").store(Task(kind="trials", parameters={}), Table({}))
+
+
+class TestLocalExecutor:
+    def computed(self, executor: LocalExecutor, num_tasks: int = 4) -> list[Table]:
+        wanted = list(trial_tasks(series(num_trials=2 * num_tasks), 2))
+        found: dict[str, Table] = {}
+        executor.run(wanted, lambda task, table: found.update({task_key(task): table}))
+        return [found[task_key(task)] for task in wanted]
+
+    def test_processes_change_nothing(self) -> None:
+        assert outcome(self.computed(LocalExecutor(2))) == outcome(self.computed(LocalExecutor(1)))
+        assert multiprocessing.active_children() == []
+
+    @pytest.mark.slow
+    def test_a_killed_process_changes_nothing(self) -> None:
+        killed: list[int] = []
+
+        def kill_one(task: Task, table: Table) -> None:
+            found.update({task_key(task): table})
+            if not killed:
+                child = multiprocessing.active_children()[0]
+                assert child.pid is not None
+                killed.append(child.pid)
+                os.kill(child.pid, signal.SIGKILL)
+
+        wanted = list(trial_tasks(series(num_trials=60, max_steps=200), 3))
+        found: dict[str, Table] = {}
+        LocalExecutor(2).run(wanted, kill_one)
+        assert killed
+        alone: list[Table] = []
+        LocalExecutor(1).run(wanted, lambda _, table: alone.append(table))
+        assert outcome([found[task_key(task)] for task in wanted]) == outcome(alone)
+
+    def test_a_task_that_kills_is_given_up(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        always = Task(kind="trials", parameters={"a": 1})
+
+        def lose_all(
+            self: LocalExecutor, pending: list[tuple[int, Task]], on_result: object
+        ) -> list[tuple[int, Task]]:
+            lost = list(pending)
+            pending.clear()
+            return lost
+
+        monkeypatch.setattr(LocalExecutor, "_run_pool", lose_all)
+        with pytest.raises(TaskError, match="killed 3 times while it computed trials"):
+            LocalExecutor(2).run([always, always], lambda *_: None)
+
+    def test_an_error_ends_it_and_its_processes(self) -> None:
+        wrong = Task(kind="trials", parameters={"first_trial": 0, "problem": "nothing"})
+        with pytest.raises(Exception, match="nothing"):
+            LocalExecutor(2).run([wrong, wrong, wrong], lambda *_: None)
+        assert multiprocessing.active_children() == []
+
+    @pytest.mark.parametrize("count", [0, -1, 100_000])
+    def test_bounds(self, count: int) -> None:
+        with pytest.raises(InvalidValueError, match=f"--jobs {count}: must be from 1 to"):
+            LocalExecutor(count)
+
+
+class OneSeries:
+    """A study of seven trials."""
+
+    name = "one_series"
+    title = "Seven trials"
+
+    def tasks(self, scale: Scale) -> list[Task]:
+        return list(trial_tasks(series(seed=scale.seed), 3))
+
+    def report(self, scale: Scale, results: Results) -> Report:
+        table = results.of(self.tasks(scale))
+        mean = float(table.numbers("reward").mean())
+        return Report(
+            summary={"means": Table({"reward": [mean]})},
+            raw={"one_series": table},
+            findings=[f"a mean of {mean:.3f}"],
+        )
+
+
+class TestWorkload:
+    def test_what_is_known_is_not_computed_again(self, tmp_path: Path) -> None:
+        study, scale = OneSeries(), Scale(seed=4)
+        first = Workload([study], scale, tmp_path)
+        assert (first.units, first.finished_units, len(first.pending)) == (7, 0, 3)
+
+        class GivenUpError(Exception):
+            pass
+
+        def give_up(finished: int) -> None:
+            if finished >= 6:
+                raise GivenUpError
+
+        with pytest.raises(GivenUpError):
+            compute(first, LocalExecutor(1), give_up)
+        second = Workload([study], scale, tmp_path)
+        assert (second.finished_units, len(second.pending)) == (6, 1)
+        compute(second, LocalExecutor(1), lambda _: None)
+        third = Workload([study, study], scale, tmp_path)
+        assert third.pending == []
+        assert third.units == 7, "what two studies need is computed once"
+        assert outcome([study.report(scale, third.results).raw["one_series"]]) == outcome(
+            [run_task(next(trial_tasks(series(), 100)))]
+        )
+
+    def test_what_is_written(self, tmp_path: Path) -> None:
+        study, scale = OneSeries(), Scale(seed=4)
+        workload = Workload([study], scale, tmp_path)
+        compute(workload, LocalExecutor(1), lambda _: None)
+        report = study.report(scale, workload.results)
+        names = write_report(study, scale, report, tmp_path / "one_series")
+        assert names == ["means.csv", "one_series_trials.csv", "origin.json"]
+        origin = msgspec.json.decode((tmp_path / "one_series" / "origin.json").read_bytes())
+        assert (origin["seed"], origin["quick"]) == (4, False)
+        assert origin["findings"] == report.findings
+        assert "processor" in origin["machine"]
+
+
+def test_exclusive_tasks_come_last_and_here(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ran: list[tuple[int, str]] = []
+
+    class Noting:
+        description = "somewhere else"
+
+        def run(self, some: Sequence[Task], on_result: Callable[[Task, Table], None]) -> None:
+            for task in some:
+                ran.append((int(task.parameters["a"]), "there"))
+                on_result(task, Table({}))
+
+    class Both(OneSeries):
+        def tasks(self, scale: Scale) -> list[Task]:
+            return [
+                Task(kind="trials", parameters={"a": number}, exclusive=number == 0)
+                for number in range(3)
+            ]
+
+    def run_here(task: Task) -> Table:
+        ran.append((int(task.parameters["a"]), "here"))
+        return Table({})
+
+    monkeypatch.setattr(executors, "run_task", run_here)
+    compute(Workload([Both()], Scale(), tmp_path), Noting(), lambda _: None)
+    assert ran == [(1, "there"), (2, "there"), (0, "here")]

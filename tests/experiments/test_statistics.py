@@ -1,0 +1,78 @@
+"""Intervals and tests: against closed forms, and how often they err."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from holdfast.errors import InvalidValueError
+from holdfast.experiments.statistics import (
+    agreement_of_means,
+    agreement_of_rates,
+    mean_interval,
+    paired_difference,
+    paired_rates,
+    smallest_levels,
+)
+
+
+def test_mean_interval_is_students() -> None:
+    values = np.array([1.0, 2.0, 4.0, np.nan, 5.0])
+    interval = mean_interval(values)
+    low, high = stats.t.interval(0.95, 3, loc=3.0, scale=stats.sem([1.0, 2.0, 4.0, 5.0]))
+    assert interval == pytest.approx((3.0, low, high))
+    assert str(interval) == "3 [0.0948, 5.91]"
+
+
+def test_mean_interval_of_few() -> None:
+    assert all(math.isnan(number) for number in mean_interval(np.array([np.nan])))
+    assert mean_interval(np.array([2.0])) == (2.0, -math.inf, math.inf)
+
+
+def test_intervals_hold_the_truth_as_often_as_they_say() -> None:
+    # 2,000 intervals of 95 %: fewer than 1,850 or more than 1,950 of them have a probability below
+    # 1e-6 (binomial).
+    samples = np.random.default_rng(3).normal(1.0, 2.0, size=(2000, 12))
+    held = sum(each.low <= 1.0 <= each.high for each in map(mean_interval, samples))
+    assert 1850 <= held <= 1950
+
+
+def test_paired_difference_takes_the_worlds_out() -> None:
+    generator = np.random.default_rng(5)
+    worlds = generator.normal(0.0, 100.0, size=400)
+    first = worlds + 1.0 + generator.normal(0.0, 1.0, size=400)
+    interval, p_value = paired_difference(first, worlds)
+    assert interval.low < 1.0 < interval.high
+    assert interval.high - interval.low < 0.25
+    assert p_value < 1e-9
+    assert paired_difference(worlds, worlds) == ((0.0, 0.0, 0.0), 1.0)
+    with pytest.raises(InvalidValueError, match="400 and 399"):
+        paired_difference(worlds, worlds[1:])
+
+
+def test_paired_rates_are_mcnemars() -> None:
+    first = np.array([True] * 8 + [False] + [True] * 50)
+    second = np.array([False] * 8 + [True] + [True] * 50)
+    interval, p_value = paired_rates(first, second)
+    assert interval.value == pytest.approx(7 / 59)
+    # Of 9 trials 8 go one way: 2 (1 + 9) / 2^9.
+    assert p_value == pytest.approx(20 / 512)
+    assert paired_rates(first, first)[1] == 1.0
+
+
+def test_agreement() -> None:
+    assert agreement_of_rates(810, 1000, 809, 1000) > 0.9
+    assert agreement_of_rates(900, 1000, 809, 1000) < 1e-7
+    values = np.linspace(-10.0, 10.0, 801)
+    assert agreement_of_means(values, 0.0, 800) == pytest.approx(1.0)
+    assert agreement_of_means(values, 3.0, 800) < 1e-9
+    assert math.isnan(agreement_of_means(values[:1], 0.0, 800))
+
+
+def test_smallest_levels_are_holms() -> None:
+    # In order 0.01, 0.02, 0.03, 0.5: times 4, 3, 2, 1, and never less than the one before.
+    np.testing.assert_allclose(
+        smallest_levels(np.array([0.03, 0.5, 0.01, 0.02])), [0.06, 0.5, 0.04, 0.06]
+    )
+    assert smallest_levels(np.array([0.9, 0.8])).max() == 1.0
