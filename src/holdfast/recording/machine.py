@@ -25,7 +25,7 @@ __all__ = ["commit", "describe", "kernel_hash", "machines"]
 
 _HERE = Path(__file__).resolve().parent
 _GIT_TIMEOUT_S = 10.0
-_SOURCES = ("src", "cpp", "CMakeLists.txt")
+_SOURCES = ("src", "cpp", "cmake", "CMakeLists.txt")
 
 
 def describe() -> dict[str, str]:
