@@ -4,19 +4,23 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+# Beside it, what is as pip installs it: not editable, with the state machines compiled.
+COMPILED := .venv-compiled
 
 # Both stand inside the environment, so that they go when it goes.
 INSTALLED_FIGURES := $(VENV)/.installed-figures
 INSTALLED_DEV := $(VENV)/.installed-dev
+INSTALLED_COMPILED := $(COMPILED)/.installed
 
 NATIVE_SOURCES := $(wildcard CMakeLists.txt) $(shell find cpp -type f)
+PACKAGE_SOURCES := $(shell find cmake src -type f -not -name '*.pyc')
 CPP_FILES := $(shell find cpp -name '*.hpp' -o -name '*.cpp')
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-slow lint format simulate chaos fuzz soak bench clean
+.PHONY: help demo test test-slow test-compiled lint format simulate chaos fuzz soak bench clean
 
 help: ## what there is to make
-	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-13s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
 demo: $(INSTALLED_FIGURES) ## a cloud and a robot are killed, and no decision changes; see demo-run
 	rm -rf demo-run
@@ -27,6 +31,10 @@ test: $(INSTALLED_DEV) ## the quick tests
 
 test-slow: $(INSTALLED_DEV) ## the tests that take minutes
 	$(BIN)/pytest -q -m slow
+
+test-compiled: $(INSTALLED_COMPILED) ## the simulator's tests and 10,000 seeds through compiled machines
+	$(COMPILED)/bin/pytest -q -m "slow or not slow" tests/scenarios tests/simulation/test_world.py \
+	    tests/processes/test_compiled.py
 
 fuzz: $(INSTALLED_DEV) ## 1,000,000 hostile messages to a live service; some 15 minutes
 	$(BIN)/python -m tests.fuzz.live --messages 1000000 --seed 1
@@ -46,10 +54,10 @@ format: $(INSTALLED_DEV) ## rewrite the code in the common style
 	$(BIN)/ruff format .
 	$(BIN)/clang-format -i $(CPP_FILES)
 
-simulate: $(INSTALLED_DEV) ## 100,000 simulated runs with faults: minutes
-	$(BIN)/holdfast simulate --seeds 0:100000
+simulate: $(INSTALLED_COMPILED) ## 100,000 simulated runs with faults: minutes
+	$(COMPILED)/bin/holdfast simulate --seeds 0:100000
 
-bench: $(INSTALLED_DEV) ## the benchmarks
+bench: $(INSTALLED_DEV) $(INSTALLED_COMPILED) ## the benchmarks
 	$(BIN)/python benchmarks/run.py
 
 chaos: $(INSTALLED_FIGURES) ## 500 runs with real faults, about 25 minutes; see chaos-run
@@ -59,6 +67,7 @@ chaos: $(INSTALLED_FIGURES) ## 500 runs with real faults, about 25 minutes; see 
 clean: ## remove what was built or run here, but keep .venv
 	rm -rf build dist demo-run chaos-run .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis
 	rm -f $(INSTALLED_FIGURES) $(INSTALLED_DEV)
+	rm -rf $(COMPILED)
 
 # The interpreter is looked at first: without this, what is missing shows only as an error deep in
 # pip or CMake.
@@ -83,3 +92,9 @@ $(INSTALLED_FIGURES): pyproject.toml $(NATIVE_SOURCES) | $(BIN)/python
 $(INSTALLED_DEV): pyproject.toml $(NATIVE_SOURCES) | $(BIN)/python
 	$(BIN)/python -m pip install --disable-pip-version-check -q -e ".[dev]"
 	@touch $(INSTALLED_FIGURES) $@
+
+# The sources are copied into it, so whatever of them changes is installed again.
+$(INSTALLED_COMPILED): pyproject.toml $(NATIVE_SOURCES) $(PACKAGE_SOURCES) | $(BIN)/python
+	$(BIN)/python -m venv $(COMPILED)
+	HOLDFAST_COMPILED=1 $(COMPILED)/bin/python -m pip install --disable-pip-version-check -q ".[test]"
+	@touch $@

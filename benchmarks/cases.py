@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from benchmarks import command, decisions, faults, scale, service
+from benchmarks import command, decisions, faults, scale, service, simulator
 from benchmarks.common import Case
 
 __all__ = ["CASES"]
@@ -25,4 +25,5 @@ CASES = (
     Case("kills", "A killed cloud, and a new one", faults.kills, 90.0, 12.0),
     Case("capacity", "Many robots", service.capacity, 290.0, 60.0),
     Case("serve", "The service's process", service.serve, 50.0, 14.0),
+    Case("simulated", "Simulated runs", simulator.simulated, 15.0, 5.0),
 )

@@ -39,10 +39,18 @@ def is_users_file(name: str) -> bool:
     """
     if name.startswith("<"):
         return False
-    path = Path(name).resolve()
+    path = _place(name)
     return _PACKAGE_FOLDERS.isdisjoint(path.parts) and not any(
         path.is_relative_to(folder) for folder in (_HOLDFAST, *_LIBRARIES)
     )
+
+
+def _place(name: str) -> Path:
+    # Compiled modules give their sources' names as they lie in the package, wherever that is.
+    installed = _HOLDFAST.parent / name
+    if installed.is_relative_to(_HOLDFAST) and installed.is_file():
+        return installed
+    return Path(name).resolve()
 
 
 def account_of_user_error(error: BaseException, name: str) -> str | None:
@@ -65,7 +73,7 @@ def account_of_user_error(error: BaseException, name: str) -> str | None:
     frames = []
     for frame in traceback.extract_tb(error.__traceback__):
         # Whatever calls holdfast (a script, a notebook) comes first and is not at fault.
-        ours = ours or Path(frame.filename).resolve().is_relative_to(_HOLDFAST)
+        ours = ours or _place(frame.filename).is_relative_to(_HOLDFAST)
         if ours and is_users_file(frame.filename):
             frames.append(frame)
     if isinstance(error, SyntaxError) and error.filename and is_users_file(error.filename):

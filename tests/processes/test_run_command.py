@@ -16,6 +16,9 @@ from pathlib import Path
 
 import pytest
 
+from holdfast import __version__
+from holdfast.recording.machine import machines
+
 COMMAND = [sys.executable, "-c", "from holdfast.cli import main; main()"]
 
 PEG = """
@@ -290,7 +293,7 @@ class TestOutput:
     def test_version(self, workplace: Path) -> None:
         done = holdfast(workplace, "--version")
         assert done.returncode == 0
-        assert done.stdout.startswith("holdfast ")
+        assert done.stdout == f"holdfast {__version__} ({machines()} state machines)\n"
 
 
 class TestInterruption:

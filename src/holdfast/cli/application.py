@@ -91,7 +91,9 @@ def run_application(arguments: list[str]) -> None:
 
 def _print_version(wanted: bool) -> None:
     if wanted:
-        typer.echo(f"holdfast {__version__}")
+        from holdfast.recording.machine import machines
+
+        typer.echo(f"holdfast {__version__} ({machines()} state machines)")
         raise typer.Exit
 
 

@@ -1,8 +1,8 @@
 """Where tasks are computed: in this process, or in others.
 
 All places give the same results, for a task is a function of its parameters; they differ in time
-alone. A process that is killed takes nothing with it but the tasks that it had: they are computed again
-elsewhere, and only a task that has cost its process its life several times is given up.
+alone. A process that is killed takes nothing with it but the tasks that it had: they are computed
+again elsewhere, and only a task that has cost its process its life several times is given up.
 """
 
 from __future__ import annotations

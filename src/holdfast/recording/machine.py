@@ -6,11 +6,13 @@ A time says something only together with this.
 from __future__ import annotations
 
 import hashlib
+import importlib.util
 import os
 import platform
 import re
 import subprocess
 from datetime import UTC, datetime
+from importlib.machinery import EXTENSION_SUFFIXES
 from pathlib import Path
 
 import numpy as np
@@ -19,11 +21,11 @@ import holdfast
 from holdfast import _kernel
 from holdfast.runtime.trials import available_cores
 
-__all__ = ["commit", "describe", "kernel_hash"]
+__all__ = ["commit", "describe", "kernel_hash", "machines"]
 
 _HERE = Path(__file__).resolve().parent
 _GIT_TIMEOUT_S = 10.0
-_SOURCES = ("src", "cpp", "CMakeLists.txt")
+_SOURCES = ("src", "cpp", "cmake", "CMakeLists.txt")
 
 
 def describe() -> dict[str, str]:
@@ -37,6 +39,7 @@ def describe() -> dict[str, str]:
         "NumPy": np.__version__,
         "compiler of the kernel": _compiler(),
         "instruction set": _kernel.simd(),
+        "state machines": machines(),
         "holdfast": f"{holdfast.__version__}, {commit()}",
         "date": f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC",
     }
@@ -45,6 +48,13 @@ def describe() -> dict[str, str]:
 def kernel_hash() -> str:
     """Return a short hash of the kernel's file, to notice that it was built again meanwhile."""
     return hashlib.blake2b(_kernel_bytes(), digest_size=6).hexdigest()
+
+
+def machines() -> str:
+    """Return whether the state machines of sessions are ``compiled`` or ``interpreted``."""
+    found = importlib.util.find_spec("holdfast.session.robot")
+    origin = (found and found.origin) or ""
+    return "compiled" if origin.endswith(tuple(EXTENSION_SUFFIXES)) else "interpreted"
 
 
 def _kernel_bytes() -> bytes:

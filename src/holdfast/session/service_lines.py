@@ -191,16 +191,21 @@ class Lines:
             # Half of the room is kept for those that were served before.
             or (newcomer and 2 * self._num_newcomers >= limits.max_waiting)
             or (newcomer and 2 * self._bytes_of_newcomers >= limits.max_waiting_bytes)
-            or 1e3 * self.wait_s(now, newcomer=newcomer) > limits.max_wait_ms
+            # Nobody who was served before is turned away because of newcomers.
+            or 1e3 * self._ahead_s(now, newcomer=newcomer) > limits.max_wait_ms * self._workers
         )
 
     def wait_s(self, now: float, *, newcomer: bool) -> float:
         """Estimate how long a request that came now would wait for its answer to be begun."""
-        ahead_s = self._backlog_s
+        ahead_s = self._ahead_s(now, newcomer=newcomer)
         if not newcomer:
             # Of the newcomers as many at most are ahead as of the others: they go by turns.
-            ahead_s -= self._backlog_of_newcomers_s
             ahead_s += min(ahead_s, self._backlog_of_newcomers_s)
+        return ahead_s / self._workers
+
+    def _ahead_s(self, now: float, *, newcomer: bool) -> float:
+        """Add up what the works ahead are expected to take, newcomers for newcomers alone."""
+        ahead_s = self._backlog_s - (0.0 if newcomer else self._backlog_of_newcomers_s)
         for work in self._running.values():
             ahead_s += max(0.0, work.cost_s - (now - work.started_at))
-        return ahead_s / self._workers
+        return ahead_s

@@ -236,7 +236,7 @@ class RobotNode:
         self._robot = Robot(task.planner, task.simulator, dispatcher, self._run.rate_hz)
         self._network.robot_started(self.process)
         self._carry_out(self._robot.start(self._now()))
-        if self._robot is not None:
+        if self.process:  # else it was killed meanwhile
             self._begin_next()
 
     def kill(self, *, lost_appends: int | None = None, body_goes_on: bool = False) -> None:
@@ -442,7 +442,7 @@ class RobotNode:
             raise Violation(f"the robot holds still: {error}")
 
     def _written(self, process: int, stall_s: float) -> None:
-        if process != self.process or self._robot is None:
+        if process != self.process:
             return
         if self._stopped:
             self._deferred.appendleft((None, self._written, (process, stall_s)))
