@@ -74,116 +74,51 @@ supports the successes alone.
 
 from __future__ import annotations
 
-import csv
 import functools
 import math
-from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import pytest
 from scipy import stats
 
 from holdfast.experiments.emulation_2017 import Emulation, drawn_particle, emulate, likelihoods
-from holdfast.problems.capsule_robot import CapsuleRobot
-from holdfast.problems.multitier_peg_in_hole_2d import (
-    Hole,
-    MultitierPegInHole2D,
-    MultitierPegInHole2DModel,
-)
+from holdfast.experiments.published_2017 import PublishedRow, published_rows, series_of
+from holdfast.experiments.trial_batches import problem_of
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.problems.problem import FloatArray, Problem
-from holdfast.settings import ParticleFilterSettings, PlanningSettings, SelectorSettings
 
 SEED = 2017
 FAMILY_WISE_LEVEL = 0.001
 QUICK_TRIALS = 150
 
-EARLIER_VERSION = "2017-09-04"
 
-
-def wider_map(*tolerances: float) -> MultitierPegInHole2DModel:
-    centers = ((4.0, 6.0), (-4.0, 0.0), (0.0, -6.0))
-    return MultitierPegInHole2DModel(
-        map_dim=(-15.0, -15.0, 15.0, 15.0),
-        holes=tuple(
-            Hole(center=center, tol=tolerance)
-            for center, tolerance in zip(centers, tolerances, strict=True)
-        ),
-    )
-
-
-# As the logs of those days list them; later ones have the default.
-LOGGED_MODELS = {
-    "2017-09-06": wider_map(0.3, 0.2, 0.1),
-    "2017-09-07": wider_map(0.2, 0.15, 0.1),
-}
-
-
-class Row(NamedTuple):
-    """A row of the table of 2017."""
-
-    problem: str
-    logged: str
-    sensing_interval: int
-    max_steps: int
-    num_trials: int
-    num_particles: int
-    successes: int
-    mean_reward: float
-
-
-def random_rows(problem: str) -> list[Row]:
-    path = Path(__file__).parent / "data" / "original_results_2017.csv"
-    with path.open(encoding="utf-8", newline="") as file:
-        return [
-            Row(
-                entry["problem"],
-                entry["logged"],
-                int(entry["sensing_interval"]),
-                int(entry["max_steps"]),
-                int(entry["num_trials"]),
-                int(entry["num_particles"]),
-                int(entry["successes"]),
-                float(entry["mean_reward_of_successes"]),
-            )
-            for entry in csv.DictReader(file)
-            if entry["problem"] == problem and entry["selector"] == "random"
-        ]
+def random_rows(problem: str) -> list[PublishedRow]:
+    return [
+        row
+        for row in published_rows()
+        if row.covered and (row.problem, row.selector) == (problem, "random")
+    ]
 
 
 PEG_ROWS = random_rows("peg_hole_2d")
-MULTITIER_ROWS = [
-    row
-    for row in random_rows("multitier_peg_hole_2d")
-    if not row.logged.startswith(EARLIER_VERSION)
-]
+MULTITIER_ROWS = random_rows("multitier_peg_hole_2d")
 (CAPSULE_ROW,) = random_rows("capsule_robot")
 
 
-def label(row: Row) -> str:
+def label(row: PublishedRow) -> str:
     return f"{row.logged[:10]}-interval-{row.sensing_interval}"
 
 
-def problem_of(row: Row) -> Problem:
-    if row.problem == "multitier_peg_hole_2d":
-        return MultitierPegInHole2D(LOGGED_MODELS.get(row.logged[:10]))
-    return PegInHole2D() if row.problem == "peg_hole_2d" else CapsuleRobot()
-
-
 @functools.cache
-def emulated(row: Row, num_trials: int) -> Emulation:
-    planning = PlanningSettings(
-        particle_filter=ParticleFilterSettings(num_particles=row.num_particles),
-        selector=SelectorSettings(method="random"),
-        sensing_interval=row.sensing_interval,
-    )
+def emulated(row: PublishedRow, num_trials: int) -> Emulation:
+    series = series_of(row, num_trials, SEED)
+    problem = problem_of(series.problem, series.model, series.state_space_planner)
     return emulate(
-        problem_of(row), planning, max_steps=row.max_steps, num_trials=num_trials, seed=SEED
+        problem, series.planning, max_steps=row.max_steps, num_trials=num_trials, seed=SEED
     )
 
 
-def success_p_value(successes: int, num_trials: int, row: Row) -> float:
+def success_p_value(successes: int, num_trials: int, row: PublishedRow) -> float:
     table = [
         [successes, num_trials - successes],
         [row.successes, row.num_trials - row.successes],
@@ -191,13 +126,14 @@ def success_p_value(successes: int, num_trials: int, row: Row) -> float:
     return float(stats.fisher_exact(table).pvalue)
 
 
-def reward_p_value(rewards: FloatArray, row: Row) -> float:
+def reward_p_value(rewards: FloatArray, row: PublishedRow) -> float:
     """Compare the mean over our successful trials with the one of 2017, by the normal law."""
     deviation = float(np.std(rewards, ddof=1)) * math.sqrt(1 / rewards.size + 1 / row.successes)
-    return math.erfc(abs(float(np.mean(rewards)) - row.mean_reward) / deviation / math.sqrt(2.0))
+    distance = abs(float(np.mean(rewards)) - row.mean_reward_of_successes)
+    return math.erfc(distance / deviation / math.sqrt(2.0))
 
 
-def check_successes(emulation: Emulation, row: Row, num_rows: int) -> None:
+def check_successes(emulation: Emulation, row: PublishedRow, num_rows: int) -> None:
     count, num_trials = int(emulation.successes.sum()), emulation.successes.size
     level = FAMILY_WISE_LEVEL / num_rows
     assert success_p_value(count, num_trials, row) >= level, (
@@ -205,17 +141,17 @@ def check_successes(emulation: Emulation, row: Row, num_rows: int) -> None:
     )
 
 
-def check_rewards(emulation: Emulation, row: Row, num_rows: int) -> None:
+def check_rewards(emulation: Emulation, row: PublishedRow, num_rows: int) -> None:
     rewards = emulation.rewards[emulation.successes]
     level = FAMILY_WISE_LEVEL / num_rows
     assert reward_p_value(rewards, row) >= level, (
         f"mean reward {np.mean(rewards):.3f} of {rewards.size} successful trials, in 2017 "
-        f"{row.mean_reward} of {row.successes}"
+        f"{row.mean_reward_of_successes} of {row.successes}"
     )
 
 
 @pytest.mark.parametrize("row", PEG_ROWS, ids=label)
-def test_peg_in_hole_2d_in_few_trials(row: Row) -> None:
+def test_peg_in_hole_2d_in_few_trials(row: PublishedRow) -> None:
     emulation = emulated(row, QUICK_TRIALS)
     check_successes(emulation, row, len(PEG_ROWS))
     check_rewards(emulation, row, len(PEG_ROWS))
@@ -223,7 +159,7 @@ def test_peg_in_hole_2d_in_few_trials(row: Row) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("row", PEG_ROWS, ids=label)
-def test_peg_in_hole_2d(row: Row) -> None:
+def test_peg_in_hole_2d(row: PublishedRow) -> None:
     emulation = emulated(row, row.num_trials)
     check_successes(emulation, row, len(PEG_ROWS))
     check_rewards(emulation, row, len(PEG_ROWS))
@@ -231,7 +167,7 @@ def test_peg_in_hole_2d(row: Row) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("row", MULTITIER_ROWS, ids=label)
-def test_multitier_peg_in_hole_2d(row: Row) -> None:
+def test_multitier_peg_in_hole_2d(row: PublishedRow) -> None:
     emulation = emulated(row, row.num_trials)
     check_successes(emulation, row, len(MULTITIER_ROWS))
     check_rewards(emulation, row, len(MULTITIER_ROWS))
@@ -257,7 +193,7 @@ def test_the_table_has_the_rows_compared() -> None:
 
 
 @pytest.mark.parametrize("row", PEG_ROWS, ids=label)
-def test_the_comparison_rejects_a_sound_filter(row: Row) -> None:
+def test_the_comparison_rejects_a_sound_filter(row: PublishedRow) -> None:
     # The success rate with a true systematic resampler is about 99 %.
     assert success_p_value(990, 1000, row) < FAMILY_WISE_LEVEL / len(PEG_ROWS)
 
@@ -265,8 +201,9 @@ def test_the_comparison_rejects_a_sound_filter(row: Row) -> None:
 def test_the_comparison_rejects_a_shifted_mean_and_keeps_the_same() -> None:
     row = next(row for row in PEG_ROWS if row.sensing_interval == 8)
     spread = np.linspace(-24.0, 24.0, row.successes)  # standard deviation 13.9, as logged rows have
-    assert reward_p_value(row.mean_reward + spread, row) > 0.99
-    assert reward_p_value(row.mean_reward + 4.0 + spread, row) < FAMILY_WISE_LEVEL / len(PEG_ROWS)
+    rewards = row.mean_reward_of_successes + spread
+    assert reward_p_value(rewards, row) > 0.99
+    assert reward_p_value(rewards + 4.0, row) < FAMILY_WISE_LEVEL / len(PEG_ROWS)
 
 
 def test_trials_do_not_mix() -> None:
