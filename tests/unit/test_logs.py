@@ -333,8 +333,9 @@ class TestTargets:
             print("alive", log.lost)
         """)
         leader, follower = os.openpty()
+        # Unbuffered: of what stays in a buffer, Python itself complains at the end (status 120).
         with subprocess.Popen(
-            [sys.executable, "-c", program],
+            [sys.executable, "-u", "-c", program],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=follower,
