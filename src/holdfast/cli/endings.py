@@ -103,9 +103,10 @@ def ended_by_signals(*, once: bool = False) -> Iterator[None]:
         nonlocal ended
         del frame
         ended = True
-        # One is enough: another would cut short what the first one began.
+        # One is enough: another would cut short what the first one began. Of one that has come
+        # already when it is to be ignored, Python would complain; so it is heard, for nothing.
         for handled in saved:
-            signal.signal(handled, signal.SIG_IGN)
+            signal.signal(handled, _take_no_notice)
         raise EndedBySignal(number)
 
     # What is ignored from the start stays so: nohup asks for that.
@@ -122,9 +123,12 @@ def ended_by_signals(*, once: bool = False) -> Iterator[None]:
     except KeyboardInterrupt as interruption:
         raise SystemExit(EXIT_SIGNAL + signal_of(interruption)) from None
     finally:
-        if not (once and ended):
-            for number, before in saved.items():
-                signal.signal(number, before)
+        for number, before in saved.items():
+            signal.signal(number, signal.SIG_IGN if once and ended else before)
+
+
+def _take_no_notice(number: int, frame: object) -> None:
+    del number, frame
 
 
 def signal_of(interruption: KeyboardInterrupt) -> signal.Signals:
