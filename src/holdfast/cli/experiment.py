@@ -23,6 +23,9 @@ __all__ = ["experiment"]
 
 _DEFAULT_DIRECTORY = Path("runs") / "experiments"
 
+_NOTE = "all kept"
+"""What is to be said of the trials that are finished."""
+
 
 def experiment(
     names: Annotated[
@@ -123,9 +126,9 @@ def _compute(workload: Workload, directory: Path, executor: Executor) -> None:
     title = f"{counted(workload.units, 'trial')} in {executor.description}"
     if workload.finished_units:
         title += f", {workload.finished_units:,} known before"
-    line.start(f"{title}; results in {directory}", workload.finished_units, "")
+    line.start(f"{title}; results in {directory}", workload.finished_units, _NOTE)
     try:
-        compute(workload, executor, lambda finished: line.show(finished, ""))
+        compute(workload, executor, lambda finished: line.show(finished, _NOTE))
     finally:
         with contextlib.suppress(OSError):
             line.stop()
