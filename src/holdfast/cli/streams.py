@@ -11,7 +11,7 @@ import io
 import os
 import signal
 import sys
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TextIO
 
 from holdfast.errors import HoldfastError
 
@@ -55,18 +55,9 @@ def forgive_unwritable_errors() -> None:
     wherever something is said, and once more at the end of the process.
     """
     before = sys.stderr
-    if before is not sys.__stderr__ or not isinstance(before, io.TextIOWrapper):
-        return  # somebody else's
-    try:
-        descriptor = before.fileno()
-    except (OSError, ValueError):
-        return
-    sys.stderr = io.TextIOWrapper(
-        io.BufferedWriter(_ForgivingFile(descriptor, "w", closefd=False)),
-        encoding=before.encoding,
-        errors=before.errors,
-        line_buffering=True,
-    )
+    # Else it is somebody else's.
+    if before is sys.__stderr__ and isinstance(before, io.TextIOWrapper):
+        sys.stderr = _over(before, _ForgivingFile, line_buffering=True)
 
 
 def end_with_the_reader() -> None:
@@ -76,17 +67,24 @@ def end_with_the_reader() -> None:
     what comes after that, such as what is still buffered, is lost.
     """
     before = sys.stdout
-    if before is not sys.__stdout__ or not isinstance(before, io.TextIOWrapper):
-        return  # somebody else's
+    # Else it is somebody else's.
+    if before is sys.__stdout__ and isinstance(before, io.TextIOWrapper):
+        sys.stdout = _over(before, _EndingFile)
+
+
+def _over(
+    stream: io.TextIOWrapper, kind: type[io.FileIO], *, line_buffering: bool = False
+) -> TextIO:
+    """Return a stream like another, over a file of its descriptor; that one if it has none."""
     try:
-        descriptor = before.fileno()
+        descriptor = stream.fileno()
     except (OSError, ValueError):
-        return
-    sys.stdout = io.TextIOWrapper(
-        io.BufferedWriter(_EndingFile(descriptor, "w", closefd=False)),
-        encoding=before.encoding,
-        errors=before.errors,
-        line_buffering=before.line_buffering or before.write_through,
+        return stream
+    return io.TextIOWrapper(
+        io.BufferedWriter(kind(descriptor, "w", closefd=False)),
+        encoding=stream.encoding,
+        errors=stream.errors,
+        line_buffering=line_buffering or stream.line_buffering or stream.write_through,
     )
 
 

@@ -18,12 +18,11 @@ from matplotlib.figure import Figure
 from holdfast.files import write_atomically
 from holdfast.recording.figure import STYLE
 
-__all__ = ["COLORS", "LINES", "MARKERS", "Dots", "dot_rows", "figure_of", "save", "stacked_panels"]
+__all__ = ["COLORS", "MARKERS", "Dots", "dot_rows", "figure_of", "save", "stacked_panels"]
 
 # Ordered so that neighbours differ in lightness, too.
 COLORS = ("#1D3C78", "#E8A317", "#B5342B", "#54B5A6", "#7D3C98", "#9AA05A", "#4A4F57", "#D98CA6")
 MARKERS = ("s", "o", "D", "^", "v", "P", "X", "*")
-LINES = ("-", "--", "-.", ":", (0, (5, 1)), (0, (3, 1, 1, 1)), (0, (1, 1)), (0, (8, 2)))
 
 _ROW_INCHES = 0.26
 _DOTS_PER_INCH = 150

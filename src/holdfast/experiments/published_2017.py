@@ -281,7 +281,7 @@ def _draw(summary: Table) -> Figure:
     }
     figure, panels = plots.stacked_panels(
         [len(rows) for rows in rows_of.values()],
-        title="Success of 1,000 trials, three ways",
+        title="Success, three ways",
         width=8.0,
     )
     for panel, (problem, rows) in zip(panels, rows_of.items(), strict=True):
