@@ -18,22 +18,31 @@ using namespace holdfast::bindings;
 
 namespace {
 
-EntropySettings make_settings(bool mixture, std::uint32_t neighbors, double resolution,
+EntropySettings make_settings(Estimator estimator, std::uint32_t neighbors, double resolution,
                               double exponent, double offset, int threads) {
-    return {mixture ? Estimator::gaussian_mixture : Estimator::nearest_neighbor,
-            neighbors,
-            resolution,
-            exponent,
-            offset,
-            threads};
+    return {estimator, neighbors, resolution, exponent, offset, threads};
+}
+
+/// `number` as in `EstimatorKind` of entropy.py.
+Estimator to_estimator(int number) {
+    switch (number) {
+        case 0:
+            return Estimator::nearest_neighbor;
+        case 1:
+            return Estimator::gaussian_mixture;
+        case 2:
+            return Estimator::total_variance;
+        default:
+            throw nb::value_error("there is no such estimator");
+    }
 }
 
 HypothesisInput make_input(const Input<1>& weights, const std::vector<std::uint32_t>& sizes,
                            const Input<2>& predicted, const Input<2>& variance, std::size_t samples,
-                           const StreamWords& stream) {
-    return {weights.shape(0),       weights.data(),   sizes.size(),
-            sizes.data(),           predicted.data(), variance.data(),
-            variance.shape(1) != 1, samples,          to_stream(stream)};
+                           const StreamWords& stream, bool drop_negligible) {
+    return {weights.shape(0),  weights.data(),  sizes.size(),           sizes.data(),
+            predicted.data(),  variance.data(), variance.shape(1) != 1, samples,
+            to_stream(stream), drop_negligible};
 }
 
 double seconds_since(std::chrono::steady_clock::time_point start) {
@@ -48,26 +57,28 @@ void holdfast::bind_entropy(nb::module_& module) {
     define(module, "threads_started", [] { return threads_started(); });
 
     define(module, "entropies",
-           [](const Input<2>& points, const Input<2>& rows_in, bool logarithms, bool mixture,
+           [](const Input<2>& points, const Input<2>& rows_in, bool logarithms, int number,
               std::uint32_t neighbors, double resolution, double exponent, double offset,
               int threads) {
                const std::size_t posteriors = rows_in.shape(0), count = points.shape(0);
                double* out;
                auto result = make_array<double>({posteriors}, out);
                EntropyCounts counts;
+               const Estimator estimator = to_estimator(number);
+               const bool drop = drops_negligible(estimator);
                {
                    WithoutInterpreter released;
                    const VectorKernels& kernels = vector_kernels();
                    const double* rows = rows_in.data();
                    const auto source = [&](std::size_t index, double* weights) {
                        const double* row = rows + index * count;
-                       if (logarithms) return kernels.normalize(row, count, true, weights);
+                       if (logarithms) return kernels.normalize(row, count, drop, weights);
                        kernels.log(row, weights, count);
-                       return kernels.normalize(weights, count, true, weights);
+                       return kernels.normalize(weights, count, drop, weights);
                    };
                    entropies(
                        points.data(), count, points.shape(1), posteriors, source,
-                       make_settings(mixture, neighbors, resolution, exponent, offset, threads),
+                       make_settings(estimator, neighbors, resolution, exponent, offset, threads),
                        out, counts);
                }
                return nb::make_tuple(
@@ -79,19 +90,21 @@ void holdfast::bind_entropy(nb::module_& module) {
         module, "hypothetical_entropies",
         [](const Input<1>& weights, const std::vector<std::uint32_t>& sizes,
            const Input<2>& predicted, const Input<2>& variance, std::size_t samples,
-           const StreamWords& stream, const Input<2>& points, bool mixture, std::uint32_t neighbors,
+           const StreamWords& stream, const Input<2>& points, int number, std::uint32_t neighbors,
            double resolution, double exponent, double offset, int threads) {
             double* out;
             auto result = make_array<double>({sizes.size(), samples}, out);
             double* mean;
             auto means = make_array<double>({sizes.size()}, mean);
             EntropyCounts counts;
+            const Estimator estimator = to_estimator(number);
             {
                 WithoutInterpreter released;
                 hypothetical_entropies(
-                    make_input(weights, sizes, predicted, variance, samples, stream), points.data(),
-                    points.shape(1),
-                    make_settings(mixture, neighbors, resolution, exponent, offset, threads), out,
+                    make_input(weights, sizes, predicted, variance, samples, stream,
+                               drops_negligible(estimator)),
+                    points.data(), points.shape(1),
+                    make_settings(estimator, neighbors, resolution, exponent, offset, threads), out,
                     counts);
                 for (std::size_t j = 0; j < sizes.size(); ++j) {
                     double total = 0.0;
@@ -105,12 +118,13 @@ void holdfast::bind_entropy(nb::module_& module) {
     define(module, "hypothetical_weights",
            [](const Input<1>& weights, const std::vector<std::uint32_t>& sizes,
               const Input<2>& predicted, const Input<2>& variance, std::size_t samples,
-              const StreamWords& stream) {
+              const StreamWords& stream, bool drop_negligible) {
                double* out;
                auto result = make_array<double>({sizes.size(), samples, weights.shape(0)}, out);
                WithoutInterpreter released;
-               hypothetical_weights(
-                   make_input(weights, sizes, predicted, variance, samples, stream), out);
+               hypothetical_weights(make_input(weights, sizes, predicted, variance, samples, stream,
+                                               drop_negligible),
+                                    out);
                return result;
            });
 

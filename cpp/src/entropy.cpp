@@ -73,6 +73,22 @@ std::uint32_t neighbors_among(const Task& task, std::size_t survivors) {
         std::min<std::size_t>(task.settings->neighbors, survivors - 1));
 }
 
+/// sum_n w_n |u_n - mean|^2, in two passes.
+double total_variance(const Task& task, const double* weights) {
+    std::vector<double> mean(task.dimension);
+    task.kernels->weighted_sums(weights, task.points, task.count, task.dimension, mean.data());
+    double total = 0.0;
+    for (std::size_t n = 0; n < task.count; ++n) {
+        double distance = 0.0;
+        for (std::size_t c = 0; c < task.dimension; ++c) {
+            const double difference = task.points[n * task.dimension + c] - mean[c];
+            distance += difference * difference;
+        }
+        total += weights[n] * distance;
+    }
+    return total;
+}
+
 /// A single surviving point: its action is known to within the resolution (or the motion noise).
 double entropy_of_one(const Task& task) {
     if (task.settings->estimator == Estimator::gaussian_mixture) return 0.0;
@@ -241,13 +257,13 @@ double own_tree_entropy(const Task& task, const double* weights, std::size_t sur
 void entropies(const double* points, std::size_t count, std::size_t dimension,
                std::size_t posteriors, const PosteriorSource& source,
                const EntropySettings& settings, double* out, EntropyCounts& counts) {
-    const bool mixture = settings.estimator == Estimator::gaussian_mixture;
+    const bool nearest = settings.estimator == Estimator::nearest_neighbor;
     const Task task{points,
                     count,
                     dimension,
                     &settings,
-                    {settings.resolution, mixture ? 0.0 : log_unit_ball(dimension),
-                     mixture ? nullptr : bias_corrections(count)},
+                    {settings.resolution, nearest ? log_unit_ball(dimension) : 0.0,
+                     nearest ? bias_corrections(count) : nullptr},
                     &vector_kernels()};
     // Posteriors are taken in batches: their weights fill 64 MB, or those of one group if that is
     // more.
@@ -267,6 +283,17 @@ void entropies(const double* points, std::size_t count, std::size_t dimension,
         parallel_for(number, threads_for(work_that_follows * likelihoods, number, settings.threads),
                      [&](std::size_t i) { survivors[i] = source(first + i, &weights[i * count]); });
         counts.likelihoods += number * count;
+
+        if (settings.estimator == Estimator::total_variance) {
+            parallel_for(
+                number, threads_for(work_that_follows * likelihoods, number, settings.threads),
+                [&](std::size_t i) {
+                    out[first + i] = survivors[i] == 0 ? std::numeric_limits<double>::quiet_NaN()
+                                                       : total_variance(task, &weights[i * count]);
+                });
+            counts.visits += number * count;
+            continue;
+        }
 
         const double shared_from = grouped_share * static_cast<double>(count);
         double candidates_alone = 0.0;

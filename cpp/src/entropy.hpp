@@ -13,6 +13,8 @@
 //     d/2 log(2 pi e) + 1/2 log |S| - sum_i w_i log sum_j w_j exp(-c (u_i - u_j)' S^-1 (u_i -
 //     u_j)),
 // c = 1/2 from above, 1/8 from below. The caller scales the points by S^-1/2.
+//
+// Total variance: no entropy, but the trace of the weighted points' covariance, to compare with.
 
 #pragma once
 
@@ -22,7 +24,7 @@
 
 namespace holdfast {
 
-enum class Estimator { nearest_neighbor, gaussian_mixture };
+enum class Estimator { nearest_neighbor, gaussian_mixture, total_variance };
 
 struct EntropySettings {
     Estimator estimator;
@@ -43,8 +45,13 @@ struct EntropyCounts {
     std::uint64_t grouped = 0;
 };
 
-/// Fills `weights[count]` with posterior `index`, normalised and without negligible weights
-/// (lanes/posterior.hpp); returns the number of non-zero ones.
+/// Whether an estimate looks at weights that are negligible (lanes/posterior.hpp) as well: a far
+/// point of small weight says nothing about densities, but much about a variance.
+inline bool drops_negligible(Estimator estimator) {
+    return estimator != Estimator::total_variance;
+}
+
+/// Fills `weights[count]` with posterior `index`, normalised; returns the number of non-zero ones.
 /// Called from several threads at once.
 using PosteriorSource = std::function<std::size_t(std::size_t index, double* weights)>;
 

@@ -30,6 +30,7 @@ struct HypothesisInput {
     bool varying_variance;
     std::size_t samples;  // M
     Stream stream;
+    bool drop_negligible;  // weights of the posteriors
 };
 
 /// Entropies of the J x M hypothetical posteriors, row by row; NaN where an observation explains

@@ -26,6 +26,7 @@ struct PosteriorInput {
     const double* inverse_variance;  // [observation_size], or [observation_size][count]
     const double* log_normalizer;    // null, or [count]: sum over coordinates of log(variance) / 2
     const double* observation;       // [observation_size]
+    bool drop_negligible;
 };
 
 /// Posteriors over the points of one tree, side by side: row = slot of the tree, column =
@@ -70,8 +71,7 @@ struct VectorKernels {
     double (*sum)(const double* in, std::size_t count);
     void (*weighted_sums)(const double* weights, const double* rows, std::size_t count,
                           std::size_t dimension, double* out);
-    /// Normalised posterior weights without the negligible ones; returns how many are not zero, 0
-    /// if there is no posterior.
+    /// Normalised posterior weights; returns how many are not zero, 0 if there is no posterior.
     std::size_t (*posterior)(const PosteriorInput&, double* weights);
     /// Normalises weights e^log_weights; those that underflow next to the largest are zero.
     std::size_t (*normalize)(const double* log_weights, std::size_t count, bool drop_negligible,

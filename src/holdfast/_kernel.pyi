@@ -27,7 +27,7 @@ def entropies(
     points: _Floats,
     weights: _Floats,
     logarithms: bool,
-    mixture: bool,
+    estimator: int,
     neighbors: int,
     resolution: float,
     exponent: float,
@@ -44,7 +44,7 @@ def hypothetical_entropies(
     samples: int,
     stream: _Words,
     points: _Floats,
-    mixture: bool,
+    estimator: int,
     neighbors: int,
     resolution: float,
     exponent: float,
@@ -58,6 +58,7 @@ def hypothetical_weights(
     variance: _Floats,
     samples: int,
     stream: _Words,
+    drop_negligible: bool,
 ) -> _Floats: ...
 def measure_exp(count: int, repetitions: int) -> float: ...
 def measure_visit(count: int, dimension: int, repetitions: int) -> float: ...

@@ -12,7 +12,7 @@ still ranks them instead of turning every weight into zero.
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -141,8 +141,19 @@ class UpdateInfo(NamedTuple):
     explained: bool
 
 
-def estimate(belief: Belief) -> FloatArray:
-    """Return the mean state, shape ``(state_size,)``."""
+def estimate(belief: Belief, kind: Literal["mean", "most_likely"] = "mean") -> FloatArray:
+    """Return the state that stands for a belief, shape ``(state_size,)``.
+
+    Parameters
+    ----------
+    belief : Belief
+    kind : {"mean", "most_likely"}
+        The mean, or the particle of the greatest weight (the first of equals).
+    """
+    if kind == "most_likely":
+        # A copy: the belief may be large, and what is returned may outlive it.
+        likely: FloatArray = belief.states[int(np.argmax(belief.weights))].copy()
+        return likely
     return _kernel.weighted_sums(belief.weights, belief.states)
 
 

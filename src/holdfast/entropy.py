@@ -11,6 +11,7 @@ Entropies are in nats. Those of continuous quantities may be negative.
 
 from __future__ import annotations
 
+from enum import IntEnum
 from typing import NamedTuple
 
 import numpy as np
@@ -83,15 +84,32 @@ class GaussianMixture(NamedTuple):
     upper: bool = True
 
 
+class EstimatorKind(IntEnum):
+    """What the kernel computes of weighted points."""
+
+    NEAREST_NEIGHBOR = 0
+    GAUSSIAN_MIXTURE = 1
+    TOTAL_VARIANCE = 2
+
+
 class KernelEstimator(NamedTuple):
     """An estimator in the kernel's terms; the points are to be multiplied by ``scale``."""
 
-    mixture: bool
+    kind: EstimatorKind
     neighbors: int
     resolution: float
     exponent: float
     offset: float
     scale: FloatArray | None
+
+    @property
+    def drops_negligible(self) -> bool:
+        """Whether points of negligible weight are left out."""
+        return self.kind != EstimatorKind.TOTAL_VARIANCE
+
+
+TOTAL_VARIANCE = KernelEstimator(EstimatorKind.TOTAL_VARIANCE, 1, 1.0, 0.0, 0.0, None)
+"""Not an entropy: the trace of the covariance of weighted points, to compare with."""
 
 
 def first_unbounded(points: FloatArray) -> int | None:
@@ -122,7 +140,14 @@ def kernel_estimator(
             raise InvalidValueError(
                 f"resolution {estimator.resolution}: allowed are {1.0 / LARGEST:g} to {LARGEST:g}"
             )
-        return KernelEstimator(False, estimator.neighbors, estimator.resolution, 0.0, 0.0, None)
+        return KernelEstimator(
+            EstimatorKind.NEAREST_NEIGHBOR,
+            estimator.neighbors,
+            estimator.resolution,
+            0.0,
+            0.0,
+            None,
+        )
     variance = np.ascontiguousarray(estimator.variance, dtype=np.float64).reshape(-1)
     if variance.shape != (dimension,):
         raise InvalidValueError(f"variance of shape {variance.shape}: need ({dimension},)")
@@ -132,7 +157,8 @@ def kernel_estimator(
     offset = 0.5 * dimension * float(numerics.log(two_pi_e))
     offset += 0.5 * numerics.sum(numerics.log(variance))
     scale = 1.0 / np.sqrt(variance)
-    return KernelEstimator(True, 1, 1.0, 0.5 if estimator.upper else 0.125, offset, scale)
+    exponent = 0.5 if estimator.upper else 0.125
+    return KernelEstimator(EstimatorKind.GAUSSIAN_MIXTURE, 1, 1.0, exponent, offset, scale)
 
 
 def entropy(
@@ -203,7 +229,7 @@ def entropy(
         array,
         rows,
         False,
-        kernel.mixture,
+        kernel.kind,
         kernel.neighbors,
         kernel.resolution,
         kernel.exponent,

@@ -103,7 +103,8 @@ class TaskInfo(NamedTuple):
     Attributes
     ----------
     estimate : array of shape (state_size,)
-        The mean of the belief.
+        The state that the policy was asked for: the mean of the belief, or its most likely
+        particle.
     commanded : array of shape (action_size,)
         What the policy said; the action itself is what the limits leave of it.
     stage : int
@@ -256,7 +257,7 @@ def observe(
 def choose_task_action(
     problem: Problem, settings: PlanningSettings, state: PlanningState
 ) -> tuple[FloatArray, TaskInfo]:
-    """Choose the next task action: the policy's for the mean of the belief, within its limits.
+    """Choose the next task action: the policy's for the estimate of the state, within its limits.
 
     Returns
     -------
@@ -269,14 +270,13 @@ def choose_task_action(
     ProblemError
         If the policy's action is not finite.
     """
-    del settings  # the choice of the estimate will be one; callers should not have to change then
-    mean = estimate(state.belief)
-    stage = contract.next_stage(problem, mean, state.stage)
-    commanded = contract.policy(problem, mean, stage)
+    estimated = estimate(state.belief, settings.particle_filter.estimate)
+    stage = contract.next_stage(problem, estimated, state.stage)
+    commanded = contract.policy(problem, estimated, stage)
     action = contract.executed_action(problem, commanded)
     if not numerics.all_finite(action):
-        raise ProblemError(f"policy of {problem.name} gives {action} in state {mean}")
-    return action, TaskInfo(mean, commanded, stage)
+        raise ProblemError(f"policy of {problem.name} gives {action} in state {estimated}")
+    return action, TaskInfo(estimated, commanded, stage)
 
 
 def advance(
@@ -299,7 +299,6 @@ def advance(
     ProblemError
         If the problem moves a particle to a state that is not finite.
     """
-    del settings
     action = np.asarray(task_action, dtype=np.float64)
     if action.shape != (problem.action_size,) or not numerics.all_finite(action):
         raise InvalidValueError(
@@ -307,7 +306,8 @@ def advance(
         )
     belief = state.belief
     # Computed again, not taken from whoever calls: the action may come from another machine.
-    stage = contract.next_stage(problem, estimate(belief), state.stage)
+    estimated = estimate(belief, settings.particle_filter.estimate)
+    stage = contract.next_stage(problem, estimated, state.stage)
     motion = stream(state.seed, state.trial, state.step, Purpose.PREDICTION)
     moved = problem.move(belief.states, action, motion)
     states = contract.states_of(problem, "move", moved, belief.states.shape)

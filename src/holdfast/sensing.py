@@ -4,8 +4,9 @@ Look ahead by one observation: for each sensing action, imagine what it might sh
 belief by it, and ask how uncertain the robot would then be about what to **do**. The sensing
 action with the least expected entropy of the task actions wins (*action entropy*). Asking instead
 how uncertain it would be about where it *is* (*state entropy*) spends sensing on differences that
-change no action. Two choices that imagine nothing, *random* and *fixed*, are there to compare
-with.
+change no action. Asking how far the task actions would spread (*action covariance*, the trace of
+their covariance) is simpler, and sees how far two different actions are from each other, which
+entropy does not. Two choices that imagine nothing, *random* and *fixed*, are there to compare with.
 
 Source: Greigarn, Branicky and Çavuşoğlu, "Task-oriented active sensing via action entropy
 minimization", IEEE Access, 2019; Algorithm 2 of the thesis that the configuration files come from.
@@ -20,9 +21,10 @@ import numpy as np
 import numpy.typing as npt
 
 from holdfast import _kernel, contract, numerics
-from holdfast.belief import Belief
+from holdfast.belief import Belief, estimate
 from holdfast.entropy import (
     LARGEST,
+    TOTAL_VARIANCE,
     GaussianMixture,
     KernelEstimator,
     NearestNeighbor,
@@ -49,7 +51,8 @@ class SensingInfo(NamedTuple):
     Attributes
     ----------
     entropies : array of shape (J,) or None
-        Expected (discounted, summed) entropy after each sensing action, in nats; None for
+        Expected (discounted, summed) entropy after each sensing action, in nats; for
+        ``action_covariance`` the trace of the covariance, in the actions' units squared; None for
         ``random`` and ``fixed``.
     samples : array of shape (J, M) or None
         The entropies of the single hypothetical observations, whose means ``entropies`` are.
@@ -120,7 +123,7 @@ def choose_sensing_action(
         samples, likelihoods, visits = _entropies(points, log_weights, True, estimator, threads)
         samples = samples.reshape(count, -1)
         entropies = _row_means(samples)
-        weights = _normalized(log_weights) if several_steps else None
+        weights = _normalized(log_weights, estimator) if several_steps else None
     else:
         sizes, predicted, variance = _predictions(problem, belief)
         entropies, samples, likelihoods, visits = _kernel.hypothetical_entropies(
@@ -131,7 +134,7 @@ def choose_sensing_action(
             settings.active_sensing.num_observation_samples,
             hypotheses.words,
             points if estimator.scale is None else points * estimator.scale,
-            estimator.mixture,
+            estimator.kind,
             estimator.neighbors,
             estimator.resolution,
             estimator.exponent,
@@ -141,7 +144,13 @@ def choose_sensing_action(
         weights = None
         if several_steps:
             weights = _kernel.hypothetical_weights(
-                belief.weights, sizes, predicted, variance, samples.shape[1], hypotheses.words
+                belief.weights,
+                sizes,
+                predicted,
+                variance,
+                samples.shape[1],
+                hypotheses.words,
+                estimator.drops_negligible,
             )
     if weights is not None and not np.isnan(entropies).any():
         later = _later_entropies(
@@ -185,6 +194,8 @@ def _estimator(
     _require_bounded(problem, points, belief.states, "state")
     dimension = points.shape[1]
     selector = settings.selector
+    if selector.method == "action_covariance":
+        return TOTAL_VARIANCE
     if selector.estimator == "nearest_neighbor":
         neighbors = settings.active_sensing.num_nearest_neighbors
         if neighbors >= points.shape[0]:
@@ -273,9 +284,10 @@ def _general_log_weights(
     return np.ascontiguousarray(rows, dtype=np.float64)
 
 
-def _normalized(log_weights: FloatArray) -> FloatArray:
-    """Return the weights, row by row, without the negligible ones."""
-    return np.array([_kernel.normalize(row, True)[0] for row in log_weights])
+def _normalized(log_weights: FloatArray, estimator: KernelEstimator) -> FloatArray:
+    """Return the weights, row by row, as the estimator takes them."""
+    drop = estimator.drops_negligible
+    return np.array([_kernel.normalize(row, drop)[0] for row in log_weights])
 
 
 def _stratified(weights: FloatArray, samples: int, stream: Stream) -> list[int]:
@@ -298,7 +310,7 @@ def _entropies(
         np.ascontiguousarray(points if estimator.scale is None else points * estimator.scale),
         weights,
         logarithms,
-        estimator.mixture,
+        estimator.kind,
         estimator.neighbors,
         estimator.resolution,
         estimator.exponent,
@@ -325,6 +337,7 @@ def _later_entropies(
     noise is the same for every sensing action, as the observation noise is.
     """
     sensing = settings.active_sensing
+    kind = settings.particle_filter.estimate
     actions, samples, _ = weights.shape
     motion = hypotheses.substream(_HORIZON_MOTION)
     later = np.zeros((actions, samples))
@@ -335,10 +348,10 @@ def _later_entropies(
             own_stage: int = stage
             factor = 1.0
             for step in range(1, sensing.horizon):
-                mean = _kernel.weighted_sums(own_weights, states)
-                own_stage = contract.next_stage(problem, mean, own_stage)
+                estimated = estimate(Belief(states, own_weights), kind)
+                own_stage = contract.next_stage(problem, estimated, own_stage)
                 action = contract.executed_action(
-                    problem, contract.policy(problem, mean, own_stage)
+                    problem, contract.policy(problem, estimated, own_stage)
                 )
                 moved = problem.move(states, action, motion.substream(i).substream(step))
                 states = contract.states_of(problem, "move", moved, states.shape)

@@ -51,10 +51,15 @@ class ParticleFilterSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=
     resampling_threshold : float
         Resample after an observation when the effective sample size is at most this fraction of
         the number of particles. 1 (the default) resamples after every observation.
+    estimate : {"mean", "most_likely"}
+        The state for which the policy is asked: the mean of the belief, or the particle of the
+        greatest weight. Of equal weights, as all are after resampling, it is the first particle:
+        no more than a draw from the belief.
     """
 
     num_particles: Annotated[int, msgspec.Meta(ge=1, le=MAX_PARTICLES)] = 100
     resampling_threshold: Annotated[float, msgspec.Meta(ge=0.0, le=1.0)] = 1.0
+    estimate: Literal["mean", "most_likely"] = "mean"
 
 
 class ActiveSensingSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -87,20 +92,24 @@ class SelectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
 
     Attributes
     ----------
-    method : {"action_entropy", "state_entropy", "random", "fixed"}
-        What is minimised; ``random`` and ``fixed`` look at no belief.
+    method : {"action_entropy", "state_entropy", "action_covariance", "random", "fixed"}
+        What is minimised: an entropy, or the trace of the covariance of the actions; ``random`` and
+        ``fixed`` look at no belief.
     sensing_action : int
         Index of the sensing action that ``fixed`` chooses.
     estimator : {"nearest_neighbor", "gaussian_mixture_upper", "gaussian_mixture_lower"}
-        The entropy estimate.
+        The estimate of the two entropies.
     actions : {"commanded", "executed"}
-        Whether ``action_entropy`` looks at what the policy says or at what the limits leave of it.
+        Whether ``action_entropy`` and ``action_covariance`` look at what the policy says or at what
+        the limits leave of it.
     resolution : float or None
         Distance below which two actions (or states) do not differ in practice, in their unit.
         None takes the problem's own, which follows its motion noise.
     """
 
-    method: Literal["action_entropy", "state_entropy", "random", "fixed"] = "action_entropy"
+    method: Literal["action_entropy", "state_entropy", "action_covariance", "random", "fixed"] = (
+        "action_entropy"
+    )
     sensing_action: NonNegativeCount = 0
     estimator: Literal["nearest_neighbor", "gaussian_mixture_upper", "gaussian_mixture_lower"] = (
         "nearest_neighbor"

@@ -40,6 +40,10 @@ LOOKING = [
         ("commanded", "executed"),
     )
 ]
+LOOKING += [
+    SelectorSettings(method="action_covariance", actions=actions)
+    for actions in ("commanded", "executed")
+]
 SELECTORS = [
     *LOOKING,
     SelectorSettings(),

@@ -68,7 +68,9 @@ plannings = st.builds(
     ),
     selector=st.builds(
         SelectorSettings,
-        method=st.sampled_from(("action_entropy", "state_entropy", "random", "fixed")),
+        method=st.sampled_from(
+            ("action_entropy", "state_entropy", "action_covariance", "random", "fixed")
+        ),
         sensing_action=st.integers(0, 100),
     ),
     sensing_interval=st.integers(0, 1000),

@@ -99,7 +99,7 @@ def find(
         points if kernel.scale is None else points * kernel.scale,
         weights,
         False,
-        kernel.mixture,
+        kernel.kind,
         kernel.neighbors,
         kernel.resolution,
         kernel.exponent,

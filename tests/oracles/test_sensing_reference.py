@@ -9,6 +9,7 @@ the noise of predicted motion. Both sides round differently, so they agree to 1e
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -144,6 +145,8 @@ def reference_entropy(
     problem: Problem, settings: PlanningSettings, points: FloatArray, weights: FloatArray
 ) -> float:
     selector = settings.selector
+    if selector.method == "action_covariance":
+        return float(np.trace(np.atleast_2d(np.cov(points.T, aweights=weights, ddof=0))))
     if selector.estimator == "nearest_neighbor":
         neighbors = settings.active_sensing.num_nearest_neighbors
         resolution = selector.resolution or problem.resolution
@@ -189,12 +192,16 @@ def algorithm_2(
             points = reference_points(problem, settings, states, stage)
             found[j, i] = reference_entropy(problem, settings, points, posterior)
 
-            # The belief moved on by its own action; negligible particles are gone by then.
-            posterior = np.where(significant(posterior), posterior, 0.0)
-            posterior /= posterior.sum()
+            # The belief moved on by its own action; negligible particles are gone by then, except
+            # where they count.
+            if settings.selector.method != "action_covariance":
+                posterior = np.where(significant(posterior), posterior, 0.0)
+                posterior /= posterior.sum()
             later_states, later_stage = states, stage
             for step in range(1, sensing.horizon):
                 estimate = posterior @ later_states
+                if settings.particle_filter.estimate == "most_likely":
+                    estimate = later_states[int(np.argmax(posterior))]
                 later_stage = int(problem.next_stage(estimate, later_stage))
                 action = problem.execute(problem.policy(estimate, later_stage))
                 motion = hypotheses.substream(2).substream(i).substream(step)
@@ -213,9 +220,10 @@ def settings_of(
     horizon: int = 1,
     discount: float = 1.0,
     selector: SelectorSettings | None = None,
+    estimate: Literal["mean", "most_likely"] = "mean",
 ) -> PlanningSettings:
     return PlanningSettings(
-        particle_filter=ParticleFilterSettings(num_particles=40),
+        particle_filter=ParticleFilterSettings(num_particles=40, estimate=estimate),
         active_sensing=ActiveSensingSettings(
             horizon=horizon,
             discount=discount,
@@ -281,6 +289,45 @@ def test_selectors(method: str, actions: str, estimator: str, resolution: float 
     compare(problem, settings_of(selector=selector), some_belief(problem, 60, "weighted"))
 
 
+@pytest.mark.parametrize("actions", ["commanded", "executed"])
+@pytest.mark.parametrize("horizon", [1, 3])
+@pytest.mark.parametrize("kind", ["uniform", "weighted", "zeros"])
+@pytest.mark.parametrize("problem", [Plane(), LightDark()], ids=lambda p: p.name)
+def test_action_covariance(
+    problem: Problem, kind: str, horizon: int, actions: Literal["commanded", "executed"]
+) -> None:
+    selector = SelectorSettings(method="action_covariance", actions=actions)
+    settings = settings_of(samples=4, horizon=horizon, selector=selector)
+    compare(problem, settings, some_belief(problem, 50, kind))
+
+
+def test_action_covariance_counts_far_particles_of_small_weight() -> None:
+    """Of which an entropy estimate takes no notice: they are most of the variance here."""
+    selector = SelectorSettings(method="action_covariance")
+    problem = Plane()
+    states = some_belief(problem, 50, "uniform").states.copy()
+    states[0] = [0.2, 40.0, -40.0]
+    weights = np.ones(50)
+    weights[0] = 1e-3
+    found = compare(problem, settings_of(selector=selector), Belief.weighted(states, weights))
+    # Sensed without noise to speak of, the far one is ruled out; else it is not.
+    assert found.max() > 10.0 * found.min()
+
+
+def test_action_covariance_with_a_general_likelihood() -> None:
+    selector = SelectorSettings(method="action_covariance")
+    settings = settings_of(samples=8, horizon=2, selector=selector)
+    inner = Plane()
+    hypotheses = stream(33, 0, 1, Purpose.HYPOTHESES)
+    general: Problem = General(inner, hypotheses, 8)  # type: ignore[assignment]
+    belief = some_belief(inner, 70, "weighted")
+    _, info = choose_sensing_action(general, settings, belief, 0, hypotheses, hypotheses)
+    _, expected = choose_sensing_action(inner, settings, belief, 0, hypotheses, hypotheses)
+    assert info.samples is not None
+    assert expected.samples is not None
+    np.testing.assert_allclose(info.samples, expected.samples, rtol=0.0, atol=TOLERANCE)
+
+
 @pytest.mark.parametrize("neighbors", [1, 5, 30])
 @pytest.mark.parametrize("samples", [1, 2, 13])
 def test_numbers_of_samples_and_neighbours(samples: int, neighbors: int) -> None:
@@ -307,6 +354,14 @@ def test_horizon(problem: Problem, horizon: int, discount: float) -> None:
         assert np.abs(found - at_once).max() > 0.1
     else:
         np.testing.assert_allclose(found, at_once, rtol=0.0, atol=TOLERANCE)
+
+
+def test_horizon_by_the_most_likely_particle() -> None:
+    problem = LightDark()
+    belief = some_belief(problem, 50, "weighted")
+    found = compare(problem, settings_of(samples=3, horizon=3, estimate="most_likely"), belief)
+    by_mean = compare(problem, settings_of(samples=3, horizon=3), belief)
+    assert np.abs(found - by_mean).max() > 1e-3
 
 
 @pytest.mark.parametrize("inner", [Plane(), LightDark()], ids=lambda p: p.name)
@@ -428,6 +483,7 @@ def test_both_paths_imagine_from_the_same_particles(kind: str, samples: int) -> 
             np.full((1, 1), 1e-8),
             samples,
             hypotheses.words,
+            True,
         ).reshape(samples, count)
         assert (posteriors.max(axis=1) == 1.0).all()
         drawn = _stratified(weights, samples, hypotheses)

@@ -84,18 +84,21 @@ for count, dimension, kept, posteriors, way in (
         for neighbors in (1, 5, 8, 9, 30):
             for resolution in (1e-9, 0.2, 20.0):
                 result, _, visits, ways = kernel.entropies(
-                    points, log_weights, True, False, neighbors, resolution, 0.0, 0.0, 2)
+                    points, log_weights, True, 0, neighbors, resolution, 0.0, 0.0, 2)
                 name = f"nearest {count} {dimension} {kept} {deviation} {neighbors} {resolution}"
                 note(name, result, np.array(visits))
                 if deviation < 1.0 and ways[way] != posteriors:
                     wrong_ways.append(name)
     for exponent in (0.5, 0.125):
         result, _, visits, ways = kernel.entropies(
-            points * 3.0, normals * 0.4, True, True, 1, 1.0, exponent, 0.3, 2)
+            points * 3.0, normals * 0.4, True, 1, 1, 1.0, exponent, 0.3, 2)
         name = f"mixture {count} {dimension} {kept} {exponent}"
         note(name, result, np.array(visits))
         if ways[way] != posteriors:
             wrong_ways.append(name)
+
+    result, *_ = kernel.entropies(points, normals, True, 2, 1, 1.0, 0.0, 0.0, 2)
+    note(f"variance {count} {dimension} {kept}", result)
 
 for count in (5, 100, 1001):
     draw = stream.substream(count)
@@ -105,9 +108,10 @@ for count in (5, 100, 1001):
     for variance in (np.full((5, 1), 0.1), np.ascontiguousarray(0.1 + predicted**2)):
         arguments = (weights, [1, 1, 1, 2], predicted, variance, 9, words)
         found = kernel.hypothetical_entropies(
-            *arguments, np.ascontiguousarray(-states), False, 3, 0.05, 0.0, 0.0, 2)
+            *arguments, np.ascontiguousarray(-states), 0, 3, 0.05, 0.0, 0.0, 2)
         note(f"hypotheses {count} {variance.shape}", *found[:2],
-             kernel.hypothetical_weights(*arguments))
+             kernel.hypothetical_weights(*arguments, True),
+             kernel.hypothetical_weights(*arguments, False))
 
 deviation = np.full(6, 0.1)
 flat = [(-3.0, -2.0, -1.0, -1.5), (0.5, -1.0, 0.7, 2.0)]
@@ -365,9 +369,9 @@ class TestThreads:
         yield
         assert _kernel.use_threads_from(usual) == 0.0
 
-    @pytest.mark.parametrize("mixture", [False, True])
+    @pytest.mark.parametrize("estimator", [0, 1, 2])
     @pytest.mark.parametrize(("count", "posteriors"), [(100, 30), (1500, 40), (4000, 3)])
-    def test_entropies(self, count: int, posteriors: int, mixture: bool) -> None:
+    def test_entropies(self, count: int, posteriors: int, estimator: int) -> None:
         points = _kernel.normals(WORDS, count * 3).reshape(count, 3)
         log_weights = _kernel.normals((8, 0, 3, 2, 1), posteriors * count).reshape(posteriors, -1)
         # Posteriors of all sizes, so that more than one way is taken.
@@ -377,11 +381,12 @@ class TestThreads:
         results = set()
         for threads in (1, 2, 3, 64, 0):
             result, _, visits, ways = _kernel.entropies(
-                points, log_weights, True, mixture, 5, 0.1, 0.5, 0.0, threads
+                points, log_weights, True, estimator, 5, 0.1, 0.5, 0.0, threads
             )
             results.add((result.tobytes(), visits, ways))
-            assert ways[0] > 0
-            assert ways[1] + ways[2] > 0
+            # A variance has but one way.
+            assert (ways[0] > 0) == (estimator < 2)
+            assert (ways[1] + ways[2] > 0) == (estimator < 2)
         assert len(results) == 1
         if _processors() > 1:
             assert _kernel.threads_started() > 0

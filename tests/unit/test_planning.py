@@ -265,6 +265,26 @@ class TestFunctions:
         assert info.commanded.tolist() == problem.policy(mean, info.stage).tolist()
         assert action.tolist() == problem.execute(info.commanded).tolist()
 
+    def test_task_action_of_the_most_likely_particle(self, problem: Problem) -> None:
+        configured = msgspec.structs.replace(
+            planning_settings(),
+            particle_filter=ParticleFilterSettings(num_particles=40, estimate="most_likely"),
+        )
+        state = planning.initial_state(problem, configured, SEED, TRIAL)
+        weights = np.ones(40)
+        weights[[7, 9]] = 3.0
+        weighted = state._replace(belief=Belief.weighted(state.belief.states, weights))
+        action, info = planning.choose_task_action(problem, configured, weighted)
+        likely = state.belief.states[7]
+        assert info.estimate.tolist() == likely.tolist()
+        assert not np.shares_memory(info.estimate, state.belief.states)
+        stage = int(problem.next_stage(likely, state.stage))
+        assert action.tolist() == problem.execute(problem.policy(likely, stage)).tolist()
+        assert planning.advance(problem, configured, weighted, action).stage == stage
+        # Of equals the first.
+        _, info = planning.choose_task_action(problem, configured, state)
+        assert info.estimate.tolist() == state.belief.states[0].tolist()
+
     def test_advance(self, problem: Problem) -> None:
         configured = planning_settings()
         state = planning.initial_state(problem, configured, SEED, TRIAL)

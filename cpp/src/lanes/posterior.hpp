@@ -116,7 +116,7 @@ static std::size_t posterior(const PosteriorInput& in, double* weights) {
             store_partial(weights + i, log_weight, left);
         }
     }
-    return normalize_in_place(weights, in.count, maximum_of(largest), true);
+    return normalize_in_place(weights, in.count, maximum_of(largest), in.drop_negligible);
 }
 
 }  // namespace holdfast::inline HOLDFAST_ISA

@@ -8,9 +8,11 @@ and the code.
 
 from __future__ import annotations
 
+import ast
 import functools
 import hashlib
 import importlib
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, cast
@@ -30,8 +32,7 @@ _FUNCTIONS: Mapping[str, str] = {
 }
 """Where the function of each kind of task is; imported when it is needed."""
 
-_WITHOUT_EFFECT = ("cli", "chaos", "recording", "simulation", "experiments")
-"""Packages on which no task depends, but for the module of its own function."""
+_PLACE = re.compile(r"\w+(\.\w+)+:\w+")
 
 _KEY_SIZE = 16
 
@@ -73,8 +74,9 @@ def task_key(task: Task) -> str:
 def code_digest(kind: str) -> str:
     """Return the digest of the code that computes a kind of task, in hexadecimal.
 
-    The version of holdfast alone would not tell what a developer has changed since: the sources
-    that a decision can depend on are hashed, and the compiled kernel.
+    The version of holdfast alone would not tell what a developer has changed since: what is hashed
+    are the sources of the function's module and of all modules that it imports, directly or not,
+    and the compiled kernel.
 
     Raises
     ------
@@ -82,13 +84,10 @@ def code_digest(kind: str) -> str:
         If there is no such kind.
     """
     package = Path(holdfast.__file__).parent
-    module = _place_of(kind).partition(":")[0]
-    own = package.joinpath(*module.split(".")[1:]).with_suffix(".py")
     digest = hashlib.blake2b(holdfast.__version__.encode(), digest_size=_KEY_SIZE)
-    for path in sorted(package.rglob("*.py")):
+    for path in sorted(_sources_behind(_place_of(kind).partition(":")[0], package)):
         inside = path.relative_to(package)
-        if inside.parts[0] not in _WITHOUT_EFFECT or path == own:
-            digest.update(str(inside).encode() + b"\0" + path.read_bytes() + b"\0")
+        digest.update(str(inside).encode() + b"\0" + path.read_bytes() + b"\0")
     if _kernel.__file__:
         digest.update(Path(_kernel.__file__).read_bytes())
     return digest.hexdigest()
@@ -107,6 +106,36 @@ def run_task(task: Task) -> Table:
     module, _, name = _place_of(task.kind).partition(":")
     function = getattr(importlib.import_module(module), name)
     return cast(Table, function(**task.parameters))
+
+
+def _sources_behind(module: str, package: Path) -> set[Path]:
+    """Return the files of a module of the package and of all that it imports of the package.
+
+    What a string names as ``module:attribute``, as registries do, counts as imported.
+    """
+    found: set[Path] = set()
+    waiting = [module]
+    while waiting:
+        name = waiting.pop()
+        # A module's own package is imported with it.
+        parent, _, _ = name.rpartition(".")
+        if parent:
+            waiting.append(parent)
+        place = package.joinpath(*name.split(".")[1:])
+        path = place / "__init__.py" if place.is_dir() else place.with_suffix(".py")
+        if path in found or not path.is_file() or name == __name__:
+            continue  # seen; or a name inside a module; or this one, which knows all functions
+        found.add(path)
+        for node in ast.walk(ast.parse(path.read_bytes())):
+            names: list[str] = []
+            if isinstance(node, ast.Constant) and isinstance(node.value, str):
+                names = [node.value.partition(":")[0]] if _PLACE.fullmatch(node.value) else []
+            elif isinstance(node, ast.Import):
+                names = [alias.name for alias in node.names]
+            elif isinstance(node, ast.ImportFrom) and node.module:
+                names = [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
+            waiting += [name for name in names if name.split(".")[0] == package.name]
+    return found
 
 
 def _place_of(kind: str) -> str:
