@@ -54,8 +54,8 @@ __all__ = [
     "run_emulation",
 ]
 
-_TRIALS_AT_A_TIME = 64
-"""Trials whose hypothetical weights are in memory together: some 10 MB each array."""
+_TRIALS_AT_A_TIME = 16
+"""Trials whose hypothetical weights are in memory together: arrays of a megabyte, as caches hold."""
 
 _NEGLIGIBLE = 1e-16
 """Weight below which a neighbourhood was left out."""
@@ -88,6 +88,7 @@ def emulate(
     max_steps: int,
     num_trials: int,
     seed: int,
+    first_trial: int = 0,
 ) -> Emulation:
     """Run trials as the implementation of 2017 did.
 
@@ -98,34 +99,38 @@ def emulate(
     planning : PlanningSettings
         Number of particles, sensing interval, and how sensing actions are chosen.
     max_steps, num_trials : int
-    seed : int
-        Names the streams; all trials share one stream per step and purpose.
+    seed, first_trial : int
+        Name the streams; all these trials share one stream per step and purpose.
     """
     num_particles = planning.particle_filter.num_particles
-    world = problem.initial_states(stream(seed, 0, 0, Purpose.WORLD_INITIAL_STATE), num_trials)
+    world = problem.initial_states(
+        stream(seed, first_trial, 0, Purpose.WORLD_INITIAL_STATE), num_trials
+    )
     particles = problem.initial_states(
-        stream(seed, 0, 0, Purpose.INITIAL_BELIEF), num_trials * num_particles
+        stream(seed, first_trial, 0, Purpose.INITIAL_BELIEF), num_trials * num_particles
     ).reshape(num_trials, num_particles, problem.state_size)
     stages = np.zeros(num_trials, dtype=np.int64)
     done = np.array(problem.is_goal(world))
     rewards = np.zeros(num_trials)
     steps = np.zeros(num_trials, dtype=np.int64)
 
+    # Whatever is drawn in step t is named by this, t and its purpose.
+    name = (seed, first_trial)
     running = np.flatnonzero(~done)
     world, particles, stages = world[running], particles[running], stages[running]
     for step in range(max_steps):
         if running.size == 0:
             break
         if step % (planning.sensing_interval + 1) == 0:
-            chosen = _chosen(problem, planning, particles, stages, running, seed, step)
-            particles = _sense(problem, world, particles, chosen, seed, step)
+            chosen = _chosen(problem, planning, particles, stages, running, name, step)
+            particles = _sense(problem, world, particles, chosen, name, step)
         first = particles[:, 0]
         stages = np.asarray(problem.next_stage(first, stages))
         actions = problem.execute(problem.policy(first, stages))
         particles = problem.move(
-            particles, actions[:, None, :], stream(seed, 0, step, Purpose.PREDICTION)
+            particles, actions[:, None, :], stream(*name, step, Purpose.PREDICTION)
         )
-        world = problem.move(world, actions, stream(seed, 0, step, Purpose.WORLD_MOTION))
+        world = problem.move(world, actions, stream(*name, step, Purpose.WORLD_MOTION))
         rewards[running] += problem.reward(world, actions)
         steps[running] += 1
         arrived = np.array(problem.is_goal(world))
@@ -137,11 +142,12 @@ def emulate(
     return Emulation(done, rewards, steps)
 
 
-def run_emulation(**series: Any) -> Table:
-    """Emulate a series of trials; the function of tasks of the kind ``emulation_2017``.
+def run_emulation(first_trial: int, **series: Any) -> Table:
+    """Emulate some trials of a series; the function of tasks of the kind ``emulation_2017``.
 
     Parameters
     ----------
+    first_trial : int
     **series
         The fields of :class:`~holdfast.experiments.trial_batches.TrialSeries`.
     """
@@ -153,10 +159,11 @@ def run_emulation(**series: Any) -> Table:
         max_steps=wanted.max_steps,
         num_trials=wanted.num_trials,
         seed=wanted.seed,
+        first_trial=first_trial,
     )
     return Table(
         {
-            "trial": list(range(wanted.num_trials)),
+            "trial": list(range(first_trial, first_trial + wanted.num_trials)),
             "success": emulation.successes.tolist(),
             "steps": emulation.steps.tolist(),
             "reward": emulation.rewards.tolist(),
@@ -170,20 +177,21 @@ def _chosen(
     particles: FloatArray,
     stages: IntArray,
     running: IntArray,
-    seed: int,
+    name: tuple[int, int],
     step: int,
 ) -> IntArray:
     """Return the sensing action of each trial."""
     if planning.selector.method == "random":
         num_actions = len(problem.sensing_actions)
-        selection = stream(seed, 0, step, Purpose.SELECTION).uniform(len(particles))
+        selection = stream(*name, step, Purpose.SELECTION).uniform(len(particles))
         return np.minimum((selection * num_actions).astype(np.int64), num_actions - 1)
     chosen = np.empty(len(particles), dtype=np.int64)
     for first in range(0, len(particles), _TRIALS_AT_A_TIME):
         some = slice(first, first + _TRIALS_AT_A_TIME)
-        names = running[some]
-        entropies = _entropies(problem, planning, particles[some], stages[some], names, seed, step)
-        drawn = stream(seed, first, step, Purpose.SELECTION).uniform(len(names))
+        # Any name that no other draw of these trials has.
+        own = (name[0], name[1] + int(running[first]))
+        entropies = _entropies(problem, planning, particles[some], stages[some], own, step)
+        drawn = stream(*own, step, Purpose.SELECTION).uniform(len(entropies))
         chosen[some] = least_of(entropies, drawn)
     return chosen
 
@@ -193,8 +201,7 @@ def _entropies(
     planning: PlanningSettings,
     particles: FloatArray,
     stages: IntArray,
-    names: IntArray,
-    seed: int,
+    name: tuple[int, int],
     step: int,
 ) -> FloatArray:
     """Return the entropy after each sensing action, summed over its hypothetical observations.
@@ -212,8 +219,7 @@ def _entropies(
     samples = planning.active_sensing.num_observation_samples
     num_actions = len(problem.sensing_actions)
     trials, count, _ = particles.shape
-    # Any name that no other draw of these trials has.
-    hypotheses = stream(seed, int(names[0]), step, Purpose.HYPOTHESES)
+    hypotheses = stream(*name, step, Purpose.HYPOTHESES)
     shape = (trials, num_actions, samples)
     drawn = np.minimum((hypotheses.uniform(shape) * count).astype(np.int64), count - 1)
     entropies = np.empty((trials, num_actions))
@@ -225,13 +231,30 @@ def _entropies(
         variance = problem.observation_variance(particles[:, 0], action)
         observed = problem.observation_mean(states, action) + np.sqrt(variance) * noise
         expected = problem.observation_mean(particles, action)
-        difference = observed[:, :, None, :] - expected[:, None, :, :]
-        weights = np.exp(-0.5 * (difference * difference / variance).sum(axis=-1))
+        scale = np.sqrt(variance)
+        weights = np.exp(-0.5 * _squared_distances(observed / scale, expected / scale))
         # Where none is likely this is 0 / 0, as it was.
         with np.errstate(invalid="ignore"):
             weights /= weights.sum(axis=-1, keepdims=True)
         entropies[:, action] = entropy_of_neighborhoods(weights, neighbors, log_volumes).sum(axis=1)
     return entropies
+
+
+def _squared_distances(first: FloatArray, second: FloatArray) -> FloatArray:
+    """Return the squared distances of points, shape (trials, a, b).
+
+    Parameters
+    ----------
+    first : array of shape (trials, a, d)
+    second : array of shape (trials, b, d)
+    """
+    squares = np.zeros((first.shape[0], first.shape[1], second.shape[1]))
+    # One coordinate after the other: arrays with the few coordinates as last axis are slow.
+    for coordinate in range(first.shape[2]):
+        difference = first[:, :, None, coordinate] - second[:, None, :, coordinate]
+        difference *= difference
+        squares += difference
+    return squares
 
 
 def _neighborhoods(points: FloatArray, neighbors: int) -> tuple[IntArray, FloatArray]:
@@ -248,8 +271,7 @@ def _neighborhoods(points: FloatArray, neighbors: int) -> tuple[IntArray, FloatA
     log_volumes : array of shape (trials, num_particles)
         Minus infinity where all neighbours are the same point.
     """
-    difference = points[:, :, None, :] - points[:, None, :, :]
-    squares = (difference * difference).sum(axis=-1)
+    squares = _squared_distances(points, points)
     indices = np.argpartition(squares, neighbors - 1, axis=-1)[..., :neighbors]
     farthest = np.take_along_axis(squares, indices, axis=-1).max(axis=-1)
     size = points.shape[-1]
@@ -278,10 +300,11 @@ def entropy_of_neighborhoods(
     """
     neighbors = indices.shape[-1]
     trials, samples, count = weights.shape
-    near = np.take_along_axis(
-        weights, indices.reshape(trials, 1, count * neighbors).repeat(samples, axis=1), axis=2
-    ).reshape(trials, samples, count, neighbors)
-    mass = near.sum(axis=-1)
+    # A neighbour after the other, in one flat gather each.
+    mass = np.zeros(weights.shape)
+    rows = count * np.arange(trials * samples).reshape(trials, samples, 1)
+    for neighbor in range(neighbors):
+        mass += weights.reshape(-1).take(rows + indices[:, None, :, neighbor])
     with np.errstate(divide="ignore", invalid="ignore"):
         terms = mass * (np.log(mass) - log_volumes[:, None, :]) / neighbors
     terms = np.where(mass <= _NEGLIGIBLE, 0.0, terms)
@@ -316,13 +339,13 @@ def _sense(
     world: FloatArray,
     particles: FloatArray,
     chosen: IntArray,
-    seed: int,
+    name: tuple[int, int],
     step: int,
 ) -> FloatArray:
     """Return the particles after one observation per trial."""
     num_actions = len(problem.sensing_actions)
-    offsets = stream(seed, 0, step, Purpose.RESAMPLING).uniform(len(world))
-    noise = stream(seed, 0, step, Purpose.WORLD_OBSERVATION)
+    offsets = stream(*name, step, Purpose.RESAMPLING).uniform(len(world))
+    noise = stream(*name, step, Purpose.WORLD_OBSERVATION)
     copied = np.zeros(len(world), dtype=np.int64)
     for action in range(num_actions):
         trials = np.flatnonzero(chosen == action)

@@ -60,6 +60,7 @@ _WIDER_TOLERANCES: Mapping[str, tuple[float, float, float]] = {
 _CENTERS = ((4.0, 6.0), (-4.0, 0.0), (0.0, -6.0))
 _QUICK_TRIALS = 40
 _TRIALS_IN_EACH = 50
+_EMULATED_IN_EACH = 250  # side by side
 _SELECTORS = ("random", "state_entropy", "action_entropy")
 
 
@@ -161,8 +162,7 @@ class Published2017:
 
 def _emulated(row: PublishedRow, scale: Scale) -> list[Task]:
     series = series_of(row, _num_trials(row, scale), scale.seed)
-    parameters = msgspec.to_builtins(series)
-    return [Task(kind="emulation_2017", parameters=parameters, units=series.num_trials)]
+    return list(trial_tasks(series, _EMULATED_IN_EACH, "emulation_2017"))
 
 
 def _sound(row: PublishedRow, scale: Scale) -> list[Task]:

@@ -58,7 +58,7 @@ class TrialSeries(msgspec.Struct, frozen=True, kw_only=True):
     num_trials: int = 1000
 
 
-def trial_tasks(series: TrialSeries, trials_in_each: int) -> Iterator[Task]:
+def trial_tasks(series: TrialSeries, trials_in_each: int, kind: str = "trials") -> Iterator[Task]:
     """Yield the tasks of a series, in the order of its trials.
 
     Parameters
@@ -67,13 +67,15 @@ def trial_tasks(series: TrialSeries, trials_in_each: int) -> Iterator[Task]:
     trials_in_each : int
         Trials of a task: what is lost when a process is killed, and what is done twice when a
         series is made longer.
+    kind : str
+        Of a function with the parameters of :func:`run_trials_of`.
     """
     common = msgspec.to_builtins(series)
     del common["num_trials"]
     for first in range(0, series.num_trials, trials_in_each):
         count = min(trials_in_each, series.num_trials - first)
         parameters = {**common, "first_trial": first, "num_trials": count}
-        yield Task(kind="trials", parameters=parameters, units=count)
+        yield Task(kind=kind, parameters=parameters, units=count)
 
 
 def run_trials_of(first_trial: int, **series: Any) -> Table:
