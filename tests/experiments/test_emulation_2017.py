@@ -2,6 +2,8 @@
 
 import math
 
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy import special
@@ -71,7 +73,8 @@ def test_what_wins() -> None:
 
 
 def test_a_series_is_the_same_again() -> None:
-    series = {
+    series: dict[str, Any] = {
+        "first_trial": 0,
         "problem": "peg_in_hole_2d",
         "planning": {"selector": {"method": "action_entropy"}, "sensing_interval": 8},
         "max_steps": 30,
@@ -81,4 +84,7 @@ def test_a_series_is_the_same_again() -> None:
     first, second = run_emulation(**series), run_emulation(**series)
     assert first == second
     assert first.num_rows == 70
+    others = run_emulation(**{**series, "first_trial": 70})
+    assert others.columns["trial"] == list(range(70, 140))
+    assert others.columns["reward"] != first.columns["reward"]
     assert set(first.columns) == {"trial", "success", "steps", "reward"}

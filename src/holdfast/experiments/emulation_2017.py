@@ -55,7 +55,7 @@ __all__ = [
 ]
 
 _TRIALS_AT_A_TIME = 16
-"""Trials whose hypothetical weights are in memory together: arrays of a megabyte, as caches hold."""
+"""Trials whose hypothetical weights are in memory together: a megabyte, which caches hold."""
 
 _NEGLIGIBLE = 1e-16
 """Weight below which a neighbourhood was left out."""
