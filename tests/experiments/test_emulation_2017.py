@@ -1,7 +1,6 @@
 """The entropies of 2017, against their formula written out, and what won without a number."""
 
 import math
-
 from typing import Any
 
 import numpy as np
