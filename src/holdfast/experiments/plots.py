@@ -6,7 +6,7 @@ This module imports matplotlib; import it only where a figure is wanted.
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,7 +18,18 @@ from matplotlib.figure import Figure
 from holdfast.files import write_atomically
 from holdfast.recording.figure import STYLE
 
-__all__ = ["COLORS", "MARKERS", "Dots", "dot_rows", "figure_of", "save", "stacked_panels"]
+__all__ = [
+    "COLORS",
+    "MARKERS",
+    "Dots",
+    "dot_rows",
+    "figure_of",
+    "grid_of_panels",
+    "label_grid",
+    "line_with_intervals",
+    "save",
+    "stacked_panels",
+]
 
 # Ordered so that neighbours differ in lightness, too.
 COLORS = ("#1D3C78", "#E8A317", "#B5342B", "#54B5A6", "#7D3C98", "#9AA05A", "#4A4F57", "#D98CA6")
@@ -63,6 +74,72 @@ def stacked_panels(
     return figure, list(panels[:, 0])
 
 
+def grid_of_panels(
+    names: Sequence[str], *, columns: int, title: str, width: float
+) -> tuple[Figure, dict[str, Axes]]:
+    """Return a figure with a panel for each name, row by row, each with its name on top.
+
+    Parameters
+    ----------
+    names : sequence of str
+    columns : int
+        Panels in a row.
+    title : str
+    width : float
+        Of the figure, in inches.
+    """
+    rows = -(-len(names) // columns)
+    figure = figure_of(width, 2.5 * rows + 0.8, title)
+    with mpl.rc_context(STYLE):
+        panels = figure.subplots(rows, columns, squeeze=False).ravel()
+    for panel in panels[len(names) :]:
+        panel.remove()
+    for panel, name in zip(panels, names, strict=False):
+        panel.set_title(name, loc="left", fontsize=10.0)
+    return figure, dict(zip(names, panels, strict=False))
+
+
+def label_grid(figure: Figure, panels: Mapping[str, Axes], x_label: str, y_label: str) -> None:
+    """Label a figure of panels once, with one legend below for all that say the same."""
+    figure.supxlabel(x_label, fontsize=10.0)
+    if y_label:
+        figure.supylabel(y_label, fontsize=10.0)
+    handles, labels = next(iter(panels.values())).get_legend_handles_labels()
+    if any(labels):
+        figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize=9.0)
+
+
+def line_with_intervals(
+    panel: Axes, places: Sequence[float], line: Dots, *, number: int, offset: float = 0.0
+) -> None:
+    """Draw values over places, joined, each with its interval.
+
+    Parameters
+    ----------
+    panel : Axes
+    places : sequence of float
+    line : Dots
+    number : int
+        Which colour and mark.
+    offset : float
+        By which all are moved to the right, so that intervals do not cover each other.
+    """
+    below = [value - low for value, low in zip(line.values, line.lows, strict=True)]
+    above = [high - value for value, high in zip(line.values, line.highs, strict=True)]
+    panel.errorbar(
+        [place + offset for place in places],
+        line.values,
+        yerr=[below, above],
+        fmt=MARKERS[number] + "-",
+        color=COLORS[number],
+        markersize=4.2,
+        linewidth=1.1,
+        elinewidth=1.0,
+        label=line.label,
+    )
+    panel.grid(axis="y")
+
+
 def dot_rows(panel: Axes, labels: Sequence[str], kinds: Sequence[Dots]) -> None:
     """Draw rows of values with intervals, a mark for each kind, the first row on top.
 
@@ -96,7 +173,15 @@ def dot_rows(panel: Axes, labels: Sequence[str], kinds: Sequence[Dots]) -> None:
     panel.set_ylim(len(labels) - 0.4, -0.6)
     panel.grid(axis="x")
     panel.tick_params(axis="y", length=0)
-    panel.legend(loc="best", handletextpad=0.3)
+    if any(kind.label for kind in kinds):
+        # Above the rows, where it covers none.
+        panel.legend(
+            loc="lower right",
+            bbox_to_anchor=(1.0, 1.0),
+            ncols=len(kinds),
+            handletextpad=0.3,
+            borderaxespad=0.2,
+        )
 
 
 def save(figure: Figure, directory: Path, name: str) -> list[str]:

@@ -1,0 +1,394 @@
+"""What is really best: the ways of choosing what to sense, on problems easy and hard.
+
+All ways see the same worlds: trial i starts in the same state and is disturbed by the same noise,
+whatever looks where. So ways are compared trial by trial. Three measures: how many trials reach the
+goal, how many steps they take (a trial that fails takes all that it has), and the mean reward over
+all trials. Steps have a meaning in every problem; their logarithms are compared, so that a tenth
+fewer steps counts the same where a task takes fifty or five hundred.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Mapping
+from functools import partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from holdfast.experiments import statistics
+from holdfast.experiments.cases import CASES, Case
+from holdfast.experiments.study import Report, Results, Scale
+from holdfast.experiments.tables import Cell, Table
+from holdfast.experiments.tasks import Task
+from holdfast.experiments.trial_batches import trial_tasks
+from holdfast.recording.tables import wilson_interval
+from holdfast.settings import SelectorSettings
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["INTERVALS", "WAYS", "Selectors"]
+
+INTERVALS = (0, 4, 8, 14)
+"""Steps between two sensing steps."""
+
+LEVEL = 0.01
+"""Of a family of tests: the probability that any difference is claimed where there is none."""
+
+WAYS: Mapping[str, SelectorSettings] = {
+    "random": SelectorSettings(method="random"),
+    "fixed": SelectorSettings(method="fixed"),
+    "state entropy, neighbours": SelectorSettings(method="state_entropy"),
+    "state entropy, mixture": SelectorSettings(
+        method="state_entropy", estimator="gaussian_mixture_upper"
+    ),
+    "action entropy, neighbours": SelectorSettings(),
+    "action entropy, neighbours, executed": SelectorSettings(actions="executed"),
+    "action entropy, mixture": SelectorSettings(estimator="gaussian_mixture_upper"),
+    "action entropy, mixture, executed": SelectorSettings(
+        estimator="gaussian_mixture_upper", actions="executed"
+    ),
+    "action covariance": SelectorSettings(method="action_covariance"),
+}
+"""By the names that tables and figures give them; actions are the commanded ones, unless it says
+that they are the executed ones."""
+
+BASELINE = "random"
+
+_ALL = "all"
+"""Stands for all problems together."""
+
+_SHOWN = {
+    "random": "random",
+    "fixed": "fixed",
+    "state entropy, neighbours": "state entropy",
+    "action entropy, mixture": "action entropy",
+}
+"""Ways in the figure for a first look, and what they are called there."""
+
+_TRIALS = 200
+_QUICK_TRIALS = 8
+_TRIALS_IN_EACH = 20
+
+
+class Selectors:
+    """The study ``selectors``."""
+
+    name = "selectors"
+    title = "What is really best: choosing what to sense, on six problems"
+
+    def tasks(self, scale: Scale) -> list[Task]:
+        """Return all that is to be computed, in the order in which to begin."""
+        return [task for cell in _cells() for task in _tasks(*cell, scale)]
+
+    def report(self, scale: Scale, results: Results) -> Report:
+        """Return what it comes to, from the results of all its tasks."""
+        report = Report()
+        tables = {cell: results.of(_tasks(*cell, scale)) for cell in _cells()}
+        raw = Table({})
+        for (case, interval, way), table in tables.items():
+            raw.extend(table, problem=case, sensing_interval=interval, way=way)
+        summary = _summary(tables)
+        gains_of_trials = _gains_of_trials(tables)
+        gains = _gains(gains_of_trials)
+        rivals = _rivals(gains_of_trials)
+        costs = _costs(tables)
+        report.raw["selectors"] = raw
+        report.summary |= {
+            "selectors": summary,
+            "gains": gains,
+            "rivals": rivals,
+            "costs_of_looks": costs,
+        }
+        report.figures["choice_of_sensing"] = partial(_draw_choice, summary)
+        report.figures["selectors"] = partial(_draw_gains, gains)
+        report.figures["costs_of_looks"] = partial(_draw_costs, costs)
+        report.findings = _findings(summary, gains, rivals)
+        return report
+
+
+FloatArray = npt.NDArray[np.float64]
+
+_Cell = tuple[str, int, str]
+"""Names of a case, an interval and a way."""
+
+_CASES: Mapping[str, Case] = {case.name: case for case in CASES}
+
+
+def _cells() -> Iterator[_Cell]:
+    for case in _CASES:
+        for interval in INTERVALS:
+            for way in WAYS:
+                yield case, interval, way
+
+
+def _tasks(case: str, interval: int, way: str, scale: Scale) -> list[Task]:
+    series = _CASES[case].series(
+        WAYS[way],
+        interval,
+        seed=scale.seed,
+        num_trials=_QUICK_TRIALS if scale.quick else _TRIALS,
+    )
+    return list(trial_tasks(series, _TRIALS_IN_EACH))
+
+
+def _summary(tables: Mapping[_Cell, Table]) -> Table:
+    """Return a row for each cell, with its paired differences from the baseline."""
+    rows: list[dict[str, Cell]] = []
+    for (case, interval, way), table in tables.items():
+        baseline = tables[case, interval, BASELINE]
+        success, other = (each.numbers("success") == 1.0 for each in (table, baseline))
+        low, high = wilson_interval(int(success.sum()), success.size)
+        row: dict[str, Cell] = {
+            "problem": case,
+            "sensing_interval": interval,
+            "way": way,
+            "trials": table.num_rows,
+            "success": float(success.mean()),
+            "success_low": low,
+            "success_high": high,
+        }
+        for name in ("steps", "reward"):
+            row |= _interval(f"mean_{name}", statistics.mean_interval(table.numbers(name)))
+        row["mean_sensing_ms"] = float(np.nanmean(table.numbers("mean_sensing_ms")))
+        difference, row["success_p_value"] = statistics.paired_rates(success, other)
+        row |= _interval("success_gain", difference)
+        difference, row["reward_p_value"] = statistics.paired_difference(
+            table.numbers("reward"), baseline.numbers("reward")
+        )
+        row |= _interval("reward_gain", difference)
+        difference, row["steps_p_value"] = statistics.paired_difference(
+            np.log(baseline.numbers("steps")), np.log(table.numbers("steps"))
+        )
+        row |= _interval("fewer_steps", statistics.Interval(*map(_share, difference)))
+        rows.append(row)
+    summary = Table({name: [row[name] for row in rows] for name in rows[0]})
+    compared = np.array([way != BASELINE for way in summary.columns["way"]])
+    for name in ("success", "reward", "steps"):
+        adjusted = np.ones(compared.size)
+        adjusted[compared] = statistics.smallest_levels(
+            summary.numbers(f"{name}_p_value")[compared]
+        )
+        summary.columns[f"{name}_adjusted_p_value"] = [float(value) for value in adjusted]
+    return summary
+
+
+def _gains_of_trials(tables: Mapping[_Cell, Table]) -> dict[tuple[str, str], FloatArray]:
+    """Return how much shorter than the baseline's each trial is, as a difference of logarithms.
+
+    A trial's gain is the mean over the sensing intervals: these share its world, trials do not
+    share theirs. The entries of all problems together are means over the problems, of the trials
+    that all of them have.
+    """
+    gains: dict[tuple[str, str], FloatArray] = {}
+    for case in _CASES:
+        for way in WAYS:
+            differences = [
+                np.log(tables[case, interval, BASELINE].numbers("steps"))
+                - np.log(tables[case, interval, way].numbers("steps"))
+                for interval in INTERVALS
+            ]
+            gains[case, way] = np.mean(differences, axis=0)
+    fewest = min(gain.size for gain in gains.values())
+    for way in WAYS:
+        gains[_ALL, way] = np.mean([gains[case, way][:fewest] for case in _CASES], axis=0)
+    return gains
+
+
+def _gains(gains: Mapping[tuple[str, str], FloatArray]) -> Table:
+    """Return how many fewer steps each way takes than the baseline."""
+    return _compared(
+        ({"problem": case, "way": way}, gain, np.zeros_like(gain))
+        for (case, way), gain in gains.items()
+        if way != BASELINE
+    )
+
+
+def _rivals(gains: Mapping[tuple[str, str], FloatArray]) -> Table:
+    """Return how many fewer steps each way takes than each other one, in all problems together."""
+    choosing = [way for way in WAYS if WAYS[way].method not in ("random", "fixed")]
+    return _compared(
+        ({"way": way, "rival": rival}, gains[_ALL, way], gains[_ALL, rival])
+        for number, way in enumerate(choosing)
+        for rival in choosing[:number]
+    )
+
+
+def _compared(
+    pairs: Iterable[tuple[dict[str, Cell], FloatArray, FloatArray]],
+) -> Table:
+    rows: list[dict[str, Cell]] = []
+    for names, gain, other in pairs:
+        difference, p_value = statistics.paired_difference(gain, other)
+        shares = statistics.Interval(*map(_share, difference))
+        rows.append(
+            {
+                **names,
+                "trials": gain.size,
+                **_interval("fewer_steps", shares),
+                "p_value": p_value,
+            }
+        )
+    table = Table({name: [row[name] for row in rows] for name in rows[0]})
+    adjusted = statistics.smallest_levels(table.numbers("p_value"))
+    table.columns["adjusted_p_value"] = adjusted.tolist()
+    return table
+
+
+_COSTS = (0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
+"""Of a look, in units of reward (the length of the way, in most problems)."""
+
+
+def _costs(tables: Mapping[_Cell, Table]) -> Table:
+    """Return how often to look where looking costs: the best interval and what it earns."""
+    rows: list[dict[str, Cell]] = []
+    for case in _CASES:
+        for way in _SHOWN:
+            for cost in _COSTS:
+                nets = {
+                    interval: statistics.mean_interval(
+                        tables[case, interval, way].numbers("reward")
+                        - cost * tables[case, interval, way].numbers("sensing_decisions")
+                    )
+                    for interval in INTERVALS
+                }
+                best = max(nets, key=lambda interval: nets[interval].value)
+                rows.append(
+                    {
+                        "problem": case,
+                        "way": way,
+                        "cost_of_a_look": cost,
+                        "best_interval": best,
+                        **_interval("net_reward", nets[best]),
+                    }
+                )
+    return Table({name: [row[name] for row in rows] for name in rows[0]})
+
+
+def _interval(name: str, interval: statistics.Interval) -> dict[str, Cell]:
+    ends = zip(("", "_low", "_high"), interval, strict=True)
+    return {f"{name}{end}": value if math.isfinite(value) else None for end, value in ends}
+
+
+def _share(difference: float) -> float:
+    """Return which share is saved, from a difference of logarithms."""
+    return -math.expm1(-difference) if math.isfinite(difference) else difference
+
+
+def _findings(summary: Table, gains: Table, rivals: Table) -> list[str]:
+    findings = [
+        f"{row['way']}: {_percent(row)} fewer steps than random in {_place(row)} (mean over the "
+        f"intervals {', '.join(map(str, INTERVALS))}; n = {row['trials']}, paired t-test, Holm-"
+        f"adjusted p {row['adjusted_p_value']:.2g})"
+        for row in gains.rows()
+        if row["problem"] == _ALL
+    ]
+    findings += [
+        f"{row['way']} against {row['rival']}: {_percent(row)} fewer steps in all problems "
+        f"together (n = {row['trials']}, paired t-test, Holm-adjusted p "
+        f"{row['adjusted_p_value']:.2g})"
+        for row in rivals.rows()
+        if float(row["adjusted_p_value"] or 0.0) < LEVEL
+    ]
+    for case in _CASES:
+        better: list[str] = []
+        worse: list[str] = []
+        for row in summary.rows():
+            if row["problem"] == case and row["way"] != BASELINE:
+                gain = float(row["success_gain"] or 0.0)
+                if float(row["success_adjusted_p_value"] or 0.0) < LEVEL:
+                    (better if gain > 0.0 else worse).append(
+                        f"{row['way']} at {row['sensing_interval']}"
+                    )
+        findings.append(
+            f"{case}, successes beyond random's (McNemar, Holm-adjusted level {LEVEL:g} over all "
+            f"problems): more: {', '.join(better) or 'none'}; fewer: {', '.join(worse) or 'none'}"
+        )
+    return findings
+
+
+def _percent(row: Mapping[str, Cell]) -> str:
+    value, low, high = (
+        100.0 * float(row[f"fewer_steps{end}"] or 0.0) for end in ("", "_low", "_high")
+    )
+    return f"{value:.1f} % [{low:.1f}, {high:.1f}]"
+
+
+def _place(row: Mapping[str, Cell]) -> str:
+    return "all problems together" if row["problem"] == _ALL else str(row["problem"])
+
+
+def _draw_choice(summary: Table) -> Figure:
+    from holdfast.experiments import plots
+
+    figure, panels = plots.grid_of_panels(
+        list(_CASES), columns=3, title="What choosing the sensing action gains", width=9.0
+    )
+    for case, panel in panels.items():
+        for number, (way, label) in enumerate(_SHOWN.items()):
+            rows = [row for row in summary.rows() if row["problem"] == case and row["way"] == way]
+            plots.line_with_intervals(
+                panel,
+                [int(row["sensing_interval"] or 0) for row in rows],
+                plots.Dots(label, *_ends(rows, "mean_steps", 1.0)),
+                number=number,
+                offset=0.22 * (number - 1.5),
+            )
+        panel.set_xticks(INTERVALS)
+        panel.set_ylim(bottom=0.0)
+    plots.label_grid(figure, panels, "steps between two looks", "steps to the goal (mean)")
+    return figure
+
+
+def _draw_gains(gains: Table) -> Figure:
+    from holdfast.experiments import plots
+
+    figure, panels = plots.grid_of_panels(
+        [*_CASES, _ALL], columns=4, title="Fewer steps than with random looks", width=12.0
+    )
+    ways = [way for way in WAYS if way not in (BASELINE, "fixed")]
+    for case, panel in panels.items():
+        rows = [row for row in gains.rows() if row["problem"] == case and row["way"] in ways]
+        plots.dot_rows(panel, ways, [plots.Dots("", *_ends(rows, "fewer_steps", 100.0))])
+        panel.axvline(0.0, color="black", linewidth=0.8)
+    plots.label_grid(figure, panels, "fewer steps than random (%)", "")
+    return figure
+
+
+def _draw_costs(costs: Table) -> Figure:
+    from holdfast.experiments import plots
+
+    figure, panels = plots.grid_of_panels(
+        list(_CASES), columns=3, title="Where a look costs: reward at the best interval", width=9.0
+    )
+    for case, panel in panels.items():
+        for number, (way, label) in enumerate(_SHOWN.items()):
+            rows = [row for row in costs.rows() if row["problem"] == case and row["way"] == way]
+            plots.line_with_intervals(
+                panel,
+                [float(row["cost_of_a_look"] or 0.0) for row in rows],
+                plots.Dots(label, *_ends(rows, "net_reward", 1.0)),
+                number=number,
+            )
+        panel.set_xscale("symlog", linthresh=_COSTS[1])
+        panel.set_xlim(left=0.0)
+    plots.label_grid(
+        figure, panels, "cost of a look (reward)", "mean reward less the costs of looks"
+    )
+    return figure
+
+
+def _ends(
+    rows: Iterable[Mapping[str, Cell]], name: str, factor: float
+) -> tuple[list[float], list[float], list[float]]:
+    values, lows, highs = [], [], []
+    for row in rows:
+        value = factor * float(row[name] or 0.0)
+        low, high = row[f"{name}_low"], row[f"{name}_high"]
+        values.append(value)
+        # Of a single trial there is no interval.
+        lows.append(value if low is None else factor * float(low))
+        highs.append(value if high is None else factor * float(high))
+    return values, lows, highs
