@@ -75,7 +75,13 @@ def stacked_panels(
 
 
 def grid_of_panels(
-    names: Sequence[str], *, columns: int, title: str, width: float
+    names: Sequence[str],
+    *,
+    columns: int,
+    title: str,
+    width: float,
+    row_height: float = 2.5,
+    same_rows: bool = False,
 ) -> tuple[Figure, dict[str, Axes]]:
     """Return a figure with a panel for each name, row by row, each with its name on top.
 
@@ -87,11 +93,15 @@ def grid_of_panels(
     title : str
     width : float
         Of the figure, in inches.
+    row_height : float
+        Of a row of panels, in inches.
+    same_rows : bool
+        All panels have the same rows, which are named once.
     """
     rows = -(-len(names) // columns)
-    figure = figure_of(width, 2.5 * rows + 0.8, title)
+    figure = figure_of(width, row_height * rows + 0.8, title)
     with mpl.rc_context(STYLE):
-        panels = figure.subplots(rows, columns, squeeze=False).ravel()
+        panels = figure.subplots(rows, columns, squeeze=False, sharey=same_rows).ravel()
     for panel in panels[len(names) :]:
         panel.remove()
     for panel, name in zip(panels, names, strict=False):
@@ -100,8 +110,14 @@ def grid_of_panels(
 
 
 def label_grid(figure: Figure, panels: Mapping[str, Axes], x_label: str, y_label: str) -> None:
-    """Label a figure of panels once, with one legend below for all that say the same."""
-    figure.supxlabel(x_label, fontsize=10.0)
+    """Label a figure of panels, with one legend below for all that say the same."""
+    lowest = {}
+    for panel in panels.values():
+        place = panel.get_subplotspec()
+        if place is not None:
+            lowest[place.colspan.start] = panel
+    for panel in lowest.values():
+        panel.set_xlabel(x_label)
     if y_label:
         figure.supylabel(y_label, fontsize=10.0)
     handles, labels = next(iter(panels.values())).get_legend_handles_labels()

@@ -16,6 +16,7 @@ ALL = "all"
 
 _STUDIES: Mapping[str, str] = {
     "selectors": "holdfast.experiments.selectors:Selectors",
+    "parameters": "holdfast.experiments.parameters:Parameters",
     "published_2017": "holdfast.experiments.published_2017:Published2017",
 }
 """Where each is; imported when it is needed."""

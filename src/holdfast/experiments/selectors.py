@@ -9,7 +9,6 @@ fewer steps counts the same where a task takes fifty or five hundred.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Iterator, Mapping
 from functools import partial
 from typing import TYPE_CHECKING
@@ -151,18 +150,20 @@ def _summary(tables: Mapping[_Cell, Table]) -> Table:
             "success_high": high,
         }
         for name in ("steps", "reward"):
-            row |= _interval(f"mean_{name}", statistics.mean_interval(table.numbers(name)))
+            row |= statistics.cells_of(
+                f"mean_{name}", statistics.mean_interval(table.numbers(name))
+            )
         row["mean_sensing_ms"] = float(np.nanmean(table.numbers("mean_sensing_ms")))
         difference, row["success_p_value"] = statistics.paired_rates(success, other)
-        row |= _interval("success_gain", difference)
+        row |= statistics.cells_of("success_gain", difference)
         difference, row["reward_p_value"] = statistics.paired_difference(
             table.numbers("reward"), baseline.numbers("reward")
         )
-        row |= _interval("reward_gain", difference)
+        row |= statistics.cells_of("reward_gain", difference)
         difference, row["steps_p_value"] = statistics.paired_difference(
             np.log(baseline.numbers("steps")), np.log(table.numbers("steps"))
         )
-        row |= _interval("fewer_steps", statistics.Interval(*map(_share, difference)))
+        row |= statistics.cells_of("fewer_steps", statistics.saved_share(difference))
         rows.append(row)
     summary = Table({name: [row[name] for row in rows] for name in rows[0]})
     compared = np.array([way != BASELINE for way in summary.columns["way"]])
@@ -222,12 +223,12 @@ def _compared(
     rows: list[dict[str, Cell]] = []
     for names, gain, other in pairs:
         difference, p_value = statistics.paired_difference(gain, other)
-        shares = statistics.Interval(*map(_share, difference))
+        shares = statistics.saved_share(difference)
         rows.append(
             {
                 **names,
                 "trials": gain.size,
-                **_interval("fewer_steps", shares),
+                **statistics.cells_of("fewer_steps", shares),
                 "p_value": p_value,
             }
         )
@@ -261,20 +262,10 @@ def _costs(tables: Mapping[_Cell, Table]) -> Table:
                         "way": way,
                         "cost_of_a_look": cost,
                         "best_interval": best,
-                        **_interval("net_reward", nets[best]),
+                        **statistics.cells_of("net_reward", nets[best]),
                     }
                 )
     return Table({name: [row[name] for row in rows] for name in rows[0]})
-
-
-def _interval(name: str, interval: statistics.Interval) -> dict[str, Cell]:
-    ends = zip(("", "_low", "_high"), interval, strict=True)
-    return {f"{name}{end}": value if math.isfinite(value) else None for end, value in ends}
-
-
-def _share(difference: float) -> float:
-    """Return which share is saved, from a difference of logarithms."""
-    return -math.expm1(-difference) if math.isfinite(difference) else difference
 
 
 def _findings(summary: Table, gains: Table, rivals: Table) -> list[str]:
@@ -346,14 +337,18 @@ def _draw_gains(gains: Table) -> Figure:
     from holdfast.experiments import plots
 
     figure, panels = plots.grid_of_panels(
-        [*_CASES, _ALL], columns=4, title="Fewer steps than with random looks", width=12.0
+        [*_CASES, _ALL],
+        columns=4,
+        title="Fewer steps than with random looks",
+        width=10.0,
+        same_rows=True,
     )
     ways = [way for way in WAYS if way not in (BASELINE, "fixed")]
     for case, panel in panels.items():
         rows = [row for row in gains.rows() if row["problem"] == case and row["way"] in ways]
         plots.dot_rows(panel, ways, [plots.Dots("", *_ends(rows, "fewer_steps", 100.0))])
         panel.axvline(0.0, color="black", linewidth=0.8)
-    plots.label_grid(figure, panels, "fewer steps than random (%)", "")
+    plots.label_grid(figure, panels, "fewer steps (%)", "")
     return figure
 
 

@@ -21,9 +21,11 @@ __all__ = [
     "Interval",
     "agreement_of_means",
     "agreement_of_rates",
+    "cells_of",
     "mean_interval",
     "paired_difference",
     "paired_rates",
+    "saved_share",
     "smallest_levels",
 ]
 
@@ -137,6 +139,20 @@ def agreement_of_means(values: FloatArray, other_mean: float, other_count: int) 
         return math.nan
     error = float(np.std(values, ddof=1)) * math.sqrt(1 / values.size + 1 / other_count)
     return math.erfc(abs(float(np.mean(values)) - other_mean) / error / math.sqrt(2.0))
+
+
+def saved_share(difference: Interval) -> Interval:
+    """Return which share is saved, from a difference of logarithms (first minus second)."""
+    return Interval(*(-math.expm1(-end) for end in difference))
+
+
+def cells_of(name: str, interval: Interval) -> dict[str, float | None]:
+    """Return an interval as cells of a row: ``name``, ``name_low``, ``name_high``.
+
+    A bound that does not exist, or the mean of nothing, is None.
+    """
+    ends = zip(("", "_low", "_high"), interval, strict=True)
+    return {f"{name}{end}": value if math.isfinite(value) else None for end, value in ends}
 
 
 def smallest_levels(p_values: FloatArray) -> FloatArray:

@@ -1,0 +1,250 @@
+"""What the parameters do: each of them changed alone, on the same worlds.
+
+Where a parameter makes no difference beyond noise, the cheapest value will do; where it does, the
+default is what this study says.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from functools import partial
+from typing import TYPE_CHECKING, NamedTuple
+
+import msgspec
+import numpy as np
+
+from holdfast.experiments import statistics
+from holdfast.experiments.cases import CASES
+from holdfast.experiments.study import Report, Results, Scale
+from holdfast.experiments.tables import Cell, Table
+from holdfast.experiments.tasks import Task
+from holdfast.experiments.trial_batches import problem_of, trial_tasks
+from holdfast.recording.tables import wilson_interval
+from holdfast.settings import ActiveSensingSettings, ParticleFilterSettings, SelectorSettings
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["Parameters", "Variant", "variants"]
+
+LEVEL = 0.01
+"""Of all tests together: the probability that any difference is claimed where there is none."""
+
+_TRIALS = 200
+_QUICK_TRIALS = 6
+_TRIALS_IN_EACH = 20
+
+_INTERVALS: Mapping[str, int] = {
+    "tight hole": 8,
+    "three plates": 8,
+    "peg in space": 4,
+    "light and dark": 4,
+}
+"""Steps between two looks, in the problems in which sensing decides about the outcome."""
+
+_CASES = {case.name: case for case in CASES if case.name in _INTERVALS}
+
+
+class Variant(NamedTuple):
+    """Settings of which one differs from the reference.
+
+    Attributes
+    ----------
+    parameter, value : str
+        What differs, and how; empty for the reference itself.
+    active_sensing : ActiveSensingSettings
+    particle_filter : ParticleFilterSettings
+    resolution : float
+        In units of the problem's own.
+    """
+
+    parameter: str = ""
+    value: str = ""
+    active_sensing: ActiveSensingSettings = ActiveSensingSettings()
+    particle_filter: ParticleFilterSettings = ParticleFilterSettings()
+    resolution: float = 1.0
+
+
+def variants() -> list[Variant]:
+    """Return the reference (action entropy by nearest neighbours) and all that differ from it."""
+    found = [Variant()]
+    for samples in (1, 3, 30, 100):
+        sensing = ActiveSensingSettings(num_observation_samples=samples)
+        found.append(Variant("M", str(samples), active_sensing=sensing))
+    for neighbors in (1, 3, 10, 20):
+        sensing = ActiveSensingSettings(num_nearest_neighbors=neighbors)
+        found.append(Variant("k", str(neighbors), active_sensing=sensing))
+    for horizon in (2, 3):
+        sensing = ActiveSensingSettings(horizon=horizon)
+        found.append(Variant("horizon", str(horizon), active_sensing=sensing))
+    found += [
+        Variant("resolution", f"x {factor:g}", resolution=factor)
+        for factor in (0.1, 0.3, 3.0, 10.0)
+    ]
+    found += [
+        Variant(
+            "resampling below",
+            f"{threshold:g} N",
+            particle_filter=ParticleFilterSettings(resampling_threshold=threshold),
+        )
+        for threshold in (0.25, 0.5)
+    ]
+    found += [
+        Variant(
+            "estimate",
+            f"most likely, resampling below {threshold:g} N",
+            particle_filter=ParticleFilterSettings(
+                estimate="most_likely", resampling_threshold=threshold
+            ),
+        )
+        for threshold in (0.5, 1.0)
+    ]
+    return found
+
+
+class Parameters:
+    """The study ``parameters``."""
+
+    name = "parameters"
+    title = "What the parameters do: M, k, resolution, horizon, estimate, resampling"
+
+    def tasks(self, scale: Scale) -> list[Task]:
+        """Return all that is to be computed, in the order in which to begin."""
+        return [task for case, variant in _cells() for task in _tasks(case, variant, scale)]
+
+    def report(self, scale: Scale, results: Results) -> Report:
+        """Return what it comes to, from the results of all its tasks."""
+        report = Report()
+        raw = Table({})
+        rows: list[dict[str, Cell]] = []
+        reference = Table({})
+        for case, variant in _cells():
+            table = results.of(_tasks(case, variant, scale))
+            names: dict[str, Cell] = {
+                "problem": case,
+                "parameter": variant.parameter,
+                "value": variant.value,
+            }
+            raw.extend(table, **names)
+            if not variant.parameter:
+                reference = table
+            rows.append({**names, **_compared(table, reference)})
+        summary = Table({name: [row[name] for row in rows] for name in rows[0]})
+        varied = np.array([bool(name) for name in summary.columns["parameter"]])
+        for name in ("success", "steps"):
+            adjusted = np.ones(varied.size)
+            adjusted[varied] = statistics.smallest_levels(
+                summary.numbers(f"{name}_p_value")[varied]
+            )
+            summary.columns[f"{name}_adjusted_p_value"] = [float(value) for value in adjusted]
+        report.raw["parameters"] = raw
+        report.summary["parameters"] = summary
+        report.figures["parameters"] = partial(_draw, summary)
+        report.findings = _findings(summary)
+        return report
+
+
+def _cells() -> Iterator[tuple[str, Variant]]:
+    for case in _CASES:
+        for variant in variants():
+            yield case, variant
+
+
+def _tasks(name: str, variant: Variant, scale: Scale) -> list[Task]:
+    case = _CASES[name]
+    selector = SelectorSettings()
+    if variant.resolution != 1.0:
+        own = problem_of(case.problem, case.model, {}).resolution
+        selector = msgspec.structs.replace(selector, resolution=variant.resolution * own)
+    series = case.series(
+        selector,
+        _INTERVALS[name],
+        seed=scale.seed,
+        num_trials=_QUICK_TRIALS if scale.quick else _TRIALS,
+        active_sensing=variant.active_sensing,
+        particle_filter=variant.particle_filter,
+    )
+    return list(trial_tasks(series, _TRIALS_IN_EACH))
+
+
+def _compared(table: Table, reference: Table) -> dict[str, Cell]:
+    success, other = (each.numbers("success") == 1.0 for each in (table, reference))
+    low, high = wilson_interval(int(success.sum()), success.size)
+    steps = statistics.mean_interval(table.numbers("steps"))
+    _, success_p_value = statistics.paired_rates(success, other)
+    difference, steps_p_value = statistics.paired_difference(
+        np.log(reference.numbers("steps")), np.log(table.numbers("steps"))
+    )
+    return {
+        "trials": table.num_rows,
+        "success": float(success.mean()),
+        "success_low": low,
+        "success_high": high,
+        **statistics.cells_of("mean_steps", steps),
+        "mean_reward": float(np.mean(table.numbers("reward"))),
+        "mean_sensing_ms": float(np.nanmean(table.numbers("mean_sensing_ms"))),
+        **statistics.cells_of("fewer_steps", statistics.saved_share(difference)),
+        "success_p_value": success_p_value,
+        "steps_p_value": steps_p_value,
+    }
+
+
+def _findings(summary: Table) -> list[str]:
+    findings = []
+    for row in summary.rows():
+        if not row["parameter"]:
+            continue
+        level = float(row["steps_adjusted_p_value"] or 0.0)
+        if level < LEVEL:
+            value, low, high = (
+                100.0 * float(row[f"fewer_steps{end}"] or 0.0) for end in ("", "_low", "_high")
+            )
+            findings.append(
+                f"{row['problem']}, {row['parameter']} {row['value']}: {value:.1f} % [{low:.1f}, "
+                f"{high:.1f}] fewer steps than the reference (n = {row['trials']}, paired t-test, "
+                f"Holm-adjusted p {level:.2g})"
+            )
+    parameters = [name for name in dict.fromkeys(summary.columns["parameter"]) if name]
+    least = {
+        name: min(
+            float(row["steps_adjusted_p_value"] or 0.0)
+            for row in summary.rows()
+            if row["parameter"] == name
+        )
+        for name in parameters
+    }
+    without = [f"{name} (least p {value:.2g})" for name, value in least.items() if value >= LEVEL]
+    findings.append(
+        "no difference in steps beyond noise (paired t-test, Holm-adjusted level "
+        f"{LEVEL:g} over all): {', '.join(without) or 'none'}"
+    )
+    return findings
+
+
+def _draw(summary: Table) -> Figure:
+    from holdfast.experiments import plots
+
+    figure, panels = plots.grid_of_panels(
+        list(_CASES),
+        columns=4,
+        title="Fewer steps than the reference: M = 10, k = 5, horizon 1, mean, resampling always",
+        width=11.0,
+        row_height=4.6,
+        same_rows=True,
+    )
+    for case, panel in panels.items():
+        rows = [row for row in summary.rows() if row["problem"] == case and row["parameter"]]
+        labels = [f"{row['parameter']} {row['value']}" for row in rows]
+        values, lows, highs = (
+            [100.0 * _number(row[f"fewer_steps{end}"]) for row in rows]
+            for end in ("", "_low", "_high")
+        )
+        plots.dot_rows(panel, labels, [plots.Dots("", values, lows, highs)])
+        panel.axvline(0.0, color="black", linewidth=0.8)
+    plots.label_grid(figure, panels, "fewer steps (%)", "")
+    return figure
+
+
+def _number(cell: Cell) -> float:
+    return math.nan if cell is None else float(cell)
