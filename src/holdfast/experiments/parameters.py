@@ -174,7 +174,7 @@ def _compared(table: Table, reference: Table) -> dict[str, Cell]:
     steps = statistics.mean_interval(table.numbers("steps"))
     _, success_p_value = statistics.paired_rates(success, other)
     difference, steps_p_value = statistics.paired_difference(
-        np.log(reference.numbers("steps")), np.log(table.numbers("steps"))
+        np.log(table.numbers("steps")), np.log(reference.numbers("steps"))
     )
     return {
         "trials": table.num_rows,
@@ -184,7 +184,7 @@ def _compared(table: Table, reference: Table) -> dict[str, Cell]:
         **statistics.cells_of("mean_steps", steps),
         "mean_reward": float(np.mean(table.numbers("reward"))),
         "mean_sensing_ms": float(np.nanmean(table.numbers("mean_sensing_ms"))),
-        **statistics.cells_of("fewer_steps", statistics.saved_share(difference)),
+        **statistics.cells_of("steps_ratio", statistics.ratio_of(difference)),
         "success_p_value": success_p_value,
         "steps_p_value": steps_p_value,
     }
@@ -198,12 +198,12 @@ def _findings(summary: Table) -> list[str]:
         level = float(row["steps_adjusted_p_value"] or 0.0)
         if level < LEVEL:
             value, low, high = (
-                100.0 * float(row[f"fewer_steps{end}"] or 0.0) for end in ("", "_low", "_high")
+                float(row[f"steps_ratio{end}"] or 0.0) for end in ("", "_low", "_high")
             )
             findings.append(
-                f"{row['problem']}, {row['parameter']} {row['value']}: {value:.1f} % [{low:.1f}, "
-                f"{high:.1f}] fewer steps than the reference (n = {row['trials']}, paired t-test, "
-                f"Holm-adjusted p {level:.2g})"
+                f"{row['problem']}, {row['parameter']} {row['value']}: {value:.3g} [{low:.3g}, "
+                f"{high:.3g}] times the steps of the reference (n = {row['trials']}, paired "
+                f"t-test, Holm-adjusted p {level:.2g})"
             )
     parameters = [name for name in dict.fromkeys(summary.columns["parameter"]) if name]
     least = {
@@ -228,7 +228,7 @@ def _draw(summary: Table) -> Figure:
     figure, panels = plots.grid_of_panels(
         list(_CASES),
         columns=4,
-        title="Fewer steps than the reference: M = 10, k = 5, horizon 1, mean, resampling always",
+        title="Steps, against M = 10, k = 5, horizon 1, the mean, and resampling always",
         width=11.0,
         row_height=4.6,
         same_rows=True,
@@ -237,12 +237,11 @@ def _draw(summary: Table) -> Figure:
         rows = [row for row in summary.rows() if row["problem"] == case and row["parameter"]]
         labels = [f"{row['parameter']} {row['value']}" for row in rows]
         values, lows, highs = (
-            [100.0 * _number(row[f"fewer_steps{end}"]) for row in rows]
-            for end in ("", "_low", "_high")
+            [_number(row[f"steps_ratio{end}"]) for row in rows] for end in ("", "_low", "_high")
         )
         plots.dot_rows(panel, labels, [plots.Dots("", values, lows, highs)])
-        panel.axvline(0.0, color="black", linewidth=0.8)
-    plots.label_grid(figure, panels, "fewer steps (%)", "")
+    plots.ratio_axes(panels.values())
+    plots.label_grid(figure, panels, "steps, relative to the reference", "")
     return figure
 
 

@@ -6,7 +6,8 @@ This module imports matplotlib; import it only where a figure is wanted.
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -27,6 +28,7 @@ __all__ = [
     "grid_of_panels",
     "label_grid",
     "line_with_intervals",
+    "ratio_axes",
     "save",
     "stacked_panels",
 ]
@@ -34,6 +36,15 @@ __all__ = [
 # Ordered so that neighbours differ in lightness, too.
 COLORS = ("#1D3C78", "#E8A317", "#B5342B", "#54B5A6", "#7D3C98", "#9AA05A", "#4A4F57", "#D98CA6")
 MARKERS = ("s", "o", "D", "^", "v", "P", "X", "*")
+
+_RATIOS = {
+    1.6: (0.8, 0.9, 1.0, 1.1, 1.25),
+    8.0: (0.3, 0.5, 0.7, 1.0, 1.4, 2.0, 3.0),
+    math.inf: (0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0),
+}
+"""Ticks of an axis of ratios, by how many times its low end the high end is at most."""
+
+_MARGIN = 1.03
 
 _ROW_INCHES = 0.26
 _DOTS_PER_INCH = 150
@@ -96,12 +107,14 @@ def grid_of_panels(
     row_height : float
         Of a row of panels, in inches.
     same_rows : bool
-        All panels have the same rows, which are named once.
+        All panels have the same rows, which are named once, and one scale.
     """
     rows = -(-len(names) // columns)
     figure = figure_of(width, row_height * rows + 0.8, title)
     with mpl.rc_context(STYLE):
-        panels = figure.subplots(rows, columns, squeeze=False, sharey=same_rows).ravel()
+        panels = figure.subplots(
+            rows, columns, squeeze=False, sharex=same_rows, sharey=same_rows
+        ).ravel()
     for panel in panels[len(names) :]:
         panel.remove()
     for panel, name in zip(panels, names, strict=False):
@@ -118,6 +131,7 @@ def label_grid(figure: Figure, panels: Mapping[str, Axes], x_label: str, y_label
             lowest[place.colspan.start] = panel
     for panel in lowest.values():
         panel.set_xlabel(x_label)
+        panel.tick_params(axis="x", labelbottom=True)
     if y_label:
         figure.supylabel(y_label, fontsize=10.0)
     handles, labels = next(iter(panels.values())).get_legend_handles_labels()
@@ -198,6 +212,22 @@ def dot_rows(panel: Axes, labels: Sequence[str], kinds: Sequence[Dots]) -> None:
             handletextpad=0.3,
             borderaxespad=0.2,
         )
+
+
+def ratio_axes(panels: Iterable[Axes]) -> None:
+    """Give panels that have been drawn one scale of ratios: equal factors, equal lengths."""
+    panels = list(panels)
+    # Some range on either side of 1, so that there are ticks.
+    low = min(0.95, *(panel.dataLim.x0 for panel in panels)) / _MARGIN
+    high = max(1.05, *(panel.dataLim.x1 for panel in panels)) * _MARGIN
+    fitting = next(ticks for most, ticks in _RATIOS.items() if high / low <= most)
+    ticks = [tick for tick in fitting if low <= tick <= high]
+    for panel in panels:
+        panel.set_xscale("log")
+        panel.set_xlim(low, high)
+        panel.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+        panel.minorticks_off()
+        panel.axvline(1.0, color="black", linewidth=0.8)
 
 
 def save(figure: Figure, directory: Path, name: str) -> list[str]:

@@ -3,8 +3,9 @@
 All ways see the same worlds: trial i starts in the same state and is disturbed by the same noise,
 whatever looks where. So ways are compared trial by trial. Three measures: how many trials reach the
 goal, how many steps they take (a trial that fails takes all that it has), and the mean reward over
-all trials. Steps have a meaning in every problem; their logarithms are compared, so that a tenth
-fewer steps counts the same where a task takes fifty or five hundred.
+all trials. Steps have a meaning in every problem; it is their ratio that is compared (the mean of
+differences of logarithms), so that a tenth fewer counts the same where a task takes fifty or five
+hundred.
 """
 
 from __future__ import annotations
@@ -90,21 +91,21 @@ class Selectors:
         for (case, interval, way), table in tables.items():
             raw.extend(table, problem=case, sensing_interval=interval, way=way)
         summary = _summary(tables)
-        gains_of_trials = _gains_of_trials(tables)
-        gains = _gains(gains_of_trials)
-        rivals = _rivals(gains_of_trials)
+        logarithms = _logarithms_of_trials(tables)
+        relative_steps = _relative_steps(logarithms)
+        rivals = _rivals(logarithms)
         costs = _costs(tables)
         report.raw["selectors"] = raw
         report.summary |= {
             "selectors": summary,
-            "gains": gains,
+            "relative_steps": relative_steps,
             "rivals": rivals,
             "costs_of_looks": costs,
         }
         report.figures["choice_of_sensing"] = partial(_draw_choice, summary)
-        report.figures["selectors"] = partial(_draw_gains, gains)
+        report.figures["selectors"] = partial(_draw_relative_steps, relative_steps)
         report.figures["costs_of_looks"] = partial(_draw_costs, costs)
-        report.findings = _findings(summary, gains, rivals)
+        report.findings = _findings(summary, relative_steps, rivals)
         return report
 
 
@@ -161,9 +162,9 @@ def _summary(tables: Mapping[_Cell, Table]) -> Table:
         )
         row |= statistics.cells_of("reward_gain", difference)
         difference, row["steps_p_value"] = statistics.paired_difference(
-            np.log(baseline.numbers("steps")), np.log(table.numbers("steps"))
+            np.log(table.numbers("steps")), np.log(baseline.numbers("steps"))
         )
-        row |= statistics.cells_of("fewer_steps", statistics.saved_share(difference))
+        row |= statistics.cells_of("steps_ratio", statistics.ratio_of(difference))
         rows.append(row)
     summary = Table({name: [row[name] for row in rows] for name in rows[0]})
     compared = np.array([way != BASELINE for way in summary.columns["way"]])
@@ -176,42 +177,42 @@ def _summary(tables: Mapping[_Cell, Table]) -> Table:
     return summary
 
 
-def _gains_of_trials(tables: Mapping[_Cell, Table]) -> dict[tuple[str, str], FloatArray]:
-    """Return how much shorter than the baseline's each trial is, as a difference of logarithms.
+def _logarithms_of_trials(tables: Mapping[_Cell, Table]) -> dict[tuple[str, str], FloatArray]:
+    """Return how much longer than the baseline's each trial is, as a difference of logarithms.
 
-    A trial's gain is the mean over the sensing intervals: these share its world, trials do not
+    A trial's entry is the mean over the sensing intervals: these share its world, trials do not
     share theirs. The entries of all problems together are means over the problems, of the trials
     that all of them have.
     """
-    gains: dict[tuple[str, str], FloatArray] = {}
+    logs: dict[tuple[str, str], FloatArray] = {}
     for case in _CASES:
         for way in WAYS:
             differences = [
-                np.log(tables[case, interval, BASELINE].numbers("steps"))
-                - np.log(tables[case, interval, way].numbers("steps"))
+                np.log(tables[case, interval, way].numbers("steps"))
+                - np.log(tables[case, interval, BASELINE].numbers("steps"))
                 for interval in INTERVALS
             ]
-            gains[case, way] = np.mean(differences, axis=0)
-    fewest = min(gain.size for gain in gains.values())
+            logs[case, way] = np.mean(differences, axis=0)
+    fewest = min(entries.size for entries in logs.values())
     for way in WAYS:
-        gains[_ALL, way] = np.mean([gains[case, way][:fewest] for case in _CASES], axis=0)
-    return gains
+        logs[_ALL, way] = np.mean([logs[case, way][:fewest] for case in _CASES], axis=0)
+    return logs
 
 
-def _gains(gains: Mapping[tuple[str, str], FloatArray]) -> Table:
-    """Return how many fewer steps each way takes than the baseline."""
+def _relative_steps(logarithms: Mapping[tuple[str, str], FloatArray]) -> Table:
+    """Return how many steps each way takes, relative to the baseline."""
     return _compared(
-        ({"problem": case, "way": way}, gain, np.zeros_like(gain))
-        for (case, way), gain in gains.items()
+        ({"problem": case, "way": way}, own, np.zeros_like(own))
+        for (case, way), own in logarithms.items()
         if way != BASELINE
     )
 
 
-def _rivals(gains: Mapping[tuple[str, str], FloatArray]) -> Table:
-    """Return how many fewer steps each way takes than each other one, in all problems together."""
+def _rivals(logarithms: Mapping[tuple[str, str], FloatArray]) -> Table:
+    """Return how many steps each way takes, relative to each other one, in all problems."""
     choosing = [way for way in WAYS if WAYS[way].method not in ("random", "fixed")]
     return _compared(
-        ({"way": way, "rival": rival}, gains[_ALL, way], gains[_ALL, rival])
+        ({"way": way, "rival": rival}, logarithms[_ALL, way], logarithms[_ALL, rival])
         for number, way in enumerate(choosing)
         for rival in choosing[:number]
     )
@@ -221,14 +222,14 @@ def _compared(
     pairs: Iterable[tuple[dict[str, Cell], FloatArray, FloatArray]],
 ) -> Table:
     rows: list[dict[str, Cell]] = []
-    for names, gain, other in pairs:
-        difference, p_value = statistics.paired_difference(gain, other)
-        shares = statistics.saved_share(difference)
+    for names, own, other in pairs:
+        difference, p_value = statistics.paired_difference(own, other)
+        ratio = statistics.ratio_of(difference)
         rows.append(
             {
                 **names,
-                "trials": gain.size,
-                **statistics.cells_of("fewer_steps", shares),
+                "trials": own.size,
+                **statistics.cells_of("steps_ratio", ratio),
                 "p_value": p_value,
             }
         )
@@ -268,16 +269,16 @@ def _costs(tables: Mapping[_Cell, Table]) -> Table:
     return Table({name: [row[name] for row in rows] for name in rows[0]})
 
 
-def _findings(summary: Table, gains: Table, rivals: Table) -> list[str]:
+def _findings(summary: Table, relative_steps: Table, rivals: Table) -> list[str]:
     findings = [
-        f"{row['way']}: {_percent(row)} fewer steps than random in {_place(row)} (mean over the "
+        f"{row['way']}: {_ratio(row)} times the steps of random in {_place(row)} (mean over the "
         f"intervals {', '.join(map(str, INTERVALS))}; n = {row['trials']}, paired t-test, Holm-"
         f"adjusted p {row['adjusted_p_value']:.2g})"
-        for row in gains.rows()
+        for row in relative_steps.rows()
         if row["problem"] == _ALL
     ]
     findings += [
-        f"{row['way']} against {row['rival']}: {_percent(row)} fewer steps in all problems "
+        f"{row['way']} against {row['rival']}: {_ratio(row)} times the steps in all problems "
         f"together (n = {row['trials']}, paired t-test, Holm-adjusted p "
         f"{row['adjusted_p_value']:.2g})"
         for row in rivals.rows()
@@ -300,11 +301,9 @@ def _findings(summary: Table, gains: Table, rivals: Table) -> list[str]:
     return findings
 
 
-def _percent(row: Mapping[str, Cell]) -> str:
-    value, low, high = (
-        100.0 * float(row[f"fewer_steps{end}"] or 0.0) for end in ("", "_low", "_high")
-    )
-    return f"{value:.1f} % [{low:.1f}, {high:.1f}]"
+def _ratio(row: Mapping[str, Cell]) -> str:
+    ends = (float(row[f"steps_ratio{end}"] or 0.0) for end in ("", "_low", "_high"))
+    return str(statistics.Interval(*ends))
 
 
 def _place(row: Mapping[str, Cell]) -> str:
@@ -323,7 +322,7 @@ def _draw_choice(summary: Table) -> Figure:
             plots.line_with_intervals(
                 panel,
                 [int(row["sensing_interval"] or 0) for row in rows],
-                plots.Dots(label, *_ends(rows, "mean_steps", 1.0)),
+                plots.Dots(label, *_ends(rows, "mean_steps")),
                 number=number,
                 offset=0.22 * (number - 1.5),
             )
@@ -333,22 +332,24 @@ def _draw_choice(summary: Table) -> Figure:
     return figure
 
 
-def _draw_gains(gains: Table) -> Figure:
+def _draw_relative_steps(relative_steps: Table) -> Figure:
     from holdfast.experiments import plots
 
     figure, panels = plots.grid_of_panels(
         [*_CASES, _ALL],
         columns=4,
-        title="Fewer steps than with random looks",
+        title="Steps to the goal, relative to random looks",
         width=10.0,
         same_rows=True,
     )
     ways = [way for way in WAYS if way not in (BASELINE, "fixed")]
     for case, panel in panels.items():
-        rows = [row for row in gains.rows() if row["problem"] == case and row["way"] in ways]
-        plots.dot_rows(panel, ways, [plots.Dots("", *_ends(rows, "fewer_steps", 100.0))])
-        panel.axvline(0.0, color="black", linewidth=0.8)
-    plots.label_grid(figure, panels, "fewer steps (%)", "")
+        rows = [
+            row for row in relative_steps.rows() if row["problem"] == case and row["way"] in ways
+        ]
+        plots.dot_rows(panel, ways, [plots.Dots("", *_ends(rows, "steps_ratio"))])
+    plots.ratio_axes(panels.values())
+    plots.label_grid(figure, panels, "steps, relative to random", "")
     return figure
 
 
@@ -364,7 +365,7 @@ def _draw_costs(costs: Table) -> Figure:
             plots.line_with_intervals(
                 panel,
                 [float(row["cost_of_a_look"] or 0.0) for row in rows],
-                plots.Dots(label, *_ends(rows, "net_reward", 1.0)),
+                plots.Dots(label, *_ends(rows, "net_reward")),
                 number=number,
             )
         panel.set_xscale("symlog", linthresh=_COSTS[1])
@@ -376,14 +377,14 @@ def _draw_costs(costs: Table) -> Figure:
 
 
 def _ends(
-    rows: Iterable[Mapping[str, Cell]], name: str, factor: float
+    rows: Iterable[Mapping[str, Cell]], name: str
 ) -> tuple[list[float], list[float], list[float]]:
     values, lows, highs = [], [], []
     for row in rows:
-        value = factor * float(row[name] or 0.0)
+        value = float(row[name] or 0.0)
         low, high = row[f"{name}_low"], row[f"{name}_high"]
         values.append(value)
         # Of a single trial there is no interval.
-        lows.append(value if low is None else factor * float(low))
-        highs.append(value if high is None else factor * float(high))
+        lows.append(value if low is None else float(low))
+        highs.append(value if high is None else float(high))
     return values, lows, highs

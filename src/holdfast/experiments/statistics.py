@@ -25,7 +25,7 @@ __all__ = [
     "mean_interval",
     "paired_difference",
     "paired_rates",
-    "saved_share",
+    "ratio_of",
     "smallest_levels",
 ]
 
@@ -33,6 +33,8 @@ FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
 
 _LEVEL = 0.95
+
+_LARGEST_EXPONENT = 700.0
 
 
 class Interval(NamedTuple):
@@ -141,9 +143,9 @@ def agreement_of_means(values: FloatArray, other_mean: float, other_count: int) 
     return math.erfc(abs(float(np.mean(values)) - other_mean) / error / math.sqrt(2.0))
 
 
-def saved_share(difference: Interval) -> Interval:
-    """Return which share is saved, from a difference of logarithms (first minus second)."""
-    return Interval(*(-math.expm1(-end) for end in difference))
+def ratio_of(difference: Interval) -> Interval:
+    """Return the ratio that a difference of logarithms stands for."""
+    return Interval(*(math.exp(min(end, _LARGEST_EXPONENT)) for end in difference))
 
 
 def cells_of(name: str, interval: Interval) -> dict[str, float | None]:
