@@ -9,6 +9,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
+import holdfast
 from holdfast.errors import InvalidValueError
 from holdfast.experiments import executors, tasks
 from holdfast.experiments.executors import LocalExecutor
@@ -64,6 +65,31 @@ class TestTasks:
         before = task_key(task)
         monkeypatch.setattr(tasks, "code_digest", lambda kind: f"another {kind}")
         assert task_key(task) != before
+
+    def test_the_key_names_the_sources_of_a_problem(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        place = "holdfast.experiments.light_dark:LightDark"
+        task = next(trial_tasks(series(problem=place), 100))
+        before = task_key(task)
+        found = tasks._digest_behind
+        monkeypatch.setattr(
+            tasks, "_digest_behind", lambda at: "another" if at == place else found(at)
+        )
+        assert task_key(task) != before
+
+    def test_the_sources_behind_a_task(self) -> None:
+        """What a trial is made of is among them; what only shows or moves it is not."""
+        package = Path(holdfast.__file__).parent
+        behind = tasks._sources_behind("holdfast.experiments.trial_batches", package)
+        names = {str(path.relative_to(package)) for path in behind}
+        assert {
+            "belief.py",
+            "sensing.py",
+            "problems/peg_in_hole_3d.py",  # named in a registry alone
+            "experiments/trial_batches.py",
+            "__init__.py",
+        } <= names
+        assert not [name for name in names if name.startswith(("cli/", "session/", "recording/"))]
+        assert "experiments/tasks.py" not in names
 
     def test_unknown_kinds_are_refused(self) -> None:
         with pytest.raises(TaskError, match="'dance': there are trials"):

@@ -8,11 +8,14 @@ from scipy import stats
 
 from holdfast.errors import InvalidValueError
 from holdfast.experiments.statistics import (
+    Interval,
     agreement_of_means,
     agreement_of_rates,
+    cells_of,
     mean_interval,
     paired_difference,
     paired_rates,
+    ratio_of,
     smallest_levels,
 )
 
@@ -76,3 +79,16 @@ def test_smallest_levels_are_holms() -> None:
         smallest_levels(np.array([0.03, 0.5, 0.01, 0.02])), [0.06, 0.5, 0.04, 0.06]
     )
     assert smallest_levels(np.array([0.9, 0.8])).max() == 1.0
+
+
+def test_ratios_of_differences_of_logarithms() -> None:
+    difference = Interval(math.log(0.5), math.log(0.25), math.log(2.0))
+    assert ratio_of(difference) == pytest.approx((0.5, 0.25, 2.0))
+    assert cells_of("ratio", ratio_of(Interval(0.0, -math.inf, 1e6))) == {
+        "ratio": 1.0,
+        "ratio_low": 0.0,
+        "ratio_high": pytest.approx(math.exp(700.0)),
+    }
+    assert cells_of("mean", Interval(math.nan, -math.inf, math.inf)) == dict.fromkeys(
+        ("mean", "mean_low", "mean_high")
+    )

@@ -70,8 +70,8 @@ class LightDark(ProblemBase):
     def next_stage(self, estimates: FloatArray, stage: int | IntArray) -> int | IntArray:
         """Advance when the estimate is at the light."""
         there = np.abs(estimates[..., 0] - _LIGHT_X) < _AT_THE_LIGHT
-        following: IntArray = np.where(there, 1, stage)
-        return following
+        following = np.where(there, 1, stage)
+        return following if following.ndim else int(following)
 
     def execute(self, actions: FloatArray) -> FloatArray:
         """Limit each coordinate of a step on its own."""
@@ -80,8 +80,8 @@ class LightDark(ProblemBase):
     def reward(self, states: FloatArray, actions: FloatArray) -> FloatArray:
         """Return minus the length of the way."""
         del states
-        length: FloatArray = -np.sqrt((actions * actions).sum(axis=-1))
-        return length
+        x, y = actions[..., 0], actions[..., 1]
+        return np.asarray(-np.sqrt(x * x + y * y))
 
     def is_goal(self, states: FloatArray) -> npt.NDArray[np.bool_]:
         """Tell which states are at the origin."""

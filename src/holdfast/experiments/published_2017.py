@@ -58,7 +58,7 @@ _WIDER_TOLERANCES: Mapping[str, tuple[float, float, float]] = {
 """The logs of these days list other holes, and a wider map."""
 
 _CENTERS = ((4.0, 6.0), (-4.0, 0.0), (0.0, -6.0))
-_QUICK_TRIALS = 40
+_QUICK_TRIALS = 12
 _TRIALS_IN_EACH = 50
 _EMULATED_IN_EACH = 250  # side by side
 _SELECTORS = ("random", "state_entropy", "action_entropy")

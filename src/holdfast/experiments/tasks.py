@@ -66,6 +66,8 @@ class Task(msgspec.Struct, frozen=True, kw_only=True):
 def task_key(task: Task) -> str:
     """Return the digest of all that a task's outcome depends on, in hexadecimal."""
     content = [task.kind, task.parameters, code_digest(task.kind)]
+    # Problems that are named by their place are code, too.
+    content += [_digest_behind(place) for place in _places_in(task.parameters)]
     plain = msgspec.json.encode(content, order="sorted")
     return hashlib.blake2b(plain, digest_size=_KEY_SIZE).hexdigest()
 
@@ -83,9 +85,14 @@ def code_digest(kind: str) -> str:
     TaskError
         If there is no such kind.
     """
+    return _digest_behind(_place_of(kind))
+
+
+@functools.cache
+def _digest_behind(place: str) -> str:
     package = Path(holdfast.__file__).parent
     digest = hashlib.blake2b(holdfast.__version__.encode(), digest_size=_KEY_SIZE)
-    for path in sorted(_sources_behind(_place_of(kind).partition(":")[0], package)):
+    for path in sorted(_sources_behind(place.partition(":")[0], package)):
         inside = path.relative_to(package)
         digest.update(str(inside).encode() + b"\0" + path.read_bytes() + b"\0")
     if _kernel.__file__:
@@ -136,6 +143,17 @@ def _sources_behind(module: str, package: Path) -> set[Path]:
                 names = [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
             waiting += [name for name in names if name.split(".")[0] == package.name]
     return found
+
+
+def _places_in(plain: object) -> list[str]:
+    """Return the places ``module:attribute`` of this package that plain data names, in order."""
+    if isinstance(plain, dict):
+        return [place for value in plain.values() for place in _places_in(value)]
+    if isinstance(plain, list | tuple):
+        return [place for value in plain for place in _places_in(value)]
+    if isinstance(plain, str) and _PLACE.fullmatch(plain):
+        return [plain] if plain.split(".")[0] == holdfast.__name__ else []
+    return []
 
 
 def _place_of(kind: str) -> str:

@@ -1,0 +1,34 @@
+"""Results that were not computed but made up, so that what is made of them is known."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from holdfast.experiments.study import Results, Scale, Study
+from holdfast.experiments.tables import Table
+from holdfast.experiments.tasks import Task, task_key
+from holdfast.experiments.trial_batches import COLUMNS
+
+
+def results_of(
+    study: Study, scale: Scale, trial: Callable[[Task, int], tuple[bool, int, float]]
+) -> Results:
+    """Return results of tasks of trials, by success, steps and reward of each of them."""
+    tables = {}
+    for task in study.tasks(scale):
+        first = task.parameters["first_trial"]
+        rows = []
+        for number in range(first, first + task.parameters["num_trials"]):
+            success, steps, reward = trial(task, number)
+            rows.append((number, success, steps, reward, steps // 2, 0.5, 0, "digest"))
+        tables[task_key(task)] = Table.of_rows(COLUMNS, rows)
+    return Results(tables, task_key)
+
+
+def noise(task: Task, number: int, names: Sequence[str]) -> float:
+    """Return a standard normal number that is the same for tasks that differ in other things."""
+    named = [str(task.parameters[name]) for name in names]
+    seed = [number, *("".join(named).encode())]
+    return float(np.random.default_rng(seed).normal())

@@ -1,0 +1,124 @@
+"""What the studies of ways and parameters make of results that are known beforehand."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from tests.experiments.made_up import noise, results_of
+
+from holdfast.experiments import parameters, selectors
+from holdfast.experiments.cases import CASES
+from holdfast.experiments.study import Report, Scale
+from holdfast.experiments.tasks import Task
+
+SCALE = Scale(seed=5)
+
+
+def selector_of(task: Task) -> dict[str, object]:
+    found: dict[str, object] = task.parameters["planning"]["selector"]
+    return found
+
+
+@pytest.fixture(scope="module")
+def compared() -> Report:
+    """Worlds differ by a factor; whoever asks for the mixture of actions takes four fifths."""
+
+    def trial(task: Task, number: int) -> tuple[bool, int, float]:
+        world = math.exp(0.3 * noise(task, number, ["problem", "model"]))
+        own = math.exp(0.05 * noise(task, number, ["problem", "model", "planning"]))
+        chosen = selector_of(task)
+        factor = 1.0
+        if chosen["method"] == "action_entropy" and chosen["estimator"] != "nearest_neighbor":
+            factor = 0.8
+        if chosen["method"] == "fixed":
+            factor = 3.0
+        steps = round(10_000 * world * own * factor)
+        return chosen["method"] != "fixed", steps, -0.01 * steps
+
+    study = selectors.Selectors()
+    return study.report(SCALE, results_of(study, SCALE, trial))
+
+
+def test_every_cell_is_there(compared: Report) -> None:
+    summary = compared.summary["selectors"]
+    assert summary.num_rows == len(CASES) * len(selectors.INTERVALS) * len(selectors.WAYS)
+    assert compared.raw["selectors"].num_rows == sum(
+        task.units for task in selectors.Selectors().tasks(SCALE)
+    )
+
+
+def test_a_known_ratio_is_found(compared: Report) -> None:
+    for row in compared.summary["relative_steps"].rows():
+        expected = {"fixed": 3.0}.get(str(row["way"]), 1.0)
+        if str(row["way"]).startswith("action entropy, mixture"):
+            expected = 0.8
+        # The interval of 200 differences of deviation 0.035: a hundredth of a per cent to spare.
+        assert row["steps_ratio"] == pytest.approx(expected, rel=0.02)
+        low, high = row["steps_ratio_low"], row["steps_ratio_high"]
+        assert isinstance(low, float)
+        assert isinstance(high, float)
+        assert low < float(row["steps_ratio"] or 0.0) < high
+        assert high / low < 1.05
+        level = float(row["adjusted_p_value"] or 0.0)
+        assert (level < selectors.LEVEL) == (expected != 1.0)
+
+
+def test_rivals_and_sentences(compared: Report) -> None:
+    better = {
+        (row["way"], row["rival"])
+        for row in compared.summary["rivals"].rows()
+        if float(row["adjusted_p_value"] or 0.0) < selectors.LEVEL
+    }
+    mixtures = {"action entropy, mixture", "action entropy, mixture, executed"}
+    assert better
+    assert all(len(mixtures & set(pair)) == 1 for pair in better)
+    # The two mixtures against the five others that choose.
+    assert len(better) == 10
+    assert any(
+        finding.startswith("fixed: 3") and "paired t-test" in finding
+        for finding in compared.findings
+    )
+    assert any("fewer: fixed at 0, fixed at 4" in finding for finding in compared.findings)
+
+
+def test_costs_move_the_best_interval(compared: Report) -> None:
+    """A look costs the same at every interval here, but the reward does not depend on it."""
+    costs = compared.summary["costs_of_looks"]
+    free = [row for row in costs.rows() if row["cost_of_a_look"] == 0.0]
+    dear = [row for row in costs.rows() if row["cost_of_a_look"] == 1.0]
+    assert len(free) == len(dear) == len(CASES) * 4
+    for cheap, expensive in zip(free, dear, strict=True):
+        assert float(expensive["net_reward"] or 0.0) < float(cheap["net_reward"] or 0.0)
+
+
+def test_what_a_parameter_does() -> None:
+    def trial(task: Task, number: int) -> tuple[bool, int, float]:
+        world = math.exp(0.3 * noise(task, number, ["problem", "model"]))
+        own = math.exp(0.05 * noise(task, number, ["problem", "model", "planning"]))
+        horizon = task.parameters["planning"]["active_sensing"]["horizon"]
+        return True, round(10_000 * world * own * (0.5 if horizon == 3 else 1.0)), 0.0
+
+    study = parameters.Parameters()
+    report = study.report(SCALE, results_of(study, SCALE, trial))
+    for row in report.summary["parameters"].rows():
+        longer = (row["parameter"], row["value"]) != ("horizon", "3")
+        assert row["steps_ratio"] == pytest.approx(1.0 if longer else 0.5, rel=0.03)
+    told = [finding for finding in report.findings if "horizon 3" in finding]
+    assert len(told) == 4
+    assert report.findings[-1].startswith("no difference in steps beyond noise")
+    assert "horizon" not in report.findings[-1]
+    assert "M (least p" in report.findings[-1]
+
+
+def test_each_variant_differs_in_one_thing() -> None:
+    for variant in parameters.variants()[1:]:
+        reference = parameters.Variant()
+        changed = [
+            name
+            for name in ("active_sensing", "particle_filter", "resolution")
+            if getattr(variant, name) != getattr(reference, name)
+        ]
+        assert len(changed) == 1
+        assert variant.parameter
+        assert variant.value
