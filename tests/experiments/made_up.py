@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -29,6 +30,5 @@ def results_of(
 
 def noise(task: Task, number: int, names: Sequence[str]) -> float:
     """Return a standard normal number that is the same for tasks that differ in other things."""
-    named = [str(task.parameters[name]) for name in names]
-    seed = [number, *("".join(named).encode())]
-    return float(np.random.default_rng(seed).normal())
+    named = "".join(str(task.parameters[name]) for name in names)
+    return float(np.random.default_rng([number, zlib.crc32(named.encode())]).normal())

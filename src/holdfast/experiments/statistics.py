@@ -85,7 +85,7 @@ def paired_difference(first: FloatArray, second: FloatArray) -> tuple[Interval, 
     -------
     Interval
     p_value : float
-        Of Student's paired test, two-sided; 1 if all differences are zero.
+        Of Student's paired test, two-sided; 1 if all differences are zero, NaN for a single pair.
 
     Raises
     ------
@@ -97,10 +97,15 @@ def paired_difference(first: FloatArray, second: FloatArray) -> tuple[Interval, 
     if first.shape != second.shape:
         raise InvalidValueError(f"{first.size} and {second.size} trials cannot be paired")
     difference = first - second
-    interval = mean_interval(difference)
     if not np.any(difference):
         return Interval(0.0, 0.0, 0.0), 1.0
-    return interval, float(stats.ttest_1samp(difference, 0.0).pvalue)
+    interval = mean_interval(difference)
+    if difference.size == 1:
+        return interval, math.nan
+    error = float(difference.std(ddof=1)) / math.sqrt(difference.size)
+    if error == 0.0:
+        return interval, 0.0
+    return interval, float(2.0 * stats.t.sf(abs(interval.value) / error, difference.size - 1))
 
 
 def paired_rates(first: BoolArray, second: BoolArray) -> tuple[Interval, float]:
