@@ -31,6 +31,9 @@ class Case(msgspec.Struct, frozen=True, kw_only=True):
     num_particles, max_steps : int
     share : float
         Of a study's trials that are run here: a problem that takes ten times as long has fewer.
+    state_resolution : float, optional
+        Standard deviation of the noise by which states are blurred for the entropy of a mixture,
+        where the problem's motion noise has not as many coordinates as its states.
     """
 
     name: str
@@ -39,6 +42,7 @@ class Case(msgspec.Struct, frozen=True, kw_only=True):
     num_particles: int = 100
     max_steps: int = 500
     share: float = 1.0
+    state_resolution: float | None = None
 
     def series(
         self,
@@ -62,6 +66,12 @@ class Case(msgspec.Struct, frozen=True, kw_only=True):
         active_sensing, particle_filter : optional
             Default: the project's, on one core, with this case's number of particles.
         """
+        if (
+            self.state_resolution is not None
+            and selector.method == "state_entropy"
+            and selector.estimator != "nearest_neighbor"
+        ):
+            selector = msgspec.structs.replace(selector, resolution=self.state_resolution)
         filtering = particle_filter or ParticleFilterSettings()
         sensing = active_sensing or ActiveSensingSettings()
         return TrialSeries(
@@ -97,6 +107,12 @@ CASES = (
         name="light and dark",
         problem="holdfast.experiments.light_dark:LightDark",
         num_particles=500,
+    ),
+    Case(
+        name="busy room",
+        problem="holdfast.experiments.busy_room:BusyRoom",
+        num_particles=200,
+        state_resolution=0.1,
     ),
 )
 """In the order in which they are shown."""

@@ -77,7 +77,7 @@ class Selectors:
     """The study ``selectors``."""
 
     name = "selectors"
-    title = "What is really best: choosing what to sense, on six problems"
+    title = "What is really best: choosing what to sense, on seven problems"
 
     def tasks(self, scale: Scale) -> list[Task]:
         """Return all that is to be computed, in the order in which to begin."""
@@ -314,7 +314,7 @@ def _draw_choice(summary: Table) -> Figure:
     from holdfast.experiments import plots
 
     figure, panels = plots.grid_of_panels(
-        list(_CASES), columns=3, title="What choosing the sensing action gains", width=9.0
+        list(_CASES), columns=4, title="What choosing the sensing action gains", width=11.0
     )
     for case, panel in panels.items():
         for number, (way, label) in enumerate(_SHOWN.items()):
@@ -357,7 +357,7 @@ def _draw_costs(costs: Table) -> Figure:
     from holdfast.experiments import plots
 
     figure, panels = plots.grid_of_panels(
-        list(_CASES), columns=3, title="Where a look costs: reward at the best interval", width=9.0
+        list(_CASES), columns=4, title="Where a look costs: reward at the best interval", width=11.0
     )
     for case, panel in panels.items():
         for number, (way, label) in enumerate(_SHOWN.items()):
