@@ -21,7 +21,7 @@ of a median).
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -113,7 +113,7 @@ def parallel_share(times: Mapping[int, float]) -> float:
     return min(max(share, 0.0), 1.0)
 
 
-def busy_cores(cores: int, pieces: int) -> float:
+def busy_cores(cores: int, pieces: int | None) -> float:
     """Return how many of some cores equal pieces of work keep busy on average.
 
     Nine pieces on eight cores take two turns, as sixteen would: 4.5 cores' worth.
@@ -123,7 +123,9 @@ def busy_cores(cores: int, pieces: int) -> float:
     InvalidValueError
         If one is below 1.
     """
-    if cores < 1 or pieces < 1:
+    if pieces is None and cores >= 1:
+        return float(cores)
+    if pieces is None or cores < 1 or pieces < 1:
         raise InvalidValueError(f"{pieces} pieces on {cores} cores: both must be at least 1")
     return pieces / math.ceil(pieces / cores)
 
@@ -192,18 +194,14 @@ class Scaling(NamedTuple):
         On one thread, in milliseconds.
     shares : tuple of Interval
         Of that, what is divided among threads, from 0 to 1.
-    pieces : int
-        Into which the divided part falls.
+    pieces : int or None
+        Into which the divided part falls; None for as many as one likes.
     """
 
     particles: tuple[int, ...]
     times: tuple[Interval, ...]
     shares: tuple[Interval, ...]
-    pieces: int
-
-    def local_ms(self) -> Curve:
-        """Return the time on one core."""
-        return Curve(self.particles, tuple(time.value for time in self.times))
+    pieces: int | None
 
     def on_cores(self, cores: int) -> Curve:
         """Return the time on some cores, as extrapolated from what was measured."""
@@ -220,47 +218,69 @@ class Scaling(NamedTuple):
         """Return what the time on some cores is at least, and at most.
 
         At least: all of the work divided evenly. At most: the least share that the measurement
-        allows, and pieces that cannot be divided further. Both about the median on one core.
+        allows, in pieces that cannot be divided further. Both about the median on one core.
         """
         busy = busy_cores(cores, self.pieces)
         least = tuple(time.value / cores for time in self.times)
+        lows = [_bounded(share.low) for share in self.shares]
         most = tuple(
             time.value * (1.0 - low + low / busy)
-            for time, low in zip(
-                self.times, (_bounded(share.low) for share in self.shares), strict=True
-            )
+            for time, low in zip(self.times, lows, strict=True)
         )
         return Curve(self.particles, least), Curve(self.particles, most)
 
-    def saved_ms(self, cores: int) -> tuple[Curve | None, Curve | None, Curve | None, Curve]:
-        """Return what some cores save of the time on one: as measured, least, most, and all even.
+    def bounds(self) -> tuple[Scaling, Scaling, Scaling]:
+        """Return what is favourable to few cores, favourable to many, and divided evenly.
 
-        Least and most follow from the ends of both intervals; a curve is None where nothing is
-        saved at some number of particles.
+        The first has the low ends of both intervals, the second their high ends, and the third the
+        medians with all of the work divided, in as many pieces as one likes.
         """
-        gain = 1.0 - 1.0 / busy_cores(cores, self.pieces)
-        value = [t.value * s.value for t, s in zip(self.times, self.shares, strict=True)]
-        low = [
-            max(t.low, 0.0) * _bounded(s.low) for t, s in zip(self.times, self.shares, strict=True)
-        ]
+        low = [Interval(*[max(time.low, 1e-9)] * 3) for time in self.times]
         high = [
-            (t.high if math.isfinite(t.high) else t.value) * _bounded(s.high)
-            for t, s in zip(self.times, self.shares, strict=True)
+            Interval(*[time.high if math.isfinite(time.high) else time.value] * 3)
+            for time in self.times
         ]
-        even = tuple(time.value * (1.0 - 1.0 / cores) for time in self.times)
+        least = [Interval(*[_bounded(share.low)] * 3) for share in self.shares]
+        most = [Interval(*[_bounded(share.high)] * 3) for share in self.shares]
+        even = [Interval(1.0, 1.0, 1.0)] * len(self.shares)
         return (
-            self._curve([gain * each for each in value]),
-            self._curve([gain * each for each in low]),
-            self._curve([gain * each for each in high]),
-            Curve(self.particles, even),
+            self._replace(times=tuple(low), shares=tuple(least)),
+            self._replace(times=tuple(high), shares=tuple(most)),
+            self._replace(shares=tuple(even), pieces=None),
         )
 
-    def _curve(self, values: Sequence[float]) -> Curve | None:
+    def saved_ms(self, robot_cores: int, cores: int, ahead_ms: float = 0.0) -> Curve | None:
+        """Return how much less a robot waits for some cores than for its own, but for the path.
+
+        Parameters
+        ----------
+        robot_cores, cores : int
+            The robot's own, and those elsewhere.
+        ahead_ms : float
+            How long before it is needed a decision is begun. Only what it takes longer is waited
+            for, by whomever it is made.
+
+        Returns
+        -------
+        Curve or None
+            From the number of particles on above which something is saved; None if nothing is.
+        """
+        own, elsewhere = self.on_cores(robot_cores), self.on_cores(cores)
+        first, last = math.log(self.particles[0]), math.log(self.particles[-1])
+        # Both are straight between what was measured; the difference of the waits is not.
+        numbers = np.unique(
+            np.concatenate(
+                [np.array(self.particles, dtype=np.float64), np.exp(np.linspace(first, last, 400))]
+            )
+        ).clip(self.particles[0], self.particles[-1])
+        waits = [np.maximum(curve.at(numbers) - ahead_ms, 0.0) for curve in (own, elsewhere)]
+        saved = waits[0] - waits[1]
         # Where nothing is saved a logarithm has no place; from there on up is what counts.
-        last = max((i for i, value in enumerate(values) if value <= 0.0), default=-1)
-        if last + 1 >= len(values):
+        nothing = np.flatnonzero(saved <= 0.0)
+        start = int(nothing[-1]) + 1 if nothing.size else 0
+        if start >= numbers.size:
             return None
-        return Curve(self.particles[last + 1 :], tuple(values[last + 1 :]))
+        return Curve(tuple(map(float, numbers[start:])), tuple(map(float, saved[start:])))
 
 
 def _bounded(share: float) -> float:
@@ -312,7 +332,8 @@ def break_even(saved_ms: Curve | None, cost_ms: float) -> BreakEven:
             f"and {cost_ms:.3g} ms paid",
         )
     if all(value > cost_ms for value in values):
-        return BreakEven(particles[0], f"at {particles[0]:,.0f} particles or fewer")
+        # The curve begins where it was measured first, or where the first time is saved.
+        return BreakEven(particles[0], f"at {_rounded(particles[0])} particles or fewer")
     after = max(i for i, value in enumerate(values) if value <= cost_ms) + 1
     low, high = math.log(values[after - 1]), math.log(values[after])
     way = (math.log(cost_ms) - low) / (high - low)

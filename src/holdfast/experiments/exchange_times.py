@@ -1,8 +1,8 @@
 """What it costs to ask a service, beside what it computes and the path to it.
 
 A robot's questions are put to a real service: ``holdfast serve`` as a process of its own, over TCP
-on this machine, and the same service inside this process. Of the time until each part of an answer has
-come, the service itself says how much it computed; the rest is the exchange: encoding, two
+on this machine, and the same service inside this process. Of the time until each part of an answer
+has come, the service itself says how much it computed; the rest is the exchange: encoding, two
 processes woken, digests, the answer decoded. A path adds its round trip to that.
 """
 

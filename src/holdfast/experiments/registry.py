@@ -16,6 +16,7 @@ ALL = "all"
 
 _STUDIES: Mapping[str, str] = {
     "published_2017": "holdfast.experiments.published_2017:Published2017",
+    "cloud_worth": "holdfast.experiments.cloud_worth:CloudWorth",
 }
 """Where each is; imported when it is needed."""
 

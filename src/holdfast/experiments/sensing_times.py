@@ -6,6 +6,9 @@ and what was sensed and done in them is told again to beliefs of any other numbe
 approximate the same posteriors, and only their size differs.
 
 Numbers of threads are timed in turns, so that whatever else the machine does meets all of them.
+Machines are shared: from a decision's time is taken what its thread waited for a core that another
+process had, which the system counts. What cannot be taken out is that a second thread comes late
+then; so the gain of threads is read from the fastest repetitions, and how busy others were is noted.
 """
 
 from __future__ import annotations
@@ -53,6 +56,8 @@ _MOST_REPETITIONS = 15
 _PLACES = (0.25, 0.5, 0.75)
 """Of a trial's sensing decisions, from which beliefs are taken."""
 
+_SCHEDULING = Path("/proc/thread-self/schedstat")
+
 _STEEPER_BY = 0.3
 """A larger number of particles may cost this much more, as an exponent, than the last ones did."""
 
@@ -82,9 +87,11 @@ class Measurement(msgspec.Struct, frozen=True, kw_only=True):
     seed : int
     repeat_s : float
         Decisions of one number of particles are repeated for about this long.
+    least_repetitions : int
+        Of each decision, however long it takes.
     limit_s : float
-        If one round, each belief on each number of threads, takes longer than this, that number of
-        particles is left out, and all above it.
+        If so many take longer than this, fewer beliefs are taken; if that does not help, the number
+        of particles is left out, and all above it.
     """
 
     problem: str
@@ -97,6 +104,7 @@ class Measurement(msgspec.Struct, frozen=True, kw_only=True):
     num_trials: int = 3
     seed: int = 0
     repeat_s: float = 0.5
+    least_repetitions: int = 3
     limit_s: float = 8.0
 
 
@@ -119,8 +127,9 @@ def measure_sensing(**measurement: Any) -> Table:
     -------
     Table
         A row for each belief and number of threads: the median and the fastest of
-        ``repetitions`` decisions in milliseconds; ``share``, the part that is divided among
-        threads, the median over the repetitions; ``mapping_ms``, what the policy and the predicted
+        ``repetitions`` decisions in milliseconds, without waiting for cores that others had; ``share``, the part that is divided among
+        threads, of the fastest ones, since whatever else the machine does delays several threads
+        sooner than one; ``mapping_ms``, what the policy and the predicted
         observations of all particles take, which one thread does; and ``others_cores``, how many
         cores other processes kept busy meanwhile.
 
@@ -149,7 +158,7 @@ def measure_sensing(**measurement: Any) -> Table:
     table = Table({})
     taken: list[tuple[int, float]] = []
     for particles in wanted.particles:
-        if _expected_s(taken, particles) > wanted.limit_s:
+        if wanted.least_repetitions * _expected_s(taken, particles) > wanted.limit_s:
             break
         settings = _settings(wanted, particles, 1)
         states = [
@@ -240,6 +249,8 @@ def _check(wanted: Measurement) -> None:
         raise InvalidValueError(f"particles {wanted.particles}: must be at least one, and rise")
     if wanted.num_trials < 1:
         raise InvalidValueError(f"num_trials {wanted.num_trials}: must be at least 1")
+    if wanted.least_repetitions < 1:
+        raise InvalidValueError(f"least_repetitions {wanted.least_repetitions}: must be at least 1")
 
 
 def _settings(wanted: Measurement, particles: int, threads: int) -> PlanningSettings:
@@ -288,7 +299,7 @@ def _few_enough(
     )
     fewer = states[: 2 * len(states) // 3]
     for some in (states, fewer):
-        if one_s * len(some) <= wanted.limit_s:
+        if wanted.least_repetitions * one_s * len(some) <= wanted.limit_s:
             return some
     return []
 
@@ -316,20 +327,14 @@ def _timed(
             repetition += 1
             if repetition == 1:
                 round_s = sum(seconds for times in taken for (seconds,) in times.values())
-                repetitions = int(min(max(wanted.repeat_s / round_s, 1), _MOST_REPETITIONS))
+                affordable = min(int(wanted.repeat_s / round_s), _MOST_REPETITIONS)
+                repetitions = max(affordable, wanted.least_repetitions)
     finally:
         if collects:
             gc.enable()
     rows: list[tuple[Cell, ...]] = []
     for belief, (state, times) in enumerate(zip(states, taken, strict=True)):
-        share = float(
-            np.median(
-                [
-                    parallel_share({p: times[p][i] for p in wanted.threads})
-                    for i in range(repetitions)
-                ]
-            )
-        )
+        share = parallel_share({threads: min(seconds) for threads, seconds in times.items()})
         mapping_ms = 1e3 * _mapping_s(problem, state)
         rows += [
             (
@@ -348,9 +353,20 @@ def _timed(
 
 
 def _decision_s(problem: Problem, settings: PlanningSettings, state: PlanningState) -> float:
+    """Return what a decision takes, less what its thread waited for a core that others had."""
+    delayed_ns = _delayed_ns()
     start = time.perf_counter()
     choose_sensing_action(problem, settings, state)
-    return time.perf_counter() - start
+    elapsed_s = time.perf_counter() - start
+    return max(elapsed_s - 1e-9 * (_delayed_ns() - delayed_ns), 1e-9)
+
+
+def _delayed_ns() -> int:
+    """Return how long this thread could have run but had no core (Linux; 0 elsewhere)."""
+    try:
+        return int(_SCHEDULING.read_bytes().split()[1])
+    except (OSError, IndexError, ValueError):
+        return 0
 
 
 def _mapping_s(problem: Problem, state: PlanningState) -> float:
