@@ -52,14 +52,14 @@ __all__ = ["CloudWorth", "Kind", "scaling_of"]
 
 _PROBLEMS = ("peg_in_hole_2d", "peg_in_hole_3d", "capsule_robot")
 _ESTIMATORS = ("nearest_neighbor", "gaussian_mixture_upper")
-_PARTICLES = (100, 300, 1000, 3000, 10_000, 30_000, 100_000)
+_PARTICLES = (100, 300, 1000, 2000, 4000, 10_000, 20_000, 40_000, 100_000)
 _SAMPLES = (10, 30, 100, 300)
 
 # Moving 4,096 particles or more uses all cores whatever it is told: beyond, one thread would not
 # be one.
-_PARTICLES_AHEAD = (100, 300, 1000, 3000)
+_PARTICLES_AHEAD = (100, 300, 1000, 2000, 4000)
 
-_QUICK_PARTICLES = (100, 1000, 10_000, 30_000)
+_QUICK_PARTICLES = (100, 1000, 2000, 5000, 20_000)
 _QUICK_SAMPLES = (10, 100)
 
 _TIMES_THE_CORES = (8, 36)
@@ -212,11 +212,11 @@ def _measured(kind: Kind, scale: Scale) -> Task:
         horizon=kind.horizon,
         particles=particles,
         threads=_threads(),
-        num_trials=2 if scale.quick else 3,
+        num_trials=3,
         seed=scale.seed,
         repeat_s=0.1 if scale.quick else 0.5,
         least_repetitions=1 if scale.quick else 3,
-        limit_s=1.5 if scale.quick else 8.0,
+        limit_s=2.0 if scale.quick else 8.0,
     )
     return Task(
         kind="sensing_times",
@@ -239,7 +239,7 @@ def _exchanges(scale: Scale) -> Iterator[tuple[tuple[str, int], Task]]:
                 problem=_SHOWN.problem,
                 particles=particles,
                 way=way,
-                num_trials=1 if scale.quick else 5,
+                num_trials=1 if scale.quick else 3,
                 seed=scale.seed,
             )
             task = Task(
@@ -517,51 +517,45 @@ def _findings(
 ) -> list[str]:
     shown = scalings[_SHOWN]
     findings = [_about_disturbance(of_beliefs), *_about_shares(scalings, of_beliefs)]
-    for kind in scalings:
-        if kind.horizon > 1 or kind.sensing_actions != _all(kind):
-            continue
-        found = [
-            f"{cores} cores at {path_ms:g} ms {_told(scalings[kind], cores, path_ms + exchange_ms)}"
-            for path_ms in _PATHS_MS
-            for cores in _TIMES_THE_CORES
-        ]
-        findings.append(
-            f"{kind.label}: a robot with one core that waits for each decision gains from "
-            + "; from ".join(found)
-        )
-    for rate_hz in _RATES_HZ:
-        found = [
-            f"{cores} cores at {path_ms:g} ms "
-            + _told(shown, cores, path_ms + exchange_ms, _ahead_ms(rate_hz))
-            for path_ms in _PATHS_MS
-            for cores in _TIMES_THE_CORES
-        ]
-        findings.append(
-            f"{_SHOWN.label}: a robot that decides ahead at {rate_hz:g} Hz has "
-            f"{_ahead_ms(rate_hz):,.0f} ms for each sensing action while it moves, and gains from "
-            + "; from ".join(found)
-        )
+    findings += [
+        f"{kind.label}, a robot with one core that waits for each decision: "
+        + _told(scaling, exchange_ms)
+        for kind, scaling in scalings.items()
+        if kind.samples in (10, 100) and kind.sensing_actions == _all(kind)
+    ]
+    findings += [
+        f"{_SHOWN.label}, a robot with one core that decides ahead at {rate_hz:g} Hz and has "
+        f"{_ahead_ms(rate_hz):,.0f} ms for each sensing action while it moves: "
+        + _told(shown, exchange_ms, _ahead_ms(rate_hz))
+        for rate_hz in _RATES_HZ
+    ]
     findings += _about_growth(summary["growth"])
     findings.append(_about_asking(summary["exchange"]))
     findings.append(_about_checkpoints(shown))
     return findings
 
 
-def _told(scaling: Scaling, cores: int, cost_ms: float, ahead_ms: float = 0.0) -> str:
-    """Say where a break-even is, with its bounds."""
-    line = _line(scaling, 1, cores, cost_ms, ahead_ms)
-    ends = [
-        f"{end.particles:,.0f}" if end.particles is not None else "beyond what was measured"
-        for end in (line.first, line.last)
-    ]
-    even = line.even.particles
-    evenly = f"{even:,.0f}" if even is not None else "none"
-    if line.value.particles is None:
-        return f"{line.value.words} [{ends[0]} to {ends[1]}; divided evenly {evenly}]"
-    return (
-        f"from {line.value.particles:,.0f} particles on [{ends[0]} to {ends[1]}; divided evenly "
-        f"{evenly}]"
-    )
+def _told(scaling: Scaling, exchange_ms: float, ahead_ms: float = 0.0) -> str:
+    """Say beyond how many particles services are faster, with bounds."""
+    texts = []
+    for path_ms in _PATHS_MS:
+        for cores in _TIMES_THE_CORES:
+            line = _line(scaling, 1, cores, path_ms + exchange_ms, ahead_ms)
+            value, low, high, even = (
+                _shown_particles(end, scaling)
+                for end in (line.value, line.first, line.last, line.even)
+            )
+            texts.append(
+                f"with {cores} cores at {path_ms:g} ms beyond {value} particles [{low}, {high}; "
+                f"divided evenly {even}]"
+            )
+    return "a service is faster " + ", ".join(texts)
+
+
+def _shown_particles(found: BreakEven, scaling: Scaling) -> str:
+    if found.particles is None:
+        return f"> {scaling.particles[-1]:,}"
+    return f"{found.particles:,.0f}"
 
 
 def _about_disturbance(of_beliefs: dict[Kind, Table]) -> str:

@@ -323,7 +323,7 @@ def break_even(saved_ms: Curve | None, cost_ms: float) -> BreakEven:
     if not cost_ms > 0.0:
         raise InvalidValueError(f"a cost of {cost_ms} ms: must be positive")
     if saved_ms is None:
-        return BreakEven(None, "never: more cores save nothing")
+        return BreakEven(None, "not within what was measured: nothing is saved there")
     particles, values = saved_ms
     if values[-1] <= cost_ms:
         return BreakEven(

@@ -8,7 +8,7 @@ approximate the same posteriors, and only their size differs.
 Numbers of threads are timed in turns, so that whatever else the machine does meets all of them.
 Machines are shared: from a decision's time is taken what its thread waited for a core that another
 process had, which the system counts. What cannot be taken out is that a second thread comes late
-then; so the gain of threads is read from the fastest repetitions, and how busy others were is noted.
+then; so what threads gain is read from the fastest repetitions, and how busy others were is noted.
 """
 
 from __future__ import annotations
@@ -126,11 +126,11 @@ def measure_sensing(**measurement: Any) -> Table:
     Returns
     -------
     Table
-        A row for each belief and number of threads: the median and the fastest of
-        ``repetitions`` decisions in milliseconds, without waiting for cores that others had; ``share``, the part that is divided among
-        threads, of the fastest ones, since whatever else the machine does delays several threads
-        sooner than one; ``mapping_ms``, what the policy and the predicted
-        observations of all particles take, which one thread does; and ``others_cores``, how many
+        A row for each belief and number of threads. ``median_ms`` and ``fastest_ms`` are those of
+        so many ``repetitions``, less what they waited for cores that others had. ``share`` is the
+        part that is divided among threads, of the fastest ones: whatever else the machine does
+        delays several threads sooner than one. ``mapping_ms`` is what the policy and the predicted
+        observations of all particles take, which one thread does, and ``others_cores`` how many
         cores other processes kept busy meanwhile.
 
     Raises
