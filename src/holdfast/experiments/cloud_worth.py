@@ -52,14 +52,14 @@ __all__ = ["CloudWorth", "Kind", "scaling_of"]
 
 _PROBLEMS = ("peg_in_hole_2d", "peg_in_hole_3d", "capsule_robot")
 _ESTIMATORS = ("nearest_neighbor", "gaussian_mixture_upper")
-_PARTICLES = (100, 300, 1000, 2000, 4000, 10_000, 20_000, 40_000, 100_000)
+_PARTICLES = (100, 300, 1000, 2000, 4000, 8000, 16_000, 32_000, 64_000, 100_000)
 _SAMPLES = (10, 30, 100, 300)
 
 # Moving 4,096 particles or more uses all cores whatever it is told: beyond, one thread would not
 # be one.
 _PARTICLES_AHEAD = (100, 300, 1000, 2000, 4000)
 
-_QUICK_PARTICLES = (100, 1000, 2000, 5000, 20_000)
+_QUICK_PARTICLES = (100, 1000, 2000, 5000, 10_000, 20_000)
 _QUICK_SAMPLES = (10, 100)
 
 _TIMES_THE_CORES = (8, 36)
@@ -193,7 +193,7 @@ def _kinds(scale: Scale) -> list[Kind]:
         kinds.append(whole._replace(sensing_actions=actions))
     for problem in (_SHOWN.problem,) if scale.quick else _PROBLEMS:
         for horizon in (2,) if scale.quick else (2, 4):
-            for samples_ahead in (10,) if scale.quick else (10, 30):
+            for samples_ahead in (10, 30) if horizon == 2 and not scale.quick else (10,):
                 kinds.append(
                     Kind(problem, _actions_of(problem), samples=samples_ahead, horizon=horizon)
                 )
@@ -214,9 +214,9 @@ def _measured(kind: Kind, scale: Scale) -> Task:
         threads=_threads(),
         num_trials=3,
         seed=scale.seed,
-        repeat_s=0.1 if scale.quick else 0.5,
+        repeat_s=0.1 if scale.quick else 0.3,
         least_repetitions=1 if scale.quick else 3,
-        limit_s=2.0 if scale.quick else 8.0,
+        limit_s=2.5 if scale.quick else 8.0,
     )
     return Task(
         kind="sensing_times",
@@ -545,8 +545,11 @@ def _told(scaling: Scaling, exchange_ms: float, ahead_ms: float = 0.0) -> str:
                 _shown_particles(end, scaling)
                 for end in (line.value, line.first, line.last, line.even)
             )
+            where = f"beyond {value}"
+            if line.value.particles is None:
+                where = f"nowhere up to {scaling.particles[-1]:,}"
             texts.append(
-                f"with {cores} cores at {path_ms:g} ms beyond {value} particles [{low}, {high}; "
+                f"with {cores} cores at {path_ms:g} ms {where} particles [{low}, {high}; "
                 f"divided evenly {even}]"
             )
     return "a service is faster " + ", ".join(texts)
@@ -694,6 +697,17 @@ def _shown_samples(scalings: dict[Kind, Scaling]) -> list[Kind]:
     return sorted(family, key=lambda kind: kind.samples)
 
 
+def _panels(figure: Figure, rows: int, columns: int) -> list[list[Axes]]:
+    """Return panels with the same axes, row by row."""
+    import matplotlib as mpl
+
+    from holdfast.recording.figure import STYLE
+
+    with mpl.rc_context(STYLE):
+        panels = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+    return [list(row) for row in panels]
+
+
 def _draw_times(scalings: dict[Kind, Scaling], exchange_ms: float) -> Figure:
     """Draw time against particles: here, and on more cores further away."""
     from holdfast.experiments import plots
@@ -704,7 +718,7 @@ def _draw_times(scalings: dict[Kind, Scaling], exchange_ms: float) -> Figure:
         3.4 * len(kinds) + 0.6,
         "Choosing a sensing action: on the robot's one core, or on more further away",
     )
-    panels = figure.subplots(len(kinds), len(_PATHS_MS), sharex=True, sharey=True, squeeze=False)
+    panels = _panels(figure, len(kinds), len(_PATHS_MS))
     for row, kind in zip(panels, kinds, strict=True):
         for panel, path_ms in zip(row, _PATHS_MS, strict=True):
             _draw_lines(panel, scalings[kind], path_ms, exchange_ms)
@@ -712,7 +726,10 @@ def _draw_times(scalings: dict[Kind, Scaling], exchange_ms: float) -> Figure:
         row[0].set_ylabel("time until the sensing action is there (ms)")
     for panel in panels[-1]:
         panel.set_xlabel("particles")
-    panels[0][0].legend(loc="upper left", handlelength=2.6)
+    handles, labels = panels[0][0].get_legend_handles_labels()
+    figure.legend(
+        handles, labels, loc="outside lower center", ncols=2, handlelength=3.2, frameon=False
+    )
     return figure
 
 
@@ -791,7 +808,7 @@ def _draw_map(scalings: dict[Kind, Scaling], exchange_ms: float) -> Figure:
     figure = plots.figure_of(
         9.2, 7.0, f"When is the cloud worth it? {_SHOWN.problem}, a robot that waits with one core"
     )
-    panels = figure.subplots(len(_TIMES_THE_CORES), len(_PATHS_MS), sharex=True, sharey=True)
+    panels = _panels(figure, len(_TIMES_THE_CORES), len(_PATHS_MS))
     first = min(scalings[kind].particles[0] for kind in kinds)
     last = max(scalings[kind].particles[-1] for kind in kinds)
     numbers = np.geomspace(first, last, 160).clip(first, last)
@@ -803,16 +820,22 @@ def _draw_map(scalings: dict[Kind, Scaling], exchange_ms: float) -> Figure:
     for row, cores in zip(panels, _TIMES_THE_CORES, strict=True):
         for panel, path_ms in zip(row, _PATHS_MS, strict=True):
             cost_ms = path_ms + exchange_ms
-            own = _over_samples(kinds, [scalings[kind].on_cores(1).at(numbers) for kind in kinds])
-            there = _over_samples(
-                kinds, [scalings[kind].on_cores(cores).at(numbers) for kind in kinds]
+            own, there = (
+                _over_samples(kinds, [scalings[kind].on_cores(c).beyond(numbers) for kind in kinds])
+                for c in (1, cores)
             )
             ratio = own(samples) / (cost_ms + there(samples))
-            panel.set_facecolor("#FBFBFB")
-            panel.patch.set_hatch("////")
-            panel.patch.set_edgecolor("#C8CCD2")
             panel.pcolormesh(
                 numbers, samples, ratio, cmap=shades, norm=norm, shading="nearest", rasterized=True
+            )
+            panel.fill_betweenx(
+                [kind.samples for kind in kinds],
+                [scalings[kind].particles[-1] for kind in kinds],
+                last,
+                facecolor="none",
+                edgecolor="#8A9099",
+                hatch="////",
+                linewidth=0.0,
             )
             _draw_break_even(panel, kinds, scalings, cores, cost_ms)
             panel.set_xscale("log")
@@ -838,18 +861,18 @@ def _draw_map(scalings: dict[Kind, Scaling], exchange_ms: float) -> Figure:
         for shade, word in zip(colors, words, strict=True)
     ]
     handles += [
-        Patch(facecolor="#FBFBFB", edgecolor="#C8CCD2", hatch="////", label="not measured"),
+        Patch(facecolor="none", edgecolor="#8A9099", hatch="////", label="extrapolated"),
         Line2D([], [], color="#B5342B", linewidth=2.2, marker="o", label="equally fast"),
         Line2D([], [], color="#B5342B", linewidth=1.0, linestyle="--", label="its bounds"),
     ]
-    figure.legend(handles=handles, loc="outside lower center", ncols=3)
+    figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False)
     return figure
 
 
 def _over_samples(
     kinds: Sequence[Kind], rows: Sequence[FloatArray]
 ) -> Callable[[FloatArray], FloatArray]:
-    """Return the times between numbers of samples, straight in logarithms; NaN if not measured."""
+    """Return the times between numbers of samples, straight in logarithms."""
     at = np.log([kind.samples for kind in kinds])
     heights = np.log(np.array(rows))
 
@@ -920,7 +943,11 @@ def _draw_all(table: Table) -> Figure:
         end = max(_number(row["measured_to"]) for row in rows if _kind_of(row) == kind)
         panel.plot([end, end], [place - 0.4, place + 0.4], color="#8A9099", linewidth=1.2)
     panel.set_xlabel("particles at break-even, with bounds; grey: measured up to here")
-    panel.legend(loc="upper center", bbox_to_anchor=(0.3, -0.06), ncols=2)
+    legend = panel.get_legend()
+    assert legend is not None
+    legend.remove()
+    handles, labels = panel.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False)
     return figure
 
 
@@ -945,7 +972,7 @@ def _draw_waiting(scalings: dict[Kind, Scaling], exchange_ms: float) -> Figure:
     figure = plots.figure_of(
         9.2, 3.9, f"What a robot stands still for at each turn: {_SHOWN.label}"
     )
-    panels = figure.subplots(1, len(ways), sharex=True, sharey=True)
+    (panels,) = _panels(figure, 1, len(ways))
     first, last = scaling.particles[0], scaling.particles[-1]
     numbers = np.geomspace(first, last, 400).clip(first, last)
     places = (
@@ -961,10 +988,13 @@ def _draw_waiting(scalings: dict[Kind, Scaling], exchange_ms: float) -> Figure:
             waits = cost_ms + np.maximum(scaling.on_cores(cores).at(numbers) - ahead_ms, 0.0)
             panel.plot(numbers, waits, style, color=color, linewidth=1.6, label=label)
         panel.set_xscale("log")
-        panel.set_ylim(0.0, 250.0)
+        panel.set_ylim(-6.0, 250.0)
         panel.grid()
         panel.set_title(way, loc="left")
         panel.set_xlabel("particles")
     panels[0].set_ylabel("waiting at each turn (ms)")
-    panels[-1].legend(loc="upper left", handlelength=2.6)
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(
+        handles, labels, loc="outside lower center", ncols=3, handlelength=3.2, frameon=False
+    )
     return figure

@@ -58,10 +58,13 @@ _PLACES = (0.25, 0.5, 0.75)
 
 _SCHEDULING = Path("/proc/thread-self/schedstat")
 
-_STEEPER_BY = 0.3
+_STEEPER_BY = 0.2
 """A larger number of particles may cost this much more, as an exponent, than the last ones did."""
 
-_FIRST_EXPONENT = 1.5
+_FIRST_EXPONENT = 1.0
+
+_FEWER = 2.0 / 3.0
+"""Of the beliefs, where there is no time for all: of nine six are left, enough for an interval."""
 
 
 class Measurement(msgspec.Struct, frozen=True, kw_only=True):
@@ -158,7 +161,9 @@ def measure_sensing(**measurement: Any) -> Table:
     table = Table({})
     taken: list[tuple[int, float]] = []
     for particles in wanted.particles:
-        if wanted.least_repetitions * _expected_s(taken, particles) > wanted.limit_s:
+        # Of fewer beliefs, if need be.
+        expected_s = _FEWER * wanted.least_repetitions * _expected_s(taken, particles)
+        if expected_s > wanted.limit_s:
             break
         settings = _settings(wanted, particles, 1)
         states = [
@@ -292,12 +297,12 @@ def _few_enough(
     settings: PlanningSettings,
     states: list[PlanningState],
 ) -> list[PlanningState]:
-    """Return as many of the beliefs as there is time for: all, two thirds of them, or none."""
+    """Return as many of the beliefs as there is time for: all, fewer, or none."""
     one_s = sum(
         _decision_s(problem, _on(settings, threads), states[len(states) // 2])
         for threads in wanted.threads
     )
-    fewer = states[: 2 * len(states) // 3]
+    fewer = states[: round(_FEWER * len(states))]
     for some in (states, fewer):
         if wanted.least_repetitions * one_s * len(some) <= wanted.limit_s:
             return some
