@@ -216,7 +216,7 @@ def _measured(kind: Kind, scale: Scale) -> Task:
         seed=scale.seed,
         repeat_s=0.1 if scale.quick else 0.3,
         least_repetitions=1 if scale.quick else 3,
-        limit_s=2.5 if scale.quick else 8.0,
+        limit_s=2.0 if scale.quick else 8.0,
     )
     return Task(
         kind="sensing_times",
