@@ -54,6 +54,8 @@ _PROBLEMS = ("peg_in_hole_2d", "peg_in_hole_3d", "capsule_robot")
 _ESTIMATORS = ("nearest_neighbor", "gaussian_mixture_upper")
 _PARTICLES = (100, 300, 1000, 2000, 4000, 8000, 16_000, 32_000, 64_000, 100_000)
 _SAMPLES = (10, 30, 100, 300)
+_SAMPLES_DRAWN = (10, 100)
+"""Of these figures and sentences tell; the tables and the map have all."""
 
 # Moving 4,096 particles or more uses all cores whatever it is told: beyond, one thread would not
 # be one.
@@ -353,7 +355,7 @@ def _growth_table(of_beliefs: dict[Kind, Table]) -> Table:
                 for belief, times in points.items()
             }
             cells += _exponents("particles", kind, mine, f"from {start:,} on")
-    for changed in ("samples", "sensing_actions"):
+    for changed in ("samples", "sensing_actions", "horizon"):
         for kind in of_beliefs:
             family = [
                 other
@@ -521,7 +523,7 @@ def _findings(
         f"{kind.label}, a robot with one core that waits for each decision: "
         + _told(scaling, exchange_ms)
         for kind, scaling in scalings.items()
-        if kind.samples in (10, 100) and kind.sensing_actions == _all(kind)
+        if kind.samples in _SAMPLES_DRAWN and kind.sensing_actions == _all(kind)
     ]
     findings += [
         f"{_SHOWN.label}, a robot with one core that decides ahead at {rate_hz:g} Hz and has "
@@ -529,18 +531,23 @@ def _findings(
         + _told(shown, exchange_ms, _ahead_ms(rate_hz))
         for rate_hz in _RATES_HZ
     ]
+    findings.append(
+        f"{_SHOWN.label}, a robot with {_ROBOT_CORES[1]} cores that waits for each decision: "
+        + _told(shown, exchange_ms, robot_cores=_ROBOT_CORES[1])
+    )
     findings += _about_growth(summary["growth"])
     findings.append(_about_asking(summary["exchange"]))
     findings.append(_about_checkpoints(shown))
     return findings
 
 
-def _told(scaling: Scaling, exchange_ms: float, ahead_ms: float = 0.0) -> str:
+def _told(scaling: Scaling, exchange_ms: float, ahead_ms: float = 0.0, robot_cores: int = 1) -> str:
     """Say beyond how many particles services are faster, with bounds."""
     texts = []
     for path_ms in _PATHS_MS:
-        for cores in _TIMES_THE_CORES:
-            line = _line(scaling, 1, cores, path_ms + exchange_ms, ahead_ms)
+        for times in _TIMES_THE_CORES:
+            cores = times * robot_cores
+            line = _line(scaling, robot_cores, cores, path_ms + exchange_ms, ahead_ms)
             value, low, high, even = (
                 _shown_particles(end, scaling)
                 for end in (line.value, line.first, line.last, line.even)
@@ -630,7 +637,7 @@ def _about_growth(growth: Table) -> list[str]:
     """Say how the time grows."""
     findings = []
     for row in growth.rows():
-        one_step = row["horizon"] == 1
+        one_step = row["horizon"] == 1 or row["grows_with"] == "horizon"
         ten = row["samples"] == 10 and row["where"] == f"from {_STEADY_FROM:,} on"
         if not one_step or (row["grows_with"] == "particles" and not ten):
             continue
@@ -638,7 +645,9 @@ def _about_growth(growth: Table) -> list[str]:
             str(row["problem"])
         ):
             continue
-        symbol = {"particles": "N", "samples": "M", "sensing_actions": "J"}[str(row["grows_with"])]
+        symbol = {"particles": "N", "samples": "M", "sensing_actions": "J", "horizon": "H"}[
+            str(row["grows_with"])
+        ]
         value, low, high = row["exponent"], row["exponent_low"], row["exponent_high"]
         ends = f"[{low:.2f}, {high:.2f}]" if low is not None and high is not None else ""
         text = (
@@ -712,7 +721,7 @@ def _draw_times(scalings: dict[Kind, Scaling], exchange_ms: float) -> Figure:
     """Draw time against particles: here, and on more cores further away."""
     from holdfast.experiments import plots
 
-    kinds = [kind for kind in _shown_samples(scalings) if kind.samples in (10, 100)]
+    kinds = [kind for kind in _shown_samples(scalings) if kind.samples in _SAMPLES_DRAWN]
     figure = plots.figure_of(
         9.2,
         3.4 * len(kinds) + 0.6,
@@ -783,13 +792,17 @@ def _draw_lines(panel: Axes, scaling: Scaling, path_ms: float, exchange_ms: floa
         at = np.array([found.particles])
         height = float(scaling.on_cores(1).at(at)[0])
         panel.plot(at, [height], mark, color=color, markeredgecolor="#1A1D21", zorder=4)
+        # The one below, the other above; to the left where there is no room to the right.
+        first = cores == _LINES[0][0]
+        left = not first or found.particles > 0.2 * numbers[-1]
         panel.annotate(
             f"{cores} cores: {found.particles:,.0f}",
             (found.particles, height),
-            xytext=(6, -12) if cores == _LINES[0][0] else (-6, 10),
+            xytext=(-8 if left else 8, -16 if first else 11),
             textcoords="offset points",
-            ha="left" if cores == _LINES[0][0] else "right",
+            ha="right" if left else "left",
             fontsize=8.0,
+            bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 0.6},
         )
     panel.set_xscale("log")
     panel.set_yscale("log")
@@ -806,7 +819,7 @@ def _draw_map(scalings: dict[Kind, Scaling], exchange_ms: float) -> Figure:
 
     kinds = _shown_samples(scalings)
     figure = plots.figure_of(
-        9.2, 7.0, f"When is the cloud worth it? {_SHOWN.problem}, a robot that waits with one core"
+        9.2, 7.0, f"When is the cloud worth it? {_SHOWN.problem}, a robot with one core that waits"
     )
     panels = _panels(figure, len(_TIMES_THE_CORES), len(_PATHS_MS))
     first = min(scalings[kind].particles[0] for kind in kinds)
@@ -907,7 +920,11 @@ def _draw_all(table: Table) -> Figure:
     """Draw the break-even of all kinds of decisions, for a robot with one core."""
     from holdfast.experiments import plots
 
-    rows = [row for row in table.rows() if row["robot_cores"] == 1]
+    rows = [
+        row
+        for row in table.rows()
+        if row["robot_cores"] == _ROBOT_CORES[0] and row["samples"] in _SAMPLES_DRAWN
+    ]
     kinds = list(dict.fromkeys(_kind_of(row) for row in rows))
     figure, panels = plots.stacked_panels(
         [2 * len(kinds)],
