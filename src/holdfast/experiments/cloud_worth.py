@@ -16,6 +16,7 @@ longer, besides one round trip for its task actions.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
@@ -125,6 +126,7 @@ def _all(kind: Kind) -> int:
     return _actions_of(kind.problem)
 
 
+@functools.cache
 def _actions_of(problem: str) -> int:
     return len(problem_of(problem, {}, {}).sensing_actions)
 
@@ -792,15 +794,13 @@ def _draw_lines(panel: Axes, scaling: Scaling, path_ms: float, exchange_ms: floa
         at = np.array([found.particles])
         height = float(scaling.on_cores(1).at(at)[0])
         panel.plot(at, [height], mark, color=color, markeredgecolor="#1A1D21", zorder=4)
-        # The one below, the other above; to the left where there is no room to the right.
-        first = cores == _LINES[0][0]
-        left = not first or found.particles > 0.2 * numbers[-1]
+        # One above the other, where nothing is drawn.
         panel.annotate(
             f"{cores} cores: {found.particles:,.0f}",
             (found.particles, height),
-            xytext=(-8 if left else 8, -16 if first else 11),
+            xytext=(-8, 26 if cores == _LINES[0][0] else 13),
             textcoords="offset points",
-            ha="right" if left else "left",
+            ha="right",
             fontsize=8.0,
             bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 0.6},
         )
