@@ -18,6 +18,7 @@ _STUDIES: Mapping[str, str] = {
     "selectors": "holdfast.experiments.selectors:Selectors",
     "parameters": "holdfast.experiments.parameters:Parameters",
     "published_2017": "holdfast.experiments.published_2017:Published2017",
+    "cloud_worth": "holdfast.experiments.cloud_worth:CloudWorth",
 }
 """Where each is; imported when it is needed."""
 

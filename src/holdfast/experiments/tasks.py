@@ -29,6 +29,8 @@ __all__ = ["Task", "TaskError", "code_digest", "run_task", "task_key"]
 _FUNCTIONS: Mapping[str, str] = {
     "trials": "holdfast.experiments.trial_batches:run_trials_of",
     "emulation_2017": "holdfast.experiments.emulation_2017:run_emulation",
+    "exchange_times": "holdfast.experiments.exchange_times:measure_exchange",
+    "sensing_times": "holdfast.experiments.sensing_times:measure_sensing",
 }
 """Where the function of each kind of task is; imported when it is needed."""
 

@@ -1,0 +1,266 @@
+"""What it costs to ask a service, beside what it computes and the path to it.
+
+A robot's questions are put to a real service: ``holdfast serve`` as a process of its own, over TCP
+on this machine, and the same service inside this process. Of the time until each part of an answer
+has come, the service itself says how much it computed; the rest is the exchange: encoding, two
+processes woken, digests, the answer decoded. A path adds its round trip to that.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import queue
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+
+from holdfast.chaos.processes import ChildProcess, Written, free_port, leash
+from holdfast.chaos.processes import Ended as ProcessEnded
+from holdfast.experiments.sensing_times import Sensed, history_of
+from holdfast.experiments.tables import Cell, Table
+from holdfast.experiments.tasks import TaskError
+from holdfast.experiments.trial_batches import problem_of
+from holdfast.planning import advance, choose_sensing_action, digest, initial_state, observe
+from holdfast.runtime.endpoints import ServiceAddress
+from holdfast.runtime.own_planner import OWN_PLANNER, OwnPlanner
+from holdfast.runtime.transport.contract import RobotTransport
+from holdfast.runtime.transport.zenoh_transport import ZenohRobotTransport
+from holdfast.session.events import Appeared, Ended, Replied, TransportEvent
+from holdfast.session.messages import (
+    DIGEST_SIZE,
+    PROTOCOL_VERSION,
+    Observed,
+    Opening,
+    Request,
+    SensingAnswer,
+    TaskAnswer,
+    decode_reply,
+    encode,
+    numbers_to,
+)
+from holdfast.settings import ParticleFilterSettings, PlanningSettings
+
+__all__ = ["COLUMNS", "Exchange", "measure_exchange"]
+
+COLUMNS = ("way", "trial", "step", "task_ms", "task_computed_ms", "sensing_ms", "computed_ms")
+"""Of the table: a row for each question. ``task_ms`` and ``sensing_ms`` are the times until the
+task actions and until the sensing action had come, ``computed_ms`` what the service computed for
+both."""
+
+_PATIENCE_S = 20.0
+_READY_S = 20.0
+_END_S = 3.0
+_SWITCH_INTERVAL_S = 0.0005
+
+
+class Exchange(msgspec.Struct, frozen=True, kw_only=True):
+    """What is asked.
+
+    Attributes
+    ----------
+    problem : str
+        Its name.
+    particles : int
+    way : {"tcp", "in_process"}
+    num_trials : int
+        All questions of so many trials.
+    seed : int
+    """
+
+    problem: str
+    particles: int = 100
+    way: str = "tcp"
+    num_trials: int = 3
+    seed: int = 0
+
+
+class _Turn(NamedTuple):
+    """A question as it crosses the wire, and the right answer."""
+
+    trial: int
+    step: int
+    sensed: bool
+    digest: bytes
+    observations: tuple[Observed, ...]
+    sensing_action: int
+
+
+def measure_exchange(**exchange: Any) -> Table:
+    """Put questions and time the answers; the function of tasks of the kind ``exchange_times``.
+
+    Parameters
+    ----------
+    **exchange
+        The fields of :class:`Exchange`.
+
+    Returns
+    -------
+    Table
+        With the columns of :data:`COLUMNS`.
+
+    Raises
+    ------
+    TaskError
+        If the service does not start, does not answer, or answers something else than what the
+        same question comes to in this process.
+    HoldfastError
+        If the problem refuses it.
+    """
+    wanted = msgspec.convert(exchange, Exchange)
+    ways: dict[str, Callable[[Exchange], contextlib.AbstractContextManager[tuple[str, Any]]]] = {
+        "tcp": _over_tcp,
+        "in_process": _in_process,
+    }
+    if wanted.way not in ways:
+        raise TaskError(f"way {wanted.way!r}: there are {', '.join(ways)}")
+    settings = PlanningSettings(
+        particle_filter=ParticleFilterSettings(num_particles=wanted.particles)
+    )
+    opening = Opening(wanted.problem, {}, {}, settings, wanted.seed)
+    turns = [turn for trial in range(wanted.num_trials) for turn in _turns(wanted, settings, trial)]
+    rows: list[tuple[Cell, ...]] = []
+    switch_interval_s = sys.getswitchinterval()
+    sys.setswitchinterval(_SWITCH_INTERVAL_S)  # as a robot's process does
+    try:
+        with ways[wanted.way](wanted) as (service, transport):
+            asking = _Asking(service, transport)
+            for number, turn in enumerate(turns, 1):
+                row = asking.ask(number, turn, opening if number == 1 else None)
+                # The first one has the problem loaded.
+                if number > 1:
+                    rows.append((wanted.way, turn.trial, turn.step, *row))
+    finally:
+        sys.setswitchinterval(switch_interval_s)
+    return Table.of_rows(COLUMNS, rows)
+
+
+def _turns(wanted: Exchange, settings: PlanningSettings, trial: int) -> Iterator[_Turn]:
+    """Yield all questions that the robot of a trial would ask, with the answers."""
+    problem = problem_of(wanted.problem, {}, {})
+    state = initial_state(problem, settings, wanted.seed, trial)
+    asked, sensing_action = state, -1
+    last: tuple[Observed, ...] = ()
+    for event in history_of(problem, settings, wanted.seed, trial):
+        if not isinstance(event, Sensed):
+            state = advance(problem, settings, state, event)
+            continue
+        sensing_action, _ = choose_sensing_action(problem, settings, state)
+        yield _Turn(
+            trial,
+            asked.step,
+            asked.sensed,
+            digest(asked)[:DIGEST_SIZE],
+            last,
+            sensing_action,
+        )
+        last = (Observed(state.step, event.sensing_action, numbers_to(event.observation)),)
+        state, _ = observe(problem, settings, state, *event)
+        asked = state
+
+
+class _Asking:
+    """Puts one question at a time, as one robot."""
+
+    def __init__(self, service: str, transport: RobotTransport) -> None:
+        self._service = service
+        self._transport = transport
+        self._events: queue.SimpleQueue[TransportEvent] = queue.SimpleQueue()
+        self._session = os.urandom(16)
+        transport.start(self._events.put)
+        while not isinstance(self._next(), Appeared):
+            pass
+
+    def ask(self, number: int, turn: _Turn, opening: Opening | None) -> tuple[Cell, ...]:
+        """Return the times of an answer."""
+        start = time.perf_counter()
+        request = Request(
+            PROTOCOL_VERSION,
+            self._session,
+            1,
+            number,
+            turn.trial,
+            turn.step,
+            turn.sensed,
+            turn.digest,
+            turn.observations,
+            opening,
+        )
+        self._transport.call(self._service, number, encode(request))
+        task_ms = task_computed_ms = None
+        answer: SensingAnswer | None = None
+        computed_ms = sensing_ms = 0.0
+        while not isinstance(event := self._next(), Ended):
+            if not isinstance(event, Replied):
+                continue
+            reply = decode_reply(event.payload)
+            elapsed_ms = 1e3 * (time.perf_counter() - start)
+            if isinstance(reply, TaskAnswer):
+                task_ms, task_computed_ms = elapsed_ms, 1e-3 * reply.computed_us
+                computed_ms += task_computed_ms
+            elif isinstance(reply, SensingAnswer):
+                sensing_ms, answer = elapsed_ms, reply
+                computed_ms += 1e-3 * reply.computed_us
+        if answer is None or answer.sensing_action != turn.sensing_action:
+            raise TaskError(
+                f"trial {turn.trial}, step {turn.step}: the service answered {answer}, which is "
+                f"not sensing action {turn.sensing_action}"
+            )
+        return task_ms, task_computed_ms, sensing_ms, computed_ms
+
+    def _next(self) -> TransportEvent:
+        try:
+            return self._events.get(timeout=_PATIENCE_S)
+        except queue.Empty:
+            raise TaskError(f"the service has not answered for {_PATIENCE_S:g} s") from None
+
+
+@contextlib.contextmanager
+def _in_process(wanted: Exchange) -> Iterator[tuple[str, RobotTransport]]:
+    planner = OwnPlanner(problem_of(wanted.problem, {}, {}))
+    try:
+        yield OWN_PLANNER, planner
+    finally:
+        planner.close()
+
+
+@contextlib.contextmanager
+def _over_tcp(wanted: Exchange) -> Iterator[tuple[str, RobotTransport]]:
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    happened: queue.SimpleQueue[Written | ProcessEnded] = queue.SimpleQueue()
+    with tempfile.TemporaryDirectory(prefix="holdfast-") as directory:
+        child = ChildProcess(
+            ["serve", "--listen", endpoint, "--problem", wanted.problem, "--until-stdin-closes"],
+            Path(directory) / "service.log",
+            dict(os.environ),
+            happened.put,
+            leash(),
+        )
+        try:
+            _await_ready(child, happened)
+            transport = ZenohRobotTransport({endpoint: ServiceAddress(endpoint)})
+            try:
+                yield endpoint, transport
+            finally:
+                transport.close()
+        finally:
+            child.terminate()
+            child.close(_END_S)
+
+
+def _await_ready(child: ChildProcess, happened: queue.SimpleQueue[Written | ProcessEnded]) -> None:
+    deadline_s = time.monotonic() + _READY_S
+    while True:
+        try:
+            event = happened.get(timeout=max(0.0, deadline_s - time.monotonic()))
+        except queue.Empty:
+            raise TaskError(f"holdfast serve was not ready within {_READY_S:g} s") from None
+        if isinstance(event, ProcessEnded):
+            raise TaskError(f"holdfast serve ended: {child.last_words()}")
+        if "is listening on" in event.line:
+            return

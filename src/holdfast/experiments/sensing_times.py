@@ -1,0 +1,415 @@
+"""How long it takes to choose a sensing action, on beliefs as they are in the middle of a task.
+
+What a decision costs depends on the belief: of a wide one few particles survive a hypothetical
+observation, of a narrow one nearly all. So trials are run once with a moderate number of particles,
+and what was sensed and done in them is told again to beliefs of any other number: all of them
+approximate the same posteriors, and only their size differs.
+
+Numbers of threads are timed in turns, so that whatever else the machine does meets all of them.
+Machines are shared: from a decision's time is taken what its thread waited for a core that another
+process had, which the system counts. What cannot be taken out is that a second thread comes late
+then; so what threads gain is read from the fastest repetitions, and how busy others were is noted.
+"""
+
+from __future__ import annotations
+
+import gc
+import os
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+import numpy as np
+
+from holdfast import contract
+from holdfast.errors import InvalidValueError
+from holdfast.experiments.cost_model import parallel_share
+from holdfast.experiments.tables import Cell, Table
+from holdfast.experiments.trial_batches import problem_of
+from holdfast.planning import (
+    PlanningState,
+    advance,
+    choose_sensing_action,
+    choose_task_action,
+    initial_state,
+    needs_sensing,
+    observe,
+)
+from holdfast.problems.problem import FloatArray, Problem
+from holdfast.runtime.environment import SimulatedEnvironment
+from holdfast.settings import (
+    ActiveSensingSettings,
+    ParticleFilterSettings,
+    PlanningSettings,
+    SelectorSettings,
+)
+
+__all__ = ["Measurement", "Sensed", "history_of", "measure_sensing", "states_in"]
+
+_TOLD_WITH = 500
+"""Particles of the trials whose story is told."""
+
+_MAX_STEPS = 200
+_MOST_REPETITIONS = 15
+_PLACES = (0.25, 0.5, 0.75)
+"""Of a trial's sensing decisions, from which beliefs are taken."""
+
+_SCHEDULING = Path("/proc/thread-self/schedstat")
+
+_STEEPER_BY = 0.2
+"""A larger number of particles may cost this much more, as an exponent, than the last ones did."""
+
+_FIRST_EXPONENT = 1.0
+
+_FEWER = 2.0 / 3.0
+"""Of the beliefs, where there is no time for all: of nine six are left, enough for an interval."""
+
+
+class Measurement(msgspec.Struct, frozen=True, kw_only=True):
+    """What is timed: decisions of one kind, over numbers of particles.
+
+    Attributes
+    ----------
+    problem : str
+        Its name.
+    num_sensing_actions : int or None
+        J: the first so many of its sensing actions; None for all.
+    estimator : str
+    num_observation_samples : int
+        M.
+    horizon : int
+        H.
+    particles : tuple of int
+        Rising. It ends earlier if a number would take too long.
+    threads : tuple of int
+        Numbers of threads, 1 among them.
+    num_trials : int
+        From each come three beliefs.
+    seed : int
+    repeat_s : float
+        Decisions of one number of particles are repeated for about this long.
+    least_repetitions : int
+        Of each decision, however long it takes.
+    limit_s : float
+        If so many take longer than this, fewer beliefs are taken; if that does not help, the number
+        of particles is left out, and all above it.
+    """
+
+    problem: str
+    num_sensing_actions: int | None = None
+    estimator: str = "nearest_neighbor"
+    num_observation_samples: int = 10
+    horizon: int = 1
+    particles: tuple[int, ...] = (100, 300, 1000)
+    threads: tuple[int, ...] = (1, 2)
+    num_trials: int = 3
+    seed: int = 0
+    repeat_s: float = 0.5
+    least_repetitions: int = 3
+    limit_s: float = 8.0
+
+
+class Sensed(NamedTuple):
+    """A sensing action and what it showed."""
+
+    sensing_action: int
+    observation: FloatArray
+
+
+def measure_sensing(**measurement: Any) -> Table:
+    """Time decisions; the function of tasks of the kind ``sensing_times``.
+
+    Parameters
+    ----------
+    **measurement
+        The fields of :class:`Measurement`.
+
+    Returns
+    -------
+    Table
+        A row for each belief and number of threads. ``median_ms`` and ``fastest_ms`` are those of
+        so many ``repetitions``, less what they waited for cores that others had. ``share`` is the
+        part that is divided among threads, of the fastest ones: whatever else the machine does
+        delays several threads sooner than one. ``mapping_ms`` is what the policy and the predicted
+        observations of all particles take, which one thread does, and ``others_cores`` how many
+        cores other processes kept busy meanwhile.
+
+    Raises
+    ------
+    InvalidValueError
+        If the measurement cannot be made so.
+    HoldfastError
+        If the problem refuses it.
+    """
+    wanted = msgspec.convert(measurement, Measurement)
+    _check(wanted)
+    problem = problem_of(wanted.problem, {}, {})
+    if wanted.num_sensing_actions is not None:
+        there_are = len(problem.sensing_actions)
+        if not 1 <= wanted.num_sensing_actions <= there_are:
+            raise InvalidValueError(
+                f"num_sensing_actions {wanted.num_sensing_actions}: {wanted.problem} has "
+                f"{there_are}"
+            )
+        problem.sensing_actions = problem.sensing_actions[: wanted.num_sensing_actions]
+    stories = [
+        history_of(problem, _settings(wanted, _TOLD_WITH, 0), wanted.seed, trial)
+        for trial in range(wanted.num_trials)
+    ]
+    table = Table({})
+    taken: list[tuple[int, float]] = []
+    for particles in wanted.particles:
+        # Of fewer beliefs, if need be.
+        expected_s = _FEWER * wanted.least_repetitions * _expected_s(taken, particles)
+        if expected_s > wanted.limit_s:
+            break
+        settings = _settings(wanted, particles, 1)
+        states = [
+            state
+            for trial, story in enumerate(stories)
+            for state in states_in(problem, settings, wanted.seed, trial, story)
+        ]
+        load = _Load()
+        states = _few_enough(wanted, problem, settings, states)
+        if not states:
+            break
+        timed, round_s = _timed(wanted, problem, settings, states)
+        table.extend(timed, particles=particles, others_cores=load.of_others())
+        taken.append((particles, round_s))
+    if not taken:
+        raise InvalidValueError(
+            f"particles {wanted.particles[0]}: a round of decisions takes longer than limit_s "
+            f"{wanted.limit_s:g}"
+        )
+    return table
+
+
+def history_of(
+    problem: Problem, settings: PlanningSettings, seed: int, trial: int
+) -> list[Sensed | FloatArray]:
+    """Run a trial; return what was sensed and what was done, in order."""
+    state = initial_state(problem, settings, seed, trial)
+    environment = SimulatedEnvironment(problem, seed, trial)
+    story: list[Sensed | FloatArray] = []
+    while not environment.is_done() and state.step < _MAX_STEPS:
+        if needs_sensing(settings, state):
+            sensing_action, _ = choose_sensing_action(problem, settings, state)
+            observation = environment.perform_sensing(sensing_action)
+            story.append(Sensed(sensing_action, observation))
+            state, _ = observe(problem, settings, state, sensing_action, observation)
+        action, _ = choose_task_action(problem, settings, state)
+        environment.perform(action)
+        story.append(action)
+        state = advance(problem, settings, state, action)
+    return story
+
+
+def states_in(
+    problem: Problem,
+    settings: PlanningSettings,
+    seed: int,
+    trial: int,
+    story: Sequence[Sensed | FloatArray],
+) -> list[PlanningState]:
+    """Tell a trial's story to another belief; return its states before some sensing decisions.
+
+    They are a quarter, half and three quarters through: neither the first belief, which nothing
+    has narrowed yet, nor the last.
+    """
+    decisions = sum(isinstance(event, Sensed) for event in story)
+    wanted = [int(place * decisions) for place in _PLACES]
+    found = []
+    number = 0
+    state = initial_state(problem, settings, seed, trial)
+    for event in story:
+        if not isinstance(event, Sensed):
+            state = advance(problem, settings, state, event)
+            continue
+        found += [state] * wanted.count(number)
+        if len(found) == len(wanted):
+            break
+        state, _ = observe(problem, settings, state, *event)
+        number += 1
+    return found
+
+
+_COLUMNS = (
+    "belief",
+    "step",
+    "threads",
+    "median_ms",
+    "fastest_ms",
+    "repetitions",
+    "share",
+    "mapping_ms",
+)
+
+
+def _check(wanted: Measurement) -> None:
+    if 1 not in wanted.threads or len(set(wanted.threads)) < 2 or min(wanted.threads) < 1:
+        raise InvalidValueError(f"threads {wanted.threads}: 1 and at least one more are needed")
+    if not wanted.particles or list(wanted.particles) != sorted(set(wanted.particles)):
+        raise InvalidValueError(f"particles {wanted.particles}: must be at least one, and rise")
+    if wanted.num_trials < 1:
+        raise InvalidValueError(f"num_trials {wanted.num_trials}: must be at least 1")
+    if wanted.least_repetitions < 1:
+        raise InvalidValueError(f"least_repetitions {wanted.least_repetitions}: must be at least 1")
+
+
+def _settings(wanted: Measurement, particles: int, threads: int) -> PlanningSettings:
+    return PlanningSettings(
+        particle_filter=ParticleFilterSettings(num_particles=particles),
+        active_sensing=ActiveSensingSettings(
+            num_observation_samples=wanted.num_observation_samples,
+            horizon=wanted.horizon,
+            num_cores=threads,
+        ),
+        selector=msgspec.convert(
+            {"method": "action_entropy", "estimator": wanted.estimator}, SelectorSettings
+        ),
+    )
+
+
+def _on(settings: PlanningSettings, threads: int) -> PlanningSettings:
+    return msgspec.structs.replace(
+        settings,
+        active_sensing=msgspec.structs.replace(settings.active_sensing, num_cores=threads),
+    )
+
+
+def _expected_s(taken: Sequence[tuple[int, float]], particles: int) -> float:
+    """Return about how long a round will take, from those before; 0 if there were none."""
+    if not taken:
+        return 0.0
+    last, seconds = taken[-1]
+    exponent = _FIRST_EXPONENT
+    if len(taken) > 1:
+        before, earlier = taken[-2]
+        exponent = max(1.0, np.log(seconds / earlier) / np.log(last / before)) + _STEEPER_BY
+    return float(seconds * (particles / last) ** exponent)
+
+
+def _few_enough(
+    wanted: Measurement,
+    problem: Problem,
+    settings: PlanningSettings,
+    states: list[PlanningState],
+) -> list[PlanningState]:
+    """Return as many of the beliefs as there is time for: all, fewer, or none."""
+    one_s = sum(
+        _decision_s(problem, _on(settings, threads), states[len(states) // 2])
+        for threads in wanted.threads
+    )
+    fewer = states[: round(_FEWER * len(states))]
+    for some in (states, fewer):
+        if wanted.least_repetitions * one_s * len(some) <= wanted.limit_s:
+            return some
+    return []
+
+
+def _timed(
+    wanted: Measurement,
+    problem: Problem,
+    settings: PlanningSettings,
+    states: Sequence[PlanningState],
+) -> tuple[Table, float]:
+    """Return the rows of some beliefs, and what a round of all of them takes in seconds."""
+    of_threads = {threads: _on(settings, threads) for threads in wanted.threads}
+    taken: list[dict[int, list[float]]] = [{p: [] for p in wanted.threads} for _ in states]
+    round_s = 0.0
+    repetitions = 1
+    repetition = 0
+    collects = gc.isenabled()
+    gc.disable()
+    try:
+        while repetition < repetitions:
+            order = wanted.threads if repetition % 2 == 0 else wanted.threads[::-1]
+            for state, times in zip(states, taken, strict=True):
+                for threads in order:
+                    times[threads].append(_decision_s(problem, of_threads[threads], state))
+            repetition += 1
+            if repetition == 1:
+                round_s = sum(seconds for times in taken for (seconds,) in times.values())
+                affordable = min(int(wanted.repeat_s / round_s), _MOST_REPETITIONS)
+                repetitions = max(affordable, wanted.least_repetitions)
+    finally:
+        if collects:
+            gc.enable()
+    rows: list[tuple[Cell, ...]] = []
+    for belief, (state, times) in enumerate(zip(states, taken, strict=True)):
+        share = parallel_share({threads: min(seconds) for threads, seconds in times.items()})
+        mapping_ms = 1e3 * _mapping_s(problem, state)
+        rows += [
+            (
+                belief,
+                state.step,
+                threads,
+                1e3 * float(np.median(seconds)),
+                1e3 * min(seconds),
+                repetitions,
+                share,
+                mapping_ms,
+            )
+            for threads, seconds in times.items()
+        ]
+    return Table.of_rows(_COLUMNS, rows), round_s
+
+
+def _decision_s(problem: Problem, settings: PlanningSettings, state: PlanningState) -> float:
+    """Return what a decision takes, less what its thread waited for a core that others had."""
+    delayed_ns = _delayed_ns()
+    start = time.perf_counter()
+    choose_sensing_action(problem, settings, state)
+    elapsed_s = time.perf_counter() - start
+    return max(elapsed_s - 1e-9 * (_delayed_ns() - delayed_ns), 1e-9)
+
+
+def _delayed_ns() -> int:
+    """Return how long this thread could have run but had no core (Linux; 0 elsewhere)."""
+    try:
+        return int(_SCHEDULING.read_bytes().split()[1])
+    except (OSError, IndexError, ValueError):
+        return 0
+
+
+def _mapping_s(problem: Problem, state: PlanningState) -> float:
+    """Return what mapping all particles to actions and to expected observations takes."""
+    states = state.belief.states
+    seconds = []
+    for _ in range(3):
+        start = time.perf_counter()
+        contract.policy(problem, states, state.stage)
+        for sensing_action in range(len(problem.sensing_actions)):
+            mean = contract.observation_mean(problem, states, sensing_action)
+            contract.observation_variance(problem, states, sensing_action, mean)
+        seconds.append(time.perf_counter() - start)
+    return float(np.median(seconds))
+
+
+class _Load:
+    """How busy other processes keep this machine, from now on (Linux)."""
+
+    _STATISTICS = Path("/proc/stat")
+
+    def __init__(self) -> None:
+        self._began = self._now()
+
+    def of_others(self) -> float | None:
+        """Return how many cores they kept busy on average; None if it cannot be known."""
+        began, now = self._began, self._now()
+        if began is None or now is None or now[0] <= began[0]:
+            return None
+        return max(0.0, (now[1] - began[1]) / (now[0] - began[0]))
+
+    def _now(self) -> tuple[float, float] | None:
+        try:
+            fields = self._STATISTICS.read_text().split("\n", 1)[0].split()[1:]
+        except OSError:
+            return None
+        user, nice, system, _, _, interrupts, soft_interrupts, stolen = map(int, fields[:8])
+        ticks = user + nice + system + interrupts + soft_interrupts + stolen
+        own = os.times()
+        busy = ticks / os.sysconf("SC_CLK_TCK") - own.user - own.system
+        return time.monotonic(), busy

@@ -1,0 +1,139 @@
+"""The study of when the cloud is worth it: what it times, and the whole of it at a tiny scale."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from holdfast.errors import InvalidValueError
+from holdfast.experiments import cloud_worth
+from holdfast.experiments.cloud_worth import CloudWorth, Kind, scaling_of
+from holdfast.experiments.exchange_times import measure_exchange
+from holdfast.experiments.executors import LocalExecutor
+from holdfast.experiments.running import Workload, compute, write_report
+from holdfast.experiments.sensing_times import Sensed, history_of, measure_sensing, states_in
+from holdfast.experiments.study import Scale
+from holdfast.experiments.tables import Table
+from holdfast.experiments.tasks import TaskError
+from holdfast.experiments.trial_batches import problem_of
+from holdfast.settings import ParticleFilterSettings, PlanningSettings
+
+BRIEF: dict[str, Any] = {
+    "problem": "peg_in_hole_2d",
+    "particles": (50, 100),
+    "num_trials": 1,
+    "seed": 3,
+    "repeat_s": 0.001,
+    "least_repetitions": 1,
+}
+
+
+def planning(num_particles: int) -> PlanningSettings:
+    return PlanningSettings(particle_filter=ParticleFilterSettings(num_particles=num_particles))
+
+
+def test_a_story_is_told_to_beliefs_of_any_size() -> None:
+    problem = problem_of("peg_in_hole_2d", {}, {})
+    story = history_of(problem, planning(200), 3, 0)
+    decisions = sum(isinstance(event, Sensed) for event in story)
+    found = {n: states_in(problem, planning(n), 3, 0, story) for n in (2000, 5000)}
+    places = [int(part * decisions) * 9 for part in (0.25, 0.5, 0.75)]
+    for states in found.values():
+        assert [state.step for state in states] == places
+    # They approximate the same posteriors: the means differ by less than the states are spread.
+    for few, many in zip(*found.values(), strict=True):
+        means = [state.belief.weights @ state.belief.states for state in (few, many)]
+        spread = np.sqrt(many.belief.weights @ (many.belief.states - means[1]) ** 2)
+        assert (np.abs(means[0] - means[1]) < spread).all()
+        assert (spread[:2] < 1.0).all()
+
+
+def test_what_is_measured() -> None:
+    table = measure_sensing(**BRIEF, threads=(1, 2))
+    assert table.columns["particles"] == [50] * 6 + [100] * 6
+    assert table.columns["threads"] == [1, 2] * 6
+    assert table.columns["belief"] == [0, 0, 1, 1, 2, 2] * 2
+    assert (table.numbers("median_ms") >= table.numbers("fastest_ms")).all()
+    assert (table.numbers("fastest_ms") > 0.0).all()
+    assert ((table.numbers("share") >= 0.0) & (table.numbers("share") <= 1.0)).all()
+
+
+def test_what_takes_too_long_is_left_out() -> None:
+    particles = (50, 100, 1_000_000)
+    table = measure_sensing(**{**BRIEF, "particles": particles, "limit_s": 1.0})
+    assert set(table.columns["particles"]) == {50, 100}
+    with pytest.raises(InvalidValueError, match=r"particles 50: a round .* limit_s 1e-07"):
+        measure_sensing(**BRIEF, limit_s=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"threads": (1,)}, "threads .*: 1 and at least one more"),
+        ({"particles": (100, 50)}, "particles .*: must be at least one, and rise"),
+        ({"num_sensing_actions": 4}, "num_sensing_actions 4: peg_in_hole_2d has 3"),
+        ({"num_trials": 0}, "num_trials 0"),
+        ({"least_repetitions": 0}, "least_repetitions 0"),
+    ],
+)
+def test_what_cannot_be_measured_is_refused(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(InvalidValueError, match=message):
+        measure_sensing(**{**BRIEF, **changes})
+
+
+def test_scaling_is_of_medians() -> None:
+    rows = [
+        (n, belief, threads, ms * n / threads, 0.5 + 0.1 * belief)
+        for n in (10, 20)
+        for belief, ms in enumerate((1.0, 3.0, 2.0))
+        for threads in (1, 2)
+    ]
+    table = Table.of_rows(("particles", "belief", "threads", "median_ms", "share"), rows)
+    found = scaling_of(Kind("peg_in_hole_2d", 3, samples=5), table)
+    assert found.particles == (10, 20)
+    assert [time.value for time in found.times] == [20.0, 40.0]
+    assert [share.value for share in found.shares] == [0.6, 0.6]
+    assert found.pieces == 15
+
+
+def test_asking_in_process() -> None:
+    table = measure_exchange(problem="peg_in_hole_2d", way="in_process", num_trials=1, seed=3)
+    assert table.num_rows >= 3
+    assert (table.numbers("sensing_ms") > table.numbers("computed_ms")).all()
+    with pytest.raises(TaskError, match="'pigeon': there are tcp, in_process"):
+        measure_exchange(problem="peg_in_hole_2d", way="pigeon")
+
+
+@pytest.mark.slow
+def test_asking_a_service_over_tcp() -> None:
+    table = measure_exchange(problem="peg_in_hole_2d", way="tcp", num_trials=1, seed=3)
+    alone = measure_exchange(problem="peg_in_hole_2d", way="in_process", num_trials=1, seed=3)
+    assert table.columns["step"] == alone.columns["step"]
+    assert (table.numbers("sensing_ms") > table.numbers("computed_ms")).all()
+
+
+@pytest.mark.slow
+def test_the_whole_study(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cloud_worth, "_QUICK_PARTICLES", (100, 200))
+    scale = Scale(quick=True, seed=3)
+    study = CloudWorth()
+    workload = Workload([study], scale, tmp_path)
+    assert all(task.exclusive for task in workload.tasks)
+    compute(workload, LocalExecutor(1), lambda _: None)
+    report = study.report(scale, workload.results)
+    lines = report.summary["break_even"]
+    assert set(lines.columns["path_ms"]) == {20.0, 87.0}
+    assert set(lines.columns["service_cores"]) == {8, 36, 32, 144}
+    # A decision on 200 particles takes a millisecond or so: no path of 87 ms is worth it.
+    for row in lines.rows():
+        if row["path_ms"] == 87.0 and row["horizon"] == 1:
+            assert row["particles"] is None
+            assert str(row["words"]).startswith("not ")
+    times = report.summary["sensing_times"]
+    assert set(times.columns["particles"]) == {100, 200}
+    assert any("nowhere up to 200" in finding for finding in report.findings)
+    names = write_report(study, scale, report, tmp_path / "report")
+    for figure in ("sensing_time", "break_even_map", "break_even", "waiting"):
+        assert f"{figure}.png" in names
+        assert (tmp_path / "report" / f"{figure}.svg").stat().st_size > 5000
