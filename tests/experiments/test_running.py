@@ -72,7 +72,9 @@ class TestTasks:
         before = task_key(task)
         found = tasks._digest_behind
         monkeypatch.setattr(
-            tasks, "_digest_behind", lambda at: "another" if at == place else found(at)
+            tasks,
+            "_digest_behind",
+            lambda at, whole=False: "another" if at == place else found(at, whole),
         )
         assert task_key(task) != before
 

@@ -34,6 +34,9 @@ _FUNCTIONS: Mapping[str, str] = {
 }
 """Where the function of each kind of task is; imported when it is needed."""
 
+_OF_PROCESSES = frozenset({"exchange_times", "cloud_trials"})
+"""Kinds that start processes of the whole program, whose sources no import leads to."""
+
 _PLACE = re.compile(r"\w+(\.\w+)+:\w+")
 
 _KEY_SIZE = 16
@@ -80,21 +83,25 @@ def code_digest(kind: str) -> str:
 
     The version of holdfast alone would not tell what a developer has changed since: what is hashed
     are the sources of the function's module and of all modules that it imports, directly or not,
-    and the compiled kernel.
+    and the compiled kernel; if the function starts processes, all that these may be made of.
 
     Raises
     ------
     TaskError
         If there is no such kind.
     """
-    return _digest_behind(_place_of(kind))
+    return _digest_behind(_place_of(kind), kind in _OF_PROCESSES)
 
 
 @functools.cache
-def _digest_behind(place: str) -> str:
+def _digest_behind(place: str, whole_program: bool = False) -> str:
     package = Path(holdfast.__file__).parent
     digest = hashlib.blake2b(holdfast.__version__.encode(), digest_size=_KEY_SIZE)
-    for path in sorted(_sources_behind(place.partition(":")[0], package)):
+    sources = _sources_behind(place.partition(":")[0], package)
+    if whole_program:
+        studies = package / "experiments"
+        sources |= {path for path in package.rglob("*.py") if studies not in path.parents}
+    for path in sorted(sources):
         inside = path.relative_to(package)
         digest.update(str(inside).encode() + b"\0" + path.read_bytes() + b"\0")
     if _kernel.__file__:
