@@ -20,6 +20,11 @@ from holdfast.chaos.processes import free_port
 _START_S = 90.0
 _END_S = 20.0
 _OBJECT_STORE_BYTES = 80_000_000  # about the least that Ray takes
+_ENVIRONMENT = {
+    "RAY_USAGE_STATS_ENABLED": "0",
+    # On a machine that has much else to do, more than the usual 30 s can pass.
+    "RAY_CLIENT_SERVER_CHECK_CHANNEL_TIMEOUT_S": "120",
+}
 
 
 class _Node:
@@ -36,7 +41,7 @@ class _Node:
                 stdin=subprocess.DEVNULL,
                 stdout=output,
                 stderr=subprocess.STDOUT,
-                env={**os.environ, "RAY_USAGE_STATS_ENABLED": "0"},
+                env={**os.environ, **_ENVIRONMENT},
                 start_new_session=True,
             )
 
@@ -114,7 +119,7 @@ class RayCluster:
             # One after the other: together they would take each other's ports.
             self._start(head)
             for _ in range(num_workers):
-                self._start(["--address", self.native_address, "--num-cpus", "1"])
+                self.add_worker()
             _wait_for_port(client_port)
         except BaseException:
             self.close()
@@ -129,10 +134,13 @@ class RayCluster:
         """Return the processes that compute a task."""
         return [process for node in self._nodes for process in node.busy()]
 
-    def kill_worker(self) -> None:
-        """Kill a whole node, one that computes something if there is one."""
-        workers = self._nodes[1:]
-        node = next((node for node in workers if node.busy()), workers[-1])
+    def add_worker(self) -> None:
+        """Start another node."""
+        self._start(["--address", self.native_address, "--num-cpus", "1"])
+
+    def kill_busy_worker(self) -> None:
+        """Kill a whole node that computes something."""
+        node = next(node for node in self._nodes if node.busy())
         node.kill()
         self._nodes.remove(node)
 

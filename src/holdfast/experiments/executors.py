@@ -49,7 +49,9 @@ class Executor(Protocol):
         TaskError
             If a task cannot be computed, or was lost with its process several times.
         HoldfastError
-            If the function of a task refuses its parameters.
+            If the function of a task refuses its parameters, or nothing can be computed there.
+        TaskCrashError
+            If anything else went wrong in another process.
         KeyboardInterrupt
             After everything that it started has been ended.
         """

@@ -98,8 +98,6 @@ class RayExecutor:
         if not tasks:
             return
         ray = _imported()
-        if self._address is not None:
-            _check_that_somebody_listens(self._address)
         try:
             self._join(ray)
             _compute(ray, tasks, on_result)
@@ -112,6 +110,8 @@ class RayExecutor:
 
     def _join(self, ray: ModuleType) -> None:
         try:
+            if self._address is not None:
+                _check_that_somebody_listens(self._address)
             with _own_handler_of_sigterm():
                 ray.init(
                     address=self._address or "auto",
@@ -136,15 +136,9 @@ def _imported() -> ModuleType:
 
 
 def _check_that_somebody_listens(address: str) -> None:
-    """Say at once what Ray would find out after many attempts."""
-    found = _ADDRESS.fullmatch(address)
-    assert found is not None
-    try:
-        place = (found["host"].strip("[]"), int(found["port"]))
-        socket.create_connection(place, _CONNECT_S).close()
-    except OSError as error:
-        reason = error.strerror or _line_of(error)
-        raise HoldfastError(f"no Ray cluster can be joined at {address}: {reason}") from error
+    """Find out at once what Ray would find out after many attempts."""
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    socket.create_connection((host.strip("[]"), int(port)), _CONNECT_S).close()
 
 
 @contextlib.contextmanager
@@ -198,11 +192,20 @@ def _answer(ray: ModuleType, reference: object, task: Task) -> bytes:
             f"a node of the cluster cannot compute {task.kind} ({_line_of(error, last=True)}): "
             "install the same holdfast on every node"
         ) from error
+    except _lost_with_its_process(ray) as error:
+        raise TaskError(
+            f"{MOST_ATTEMPTS} processes of the cluster were lost with {task.kind} "
+            f"{task.parameters}; often a node is out of memory. Ray says: {_line_of(error)}"
+        ) from error
     except ray.exceptions.RayError as error:
         raise TaskError(
-            f"the cluster has lost {task.kind} {task.parameters}, up to {MOST_ATTEMPTS} times with "
-            f"its process: {_line_of(error)}"
+            f"the cluster cannot compute {task.kind} {task.parameters}: {_line_of(error)}"
         ) from error
+
+
+def _lost_with_its_process(ray: ModuleType) -> tuple[type[Exception], ...]:
+    names = ("WorkerCrashedError", "NodeDiedError", "LocalRayletDiedError", "OutOfMemoryError")
+    return tuple(getattr(ray.exceptions, name) for name in names)
 
 
 def _line_of(error: BaseException, *, last: bool = False) -> str:
