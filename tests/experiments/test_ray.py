@@ -84,7 +84,7 @@ def on_cluster(address: str | None) -> Outcome:
     return collected(RayExecutor(address))
 
 
-def refusal(address: str, wanted: list[Task], code: str | None) -> str:
+def refusal(address: str | None, wanted: list[Task], code: str | None) -> str:
     """Return why tasks cannot be computed; if ``code`` is given, as if that were ours."""
     if code is not None:
         setattr(ray_executor, "code_digest", lambda _: code)  # noqa: B010
@@ -193,12 +193,22 @@ def test_interrupted_and_gone_on_with(cluster: RayCluster, tmp_path: Path) -> No
 
 
 @with_ray
-def test_no_cluster(monkeypatch: pytest.MonkeyPatch) -> None:
-    port = free_port()
-    with alone(refusal, f"ray://127.0.0.1:{port}", tasks(), None) as told:
-        assert told.result(PATIENCE_S) == (
-            f"HoldfastError: no Ray cluster can be joined at 127.0.0.1:{port}: Connection refused"
-        )
+@pytest.mark.parametrize("how", ["client", "environment", "file"])
+def test_no_cluster(how: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    address = f"127.0.0.1:{free_port()}"
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    if how == "environment":
+        monkeypatch.setenv("RAY_ADDRESS", address)
+    elif how == "file":
+        monkeypatch.setenv("RAY_TMPDIR", str(tmp_path))
+        (tmp_path / "ray").mkdir()
+        (tmp_path / "ray" / "ray_current_cluster").write_text(address)
+    with alone(refusal, f"ray://{address}" if how == "client" else None, tasks(), None) as told:
+        text = told.result(PATIENCE_S)
+    assert text.startswith("HoldfastError: no Ray cluster can be joined at ")
+    assert address in text
+    assert "Connection refused" in text
+    assert ("ray start --head" in text) == (how != "client")
 
 
 def test_without_ray(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,11 +14,14 @@ import contextlib
 import importlib
 import logging
 import math
+import os
 import re
 import signal
 import socket
+import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from time import monotonic
 from types import ModuleType
 from typing import Any, Self, cast
@@ -109,9 +112,9 @@ class RayExecutor:
             ray.shutdown()
 
     def _join(self, ray: ModuleType) -> None:
+        address = self._address or _address_of_this_machine()
         try:
-            if self._address is not None:
-                _check_that_somebody_listens(self._address)
+            _check_that_somebody_listens(address)
             with _own_handler_of_sigterm():
                 ray.init(
                     address=self._address or "auto",
@@ -119,9 +122,12 @@ class RayExecutor:
                     log_to_driver=False,
                 )
         except Exception as error:
+            where = self._place
+            if self._address is None and address:
+                where += f" ({address}, which RAY_ADDRESS or the last ray start names)"
             advice = "" if self._address else "; this starts one: ray start --head"
             raise HoldfastError(
-                f"no Ray cluster can be joined at {self._place}: {_line_of(error)}{advice}"
+                f"no Ray cluster can be joined at {where}: {_line_of(error)}{advice}"
             ) from error
 
 
@@ -135,22 +141,38 @@ def _imported() -> ModuleType:
         ) from error
 
 
+def _address_of_this_machine() -> str:
+    """Return where Ray will look; empty if it will look for running processes."""
+    temporary = os.environ.get("RAY_TMPDIR") or os.environ.get("TMPDIR") or "/tmp"
+    address = os.environ.get("RAY_ADDRESS", "")
+    if not address:
+        # Whoever starts a cluster leaves its address here; it may have been killed since.
+        with contextlib.suppress(OSError):
+            address = (Path(temporary) / "ray" / "ray_current_cluster").read_text().strip()
+    return address
+
+
 def _check_that_somebody_listens(address: str) -> None:
-    """Find out at once what Ray would find out after many attempts."""
+    """Find out at once what Ray would find out after minutes."""
     host, _, port = address.removeprefix("ray://").rpartition(":")
-    socket.create_connection((host.strip("[]"), int(port)), _CONNECT_S).close()
+    if host and port.isdecimal():
+        socket.create_connection((host.strip("[]"), int(port)), _CONNECT_S).close()
 
 
 @contextlib.contextmanager
 def _own_handler_of_sigterm() -> Iterator[None]:
-    """Keep the handler, which Ray replaces without asking."""
-    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})
+    """Keep the handler, which Ray replaces without asking by one that exits."""
     handler = signal.getsignal(signal.SIGTERM)
+    ended = False
     try:
         yield
+    except SystemExit:
+        ended = True
     finally:
-        signal.signal(signal.SIGTERM, handler)
-        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        if threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGTERM, handler)
+    if ended:
+        signal.raise_signal(signal.SIGTERM)
 
 
 def _compute(
