@@ -16,6 +16,7 @@ from time import monotonic, sleep
 from typing import Self
 
 from holdfast.chaos.processes import free_port
+from holdfast.runtime.leash import leash
 
 _START_S = 90.0
 _END_S = 20.0
@@ -32,7 +33,8 @@ class _Node:
 
     def __init__(self, arguments: Sequence[str], log: Path) -> None:
         self._log = log
-        command = [sys.executable, "-m", "ray.scripts.scripts", "start", "--block"]
+        # Its processes end with it, and it ends with this one.
+        command = [*leash(), sys.executable, "-m", "ray.scripts.scripts", "start", "--block"]
         command += ["--min-worker-port", "0", "--max-worker-port", "0"]
         command += ["--object-store-memory", str(_OBJECT_STORE_BYTES), *arguments]
         with log.open("wb") as output:
