@@ -20,11 +20,12 @@ from holdfast.runtime.leash import leash
 
 _START_S = 90.0
 _END_S = 20.0
+_JOIN_ATTEMPTS = 4
 _OBJECT_STORE_BYTES = 80_000_000  # about the least that Ray takes
 _ENVIRONMENT = {
     "RAY_USAGE_STATS_ENABLED": "0",
-    # On a machine that has much else to do, more than the usual 30 s can pass.
-    "RAY_CLIENT_SERVER_CHECK_CHANNEL_TIMEOUT_S": "120",
+    # Its client server forks between gRPC's threads.
+    "GRPC_ENABLE_FORK_SUPPORT": "0",
 }
 
 
@@ -123,6 +124,7 @@ class RayCluster:
             for _ in range(num_workers):
                 self.add_worker()
             _wait_for_port(client_port)
+            self._wait_for_client_server()
         except BaseException:
             self.close()
             raise
@@ -131,6 +133,15 @@ class RayCluster:
         node = _Node(arguments, self._directory / f"{len(self._nodes)}.log")
         self._nodes.append(node)
         node.wait_for_start()
+
+    def _wait_for_client_server(self) -> None:
+        """Join once: the first server that it starts for a client may fail, and is not repeated."""
+        program = f"import ray; ray.init({self.address!r}, log_to_driver=False); ray.shutdown()"
+        for _ in range(_JOIN_ATTEMPTS):
+            joined = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+            if joined.returncode == 0:
+                return
+        raise RuntimeError(f"the client server starts nothing: {joined.stderr}")
 
     def busy(self) -> list[int]:
         """Return the processes that compute a task."""
