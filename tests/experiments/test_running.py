@@ -1,8 +1,10 @@
 """Tasks, where they are computed, and what is kept of them."""
 
+import contextlib
 import multiprocessing
 import os
 import signal
+import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -33,6 +35,17 @@ def outcome(computed: Sequence[Table]) -> list[list[object]]:
         [cells for name, cells in table.columns.items() if name != "mean_sensing_ms"]
         for table in computed
     ]
+
+
+def worker_processes() -> list[int]:
+    """Return the processes that this one has started to compute."""
+    found = []
+    for folder in Path("/proc").glob("[0-9]*"):
+        with contextlib.suppress(OSError):
+            fields = (folder / "stat").read_text().rpartition(")")[2].split()
+            if int(fields[1]) == os.getpid() and b"spawn_main" in (folder / "cmdline").read_bytes():
+                found.append(int(folder.name))
+    return found
 
 
 class TestTasks:
@@ -158,19 +171,25 @@ class TestLocalExecutor:
         LocalExecutor(1).run(wanted, lambda _, table: alone.append(table))
         assert outcome([found[task_key(task)] for task in wanted]) == outcome(alone)
 
-    def test_a_task_that_kills_is_given_up(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        always = Task(kind="trials", parameters={"a": 1})
+    def test_a_task_that_kills_is_given_up(self) -> None:
+        wanted = list(trial_tasks(series(num_trials=2), 1))
+        ended = threading.Event()
 
-        def lose_all(
-            self: LocalExecutor, pending: list[tuple[int, Task]], on_result: object
-        ) -> list[tuple[int, Task]]:
-            lost = list(pending)
-            pending.clear()
-            return lost
+        def kill_all() -> None:
+            while not ended.wait(0.02):
+                for child in worker_processes():
+                    with contextlib.suppress(ProcessLookupError):
+                        os.kill(child, signal.SIGKILL)
 
-        monkeypatch.setattr(LocalExecutor, "_run_pool", lose_all)
-        with pytest.raises(TaskError, match="killed 3 times while it computed trials"):
-            LocalExecutor(2).run([always, always], lambda *_: None)
+        killer = threading.Thread(target=kill_all)
+        killer.start()
+        try:
+            with pytest.raises(TaskError, match=r"3 processes were lost with trials .* SIGKILL"):
+                LocalExecutor(2).run(wanted, lambda *_: None)
+        finally:
+            ended.set()
+            killer.join()
+        assert worker_processes() == []
 
     def test_an_error_ends_it_and_its_processes(self) -> None:
         wrong = Task(kind="trials", parameters={"first_trial": 0, "problem": "nothing"})

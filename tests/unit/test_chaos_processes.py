@@ -58,7 +58,8 @@ def test_a_command_becomes_another_one(tmp_path: Path) -> None:
 PARENT = """
 import os, sys, time
 from queue import SimpleQueue
-from holdfast.chaos.processes import ChildProcess, leash
+from holdfast.chaos.processes import ChildProcess
+from holdfast.runtime.leash import leash
 from pathlib import Path
 prefix = leash() if sys.argv[2] == "leashed" else ()
 listen = ["--listen", sys.argv[3], "--log", "json"]

@@ -32,7 +32,6 @@ __all__ = [
     "Ended",
     "Written",
     "free_port",
-    "leash",
     "local_services_of",
     "marked_processes",
     "time_of",
@@ -40,14 +39,6 @@ __all__ = [
 
 _SHOWN_CHARACTERS = 300
 _LAST_LINES = 20
-
-# It asks the system to end it with whoever started it (PR_SET_PDEATHSIG), and becomes the command.
-_LEASHED = """
-import ctypes, os, signal, sys
-ctypes.CDLL(None).prctl(1, int(signal.SIGKILL), 0, 0, 0)
-if os.getppid() == int(sys.argv[1]):
-    os.execv(sys.argv[2], sys.argv[2:])
-"""
 
 _LOWEST_PORT = 20_000
 _OUTGOING_PORTS = Path("/proc/sys/net/ipv4/ip_local_port_range")
@@ -194,17 +185,6 @@ class ChildProcess:
                 self.last_lines.append(text)
                 self._deliver(Written(self, text))
         self._deliver(Ended(self, self.process.wait()))
-
-
-def leash() -> tuple[str, ...]:
-    """Return a command that becomes another one, which ends at once when this process does (Linux).
-
-    However this one ends. Strictly, what counts is the end of the thread that starts the command. A
-    service that ends when its standard input does needs none.
-    """
-    if sys.platform != "linux":
-        return ()
-    return (sys.executable, "-I", "-S", "-c", _LEASHED, str(os.getpid()))
 
 
 class Decision(NamedTuple):

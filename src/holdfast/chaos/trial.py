@@ -34,7 +34,6 @@ from holdfast.chaos.processes import (
     Ended,
     Written,
     free_port,
-    leash,
     local_services_of,
     marked_processes,
     time_of,
@@ -48,6 +47,7 @@ from holdfast.errors import HoldfastError
 from holdfast.files import write_atomically
 from holdfast.recording.compare import compare_runs
 from holdfast.recording.run_directory import TIMINGS_NAME
+from holdfast.runtime.leash import leash
 from holdfast.runtime.links import RECOVERY_SERVICE
 
 __all__ = ["CancelledTrialError", "Pace", "TrialOutcome", "Verdict", "run_chaos_trial"]

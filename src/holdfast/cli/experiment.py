@@ -53,6 +53,17 @@ def experiment(
             help="Processes; 0: one for each core. Changes time only.",
         ),
     ] = 0,
+    place: Annotated[
+        str,
+        typer.Option(
+            "--executor",
+            metavar="local|ray[://HOST:PORT]",
+            help="Where: in processes of this machine, or on a Ray cluster (extra cluster): the "
+            "one that runs on this machine, or the one whose client server listens at HOST:PORT. "
+            "Every node needs the same holdfast. What measures times stays here. "
+            "Changes time only.",
+        ),
+    ] = "local",
     list_names: Annotated[
         bool, typer.Option("--list", help="List the experiments and end.")
     ] = False,
@@ -79,18 +90,28 @@ def experiment(
     words += ["--quick"] if quick else []
     words += ["--seed", str(seed)]
     words += ["--jobs", str(jobs)] if jobs else []
+    words += ["--executor", place] if place != "local" else []
     again = shlex.join([*words, "--out", str(out)])
     with ended_by_signals():
-        _run(studies, Scale(quick=quick, seed=seed), out, _executor_of(jobs), again)
+        _run(studies, Scale(quick=quick, seed=seed), out, _executor_of(place, jobs), again)
 
 
-def _executor_of(jobs: int) -> Executor:
+def _executor_of(place: str, jobs: int) -> Executor:
     from holdfast.experiments.executors import LocalExecutor
+    from holdfast.experiments.ray_executor import RayExecutor
     from holdfast.runtime.trials import available_cores
 
     if jobs < 0:
         raise InvalidValueError(f"--jobs {jobs}: must be 0 (one for each core) or more")
-    return LocalExecutor(jobs or available_cores())
+    if place == "local":
+        return LocalExecutor(jobs or available_cores())
+    executor = RayExecutor.of(place)
+    if jobs:
+        raise InvalidValueError(
+            f"--jobs {jobs}: has no effect with --executor {place}, where the cluster's cores say "
+            "how many tasks there are at a time; leave it out"
+        )
+    return executor
 
 
 def _run(

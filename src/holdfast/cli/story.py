@@ -33,7 +33,6 @@ from holdfast.chaos.processes import (
     Ended,
     Written,
     free_port,
-    leash,
     time_of,
 )
 from holdfast.chaos.twin import keep_undisturbed, run_undisturbed
@@ -44,6 +43,7 @@ from holdfast.errors import HoldfastError
 from holdfast.files import write_atomically
 from holdfast.recording.compare import Comparison, compare_runs
 from holdfast.recording.run_directory import TIMINGS_NAME
+from holdfast.runtime.leash import leash
 from holdfast.runtime.links import RECOVERY_SERVICE
 from holdfast.session.status import Status
 

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from holdfast.chaos.processes import ChildProcess, Written, free_port, leash
+from holdfast.chaos.processes import ChildProcess, Written, free_port
 from holdfast.chaos.processes import Ended as ProcessEnded
 from holdfast.experiments.sensing_times import Sensed, history_of
 from holdfast.experiments.tables import Cell, Table
@@ -28,6 +28,7 @@ from holdfast.experiments.tasks import TaskError
 from holdfast.experiments.trial_batches import problem_of
 from holdfast.planning import advance, choose_sensing_action, digest, initial_state, observe
 from holdfast.runtime.endpoints import ServiceAddress
+from holdfast.runtime.leash import leash
 from holdfast.runtime.own_planner import OWN_PLANNER, OwnPlanner
 from holdfast.runtime.transport.contract import RobotTransport
 from holdfast.runtime.transport.zenoh_transport import ZenohRobotTransport

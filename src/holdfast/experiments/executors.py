@@ -7,33 +7,23 @@ again elsewhere, and only a task that has cost its process its life several time
 
 from __future__ import annotations
 
-import ctypes
-import multiprocessing
-import os
-import signal
-import sys
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
+from multiprocessing.connection import Connection, wait
 from typing import Protocol
 
 from holdfast.errors import InvalidValueError
 from holdfast.experiments.tables import Table
+from holdfast.experiments.task_messages import compute_encoded, encode_task, table_of
 from holdfast.experiments.tasks import Task, TaskError, run_task
 from holdfast.runtime.command_line import MAX_JOBS
-from holdfast.runtime.trials import inherited_by_children
+from holdfast.runtime.workers import WorkerProcess, end_workers
 
-__all__ = ["Executor", "LocalExecutor"]
+__all__ = ["MOST_ATTEMPTS", "Executor", "LocalExecutor"]
 
 
-_MOST_ATTEMPTS = 3
+MOST_ATTEMPTS = 3
 """A task that is lost with its process this often is given up."""
-
-_AHEAD = 2
-"""Tasks that wait for each process, so that none is idle between two."""
-
-_PR_SET_PDEATHSIG = 1
 
 
 class Executor(Protocol):
@@ -59,7 +49,9 @@ class Executor(Protocol):
         TaskError
             If a task cannot be computed, or was lost with its process several times.
         HoldfastError
-            If the function of a task refuses its parameters.
+            If the function of a task refuses its parameters, or nothing can be computed there.
+        TaskCrashError
+            If anything else went wrong in another process.
         KeyboardInterrupt
             After everything that it started has been ended.
         """
@@ -91,63 +83,66 @@ class LocalExecutor:
             for task in tasks:
                 on_result(task, run_task(task))
             return
-        attempts: Counter[int] = Counter()
         pending = deque(enumerate(tasks))
-        while pending:
-            # A pool that lost a process is of no use any more; what it had is not lost.
-            lost = self._run_pool(pending, on_result)
-            attempts.update(number for number, _ in lost)
-            for number, task in lost:
-                if attempts[number] >= _MOST_ATTEMPTS:
-                    raise TaskError(
-                        f"a process was killed {attempts[number]} times while it computed "
-                        f"{task.kind} {task.parameters}; often the machine is out of memory: "
-                        "fewer processes (--jobs) need less"
-                    )
-            pending.extendleft(reversed(lost))
-
-    def _run_pool(
-        self, pending: deque[tuple[int, Task]], on_result: Callable[[Task, Table], None]
-    ) -> list[tuple[int, Task]]:
-        """Compute as long as no process is killed; return the tasks that were lost with one."""
-        running: dict[Future[Table], tuple[int, Task]] = {}
-        processes = min(self._processes, len(pending))
-        others = set(multiprocessing.active_children())
-        pool = ProcessPoolExecutor(
-            processes,
-            multiprocessing.get_context("spawn"),
-            initializer=_end_with_parent,
-            initargs=(os.getpid(),),
-        )
+        losses: Counter[int] = Counter()
+        workers: list[_Worker] = []
         try:
-            broken = False
-            while not broken and (pending or running):
-                while pending and len(running) < _AHEAD * processes:
-                    # The first ones start the processes. One thread each: there are enough.
-                    with inherited_by_children(1):
-                        running[pool.submit(run_task, pending[0][1])] = pending[0]
-                    pending.popleft()
-                done, _ = wait(running, return_when=FIRST_COMPLETED)
-                for future in done:
-                    if isinstance(future.exception(), BrokenProcessPool):
-                        broken = True
+            while pending or workers:
+                while pending and len(workers) < self._processes:
+                    workers.append(_Worker())
+                    workers[-1].start()
+                    workers[-1].give(*pending.popleft())
+                for worker in _ready(workers):
+                    number, task = worker.number, worker.task
+                    answer = worker.receive()
+                    if answer is None:
+                        losses[number] += 1
+                        if losses[number] == MOST_ATTEMPTS:
+                            raise _given_up(worker)
+                        pending.appendleft((number, task))
+                    if answer is None or not pending:
+                        end_workers([worker])
+                        workers.remove(worker)
                     else:
-                        _, task = running.pop(future)
-                        on_result(task, future.result())
-        except BrokenProcessPool:
-            pass  # between two tasks
+                        # Before its answer is dealt with, so that it is never idle.
+                        worker.give(*pending.popleft())
+                    if answer is not None:
+                        on_result(task, table_of(answer))
         finally:
-            pool.shutdown(wait=False, cancel_futures=True)
-            # Nobody waits for what they still compute.
-            for process in set(multiprocessing.active_children()) - others:
-                process.kill()
-                process.join()
-        return sorted(running.values(), key=lambda entry: entry[0])
+            end_workers(workers)
 
 
-def _end_with_parent(parent: int) -> None:
-    """Let this process end when its parent is killed: nobody is left who wants what it computes."""
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-        if os.getppid() != parent:
-            os._exit(1)
+class _Worker(WorkerProcess):
+    """A worker, and the task that it has."""
+
+    number: int
+    task: Task
+
+    def __init__(self) -> None:
+        # One thread each: there are enough of them.
+        super().__init__("holdfast-experiment", _work, (), 1)
+
+    def give(self, number: int, task: Task) -> None:
+        self.number, self.task = number, task
+        self.send(encode_task(task))
+
+
+def _work(connection: Connection) -> None:
+    """Compute tasks until the parent closes the pipe."""
+    while True:
+        connection.send_bytes(compute_encoded(connection.recv_bytes()))
+
+
+def _ready(workers: Sequence[_Worker]) -> list[_Worker]:
+    """Wait until there are workers that have answered or ended, and return them."""
+    ready = wait([worker.connection for worker in workers])
+    return [worker for worker in workers if worker.connection in ready]
+
+
+def _given_up(worker: _Worker) -> TaskError:
+    how, killed = worker.how_it_ended()
+    advice = "; often the machine is out of memory: fewer processes (--jobs) need less"
+    return TaskError(
+        f"{MOST_ATTEMPTS} processes were lost with {worker.task.kind} {worker.task.parameters}, "
+        f"and the last one {how}{advice if killed else ''}"
+    )

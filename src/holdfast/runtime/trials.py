@@ -4,25 +4,18 @@ A trial depends on nothing but the configuration and its number, so the order an
 trials are run change no result. The first trials are run in this process; worker processes are
 started only once the time that a trial takes shows that they would pay for their own start.
 
-The pool is made of pipes, not of ``concurrent.futures``, for two reasons: when a worker is killed
-we must say which trial it was running, and on Ctrl-C the workers must end at once. Each worker has
-a pipe of its own, is sent trial numbers, and answers with one message for each. It holds only a few
+Each worker is sent trial numbers, and answers with one message for each. It holds only a few
 numbers at a time, so ten million trials are never queued anywhere.
 """
 
 from __future__ import annotations
 
-import contextlib
-import multiprocessing
 import os
-import signal
 import traceback
 from collections import deque
 from collections.abc import Callable, Collection, Iterator
 from itertools import chain
-from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
-from multiprocessing.context import SpawnProcess
 from time import perf_counter
 from typing import Any
 
@@ -41,6 +34,7 @@ from holdfast.runtime.trial import (
     TrialObserver,
     run_trial,
 )
+from holdfast.runtime.workers import WorkerProcess, end_workers
 from holdfast.settings import PlanningSettings
 from holdfast.user_code import account_of_user_error
 
@@ -49,7 +43,6 @@ __all__ = [
     "TrialError",
     "WorkerDiedError",
     "available_cores",
-    "inherited_by_children",
     "run_trials",
 ]
 
@@ -60,8 +53,6 @@ _LOOKAHEAD_S = 0.1
 """A worker is sent trials for about this long, so that it never waits for the next number."""
 
 _MAX_LOOKAHEAD = 16
-
-_ENDING_SIGNALS = frozenset({signal.SIGINT, signal.SIGTERM, signal.SIGHUP})
 
 
 class WorkerDiedError(HoldfastError):
@@ -110,19 +101,17 @@ class _Watch(NullObserver):
             raise _TrialIsLongError
 
 
-class _Worker:
-    """A worker process as its parent sees it."""
+class _Worker(WorkerProcess):
+    """A worker, and the trials that it has been sent."""
 
-    def __init__(self, process: SpawnProcess, connection: Connection) -> None:
-        self.process = process
-        self.connection = connection
+    def __init__(self, number: int, plain: dict[str, Any], threads: int) -> None:
+        super().__init__(f"holdfast-worker-{number}", _work, (plain, threads), threads)
         self.outstanding: deque[int] = deque()
 
-    def send(self, trial: int) -> None:
+    def send_trial(self, trial: int) -> None:
+        # If it is dead, its pipe tells when it is read, where we know which trial it had.
         self.outstanding.append(trial)
-        # A dead worker is found out when its pipe is read, where we know which trial it had.
-        with contextlib.suppress(BrokenPipeError, ConnectionResetError):
-            self.connection.send_bytes(trial.to_bytes(8, "little"))
+        self.send(trial.to_bytes(8, "little"))
 
 
 def available_cores() -> int:
@@ -241,10 +230,10 @@ def _run_in_workers(
             for connection in wait(list(by_connection)):
                 assert isinstance(connection, Connection)
                 worker = by_connection[connection]
-                try:
-                    message = _MESSAGE_DECODER.decode(connection.recv_bytes())
-                except (EOFError, ConnectionResetError):
-                    raise _worker_died(worker) from None
+                answer = worker.receive()
+                if answer is None:
+                    raise _worker_died(worker)
+                message = _MESSAGE_DECODER.decode(answer)
                 if isinstance(message, _Failed):
                     if message.expected:
                         raise TrialError(message.text)
@@ -257,13 +246,7 @@ def _run_in_workers(
                 mean_s = elapsed_s / count
             _feed(workers, pending, mean_s)
     finally:
-        # There is nothing to wait for: each result is sent whole or not wanted any more. They
-        # block the gentler signals.
-        for worker in workers:
-            worker.process.kill()
-        for worker in workers:
-            worker.process.join()
-            worker.connection.close()
+        end_workers(workers)
 
 
 def _feed(workers: list[_Worker], pending: Iterator[int], mean_s: float) -> None:
@@ -275,96 +258,54 @@ def _feed(workers: list[_Worker], pending: Iterator[int], mean_s: float) -> None
                 trial = next(pending, None)
                 if trial is None:
                     return
-                worker.send(trial)
+                worker.send_trial(trial)
 
 
 def _start_workers(workers: list[_Worker], configuration: Configuration, count: int) -> None:
     """Append ``count`` started workers, one by one, so that the caller can always end them."""
-    context = multiprocessing.get_context("spawn")
     threads = max(1, available_cores() // count)
     limit = configuration.planning.active_sensing.num_cores
     if limit:
         threads = min(threads, limit)
     plain = configuration.plain()
-    # Its start would undo the mask set below, so it must have been started before.
-    resource_tracker.ensure_running()
-    with inherited_by_children(threads):
-        for number in range(count):
-            ours, theirs = context.Pipe()
-            process = context.Process(
-                target=_work,
-                args=(theirs, plain, threads),
-                name=f"holdfast-worker-{number}",
-                daemon=True,
-            )
-            process.start()
-            # Only the child must hold this end, else its death would not close the pipe.
-            theirs.close()
-            workers.append(_Worker(process, ours))
-
-
-@contextlib.contextmanager
-def inherited_by_children(threads: int) -> Iterator[None]:
-    """Let children start with few threads and with the signals blocked that end a run.
-
-    Ctrl-C, a terminal that is closed and a batch system's SIGTERM reach every process of the group;
-    the parent alone answers them. Blocking the signals here, not in the child, covers the child's
-    first moments too, and delays them for us only.
-    """
-    variables = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-    saved = {name: os.environ.get(name) for name in variables}
-    os.environ.update(dict.fromkeys(variables, str(threads)))
-    mask = signal.pthread_sigmask(signal.SIG_BLOCK, _ENDING_SIGNALS)
-    try:
-        yield
-    finally:
-        for name, value in saved.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
-        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+    for number in range(count):
+        workers.append(_Worker(number, plain, threads))
+        workers[-1].start()
 
 
 def _work(connection: Connection, plain: dict[str, Any], threads: int) -> None:
     """Run trials by number until the parent closes the pipe or one of them fails."""
     encode = msgspec.msgpack.Encoder().encode
     configuration: Configuration | None = None
-    # The parent may end at any time; then nobody is left to tell.
-    with contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError):
-        while True:
-            trial = int.from_bytes(connection.recv_bytes(), "little")
-            started = perf_counter()
-            message: _Finished | _Failed
-            try:
-                if configuration is None:
-                    configuration = Configuration.from_plain(plain)
-                    planning = msgspec.structs.replace(
-                        configuration.planning,
-                        active_sensing=msgspec.structs.replace(
-                            configuration.planning.active_sensing, num_cores=threads
-                        ),
-                    )
-                result = _run_one(configuration, planning, trial, NULL_OBSERVER)
-                message = _Finished(result, perf_counter() - started)
-            except HoldfastError as error:
-                message = _Failed(str(error), True)
-            except Exception:  # noqa: BLE001 - whatever it is, the parent raises it again
-                message = _Failed(traceback.format_exc(), False)
-            connection.send_bytes(encode(message))
-            if isinstance(message, _Failed):
-                return
+    while True:
+        trial = int.from_bytes(connection.recv_bytes(), "little")
+        started = perf_counter()
+        message: _Finished | _Failed
+        try:
+            if configuration is None:
+                configuration = Configuration.from_plain(plain)
+                planning = msgspec.structs.replace(
+                    configuration.planning,
+                    active_sensing=msgspec.structs.replace(
+                        configuration.planning.active_sensing, num_cores=threads
+                    ),
+                )
+            result = _run_one(configuration, planning, trial, NULL_OBSERVER)
+            message = _Finished(result, perf_counter() - started)
+        except HoldfastError as error:
+            message = _Failed(str(error), True)
+        except Exception:  # noqa: BLE001 - whatever it is, the parent raises it again
+            message = _Failed(traceback.format_exc(), False)
+        connection.send_bytes(encode(message))
+        if isinstance(message, _Failed):
+            return
 
 
 def _worker_died(worker: _Worker) -> WorkerDiedError:
-    worker.process.join(timeout=10.0)
-    code = worker.process.exitcode
-    if code is not None and code < 0:
-        how = f"was killed by {signal.Signals(-code).name}"
-        advice = " (often the machine is out of memory: use fewer jobs or fewer particles)"
-    else:
-        how = f"ended with exit code {code}"
-        advice = ""
+    how, killed = worker.how_it_ended()
+    advice = " (often the machine is out of memory: use fewer jobs or fewer particles)"
     trial = worker.outstanding[0] if worker.outstanding else None
     what = "before it had a trial to run" if trial is None else f"while it ran trial {trial}"
-    return WorkerDiedError(f"a worker process {how} {what}{advice}; finished trials are kept")
+    return WorkerDiedError(
+        f"a worker process {how} {what}{advice if killed else ''}; finished trials are kept"
+    )

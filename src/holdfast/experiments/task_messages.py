@@ -1,0 +1,121 @@
+"""Tasks and what they come to, as bytes: for processes that compute them elsewhere.
+
+Whoever computes answers always, also when it cannot, so that an error is the same wherever it
+happens. What travels is plain data and never code: who computes must have holdfast, and can be
+asked to have the same.
+"""
+
+from __future__ import annotations
+
+import socket
+import traceback
+
+import msgspec
+
+from holdfast import __version__
+from holdfast.errors import HoldfastError
+from holdfast.experiments.tables import Table
+from holdfast.experiments.tasks import Task, TaskError, code_digest, run_task
+
+__all__ = ["TaskCrashError", "compute_encoded", "encode_task", "table_of"]
+
+
+class TaskCrashError(RuntimeError):
+    """An unexpected error in another process; the message holds its traceback."""
+
+
+class _Request(msgspec.Struct):
+    task: Task
+    code: str | None
+
+
+class _Computed(msgspec.Struct, tag="computed"):
+    table: Table
+
+
+class _Refused(msgspec.Struct, tag="refused"):
+    reason: str
+
+
+class _Crashed(msgspec.Struct, tag="crashed"):
+    account: str
+
+
+_REQUEST_DECODER = msgspec.msgpack.Decoder(_Request)
+_Answer = _Computed | _Refused | _Crashed
+
+_ANSWER_DECODER = msgspec.msgpack.Decoder(_Answer)
+
+
+def encode_task(task: Task, code: str | None = None) -> bytes:
+    """Return a task as bytes.
+
+    Parameters
+    ----------
+    task : Task
+    code : str, optional
+        The digest of the code that may compute it, as :func:`~.tasks.code_digest` has it. Without
+        it, whoever gets the task is known to have the same code.
+    """
+    return msgspec.msgpack.encode(_Request(task, code))
+
+
+def compute_encoded(request: bytes) -> bytes:
+    """Compute a task in this process; return what it came to, or why it came to nothing.
+
+    Parameters
+    ----------
+    request : bytes
+        From :func:`encode_task`.
+
+    Returns
+    -------
+    bytes
+        For :func:`table_of`.
+    """
+    answer: _Answer
+    try:
+        asked = _REQUEST_DECODER.decode(request)
+        _check_code(asked)
+        answer = _Computed(run_task(asked.task))
+    except HoldfastError as error:
+        answer = _Refused(str(error))
+    except Exception:  # noqa: BLE001 - whatever it is, whoever asked raises it again
+        answer = _Crashed(traceback.format_exc())
+    return msgspec.msgpack.encode(answer)
+
+
+def _check_code(asked: _Request) -> None:
+    if asked.code is None:
+        return
+    kind = asked.task.kind
+    own = code_digest(kind)
+    if own != asked.code:
+        raise TaskError(
+            f"{socket.gethostname()} has other code for tasks of the kind {kind!r} (digest {own}, "
+            f"of holdfast {__version__}) than the machine that asks (digest {asked.code}), so the "
+            "results would not belong together: install the same holdfast on every node"
+        )
+
+
+def table_of(answer: bytes) -> Table:
+    """Return what a task came to.
+
+    Parameters
+    ----------
+    answer : bytes
+        From :func:`compute_encoded`.
+
+    Raises
+    ------
+    TaskError
+        If its function refused the parameters, or the code is another.
+    TaskCrashError
+        If anything else went wrong there.
+    """
+    found: _Answer = _ANSWER_DECODER.decode(answer)
+    if isinstance(found, _Refused):
+        raise TaskError(found.reason)
+    if isinstance(found, _Crashed):
+        raise TaskCrashError(f"in another process:\n{found.account}")
+    return found.table

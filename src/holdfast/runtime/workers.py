@@ -1,0 +1,139 @@
+"""Worker processes, each with a pipe of its own.
+
+Not those of ``concurrent.futures``, for two reasons: when a worker is killed we must say what it
+was computing, and on Ctrl-C the workers must end at once. Here no thread stands between the
+processes: a worker that is not wanted any more is killed, and nothing is left to be waited for.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import os
+import signal
+from collections.abc import Callable, Iterable, Iterator
+from multiprocessing import resource_tracker
+from multiprocessing.connection import Connection
+from typing import Any
+
+from holdfast.runtime.leash import end_with_parent
+
+__all__ = ["WorkerProcess", "end_workers"]
+
+_ENDING_SIGNALS = frozenset({signal.SIGINT, signal.SIGTERM, signal.SIGHUP})
+
+_END_S = 10.0
+
+
+class WorkerProcess:
+    """A worker process as its parent sees it.
+
+    It ends with this process, however this one ends (Linux), and hears no signal that a terminal or
+    a batch system sends to all: this process alone answers them. Put it where you will find it,
+    then start it: so no signal can come between its start and your knowing of it.
+
+    Parameters
+    ----------
+    name : str
+    work : callable
+        What it runs: a function of a module, called with its end of the pipe and ``arguments``.
+    arguments : tuple
+        What can be pickled.
+    threads : int
+        How many it may compute with.
+
+    Attributes
+    ----------
+    connection : multiprocessing.connection.Connection
+        This end of the pipe, for :func:`multiprocessing.connection.wait`.
+    """
+
+    def __init__(
+        self, name: str, work: Callable[..., None], arguments: tuple[Any, ...], threads: int
+    ) -> None:
+        context = multiprocessing.get_context("spawn")
+        self._threads = threads
+        self.connection, self._theirs = context.Pipe()
+        self._process = context.Process(
+            target=_begin, args=(os.getpid(), work, self._theirs, arguments), name=name, daemon=True
+        )
+
+    def start(self) -> None:
+        """Start it, once."""
+        # Its start would undo the mask set below, so it must have been started before.
+        resource_tracker.ensure_running()
+        with _inherited_by_children(self._threads):
+            self._process.start()
+        # Only the child must hold this end, else its death would not close the pipe.
+        self._theirs.close()
+
+    def send(self, message: bytes) -> None:
+        """Send a message; a dead worker is found out when its pipe is read."""
+        with contextlib.suppress(BrokenPipeError, ConnectionResetError):
+            self.connection.send_bytes(message)
+
+    def receive(self) -> bytes | None:
+        """Return its next message once it is there; None if it has ended."""
+        try:
+            return self.connection.recv_bytes()
+        except (EOFError, ConnectionResetError):
+            return None
+
+    def how_it_ended(self) -> tuple[str, bool]:
+        """Return how it ended, as a part of a sentence, and whether a signal did it."""
+        self._process.join(_END_S)
+        code = self._process.exitcode
+        if code is not None and code < 0:
+            return f"was killed by {signal.Signals(-code).name}", True
+        return f"ended with exit code {code}", False
+
+
+def end_workers(workers: Iterable[WorkerProcess]) -> None:
+    """End workers now, whatever they do, and wait until they are gone; may be repeated."""
+    workers = list(workers)
+    # There is nothing to wait for: each result is sent whole or not wanted any more. They block the
+    # gentler signals.
+    started = [worker for worker in workers if worker._process.pid is not None]
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, _ENDING_SIGNALS)
+    try:
+        for worker in started:
+            worker._process.kill()
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+    for worker in started:
+        worker._process.join()
+    for worker in workers:
+        worker.connection.close()
+        worker._theirs.close()
+
+
+@contextlib.contextmanager
+def _inherited_by_children(threads: int) -> Iterator[None]:
+    """Let children start with few threads and with the signals blocked that end a run.
+
+    Ctrl-C, a terminal that is closed and a batch system's SIGTERM reach every process of the group;
+    the parent alone answers them. Blocking the signals here, not in the child, covers the child's
+    first moments too, and delays them for us only.
+    """
+    variables = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+    saved = {name: os.environ.get(name) for name in variables}
+    os.environ.update(dict.fromkeys(variables, str(threads)))
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, _ENDING_SIGNALS)
+    try:
+        yield
+    finally:
+        for name, value in saved.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+
+
+def _begin(
+    parent: int, work: Callable[..., None], connection: Connection, arguments: tuple[Any, ...]
+) -> None:
+    end_with_parent(parent)
+    # The parent may end at any time; then nobody is left to tell.
+    with contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError):
+        work(connection, *arguments)
