@@ -223,6 +223,10 @@ class Decision(NamedTuple):
         Of the robot.
     waited_ms : float
         How long the robot stood still for it.
+    round_trip_ms : float
+        From the question until the answer.
+    computed_ms : float
+        The service's own part of that.
     """
 
     at: float
@@ -232,6 +236,8 @@ class Decision(NamedTuple):
     service: str
     status: str
     waited_ms: float
+    round_trip_ms: float = 0.0
+    computed_ms: float = 0.0
 
 
 class DecisionTable:
@@ -279,6 +285,8 @@ class DecisionTable:
                     row["service"],
                     row["status"],
                     float(row["waited_ms"]),
+                    float(row["round_trip_ms"]),
+                    float(row["computed_ms"]),
                 )
             )
 
