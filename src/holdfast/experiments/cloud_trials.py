@@ -20,7 +20,7 @@ import shutil
 import signal
 import tempfile
 import time
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any, TypeAlias
@@ -40,7 +40,12 @@ from holdfast.chaos.processes import (
 from holdfast.chaos.twin import keep_undisturbed, run_undisturbed
 from holdfast.chaos.wide_area import Path as NetworkPath
 from holdfast.chaos.wide_area import Transport, lay_path
-from holdfast.chaos.world import WitnessedWorld, difference_of_performances
+from holdfast.chaos.world import (
+    Performance,
+    WitnessedWorld,
+    difference_of_performances,
+    performances,
+)
 from holdfast.configuration import load
 from holdfast.experiments.tables import Cell, Table
 from holdfast.experiments.tasks import TaskError
@@ -70,7 +75,16 @@ COLUMNS = (
     "identical",
     "emulated_by",
 )
-"""Of the table of such trials: a row for each decision and one for each kill; see ``docs``."""
+"""Of the table of such trials: a row for each decision, each kill and, if wanted, each task action.
+
+``at_s`` counts from the run's first decision. A decision has what the robot's ``timings.csv`` has.
+A kill has, in milliseconds: ``found_ms``, from the kill until the robot says that it has lost the
+cloud; ``first_local_ms``, from then until it carries out a decision of the local service;
+``launch_ms``, from the start of that service's process until the robot sees it (nothing, if it ran
+before); ``away_ms``, from the kill until the ready line of the cloud that was started again;
+``failback_ms``, from that line until the robot carries out a decision of it; and ``waited_ms``, the
+longest time that it stood still for a decision until then.
+"""
 
 _PROBLEM = "peg_in_hole_2d"
 _MAX_TRIALS = 100
@@ -113,6 +127,8 @@ class CloudTrials(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
         Threads of a decision, at most.
     packets : bool
         Whether the path may be one for packets; see :mod:`holdfast.chaos.wide_area`.
+    actions : bool
+        Whether there is a row for each task action that was performed, too.
     """
 
     particles: int
@@ -131,6 +147,7 @@ class CloudTrials(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     num_nearest_neighbors: int = 5
     num_cores: int = 8
     packets: bool = True
+    actions: bool = False
 
 
 def run_cloud_trials(**trials: Any) -> Table:
@@ -176,8 +193,9 @@ def rows_of_run(
     *,
     identical: bool,
     emulated_by: str,
+    performed: Iterable[Performance] = (),
 ) -> Table:
-    """Return the rows of a run: its decisions, then its kill, if there was one.
+    """Return the rows of a run: its decisions, its kill, if there was one, and its actions.
 
     Parameters
     ----------
@@ -188,7 +206,10 @@ def rows_of_run(
     struck_at : float or None
         When the cloud was killed, in seconds since the epoch.
     identical : bool
+        Whether all decisions and actions are those of the undisturbed run.
     emulated_by : str
+    performed : iterable of Performance
+        Task actions to be listed.
     """
     began = table.rows[0].at
     ends: dict[str, Cell] = {"identical": identical, "emulated_by": emulated_by}
@@ -226,6 +247,17 @@ def rows_of_run(
                 **ends,
             }
         )
+    rows += [
+        {
+            "run": run,
+            "what": "action",
+            "at_s": round(each.at - began, 6),
+            "trial": each.trial,
+            "step": each.step,
+            **ends,
+        }
+        for each in performed
+    ]
     return Table({name: [row.get(name) for row in rows] for name in COLUMNS})
 
 
@@ -317,6 +349,11 @@ class _Processes:
                 strikes[0].struck_at if strikes else None,
                 identical=comparison.identical and difference is None,
                 emulated_by=self._path.emulated_by,
+                performed=(
+                    list(performances(directory / f"{_DISTURBED}.txt"))
+                    if self._wanted.actions
+                    else ()
+                ),
             )
         self._children.remove(robot)
         shutil.rmtree(directory)
@@ -396,7 +433,7 @@ class _Processes:
                 "seed": wanted.seed + run,
             },
             "offload": offload,
-            # A witness of what is done to it; and nobody draws a figure of what he cannot look into.
+            # A witness of what is done to it. (And of a world of its own nobody draws a figure.)
             "environment": {
                 "object": f"{WitnessedWorld.__module__}:{WitnessedWorld.__qualname__}",
                 "arguments": {"path": str(path.parent / f"{_DISTURBED}.txt")},

@@ -15,6 +15,7 @@ __all__ = ["ALL", "studies_of", "study_names"]
 ALL = "all"
 
 _STUDIES: Mapping[str, str] = {
+    "thesis_chapter_6": "holdfast.experiments.thesis_chapter_6:ThesisChapter6",
     "published_2017": "holdfast.experiments.published_2017:Published2017",
 }
 """Where each is; imported when it is needed."""
