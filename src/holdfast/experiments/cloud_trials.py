@@ -88,6 +88,9 @@ longest time that it stood still for a decision until then.
 
 _PROBLEM = "peg_in_hole_2d"
 _MAX_TRIALS = 100
+_USUAL_START_S = 1.0
+_MAX_SLOWNESS = 3.0
+
 _EARLIEST_KILL, _LATEST_KILL = 0.15, 0.3
 """As fractions of the run's steps; the rest is for the local service and for the return."""
 
@@ -118,7 +121,8 @@ class CloudTrials(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     min_steps : int
         Trials are added to a run until it has as many task actions.
     rate_hz : float
-        Task actions a second.
+        Task actions a second. On a machine where services start slowly it is less, down to a third,
+        or the run would be over before all has happened.
     local_decisions : int
         Sensing actions that the local service chooses before the cloud is started again.
     max_steps, sensing_interval, num_observation_samples, num_nearest_neighbors : int
@@ -275,6 +279,7 @@ class _Processes:
         self._children: list[ChildProcess] = []
         self._cloud: ChildProcess | None = None
         self._cloud_ready_at: float | None = None
+        self._slowness = 1.0
         self._robot: ChildProcess | None = None
         self._robot_done = False
         self._told: list[Told] = []
@@ -323,7 +328,9 @@ class _Processes:
             chance = random.Random(f"kill {self._wanted.seed} {run}")
             strikes: list[Strike] = []
             kill_step = int(chance.uniform(_EARLIEST_KILL, _LATEST_KILL) * sum(steps_of_trials))
-            script = self._script(table, strikes, kill_step, steps_of_trials)
+            turn_s = (self._wanted.sensing_interval + 1) / self._wanted.rate_hz
+            pause_s = chance.uniform(0.0, turn_s)
+            script = self._script(table, strikes, kill_step, pause_s, steps_of_trials)
             waiting = next(script)
 
             def done() -> bool:
@@ -364,6 +371,7 @@ class _Processes:
         table: DecisionTable,
         strikes: list[Strike],
         kill_step: int,
+        pause_s: float,
         steps_of_trials: list[int],
     ) -> _Script:
         """Say what is waited for next, and do what is due then."""
@@ -375,6 +383,9 @@ class _Processes:
             return sum(steps_of_trials[: last.trial]) + last.step
 
         yield lambda: steps_done() >= kill_step and table.rows[-1].service == self._path.connect
+        # The table grows when the robot gets an answer; a service dies at any moment between two.
+        due = time.monotonic() + pause_s
+        yield lambda: time.monotonic() >= due
         assert self._cloud is not None
         killed_at = self._cloud.kill()
         strike = Strike(kind="cloud_killed", target=self._path.connect, struck_at=killed_at)
@@ -468,7 +479,7 @@ class _Processes:
         self._robot = self._start(
             [
                 *("run", str(directory / "trials.yaml"), "--log", "json"),
-                *("--rate", f"{self._wanted.rate_hz:g}"),
+                *("--rate", f"{self._wanted.rate_hz / self._slowness:g}"),
                 *("--out", str(directory / _DISTURBED)),
             ],
             "robot.log",
@@ -533,6 +544,8 @@ class _Processes:
             self._told.append(Told(at, name, event))
         elif child is self._cloud and name == "ready":
             self._cloud_ready_at = at
+            started_s = at - child.spawned_at
+            self._slowness = min(_MAX_SLOWNESS, max(1.0, started_s / _USUAL_START_S))
 
     def _named(self) -> str:
         wanted = self._wanted

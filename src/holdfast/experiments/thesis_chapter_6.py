@@ -65,7 +65,8 @@ _UNITS_OF_RUN = 40
 """A run takes as long as about so many trials in process."""
 
 _RATE_HZ = 100.0
-_STEPS, _QUICK_STEPS = 400, 320
+_STEPS, _QUICK_STEPS = 400, 280
+_LOCAL_DECISIONS, _QUICK_LOCAL_DECISIONS = 8, 4
 
 _PICTURE_RATE_HZ = 25.0
 """At this rate the robot has up to 0.36 s of actions in hand when the cloud dies."""
@@ -179,6 +180,7 @@ def _cloud_tasks(condition: _Condition, scale: Scale) -> list[Task]:
             seed=scale.seed,
             min_steps=_QUICK_STEPS if scale.quick else _STEPS,
             rate_hz=_RATE_HZ,
+            local_decisions=_QUICK_LOCAL_DECISIONS if scale.quick else _LOCAL_DECISIONS,
             max_steps=_MAX_STEPS,
         )
         tasks.append(_task_of(trials))
@@ -191,7 +193,7 @@ def _picture_task(scale: Scale) -> Task:
             particles=300,
             round_trip_ms=THESIS_CLOUD_ROUND_TRIP_MS,
             seed=scale.seed,
-            min_steps=250,
+            min_steps=220,
             rate_hz=_PICTURE_RATE_HZ,
             local_decisions=5,
             max_steps=_MAX_STEPS,
@@ -359,6 +361,7 @@ def _success_of_thesis(particles: int) -> float:
 def _findings(rows: MeasuredRows, successes: Table, picture: Table) -> list[str]:
     findings = [_finding_of_twins(rows, picture), *_findings_of_successes(successes)]
     findings += _findings_of_times(rows)
+    findings.append(_finding_of_waiting(rows))
     findings += _findings_of_faults(rows)
     findings += _findings_of_loss(rows)
     findings.append(_finding_of_emulation(rows))
@@ -401,9 +404,14 @@ def _findings_of_successes(successes: Table) -> list[str]:
 
 
 def _told(interval: Interval) -> str:
+    value = f"{_number(interval.value)} ms"
     if math.isfinite(interval.low):
-        return f"{interval.value:.3g} ms [{interval.low:.3g}, {interval.high:.3g}]"
-    return f"{interval.value:.3g} ms [too few for an interval]"
+        return f"{value} [{_number(interval.low)}, {_number(interval.high)}]"
+    return f"{value} [too few for an interval]"
+
+
+def _number(value: float) -> str:
+    return f"{value:.0f}" if abs(value) >= 100.0 else f"{value:.3g}"
 
 
 def _findings_of_times(rows: MeasuredRows) -> list[str]:
@@ -441,6 +449,27 @@ def _findings_of_times(rows: MeasuredRows) -> list[str]:
         f"{THESIS_CLOUD_ROUND_TRIP_MS:g} ms to its cloud)"
     )
     return findings
+
+
+def _finding_of_waiting(rows: MeasuredRows) -> str:
+    waits = []
+    for service, path in (("cloud", FAR), ("local", None)):
+        chosen = rows.where(service=service)
+        if path is not None:
+            chosen &= rows.where(path=path)
+        sensing, task = (chosen & rows.where(what=what) for what in ("sensing", "task"))
+        if sensing.any() and task.any():
+            waited = rows.number("waited_ms")
+            name = service if path is None else f"{service} over {path.label}"
+            waits.append(
+                f"{name} {_told(rows.median(waited, sensing))} for what to sense, "
+                f"{_told(rows.median(waited, task))} for what to do until then, "
+                f"n = {int(sensing.sum())} turns"
+            )
+    return (
+        "how long the robot stood still, because sensing actions are computed while it moves "
+        f"(median, 95 % interval by the bootstrap over runs): {'; '.join(waits)}"
+    )
 
 
 def _findings_of_faults(rows: MeasuredRows) -> list[str]:

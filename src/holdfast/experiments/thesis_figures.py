@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullFormatter
 
 from holdfast.experiments.medians import median_interval
@@ -39,10 +40,11 @@ __all__ = ["cloud_dies", "failbacks", "launches", "round_trips", "sensing_times"
 _THESIS = "#B5342B"
 _MOST_DOTS = 250
 _STATUS_LOOKS = {
-    "standard": ("#DCE9F7", "standard: the cloud decides"),
-    "local_recovery": ("#FBE7C3", "local recovery: the robot's own service decides"),
-    "keep_alive": ("#E3F1E6", "keep alive: the cloud decides, the local service stays ready"),
+    "standard": ("#DCE9F7", "standard:\nthe cloud decides"),
+    "local_recovery": ("#FBE7C3", "local recovery:\nthe robot's own service decides"),
+    "keep_alive": ("#E3F1E6", "keep alive: the cloud again,\nthe local service stays ready"),
 }
+_KILLED, _STARTED = "#B5342B", "#1E8A4C"
 
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
@@ -78,6 +80,12 @@ def _milliseconds(panel: Axes, label: str) -> None:
     panel.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     panel.yaxis.set_minor_formatter(NullFormatter())
     panel.grid(axis="y")
+
+
+def _widen(panel: Axes) -> None:
+    """Let a logarithmic axis reach a little further than what is drawn."""
+    low, high = panel.get_ylim()
+    panel.set_ylim(low / 1.3, high * 1.3)
 
 
 def _over_particles(panel: Axes) -> None:
@@ -397,7 +405,13 @@ def launches(rows: MeasuredRows) -> Figure:
             ("launch_ms", _Series("service started until seen", COLORS[0], "s", False, -8.0)),
             (
                 "first_local_ms",
-                _Series("cloud found dead until it decides", COLORS[1], "o", True, 8.0),
+                _Series(
+                    "from the cloud found dead until the local service decides",
+                    COLORS[1],
+                    "o",
+                    True,
+                    8.0,
+                ),
             ),
         ):
             _of_particles(
@@ -409,13 +423,16 @@ def launches(rows: MeasuredRows) -> Figure:
                 dots=True,
                 median=lambda values, here: median_interval(values[here]),
             )
-        _thesis_line(panels[0], THESIS_LAUNCH_MS, f"thesis: under {THESIS_LAUNCH_MS:g} ms")
+        _thesis_line(
+            panels[0], THESIS_LAUNCH_MS, f"thesis: under {THESIS_LAUNCH_MS:g} ms after its timeout"
+        )
         _milliseconds(panels[0], "time (ms)")
+        _widen(panels[0])
         _over_particles(panels[0])
         panels[0].set_title(
             _with_count("The local service is launched", int(cold.sum())), loc="left"
         )
-        panels[0].legend(loc="lower left", fontsize=8.0)
+        _legend_below(_figure(panels), panels[0], 2)
         _over_paths(panels[1], rows, rows.number("found_ms"), kills)
         _thesis_line(
             panels[1], THESIS_TIMEOUT_MS, f"thesis: a timeout of {THESIS_TIMEOUT_MS / 1e3:g} s"
@@ -453,6 +470,7 @@ def failbacks(rows: MeasuredRows) -> Figure:
         for panel in panels:
             _thesis_line(panel, THESIS_FAILBACK_MS, "thesis: under 1 s")
         _milliseconds(panels[0], "from its ready line until it decides (ms)")
+        _widen(panels[0])
         panels[1].grid(axis="y")
     return _figure(panels)
 
@@ -486,18 +504,15 @@ def cloud_dies(table: Table) -> Figure:
     kill = next((row for row in table.rows() if row["what"] == "kill"), None)
     what = np.array(table.columns["what"], dtype=object)
     at_s = table.numbers("at_s")
-    figure = figure_of(9.6, 5.4, "The cloud dies, and the robot goes on")
+    bands = _status_bands(table, kill)
+    figure = figure_of(9.6, 5.6, "The cloud dies, the robot goes on, and no decision changes")
     with mpl.rc_context(STYLE):
-        motion, answers = figure.subplots(2, 1, sharex=True, height_ratios=(1.0, 1.25))
-        bands = _status_bands(table)
+        motion, answers = figure.subplots(2, 1, sharex=True, height_ratios=(1.0, 1.15))
         for panel in (motion, answers):
             for begin, end, status in bands:
                 panel.axvspan(begin, end, color=_STATUS_LOOKS[status][0], linewidth=0, zorder=0)
-        _draw_motion(motion, at_s[what == "action"])
-        _draw_answers(answers, table)
-        _draw_moments((motion, answers), kill)
         for begin, end, status in bands:
-            if end - begin > 0.06 * (bands[-1][1] - bands[0][0]):
+            if end - begin > 0.12 * (bands[-1][1] - bands[0][0]):
                 motion.annotate(
                     _STATUS_LOOKS[status][1],
                     (0.5 * (begin + end), 1.0),
@@ -508,21 +523,34 @@ def cloud_dies(table: Table) -> Figure:
                     va="bottom",
                     fontsize=8.5,
                 )
+        _draw_motion(motion, at_s[what == "action"])
+        _draw_answers(answers, table)
+        _draw_moments((motion, answers), kill)
         answers.set_xlabel("time since the robot's first decision (s)")
         answers.set_xlim(bands[0][0], bands[-1][1])
         figure.align_ylabels()
-        figure.supxlabel(_verdict(table, kill), x=0.012, ha="left", fontsize=9.0)
+        figure.supxlabel(_verdict(table, kill), x=0.012, ha="left", fontsize=9.5)
     return figure
 
 
-def _status_bands(table: Table) -> list[tuple[float, float, str]]:
-    """Return from when until when the robot had which status, as its decisions have it."""
-    decisions = [row for row in table.rows() if row["status"] is not None]
+def _status_bands(table: Table, kill: Mapping[str, Cell] | None) -> list[tuple[float, float, str]]:
+    """Return from when until when the robot had which status.
+
+    A decision says which it had then; local recovery begins when the robot says that it has lost
+    the cloud, before the first decision of the local service.
+    """
+    statuses = [
+        (_number(row["at_s"]), str(row["status"]))
+        for row in table.rows()
+        if row["status"] is not None
+    ]
+    if kill is not None and kill["found_ms"] is not None:
+        statuses.append(
+            (_number(kill["at_s"]) + 1e-3 * _number(kill["found_ms"]), "local_recovery")
+        )
     end_s = float(np.nanmax(table.numbers("at_s")))
     bands: list[tuple[float, float, str]] = []
-    for row in sorted(decisions, key=lambda row: float(row["at_s"] or 0.0)):
-        status = str(row["status"])
-        at_s = float(row["at_s"] or 0.0)
+    for at_s, status in sorted(statuses):
         if bands and bands[-1][2] == status:
             continue
         if bands:
@@ -531,22 +559,26 @@ def _status_bands(table: Table) -> list[tuple[float, float, str]]:
     return bands
 
 
+def _number(cell: Cell) -> float:
+    assert isinstance(cell, int | float)
+    return float(cell)
+
+
 def _draw_motion(panel: Axes, moments: FloatArray) -> None:
     ordered = np.sort(moments)
-    panel.step(
-        ordered, np.arange(1, ordered.size + 1), where="post", color="#111111", linewidth=1.6
-    )
-    panel.set_ylim(bottom=0.0)
+    done = np.arange(1, ordered.size + 1)
+    panel.step(ordered, done, where="post", color="#111111", linewidth=1.8)
+    panel.set_ylim(0.0, 1.12 * ordered.size)
     panel.set_ylabel("task actions performed")
     pauses = np.diff(ordered)
     if pauses.size:
         longest = int(pauses.argmax())
         panel.annotate(
-            f"longest time between two actions: {1e3 * pauses[longest]:.0f} ms",
-            (ordered[longest], longest + 1),
-            xytext=(26, -26),
+            f"the longest time between two actions: {1e3 * pauses[longest]:.0f} ms",
+            (ordered[longest + 1], done[longest]),
+            xytext=(30, -4),
             textcoords="offset points",
-            arrowprops={"arrowstyle": "-", "linewidth": 0.7, "color": "#4A4F57"},
+            arrowprops={"arrowstyle": "-", "linewidth": 0.8, "color": "#4A4F57"},
             fontsize=8.5,
             va="top",
         )
@@ -559,49 +591,74 @@ def _draw_answers(panel: Axes, table: Table) -> None:
     at_s, took_ms = table.numbers("at_s"), table.numbers("round_trip_ms")
     for name, number, text in (
         ("cloud", 0, "the cloud answers"),
-        ("local", 1, "the local service answers"),
+        ("local", 1, "the robot's own service answers"),
     ):
         for kind, filled in (("task", False), ("sensing", True)):
             chosen = (what == kind) & (service == name)
             panel.scatter(
                 at_s[chosen],
                 took_ms[chosen],
-                s=24.0,
+                s=26.0,
                 marker=MARKERS[number],
                 facecolor=COLORS[number] if filled else "white",
                 edgecolor=COLORS[number],
-                linewidth=0.9,
+                linewidth=1.0,
                 zorder=4,
-                label=f"{text}: {'what to sense' if filled else 'what to do until then'}",
+            )
+        chosen = (service == name) & np.isfinite(took_ms)
+        if chosen.any():
+            first = float(at_s[chosen].min())
+            below = name == "cloud"
+            height = took_ms[chosen].min() if below else took_ms[chosen].max()
+            panel.annotate(
+                text,
+                (first, float(height)),
+                xytext=(4, -8 if below else 8),
+                textcoords="offset points",
+                va="top" if below else "bottom",
+                color=COLORS[number] if below else "#8A5A00",
+                fontsize=8.5,
             )
     _milliseconds(panel, "from question to answer (ms)")
     low, high = panel.get_ylim()
-    panel.set_ylim(low / 1.5, high * 1.5)
-    panel.legend(loc="center right", ncols=1, fontsize=8.0, frameon=True, framealpha=0.9)
+    panel.set_ylim(low / 1.6, high * 1.6)
+    handles = [
+        Line2D([], [], marker="D", linestyle="", color="#4A4F57", markerfacecolor=face, label=label)
+        for face, label in (("#4A4F57", "what to sense"), ("white", "what to do until then"))
+    ]
+    panel.legend(handles=handles, loc="lower right", markerscale=0.7, fontsize=8.5)
 
 
 def _draw_moments(panels: Sequence[Axes], kill: Mapping[str, Cell] | None) -> None:
-    """Mark when the cloud is killed, when it listens again, and when it is used again."""
+    """Mark when the cloud is killed, and when it listens again."""
     if kill is None:
         return
-    killed_s = float(kill["at_s"] or 0.0)
-    moments = [(killed_s, "cloud killed\n(SIGKILL)", "#B5342B", "X")]
+    killed_s = _number(kill["at_s"])
+    moments = [(killed_s, "the cloud's process\nis killed (SIGKILL)", _KILLED, "X", "left")]
     if kill["away_ms"] is not None:
-        back_s = killed_s + 1e-3 * float(kill["away_ms"])
-        moments.append((back_s, "cloud started again", "#1E8A4C", "^"))
-    for at_s, text, color, marker in moments:
+        back_s = killed_s + 1e-3 * _number(kill["away_ms"])
+        moments.append((back_s, "it was started\nagain and listens", _STARTED, "^", "right"))
+    for at_s, text, color, marker, side in moments:
         for panel in panels:
             panel.axvline(at_s, color=color, linewidth=1.2, zorder=2)
-        panels[0].plot(
-            [at_s], [0.0], marker=marker, color=color, markersize=9.0, clip_on=False, zorder=6
-        )
+        for panel in panels:
+            panel.plot(
+                [at_s],
+                [0.0],
+                marker=marker,
+                color=color,
+                markersize=9.0,
+                clip_on=False,
+                zorder=6,
+                transform=panel.get_xaxis_transform(),
+            )
         panels[0].annotate(
             text,
             (at_s, 0.97),
             xycoords=("data", "axes fraction"),
-            xytext=(-4, 0),
+            xytext=(-5 if side == "left" else 5, 0),
             textcoords="offset points",
-            ha="right",
+            ha="right" if side == "left" else "left",
             va="top",
             color=color,
             fontsize=8.5,
@@ -616,5 +673,5 @@ def _verdict(table: Table, kill: Mapping[str, Cell] | None) -> str:
     else:
         text = f"NOT all {counted} are those of the run in which nothing dies."
     if kill is not None and kill["waited_ms"] is not None:
-        text += f" The longest wait for a decision was {float(kill['waited_ms']):.0f} ms."
+        text += f" Longest wait for a decision: {_number(kill['waited_ms']):.0f} ms."
     return text
