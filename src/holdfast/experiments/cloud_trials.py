@@ -324,11 +324,12 @@ class _Processes:
         self._told = []
         self._robot_done = False
         with contextlib.closing(DecisionTable(directory / _DISTURBED / TIMINGS_NAME)) as table:
-            robot = self._start_robot(directory)
+            rate_hz = self._wanted.rate_hz / self._slowness
+            robot = self._start_robot(directory, rate_hz)
             chance = random.Random(f"kill {self._wanted.seed} {run}")
             strikes: list[Strike] = []
             kill_step = int(chance.uniform(_EARLIEST_KILL, _LATEST_KILL) * sum(steps_of_trials))
-            turn_s = (self._wanted.sensing_interval + 1) / self._wanted.rate_hz
+            turn_s = (self._wanted.sensing_interval + 1) / rate_hz
             pause_s = chance.uniform(0.0, turn_s)
             script = self._script(table, strikes, kill_step, pause_s, steps_of_trials)
             waiting = next(script)
@@ -475,11 +476,11 @@ class _Processes:
             [*arguments, "--until-stdin-closes"], "cloud.log", self._path.service_prefix
         )
 
-    def _start_robot(self, directory: Path) -> ChildProcess:
+    def _start_robot(self, directory: Path, rate_hz: float) -> ChildProcess:
         self._robot = self._start(
             [
                 *("run", str(directory / "trials.yaml"), "--log", "json"),
-                *("--rate", f"{self._wanted.rate_hz / self._slowness:g}"),
+                *("--rate", f"{rate_hz:g}"),
                 *("--out", str(directory / _DISTURBED)),
             ],
             "robot.log",

@@ -134,9 +134,9 @@ def _dots(panel: Axes, place: float, values: FloatArray, color: str, spread: flo
     panel.scatter(
         place + spread * (chance.random(values.size) - 0.5),
         values,
-        s=5.0,
+        s=7.0,
         color=color,
-        alpha=0.22,
+        alpha=0.3,
         linewidth=0,
         zorder=2,
         rasterized=True,
@@ -196,17 +196,15 @@ def sensing_times(rows: MeasuredRows) -> Figure:
             ),
             *(
                 (
-                    _Series(
-                        f"cloud, from question to answer: {path.label}",
-                        COLORS[color],
-                        marker,
+                    look._replace(
+                        label=f"cloud, from question to answer: {path.label}",
                         filled=False,
                         offset=-6,
                     ),
                     answered,
                     in_cloud & rows.where(path=path),
                 )
-                for path, color, marker in _shown_paths(rows)
+                for path, look in _tcp_looks(rows).items()
             ),
         ):
             _of_particles(panels[2], rows, values, chosen, series, dots=False)
@@ -219,10 +217,9 @@ def sensing_times(rows: MeasuredRows) -> Figure:
     return _figure(panels)
 
 
-def _shown_paths(rows: MeasuredRows) -> list[tuple[NetworkPath, int, str]]:
-    """Return the paths without loss over TCP, with a colour and a mark."""
-    shown = [path for path in rows.paths if path.transport == "tcp" and path.loss == 0.0]
-    return [(path, (0, 3, 4)[n % 3], ("s", "^", "v")[n % 3]) for n, path in enumerate(shown)]
+def _tcp_looks(rows: MeasuredRows) -> dict[NetworkPath, _Series]:
+    """Return how the paths without loss over TCP look."""
+    return {path: look for path, look in _path_looks(rows).items() if path.transport == "tcp"}
 
 
 def _of_particles(
@@ -453,18 +450,19 @@ def failbacks(rows: MeasuredRows) -> Figure:
     kills = rows.where(what="kill") & ~np.isnan(rows.number("failback_ms"))
     times = rows.number("failback_ms")
     with mpl.rc_context(STYLE):
-        series = _Series("all paths", COLORS[0], "s")
-        _of_particles(
-            panels[0],
-            rows,
-            times,
-            kills,
-            series,
-            dots=True,
-            median=lambda values, here: median_interval(values[here]),
-        )
+        for path, look in _tcp_looks(rows).items():
+            _of_particles(
+                panels[0],
+                rows,
+                times,
+                kills & rows.where(path=path),
+                look._replace(label=path.label, offset=0.0),
+                dots=True,
+                median=lambda values, here: median_interval(values[here]),
+            )
         _over_particles(panels[0])
-        panels[0].set_title("By particles, all paths", loc="left")
+        panels[0].set_title("By particles, over tcp without loss", loc="left")
+        _legend_below(_figure(panels), panels[0], 3)
         _over_paths(panels[1], rows, times, kills)
         panels[1].set_title(_with_count("By path", int(kills.sum())), loc="left")
         for panel in panels:
@@ -618,6 +616,8 @@ def _draw_answers(panel: Axes, table: Table) -> None:
                 va="top" if below else "bottom",
                 color=COLORS[number] if below else "#8A5A00",
                 fontsize=8.5,
+                bbox={"facecolor": "white", "alpha": 0.75, "linewidth": 0, "pad": 1.0},
+                zorder=5,
             )
     _milliseconds(panel, "from question to answer (ms)")
     low, high = panel.get_ylim()
