@@ -73,13 +73,19 @@ def _figure(panels: Sequence[Axes]) -> Figure:
     return figure
 
 
-def _milliseconds(panel: Axes, label: str) -> None:
-    panel.set_yscale("log")
-    panel.set_ylabel(label)
-    panel.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    panel.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    panel.yaxis.set_minor_formatter(NullFormatter())
-    panel.grid(axis="y")
+def _milliseconds(panel: Axes, label: str, *, upright: bool = True) -> None:
+    """Let an axis show times over decades."""
+    if upright:
+        panel.set_yscale("log")
+        panel.set_ylabel(label)
+    else:
+        panel.set_xscale("log")
+        panel.set_xlabel(label)
+    axis = panel.yaxis if upright else panel.xaxis
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_formatter(NullFormatter())
+    panel.grid(axis="y" if upright else "x")
 
 
 def _widen(panel: Axes) -> None:
@@ -112,7 +118,9 @@ def _medians(
         fmt=series.marker,
         color=series.color,
         markerfacecolor=series.color if series.filled else "white",
-        markersize=5.0,
+        markeredgecolor="white" if series.filled else series.color,
+        markeredgewidth=0.7 if series.filled else 1.1,
+        markersize=6.0,
         elinewidth=1.2,
         capsize=2.5,
         zorder=4,
@@ -125,15 +133,24 @@ def _length(value: float) -> float:
     return max(0.0, value) if math.isfinite(value) else 0.0
 
 
-def _dots(panel: Axes, place: float, values: FloatArray, color: str, spread: float) -> None:
+def _dots(
+    panel: Axes,
+    place: float,
+    values: FloatArray,
+    color: str,
+    spread: float,
+    *,
+    upright: bool = True,
+) -> None:
     """Draw single values beside each other; of very many, some."""
     chance = np.random.default_rng(0)
     values = values[~np.isnan(values) & (values > 0.0)]
     if values.size > _MOST_DOTS:
         values = chance.choice(values, _MOST_DOTS, replace=False)
+    places = place + spread * (chance.random(values.size) - 0.5)
     panel.scatter(
-        place + spread * (chance.random(values.size) - 0.5),
-        values,
+        places if upright else values,
+        values if upright else places,
         s=7.0,
         color=color,
         alpha=0.3,
@@ -181,8 +198,8 @@ def sensing_times(rows: MeasuredRows) -> Figure:
     local = _Series("computing in the local service", COLORS[1], MARKERS[1])
     with mpl.rc_context(STYLE):
         for panel, chosen, series, title in (
-            (panels[0], in_cloud, cloud, "Fig. 9: computing in the cloud service"),
-            (panels[1], locally, local, "Fig. 10: computing in local recovery"),
+            (panels[0], in_cloud, cloud, "Fig. 9: in the cloud service"),
+            (panels[1], locally, local, "Fig. 10: in local recovery"),
         ):
             _of_particles(panel, rows, computed, chosen, series, dots=True)
             panel.set_title(_with_count(title, int(chosen.sum())), loc="left")
@@ -267,7 +284,7 @@ def round_trips(rows: MeasuredRows) -> Figure:
             rows,
             trips,
             local,
-            _Series("local service", COLORS[1], MARKERS[1]),
+            _Series("local service", COLORS[1], MARKERS[1], offset=-9.0),
             dots=True,
         )
         looks = _path_looks(rows)
@@ -302,7 +319,7 @@ def _path_looks(rows: MeasuredRows) -> dict[NetworkPath, _Series]:
         far = path.round_trip_ms > 0.0
         color = 0 if not far else 3 if path.round_trip_ms < THESIS_CLOUD_ROUND_TRIP_MS else 4
         marker = "s" if not far else "^" if path.transport == "tcp" else "v"
-        offset = 0.0 if not far else -7.0 if path.transport == "tcp" else 7.0
+        offset = 9.0 if not far else -7.0 if path.transport == "tcp" else 7.0
         filled = path.transport == "tcp"
         looks[path] = _Series(f"cloud, {path.label}", COLORS[color], marker, filled, offset)
     return looks
@@ -399,7 +416,10 @@ def launches(rows: MeasuredRows) -> Figure:
     cold = kills & ~np.isnan(rows.number("launch_ms"))
     with mpl.rc_context(STYLE):
         for name, series in (
-            ("launch_ms", _Series("service started until seen", COLORS[0], "s", False, -8.0)),
+            (
+                "launch_ms",
+                _Series("local service: from its start until seen", COLORS[0], "s", False, -8.0),
+            ),
             (
                 "first_local_ms",
                 _Series(
@@ -431,11 +451,11 @@ def launches(rows: MeasuredRows) -> Figure:
         )
         _legend_below(_figure(panels), panels[0], 2)
         _over_paths(panels[1], rows, rows.number("found_ms"), kills)
-        _thesis_line(
+        _milliseconds(panels[1], "time from the kill until found (ms)", upright=False)
+        _thesis_upright(
             panels[1], THESIS_TIMEOUT_MS, f"thesis: a timeout of {THESIS_TIMEOUT_MS / 1e3:g} s"
         )
-        _milliseconds(panels[1], "time from the kill until found (ms)")
-        panels[1].set_ylim(top=1.8 * THESIS_TIMEOUT_MS)
+        panels[1].set_xlim(right=1.8 * THESIS_TIMEOUT_MS)
         panels[1].set_title(
             _with_count("The cloud is found dead, by path", int(kills.sum())), loc="left"
         )
@@ -445,7 +465,7 @@ def launches(rows: MeasuredRows) -> Figure:
 def failbacks(rows: MeasuredRows) -> Figure:
     """Draw how soon a cloud that was started again is used."""
     panels = _panels(
-        10.5, 4.6, "Back to the relaunched cloud (Figure 15)", 2, sharey=True, width_ratios=(1, 1.3)
+        10.5, 4.6, "Back to the relaunched cloud (Figure 15)", 2, width_ratios=(1, 1.3)
     )
     kills = rows.where(what="kill") & ~np.isnan(rows.number("failback_ms"))
     times = rows.number("failback_ms")
@@ -465,27 +485,58 @@ def failbacks(rows: MeasuredRows) -> Figure:
         _legend_below(_figure(panels), panels[0], 3)
         _over_paths(panels[1], rows, times, kills)
         panels[1].set_title(_with_count("By path", int(kills.sum())), loc="left")
-        for panel in panels:
-            _thesis_line(panel, THESIS_FAILBACK_MS, "thesis: under 1 s")
-        _milliseconds(panels[0], "from its ready line until it decides (ms)")
+        what = "from its ready line until it decides (ms)"
+        _thesis_line(panels[0], THESIS_FAILBACK_MS, "thesis: under 1 s")
+        _thesis_upright(panels[1], THESIS_FAILBACK_MS, "thesis: under 1 s")
+        _milliseconds(panels[0], what)
         _widen(panels[0])
-        panels[1].grid(axis="y")
+        _milliseconds(panels[1], what, upright=False)
     return _figure(panels)
 
 
 def _over_paths(panel: Axes, rows: MeasuredRows, values: FloatArray, chosen: BoolArray) -> None:
-    """Draw values of each path: dots, medians and intervals."""
+    """Draw a row for each path: dots, median and interval."""
     paths = [path for path in rows.paths if (chosen & rows.where(path=path)).any()]
-    series = _Series("median with 95 % interval", COLORS[0], "s")
     for number, path in enumerate(paths):
         here = values[chosen & rows.where(path=path)]
-        color = COLORS[4] if path.transport == "quic" else COLORS[0]
-        look = series._replace(color=color, marker="v" if path.transport == "quic" else "s")
-        _dots(panel, number, here, color, 0.4)
-        _medians(panel, [number], [median_interval(here)], look)
-    labels = [path.label.replace(", ", "\n", 1).replace(", ", "\n") for path in paths]
-    panel.set_xticks(range(len(paths)), labels, fontsize=7.0)
-    panel.set_xlim(-0.6, len(paths) - 0.4)
+        quic = path.transport == "quic"
+        color = COLORS[4] if quic else COLORS[0]
+        _dots(panel, number, here, color, 0.5, upright=False)
+        interval = median_interval(here)
+        panel.errorbar(
+            [interval.value],
+            [number],
+            xerr=[
+                [_length(interval.value - interval.low)],
+                [_length(interval.high - interval.value)],
+            ],
+            fmt="v" if quic else "s",
+            color=color,
+            markeredgecolor="white",
+            markeredgewidth=0.7,
+            markersize=6.0,
+            elinewidth=1.4,
+            capsize=2.5,
+            zorder=4,
+        )
+    panel.set_yticks(range(len(paths)), [path.label for path in paths])
+    panel.set_ylim(len(paths) - 0.4, -1.3)
+    panel.tick_params(axis="y", length=0)
+
+
+def _thesis_upright(panel: Axes, place: float, text: str) -> None:
+    panel.axvline(place, color=_THESIS, linewidth=1.1, linestyle=(0, (5, 2)), zorder=1.5)
+    panel.annotate(
+        text,
+        (place, 1.0),
+        xycoords=("data", "axes fraction"),
+        xytext=(-3, -2),
+        textcoords="offset points",
+        ha="right",
+        va="top",
+        color=_THESIS,
+        fontsize=8.0,
+    )
 
 
 # -- the picture -----------------------------------------------------------------------------------
