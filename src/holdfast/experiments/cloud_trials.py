@@ -236,7 +236,7 @@ def rows_of_run(
     if fault is not None and struck_at is not None:
         decided_ms = None
         if fault.recovery_ms is not None and fault.detection_ms is not None:
-            decided_ms = max(0.0, fault.recovery_ms - fault.detection_ms)
+            decided_ms = round(max(0.0, fault.recovery_ms - fault.detection_ms), 3)
         rows.append(
             {
                 "run": run,

@@ -68,11 +68,11 @@ _RATE_HZ = 100.0
 _STEPS, _QUICK_STEPS = 400, 280
 _LOCAL_DECISIONS, _QUICK_LOCAL_DECISIONS = 8, 4
 
-_PICTURE_RATE_HZ = 25.0
-"""At this rate the robot has up to 0.36 s of actions in hand when the cloud dies."""
+_PICTURE_RATE_HZ = 30.0
+"""At this rate the robot has up to 0.3 s of actions in hand when the cloud dies."""
 
 _QUICK: dict[NetworkPath, tuple[int, ...]] = {
-    NEAR: (100, 300, 500),
+    NEAR: (100, 500),
     FAR: (200, 300, 400),
     NetworkPath("tcp", 20.0, 0.0): (300,),
     NetworkPath("quic", 20.0, 0.0): (300,),
@@ -193,7 +193,7 @@ def _picture_task(scale: Scale) -> Task:
             particles=300,
             round_trip_ms=THESIS_CLOUD_ROUND_TRIP_MS,
             seed=scale.seed,
-            min_steps=220,
+            min_steps=200,
             rate_hz=_PICTURE_RATE_HZ,
             local_decisions=5,
             max_steps=_MAX_STEPS,
@@ -515,14 +515,22 @@ def _findings_of_faults(rows: MeasuredRows) -> list[str]:
 
 
 def _findings_of_loss(rows: MeasuredRows) -> list[str]:
+    kills = rows.where(what="kill")
+    killed_s = dict(zip(rows.runs[kills], rows.number("at_s")[kills], strict=True))
+    before = rows.number("at_s") < np.array([killed_s.get(run, math.inf) for run in rows.runs])
     shares = []
     for path in rows.paths:
         if path.loss == 0.0:
             continue
-        alive = rows.where(path=path, service="cloud", what="task")
-        p95_ms = _percentile(rows.round_trips[alive], 95.0)
+        cloud = rows.where(path=path, service="cloud", what="task")
+        p95_ms = _percentile(rows.round_trips[cloud], 95.0)
+        asked = rows.where(path=path, what="task") & before
+        local = int((asked & rows.where(service="local")).sum())
         if p95_ms is not None:
-            shares.append(f"{path.label} {p95_ms:.0f} ms, n = {int(alive.sum())}")
+            shares.append(
+                f"{path.label} {_number(p95_ms)} ms, n = {int(cloud.sum())}; before its kill "
+                f"{local} of {int(asked.sum())} answers came from the local service"
+            )
     if not shares:
         return []
     return [

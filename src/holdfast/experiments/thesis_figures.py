@@ -622,14 +622,16 @@ def _draw_motion(panel: Axes, moments: FloatArray) -> None:
     pauses = np.diff(ordered)
     if pauses.size:
         longest = int(pauses.argmax())
+        early = longest < 0.5 * ordered.size
         panel.annotate(
             f"the longest time between two actions: {1e3 * pauses[longest]:.0f} ms",
             (ordered[longest + 1], done[longest]),
-            xytext=(30, -4),
+            xytext=(30 if early else -30, -4 if early else 4),
             textcoords="offset points",
             arrowprops={"arrowstyle": "-", "linewidth": 0.8, "color": "#4A4F57"},
             fontsize=8.5,
-            va="top",
+            ha="left" if early else "right",
+            va="top" if early else "bottom",
         )
 
 
