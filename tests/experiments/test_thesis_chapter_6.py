@@ -199,7 +199,7 @@ class TestReport:
         assert "Wilson" in report.findings[0]
         assert any("under the thesis's 370 ms in 10 of 10" in each for each in report.findings)
         assert any("under the thesis's 1000 ms in 10 of 10" in each for each in report.findings)
-        assert any("before its kill 0 of 11 answers came from" in each for each in report.findings)
+        assert any("before its kill 1 of 11 answers came from" in each for each in report.findings)
         assert any("as packets between two networks" in each for each in report.findings)
         assert all("nan" not in each for each in report.findings)
 
@@ -254,10 +254,13 @@ def test_over_a_proxy(transport: str) -> None:
         transport=transport,
         round_trip_ms=20.0,
         loss=0.01,
-        min_steps=250,
+        first_run=4,
+        runs=2,
+        min_steps=200,
         packets=False,
     )
     assert all(table.columns["identical"])
+    assert set(table.columns["run"]) == {4, 5}
     assert set(table.columns["emulated_by"]) == {
         "tcp proxy" if transport == "tcp" else "datagram proxy"
     }
