@@ -127,7 +127,7 @@ def made_up(task: Task) -> Table:
     chance = np.random.default_rng(wanted.particles)
     rows: list[tuple[Any, ...]] = []
     for run in range(wanted.first_run, wanted.first_run + wanted.runs):
-        end = (None, None, None, None, None, True, "packets")
+        end = (None, None, None, None, None, True, "packets", 0.5)
         for number in range(40):
             away = 10 <= number < 25
             service = "local" if away else "cloud"
@@ -136,11 +136,11 @@ def made_up(task: Task) -> Table:
             for what, computed_ms in (("sensing", 0.002 * wanted.particles), ("task", 0.1)):
                 times = (0.0, trip_ms + computed_ms, computed_ms)
                 rows.append((run, what, 0.1 * number, 0, 9 * number, service, status, *times, *end))
-        fault = (120.0, None, None, 45.0, 150.0, 120.0, 1100.0, 60.0, True, "packets")
+        fault = (120.0, None, None, 45.0, 150.0, 120.0, 1100.0, 60.0, True, "packets", 0.5)
         rows.append((run, "kill", 1.05, None, None, None, None, *fault))
         if wanted.actions:
             rows += [
-                (run, "action", 0.011 * number, 0, number, *[None] * 10, True, "packets")
+                (run, "action", 0.011 * number, 0, number, *[None] * 10, True, "packets", 0.5)
                 for number in range(360)
             ]
     return Table.of_rows(COLUMNS, rows)
@@ -201,6 +201,7 @@ class TestReport:
         assert any("under the thesis's 1000 ms in 10 of 10" in each for each in report.findings)
         assert any("before its kill 1 of 11 answers came from" in each for each in report.findings)
         assert any("as packets between two networks" in each for each in report.findings)
+        assert any("median 0.5, from 0.5 to 0.5, n = 10" in each for each in report.findings)
         assert all("nan" not in each for each in report.findings)
 
     @pytest.mark.slow

@@ -46,7 +46,7 @@ from holdfast.chaos.world import (
     difference_of_performances,
     performances,
 )
-from holdfast.configuration import load
+from holdfast.configuration import load as load_configuration
 from holdfast.experiments.tables import Cell, Table
 from holdfast.experiments.tasks import TaskError
 from holdfast.files import write_atomically
@@ -74,6 +74,7 @@ COLUMNS = (
     "failback_ms",
     "identical",
     "emulated_by",
+    "load",
 )
 """Of the table of such trials: a row for each decision, each kill and, if wanted, each task action.
 
@@ -83,7 +84,8 @@ cloud; ``first_local_ms``, from then until it carries out a decision of the loca
 ``launch_ms``, from the start of that service's process until the robot sees it (nothing, if it ran
 before); ``away_ms``, from the kill until the ready line of the cloud that was started again;
 ``failback_ms``, from that line until the robot carries out a decision of it; and ``waited_ms``, the
-longest time that it stood still for a decision until then.
+longest time that it stood still for a decision until then. ``load`` is how many processes wanted a
+core when the run began, over the minute before: times on a busy machine say little.
 """
 
 _PROBLEM = "peg_in_hole_2d"
@@ -197,6 +199,7 @@ def rows_of_run(
     *,
     identical: bool,
     emulated_by: str,
+    load: float | None = None,
     performed: Iterable[Performance] = (),
 ) -> Table:
     """Return the rows of a run: its decisions, its kill, if there was one, and its actions.
@@ -212,11 +215,13 @@ def rows_of_run(
     identical : bool
         Whether all decisions and actions are those of the undisturbed run.
     emulated_by : str
+    load : float or None
+        Of the machine.
     performed : iterable of Performance
         Task actions to be listed.
     """
     began = table.rows[0].at
-    ends: dict[str, Cell] = {"identical": identical, "emulated_by": emulated_by}
+    ends: dict[str, Cell] = {"identical": identical, "emulated_by": emulated_by, "load": load}
     rows: list[dict[str, Cell]] = [
         {
             "run": run,
@@ -317,6 +322,7 @@ class _Processes:
         """Run one robot, and return the rows of its run."""
         directory = self._directory / f"run-{run}"
         directory.mkdir()
+        load = os.getloadavg()[0]
         steps_of_trials = self._run_twin(run, directory)
         if self._cloud is None or self._cloud.killed:
             self._start_cloud()
@@ -357,6 +363,7 @@ class _Processes:
                 strikes[0].struck_at if strikes else None,
                 identical=comparison.identical and difference is None,
                 emulated_by=self._path.emulated_by,
+                load=round(load, 2),
                 performed=(
                     list(performances(directory / f"{_DISTURBED}.txt"))
                     if self._wanted.actions
@@ -410,7 +417,7 @@ class _Processes:
         """Run it in this process, without services, and see how long it is."""
         path = directory / "trials.yaml"
         self._write_configuration(path, run, _MAX_TRIALS)
-        configuration = load(path)
+        configuration = load_configuration(path)
         seed = configuration.simulator.seed
         with contextlib.ExitStack() as worlds:
 
@@ -422,7 +429,7 @@ class _Processes:
 
             results, took_s = run_undisturbed(configuration, self._wanted.min_steps, world)
         self._write_configuration(path, run, len(results))
-        keep_undisturbed(directory / _TWIN, load(path), results, took_s)
+        keep_undisturbed(directory / _TWIN, load_configuration(path), results, took_s)
         return [result.steps for result in results]
 
     def _write_configuration(self, path: Path, run: int, num_trials: int) -> None:

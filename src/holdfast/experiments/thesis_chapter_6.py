@@ -364,7 +364,7 @@ def _findings(rows: MeasuredRows, successes: Table, picture: Table) -> list[str]
     findings.append(_finding_of_waiting(rows))
     findings += _findings_of_faults(rows)
     findings += _findings_of_loss(rows)
-    findings.append(_finding_of_emulation(rows))
+    findings += [_finding_of_emulation(rows), _finding_of_load(rows)]
     return findings
 
 
@@ -561,3 +561,14 @@ def _finding_of_emulation(rows: MeasuredRows) -> str:
             labels = [path.label for path in rows.paths if (here & rows.where(path=path)).any()]
             ways.append(f"{words}: {len(labels)} of {len(rows.paths)} paths")
     return f"how the path was emulated: {'; '.join(ways)}"
+
+
+def _finding_of_load(rows: MeasuredRows) -> str:
+    _, first = np.unique(rows.runs, return_index=True)
+    loads = rows.number("load")[first]
+    return (
+        "processes that wanted a core when a run began, over the minute before: median "
+        f"{np.nanmedian(loads):.1f}, from {np.nanmin(loads):.1f} to {np.nanmax(loads):.1f}, "
+        f"n = {loads.size} (our own processes, from the run before, are among them; with many more "
+        "than there are cores, times are those of a busy machine)"
+    )
