@@ -31,6 +31,7 @@ __all__ = [
     "DecisionTable",
     "Ended",
     "Written",
+    "end_marked_processes",
     "free_port",
     "leash",
     "local_services_of",
@@ -39,6 +40,7 @@ __all__ = [
 ]
 
 _SHOWN_CHARACTERS = 300
+_LOOK_AGAIN_S = 0.008
 _LAST_LINES = 20
 
 # It asks the system to end it with whoever started it (PR_SET_PDEATHSIG), and becomes the command.
@@ -364,3 +366,29 @@ def marked_processes(name: str, value: str) -> list[int]:
                 if state != "Z":
                     found.append(int(folder.name))
     return found
+
+
+def end_marked_processes(name: str, value: str, patience_s: float) -> list[int]:
+    """Wait until all processes with a variable in their environment have ended, and end the rest.
+
+    Parameters
+    ----------
+    name, value : str
+        Of the variable; see :func:`marked_processes`.
+    patience_s : float
+        How long to wait before the rest gets SIGKILL.
+
+    Returns
+    -------
+    list of int
+        The rest.
+    """
+    deadline = time.monotonic() + patience_s
+    while left := marked_processes(name, value):
+        if time.monotonic() > deadline:
+            for pid in left:
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(pid, signal.SIGKILL)
+            break
+        time.sleep(_LOOK_AGAIN_S)
+    return left

@@ -17,7 +17,6 @@ import os
 import random
 import secrets
 import shutil
-import signal
 import tempfile
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator
@@ -27,15 +26,14 @@ from typing import Any, TypeAlias
 
 import msgspec
 
-from holdfast.chaos.measures import FaultTimes, Strike, Told, times_of_strikes
+from holdfast.chaos.measures import FaultTimes, Strike, Told, times_of_strikes, told_of
 from holdfast.chaos.processes import (
     ChildProcess,
     DecisionTable,
     Ended,
     Written,
+    end_marked_processes,
     leash,
-    marked_processes,
-    time_of,
 )
 from holdfast.chaos.twin import keep_undisturbed, run_undisturbed
 from holdfast.chaos.wide_area import Path as NetworkPath
@@ -303,20 +301,10 @@ class _Processes:
                 child.process.kill()
             for child in self._children:
                 child.close(0.0)
-            self._end_local_services()
+            # The local services end with their robot.
+            end_marked_processes(_MARK, self._mark, _END_S)
         finally:
             shutil.rmtree(self._temporary, ignore_errors=True)
-
-    def _end_local_services(self) -> None:
-        """Wait for the local services, which end with their robot; end what is left."""
-        deadline = time.monotonic() + _END_S
-        while left := marked_processes(_MARK, self._mark):
-            if time.monotonic() > deadline:
-                for pid in left:
-                    with contextlib.suppress(ProcessLookupError):
-                        os.kill(pid, signal.SIGKILL)
-                return
-            time.sleep(_TURN_S)
 
     def run(self, run: int) -> Table:
         """Run one robot, and return the rows of its run."""
@@ -541,18 +529,14 @@ class _Processes:
                     f"{child.last_words()}"
                 )
             return
-        if not happened.line.startswith("{"):
+        told = told_of(happened.line)
+        if told is None:
             return
-        try:
-            event = msgspec.json.decode(happened.line, type=dict[str, Any])
-            at, name = time_of(event["time"]), str(event["event"])
-        except (msgspec.DecodeError, KeyError, TypeError, ValueError):
-            return  # no event
         if child is self._robot:
-            self._told.append(Told(at, name, event))
-        elif child is self._cloud and name == "ready":
-            self._cloud_ready_at = at
-            started_s = at - child.spawned_at
+            self._told.append(told)
+        elif child is self._cloud and told.name == "ready":
+            self._cloud_ready_at = told.at
+            started_s = told.at - child.spawned_at
             self._slowness = min(_MAX_SLOWNESS, max(1.0, started_s / _USUAL_START_S))
 
     def _named(self) -> str:

@@ -40,9 +40,9 @@ __all__ = ["cloud_dies", "failbacks", "launches", "round_trips", "sensing_times"
 _THESIS = "#B5342B"
 _MOST_DOTS = 250
 _STATUS_LOOKS = {
-    "standard": ("#DCE9F7", "standard:\nthe cloud decides"),
-    "local_recovery": ("#FBE7C3", "local recovery:\nthe robot's own service decides"),
-    "keep_alive": ("#E3F1E6", "keep alive: the cloud again,\nthe local service stays ready"),
+    "standard": ("#E9F1FA", "standard:\nthe cloud decides"),
+    "local_recovery": ("#F5D79E", "local recovery:\nthe robot's own service decides"),
+    "keep_alive": ("#E7F4EA", "keep alive: the cloud again,\nthe local service stays ready"),
 }
 _KILLED, _STARTED = "#B5342B", "#1E8A4C"
 

@@ -122,7 +122,7 @@ class MeasuredRows:
         return self._words[name]
 
     def where(self, **wanted: object) -> BoolArray:
-        """Return which rows have these cells; ``path`` and ``on`` stand for several columns."""
+        """Return which rows have these cells; a path stands for the three columns that name it."""
         chosen = np.ones(self.runs.shape, dtype=bool)
         for name, cell in wanted.items():
             if isinstance(cell, NetworkPath):
