@@ -11,6 +11,7 @@ from holdfast.chaos.measures import (
     Told,
     spread_of,
     times_of_strikes,
+    told_of,
 )
 from holdfast.chaos.processes import Decision
 from holdfast.runtime.links import RECOVERY_SERVICE as LOCAL
@@ -152,3 +153,12 @@ def test_spread() -> None:
     many = spread_of([float(number) for number in range(100, -1, -1)])
     assert many is not None
     assert (many.count, many.median_ms, many.p95_ms, many.max_ms) == (101, 50.0, 95.0, 100.0)
+
+
+def test_lines_that_are_events() -> None:
+    line = '{"time":"1970-01-01T00:00:01.500000Z","component":"robot","event":"launch","n":3}'
+    told = told_of(line)
+    assert told is not None
+    assert (told.at, told.name, told.fields["n"]) == (1.5, "launch", 3)
+    for other in ("", "ready", "{", '{"event": "ready"}', '{"time": 3, "event": "x"}', "[]"):
+        assert told_of(other) is None

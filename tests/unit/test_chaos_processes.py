@@ -18,6 +18,7 @@ from holdfast.chaos.processes import (
     ChildProcess,
     Ended,
     Written,
+    end_marked_processes,
     free_port,
     local_services_of,
     marked_processes,
@@ -156,6 +157,17 @@ class TestFound:
         self.end(marked)
         self.end(other)
         assert marked.returncode == -signal.SIGKILL
+
+    def test_and_ended(self) -> None:
+        name = "HOLDFAST_TEST_MARK"
+        assert end_marked_processes(name, "nobody", 0.0) == []
+        marked = self.start(**{name: "def"})
+        other = self.start(**{name: "other"})
+        assert end_marked_processes(name, "def", 0.0) == [marked.pid]
+        self.end(marked)
+        self.end(other)
+        assert marked.returncode == -signal.SIGKILL
+        assert other.returncode == 0
 
     def test_by_its_parent(self) -> None:
         local = self.start("--until-stdin-closes")

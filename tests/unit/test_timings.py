@@ -69,7 +69,7 @@ def test_it_is_read_while_it_grows(tmp_path: Path) -> None:
     reader.close()
     assert [row.step for row in reader.rows] == [0, 9]
     row = reader.rows[1]
-    assert row[1:] == (2, 9, "task", "tcp/127.0.0.1:7447", "keep_alive", 1.5)
+    assert row[1:] == (2, 9, "task", "tcp/127.0.0.1:7447", "keep_alive", 1.5, 2.25, 0.75)
     assert row.at == time_of("2023-11-14T22:13:20.123456Z") == pytest.approx(1e-9 * MOMENT_NS)
 
 

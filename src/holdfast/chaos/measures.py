@@ -18,11 +18,20 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from holdfast.chaos.processes import Decision
+from holdfast.chaos.processes import Decision, time_of
 from holdfast.runtime.links import RECOVERY_SERVICE
 from holdfast.session.status import Status
 
-__all__ = ["ROBOT", "FaultTimes", "Spread", "Strike", "Told", "spread_of", "times_of_strikes"]
+__all__ = [
+    "ROBOT",
+    "FaultTimes",
+    "Spread",
+    "Strike",
+    "Told",
+    "spread_of",
+    "times_of_strikes",
+    "told_of",
+]
 
 ROBOT = "robot"
 """The target of what strikes the robot's own process; others are named as the robot names them."""
@@ -36,6 +45,17 @@ class Told(NamedTuple):
     at: float
     name: str
     fields: Mapping[str, Any]
+
+
+def told_of(line: str) -> Told | None:
+    """Return the event that a line of a process's log in JSON is; None if it is none."""
+    if not line.startswith("{"):
+        return None
+    try:
+        event = msgspec.json.decode(line, type=dict[str, Any])
+        return Told(time_of(event["time"]), str(event["event"]), event)
+    except (msgspec.DecodeError, KeyError, TypeError, ValueError):
+        return None
 
 
 class Strike(msgspec.Struct, kw_only=True):

@@ -31,6 +31,7 @@ __all__ = [
     "DecisionTable",
     "Ended",
     "Written",
+    "end_marked_processes",
     "free_port",
     "local_services_of",
     "marked_processes",
@@ -38,6 +39,7 @@ __all__ = [
 ]
 
 _SHOWN_CHARACTERS = 300
+_LOOK_AGAIN_S = 0.008
 _LAST_LINES = 20
 
 _LOWEST_PORT = 20_000
@@ -203,6 +205,10 @@ class Decision(NamedTuple):
         Of the robot.
     waited_ms : float
         How long the robot stood still for it.
+    round_trip_ms : float
+        From the question until the answer.
+    computed_ms : float
+        The service's own part of that.
     """
 
     at: float
@@ -212,6 +218,8 @@ class Decision(NamedTuple):
     service: str
     status: str
     waited_ms: float
+    round_trip_ms: float = 0.0
+    computed_ms: float = 0.0
 
 
 class DecisionTable:
@@ -259,6 +267,8 @@ class DecisionTable:
                     row["service"],
                     row["status"],
                     float(row["waited_ms"]),
+                    float(row["round_trip_ms"]),
+                    float(row["computed_ms"]),
                 )
             )
 
@@ -336,3 +346,29 @@ def marked_processes(name: str, value: str) -> list[int]:
                 if state != "Z":
                     found.append(int(folder.name))
     return found
+
+
+def end_marked_processes(name: str, value: str, patience_s: float) -> list[int]:
+    """Wait until all processes with a variable in their environment have ended, and end the rest.
+
+    Parameters
+    ----------
+    name, value : str
+        Of the variable; see :func:`marked_processes`.
+    patience_s : float
+        How long to wait before the rest gets SIGKILL.
+
+    Returns
+    -------
+    list of int
+        The rest.
+    """
+    deadline = time.monotonic() + patience_s
+    while left := marked_processes(name, value):
+        if time.monotonic() > deadline:
+            for pid in left:
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(pid, signal.SIGKILL)
+            break
+        time.sleep(_LOOK_AGAIN_S)
+    return left

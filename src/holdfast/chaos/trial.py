@@ -25,7 +25,14 @@ from typing import Any, Literal, NamedTuple, Self, TypeAlias
 
 import msgspec
 
-from holdfast.chaos.measures import ROBOT, FaultTimes, Strike, Told, times_of_strikes
+from holdfast.chaos.measures import (
+    ROBOT,
+    FaultTimes,
+    Strike,
+    Told,
+    times_of_strikes,
+    told_of,
+)
 from holdfast.chaos.namespace import NetworkNamespace
 from holdfast.chaos.processes import (
     ChildProcess,
@@ -33,10 +40,9 @@ from holdfast.chaos.processes import (
     DecisionTable,
     Ended,
     Written,
+    end_marked_processes,
     free_port,
     local_services_of,
-    marked_processes,
-    time_of,
 )
 from holdfast.chaos.proxy import Impairment, Proxy
 from holdfast.chaos.schedule import NEEDS_NAMESPACE, Fault, FaultKind, Schedule
@@ -278,23 +284,12 @@ class _Trial:
                 child.process.kill()
             for child in self._children:
                 child.close(0.0)
-            self.left_behind = self._end_the_others()
+            # The local services end with their robot.
+            self.left_behind = end_marked_processes(_MARK, self._mark, _END_S)
         finally:
             self._stack.close()
             self._table.close()
             shutil.rmtree(self._temporary, ignore_errors=True)
-
-    def _end_the_others(self) -> list[int]:
-        """Wait for the local services, which end with their robot; end and return what is left."""
-        deadline = time.monotonic() + _END_S
-        while left := marked_processes(_MARK, self._mark):
-            if time.monotonic() > deadline:
-                for pid in left:
-                    with contextlib.suppress(ProcessLookupError):
-                        os.kill(pid, signal.SIGKILL)
-                break
-            time.sleep(_TURN_S)
-        return left
 
     def run(self) -> None:
         """Run it to its end.
@@ -494,19 +489,15 @@ class _Trial:
             )
 
     def _read_line(self, child: ChildProcess, line: str) -> None:
-        if not line.startswith("{"):
-            return
-        try:
-            event = msgspec.json.decode(line, type=dict[str, Any])
-            at, name = time_of(event["time"]), str(event["event"])
-        except (msgspec.DecodeError, KeyError, TypeError, ValueError):
+        told = told_of(line)
+        if told is None:
             return  # it is in the log
-        if event.get("component") == ROBOT:
-            self.told.append(Told(at, name, event))
-        elif name == "ready":
+        if told.fields.get("component") == ROBOT:
+            self.told.append(told)
+        elif told.name == "ready":
             for number, cloud in self._clouds.items():
                 if child is cloud:
-                    self._ready_at[number] = at
+                    self._ready_at[number] = told.at
 
     # -- faults --------------------------------------------------------------------------------
 

@@ -15,10 +15,11 @@ __all__ = ["ALL", "studies_of", "study_names"]
 ALL = "all"
 
 _STUDIES: Mapping[str, str] = {
+    "thesis_chapter_6": "holdfast.experiments.thesis_chapter_6:ThesisChapter6",
+    "cloud_worth": "holdfast.experiments.cloud_worth:CloudWorth",
+    "published_2017": "holdfast.experiments.published_2017:Published2017",
     "selectors": "holdfast.experiments.selectors:Selectors",
     "parameters": "holdfast.experiments.parameters:Parameters",
-    "published_2017": "holdfast.experiments.published_2017:Published2017",
-    "cloud_worth": "holdfast.experiments.cloud_worth:CloudWorth",
 }
 """Where each is; imported when it is needed."""
 

@@ -28,6 +28,7 @@ __all__ = ["Task", "TaskError", "code_digest", "run_task", "task_key"]
 
 _FUNCTIONS: Mapping[str, str] = {
     "trials": "holdfast.experiments.trial_batches:run_trials_of",
+    "cloud_trials": "holdfast.experiments.cloud_trials:run_cloud_trials",
     "emulation_2017": "holdfast.experiments.emulation_2017:run_emulation",
     "exchange_times": "holdfast.experiments.exchange_times:measure_exchange",
     "sensing_times": "holdfast.experiments.sensing_times:measure_sensing",

@@ -1,0 +1,221 @@
+"""A robot and a service that are far from each other, on one machine.
+
+Where the machine permits it, each gets a network of its own, and between the two there is nothing
+but a line: whatever packet leaves one of them comes to this process, which hands it to the other
+half a round trip later, or never. Both ends are the system's own TCP and Zenoh's own QUIC, so what
+they do about packets that are late or lost is what they would do on a real line. (Linux has this
+ready-made, ``tc netem``, but not every kernel has that.)
+
+Where it is not permitted, a proxy stands between them: datagrams are delayed and dropped all the
+same, but TCP ends at a proxy, which cannot drop packets of it, only be late with a piece by the
+time after which they would be sent again. Each path says which of these it is.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import os
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from typing import Literal, NamedTuple, TypeAlias, get_args
+
+from holdfast.chaos.datagrams import Carrier, DatagramProxy, DelayLine
+from holdfast.chaos.namespace import NetworkNamespace, why_no_namespace
+from holdfast.chaos.processes import CannotStartError, free_port
+from holdfast.chaos.proxy import Impairment, Proxy
+from holdfast.errors import InvalidValueError
+
+__all__ = ["Emulation", "Path", "Transport", "lay_path", "why_no_wide_area"]
+
+Transport: TypeAlias = Literal["tcp", "quic"]
+
+Emulation: TypeAlias = Literal["nothing", "packets", "tcp proxy", "datagram proxy"]
+"""What delays and drops: nothing (the robot and the service share a loopback), a line for packets
+between two networks, or one of the proxies."""
+
+_ROBOT, _SERVICE = "10.77.0.1", "10.77.0.2"
+"""Addresses in the two networks, which nobody else can reach."""
+
+_DEVICE = "wan"
+_LARGEST = 65_536
+_PATIENCE_S = 10.0
+
+# Run in a network of its own: makes its end of the line and hands it over.
+_OPEN = f"""
+import fcntl, os, socket, struct, sys
+device = os.open("/dev/net/tun", os.O_RDWR)
+fcntl.ioctl(device, 0x400454CA, struct.pack("16sH", b"{_DEVICE}", 0x0001 | 0x1000))
+socket.send_fds(socket.socket(fileno=int(sys.argv[1])), [b"."], [device])
+"""
+
+
+class Path(NamedTuple):
+    """A way from a robot to a service.
+
+    Attributes
+    ----------
+    robot_prefix, service_prefix : tuple of str
+        Commands that become another one, at either end.
+    listen : str
+        The endpoint of the service.
+    connect : str
+        The same, as the robot has it.
+    host : str
+        By which the robot calls the service.
+    emulated_by : str
+        See :data:`Emulation`.
+    """
+
+    robot_prefix: tuple[str, ...]
+    service_prefix: tuple[str, ...]
+    listen: str
+    connect: str
+    host: str
+    emulated_by: Emulation
+
+
+@contextlib.contextmanager
+def lay_path(
+    transport: Transport, round_trip_ms: float, loss: float, seed: str, *, packets: bool = True
+) -> Iterator[Path]:
+    """Lay a path for as long as the ``with`` statement lasts.
+
+    Parameters
+    ----------
+    transport : {"tcp", "quic"}
+    round_trip_ms : float
+        Half of it for each way. 0 without loss is the machine's own loopback.
+    loss : float
+        Share of packets that are lost, each way.
+    seed : str
+        Of the losses.
+    packets : bool
+        False uses a proxy where two networks could be had.
+
+    Yields
+    ------
+    Path
+
+    Raises
+    ------
+    InvalidValueError
+        If there is no such transport, or a number is out of bounds.
+    CannotStartError
+        If it cannot be laid.
+    """
+    if transport not in get_args(Transport):
+        raise InvalidValueError(
+            f"transport {transport!r}: there are {', '.join(get_args(Transport))}"
+        )
+    port = free_port()
+    near = f"{transport}/127.0.0.1:{port}"
+    if round_trip_ms == 0.0 and loss == 0.0:
+        yield Path((), (), near, near, "127.0.0.1", "nothing")
+        return
+    # Also checks the numbers.
+    lines = [
+        DelayLine[bytes](0.5e-3 * round_trip_ms, loss, f"{seed} {way}") for way in ("up", "down")
+    ]
+    if packets and why_no_wide_area() is None:
+        with _two_networks(lines[0], lines[1]) as (robot, service):
+            far = f"{transport}/{_SERVICE}:{port}"
+            yield Path(robot, service, far, far, _SERVICE, "packets")
+        return
+    entry = free_port()
+    through = f"{transport}/127.0.0.1:{entry}"
+    round_trip_s = 1e-3 * round_trip_ms
+    if transport == "quic":
+        with DatagramProxy(entry, port, round_trip_s=round_trip_s, loss=loss, seed=seed):
+            yield Path((), (), near, through, "127.0.0.1", "datagram proxy")
+        return
+    with Proxy(entry, port, seed) as proxy:
+        proxy.impair(Impairment(latency_s=0.5 * round_trip_s, loss=loss))
+        yield Path((), (), near, through, "127.0.0.1", "tcp proxy")
+
+
+@functools.cache
+def why_no_wide_area() -> str | None:
+    """Return why no two networks can be made on this machine; None if they can."""
+    reason = why_no_namespace()
+    if reason is not None:
+        return reason
+    try:
+        with _two_networks(DelayLine(0.0, 0.0, ""), DelayLine(0.0, 0.0, "")):
+            return None
+    except CannotStartError as error:
+        return str(error).partition("\n")[0]
+
+
+@contextlib.contextmanager
+def _two_networks(
+    up: DelayLine[bytes], down: DelayLine[bytes]
+) -> Iterator[tuple[tuple[str, ...], tuple[str, ...]]]:
+    """Yield commands that become others, in the robot's network and in the service's."""
+    with contextlib.ExitStack() as stack:
+        robot = stack.enter_context(NetworkNamespace())
+        service = stack.enter_context(NetworkNamespace())
+        robot_end = stack.enter_context(_Device(robot, _ROBOT, _SERVICE))
+        service_end = stack.enter_context(_Device(service, _SERVICE, _ROBOT))
+        carrier = Carrier("wide-area")
+        stack.callback(carrier.close)
+        carrier.add(robot_end.descriptor, robot_end.receive, up, service_end.send)
+        carrier.add(service_end.descriptor, service_end.receive, down, robot_end.send)
+        carrier.start()
+        yield robot.prefix, service.prefix
+
+
+class _Device:
+    """The end of the line in one network: what is sent there can be read here."""
+
+    def __init__(self, network: NetworkNamespace, own: str, other: str) -> None:
+        self._prefix = network.prefix
+        here, there = socket.socketpair()
+        with here, there:
+            here.settimeout(_PATIENCE_S)
+            passed = [sys.executable, "-I", "-S", "-c", _OPEN, str(there.fileno())]
+            self._run(passed, (there.fileno(),))
+            try:
+                _, descriptors, _, _ = socket.recv_fds(here, 1, 1)
+            except OSError as error:
+                raise CannotStartError(f"no line to another network can be had: {error}") from error
+        (self.descriptor,) = descriptors
+        try:
+            os.set_blocking(self.descriptor, False)
+            for command in (
+                f"ip addr add {own} peer {other} dev {_DEVICE}",
+                f"ip link set {_DEVICE} up",
+            ):
+                self._run(command.split(), ())
+        except BaseException:
+            os.close(self.descriptor)
+            raise
+
+    def __enter__(self) -> _Device:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        os.close(self.descriptor)
+
+    def receive(self) -> bytes:
+        return os.read(self.descriptor, _LARGEST)
+
+    def send(self, packet: bytes) -> None:
+        os.write(self.descriptor, packet)
+
+    def _run(self, command: list[str], descriptors: tuple[int, ...]) -> None:
+        try:
+            done = subprocess.run(
+                [*self._prefix, *command],
+                pass_fds=descriptors,
+                capture_output=True,
+                timeout=_PATIENCE_S,
+                check=False,
+            )
+        except (OSError, subprocess.TimeoutExpired) as error:
+            raise CannotStartError(f"{command[0]} cannot be run: {error}") from error
+        if done.returncode:
+            said = done.stderr.decode(errors="replace").strip().rpartition("\n")[2]
+            raise CannotStartError(f"no line to another network can be had: {said}")
