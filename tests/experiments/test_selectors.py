@@ -110,21 +110,26 @@ def test_what_a_parameter_does(monkeypatch: pytest.MonkeyPatch) -> None:
     for row in report.summary["parameters"].rows():
         longer = (row["parameter"], row["value"]) != ("horizon", "3")
         assert row["steps_ratio"] == pytest.approx(1.0 if longer else 0.5, rel=0.08)
-    told = [finding for finding in report.findings if "horizon 3" in finding]
+    told = [finding for finding in report.findings if "horizon 3:" in finding]
     assert len(told) == 4
     assert report.findings[-1].startswith("no difference in steps beyond noise")
-    assert "horizon" not in report.findings[-1]
-    assert "M (least p" in report.findings[-1]
+    assert "horizon (mixture)" not in report.findings[-1]
+    assert "M (mixture) (least p" in report.findings[-1]
 
 
 def test_each_variant_differs_in_one_thing() -> None:
-    for variant in parameters.variants()[1:]:
-        reference = parameters.Variant()
+    reference = parameters.Variant()
+    references = 0
+    for variant in parameters.variants():
+        if not variant.parameter:
+            reference = variant
+            references += 1
+            continue
         changed = [
             name
-            for name in ("active_sensing", "particle_filter", "resolution")
+            for name in ("estimator", "active_sensing", "particle_filter", "resolution")
             if getattr(variant, name) != getattr(reference, name)
         ]
         assert len(changed) == 1
-        assert variant.parameter
         assert variant.value
+    assert references == 2

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from functools import partial
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import msgspec
 import numpy as np
@@ -46,13 +46,23 @@ _INTERVALS: Mapping[str, int] = {
 _CASES = {case.name: case for case in CASES if case.name in _INTERVALS}
 
 
+Estimator = Literal["gaussian_mixture_upper", "nearest_neighbor"]
+
+_ESTIMATORS: Mapping[Estimator, str] = {
+    "gaussian_mixture_upper": "mixture",
+    "nearest_neighbor": "neighbours",
+}
+"""What tables call them."""
+
+
 class Variant(NamedTuple):
-    """Settings of which one differs from the reference.
+    """Settings of action entropy of which one differs from those of the estimator's reference.
 
     Attributes
     ----------
     parameter, value : str
         What differs, and how; empty for the reference itself.
+    estimator : {"gaussian_mixture_upper", "nearest_neighbor"}
     active_sensing : ActiveSensingSettings
     particle_filter : ParticleFilterSettings
     resolution : float
@@ -61,46 +71,51 @@ class Variant(NamedTuple):
 
     parameter: str = ""
     value: str = ""
+    estimator: Estimator = "gaussian_mixture_upper"
     active_sensing: ActiveSensingSettings = ActiveSensingSettings()
     particle_filter: ParticleFilterSettings = ParticleFilterSettings()
     resolution: float = 1.0
 
 
 def variants() -> list[Variant]:
-    """Return the reference (action entropy by nearest neighbours) and all that differ from it."""
+    """Return each estimator's reference, followed by all that differ from it."""
     found = [Variant()]
     for samples in (1, 3, 30, 100):
         sensing = ActiveSensingSettings(num_observation_samples=samples)
         found.append(Variant("M", str(samples), active_sensing=sensing))
-    for neighbors in (1, 3, 10, 20):
-        sensing = ActiveSensingSettings(num_nearest_neighbors=neighbors)
-        found.append(Variant("k", str(neighbors), active_sensing=sensing))
     for horizon in (2, 3):
         sensing = ActiveSensingSettings(horizon=horizon)
         found.append(Variant("horizon", str(horizon), active_sensing=sensing))
     found += [
-        Variant("resolution", f"x {factor:g}", resolution=factor)
+        Variant("resampling", f"below {threshold:g} N", particle_filter=filtering)
+        for threshold in (0.25, 0.5)
+        for filtering in [ParticleFilterSettings(resampling_threshold=threshold)]
+    ]
+    found += [
+        Variant("estimate", value, particle_filter=filtering)
+        for threshold, value in (
+            (0.5, "most likely, resampling below 0.5 N"),
+            (1.0, "most likely"),
+        )
+        for filtering in [
+            ParticleFilterSettings(estimate="most_likely", resampling_threshold=threshold)
+        ]
+    ]
+    found += _resolutions("gaussian_mixture_upper")
+    found.append(Variant(estimator="nearest_neighbor"))
+    for neighbors in (1, 3, 10, 20):
+        sensing = ActiveSensingSettings(num_nearest_neighbors=neighbors)
+        found.append(
+            Variant("k", str(neighbors), estimator="nearest_neighbor", active_sensing=sensing)
+        )
+    return found + _resolutions("nearest_neighbor")
+
+
+def _resolutions(estimator: Estimator) -> list[Variant]:
+    return [
+        Variant("resolution", f"x {factor:g}", estimator=estimator, resolution=factor)
         for factor in (0.1, 0.3, 3.0, 10.0)
     ]
-    found += [
-        Variant(
-            "resampling below",
-            f"{threshold:g} N",
-            particle_filter=ParticleFilterSettings(resampling_threshold=threshold),
-        )
-        for threshold in (0.25, 0.5)
-    ]
-    found += [
-        Variant(
-            "estimate",
-            f"most likely, resampling below {threshold:g} N",
-            particle_filter=ParticleFilterSettings(
-                estimate="most_likely", resampling_threshold=threshold
-            ),
-        )
-        for threshold in (0.5, 1.0)
-    ]
-    return found
 
 
 class Parameters:
@@ -123,6 +138,7 @@ class Parameters:
             table = results.of(_tasks(case, variant, scale))
             names: dict[str, Cell] = {
                 "problem": case,
+                "estimator": _ESTIMATORS[variant.estimator],
                 "parameter": variant.parameter,
                 "value": variant.value,
             }
@@ -153,7 +169,7 @@ def _cells() -> Iterator[tuple[str, Variant]]:
 
 def _tasks(name: str, variant: Variant, scale: Scale) -> list[Task]:
     case = _CASES[name]
-    selector = SelectorSettings()
+    selector = SelectorSettings(estimator=variant.estimator)
     if variant.resolution != 1.0:
         own = problem_of(case.problem, case.model, {}).resolution
         selector = msgspec.structs.replace(selector, resolution=variant.resolution * own)
@@ -201,19 +217,16 @@ def _findings(summary: Table) -> list[str]:
                 float(row[f"steps_ratio{end}"] or 0.0) for end in ("", "_low", "_high")
             )
             findings.append(
-                f"{row['problem']}, {row['parameter']} {row['value']}: {value:.3g} [{low:.3g}, "
-                f"{high:.3g}] times the steps of the reference (n = {row['trials']}, paired "
-                f"t-test, Holm-adjusted p {level:.2g})"
+                f"{row['problem']}, {row['estimator']}, {row['parameter']} {row['value']}: "
+                f"{value:.3g} [{low:.3g}, {high:.3g}] times the steps of the reference (n = "
+                f"{row['trials']}, paired t-test, Holm-adjusted p {level:.2g})"
             )
-    parameters = [name for name in dict.fromkeys(summary.columns["parameter"]) if name]
-    least = {
-        name: min(
-            float(row["steps_adjusted_p_value"] or 0.0)
-            for row in summary.rows()
-            if row["parameter"] == name
-        )
-        for name in parameters
-    }
+    least: dict[str, float] = {}
+    for row in summary.rows():
+        if row["parameter"]:
+            name = f"{row['parameter']} ({row['estimator']})"
+            level = float(row["steps_adjusted_p_value"] or 0.0)
+            least[name] = min(least.get(name, 1.0), level)
     without = [f"{name} (least p {value:.2g})" for name, value in least.items() if value >= LEVEL]
     findings.append(
         "no difference in steps beyond noise (paired t-test, Holm-adjusted level "
@@ -228,14 +241,17 @@ def _draw(summary: Table) -> Figure:
     figure, panels = plots.grid_of_panels(
         list(_CASES),
         columns=4,
-        title="Steps, against M = 10, k = 5, horizon 1, the mean, and resampling always",
+        title=(
+            "Steps, against each estimator's reference: M = 10, horizon 1, the mean, resampling "
+            "always, k = 5"
+        ),
         width=11.0,
-        row_height=4.6,
+        row_height=6.0,
         same_rows=True,
     )
     for case, panel in panels.items():
         rows = [row for row in summary.rows() if row["problem"] == case and row["parameter"]]
-        labels = [f"{row['parameter']} {row['value']}" for row in rows]
+        labels = [f"{row['estimator']}: {row['parameter']} {row['value']}" for row in rows]
         values, lows, highs = (
             [_number(row[f"steps_ratio{end}"]) for row in rows] for end in ("", "_low", "_high")
         )

@@ -115,7 +115,9 @@ def series_of(row: PublishedRow, num_trials: int, seed: int) -> TrialSeries:
                 num_nearest_neighbors=row.num_nearest_neighbors,
                 num_cores=1,
             ),
-            selector=msgspec.convert({"method": row.selector}, SelectorSettings),
+            selector=msgspec.convert(
+                {"method": row.selector, "estimator": "nearest_neighbor"}, SelectorSettings
+            ),
             sensing_interval=row.sensing_interval,
         ),
         max_steps=row.max_steps,

@@ -40,12 +40,16 @@ LEVEL = 0.01
 WAYS: Mapping[str, SelectorSettings] = {
     "random": SelectorSettings(method="random"),
     "fixed": SelectorSettings(method="fixed"),
-    "state entropy, neighbours": SelectorSettings(method="state_entropy"),
+    "state entropy, neighbours": SelectorSettings(
+        method="state_entropy", estimator="nearest_neighbor"
+    ),
     "state entropy, mixture": SelectorSettings(
         method="state_entropy", estimator="gaussian_mixture_upper"
     ),
-    "action entropy, neighbours": SelectorSettings(),
-    "action entropy, neighbours, executed": SelectorSettings(actions="executed"),
+    "action entropy, neighbours": SelectorSettings(estimator="nearest_neighbor"),
+    "action entropy, neighbours, executed": SelectorSettings(
+        estimator="nearest_neighbor", actions="executed"
+    ),
     "action entropy, mixture": SelectorSettings(estimator="gaussian_mixture_upper"),
     "action entropy, mixture, executed": SelectorSettings(
         estimator="gaussian_mixture_upper", actions="executed"
