@@ -26,7 +26,7 @@ from holdfast.planning import (
 from holdfast.problems.problem import Problem
 from holdfast.randomness import Purpose, stream
 from holdfast.runtime.environment import SimulatedEnvironment
-from holdfast.settings import ParticleFilterSettings, PlanningSettings
+from holdfast.settings import ParticleFilterSettings, PlanningSettings, SelectorSettings
 
 __all__ = ["concentrated_state", "recorded_trial", "settings_for", "with_sensing"]
 
@@ -35,8 +35,11 @@ MAX_STEPS = 500
 
 
 def settings_for(num_particles: int, threads: int, **sensing: Any) -> PlanningSettings:
-    """Return the published settings (M = 10, k = 5, H = 1, interval 8), changed as asked."""
-    settings = PlanningSettings(particle_filter=ParticleFilterSettings(num_particles=num_particles))
+    """Return the published settings (nearest neighbours, M = 10, k = 5), changed as asked."""
+    settings = PlanningSettings(
+        particle_filter=ParticleFilterSettings(num_particles=num_particles),
+        selector=SelectorSettings(estimator="nearest_neighbor"),
+    )
     return with_sensing(settings, num_cores=threads, **sensing)
 
 

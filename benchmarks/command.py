@@ -27,7 +27,7 @@ TRIALS_BAR_S = 15.0
 CONFIGURATION = """\
 problem: peg_in_hole_2d
 particle_filter: {num_particles: 100}
-selector: {method: action_entropy}
+selector: {method: action_entropy, estimator: nearest_neighbor}
 simulator: {max_steps: 500, sensing_intervals: 8, seed: 0}
 """
 

@@ -206,16 +206,23 @@ def _estimator(
         resolution = problem.resolution if selector.resolution is None else selector.resolution
         return kernel_estimator(NearestNeighbor(neighbors, resolution), dimension)
     upper = selector.estimator == "gaussian_mixture_upper"
-    if selector.resolution is not None:
-        variance = np.full(dimension, selector.resolution * selector.resolution)
-    else:
-        variance = np.asarray(problem.motion_variance, dtype=np.float64)
-        if variance.shape != (dimension,):
-            raise InvalidValueError(
-                f"selector.estimator {selector.estimator}: {problem.name} has a motion variance of "
-                f"{variance.shape[0]} coordinates, the points {dimension}: set selector.resolution"
-            )
+    variance = _noise_variance(problem, selector.resolution, dimension)
     return kernel_estimator(GaussianMixture(variance, upper), dimension)
+
+
+def _noise_variance(problem: Problem, resolution: float | None, dimension: int) -> FloatArray:
+    """Return the variances of the noise that blurs the points of a mixture.
+
+    Where the motion noise has none for a coordinate (it moves without noise, or the points are
+    states, of which there may be more than actions), the resolution stands in.
+    """
+    if resolution is not None:
+        return np.full(dimension, resolution * resolution)
+    own = problem.resolution * problem.resolution
+    variance = np.asarray(problem.motion_variance, dtype=np.float64)
+    if variance.shape != (dimension,):
+        return np.full(dimension, own)
+    return np.where(variance == 0.0, own, variance)
 
 
 def _require_bounded(problem: Problem, points: FloatArray, states: FloatArray, which: str) -> None:

@@ -97,22 +97,24 @@ class SelectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
         ``fixed`` look at no belief.
     sensing_action : int
         Index of the sensing action that ``fixed`` chooses.
-    estimator : {"nearest_neighbor", "gaussian_mixture_upper", "gaussian_mixture_lower"}
-        The estimate of the two entropies.
+    estimator : {"gaussian_mixture_upper", "gaussian_mixture_lower", "nearest_neighbor"}
+        The estimate of the two entropies. (The thesis's is the nearest neighbour; docs/results.md
+        says why it is not the default.)
     actions : {"commanded", "executed"}
         Whether ``action_entropy`` and ``action_covariance`` look at what the policy says or at what
         the limits leave of it.
     resolution : float or None
-        Distance below which two actions (or states) do not differ in practice, in their unit.
-        None takes the problem's own, which follows its motion noise.
+        Distance below which two actions (or states) do not differ in practice, in their unit; for
+        a mixture, the standard deviation of the noise that blurs them. None takes the problem's own
+        motion noise.
     """
 
     method: Literal["action_entropy", "state_entropy", "action_covariance", "random", "fixed"] = (
         "action_entropy"
     )
     sensing_action: NonNegativeCount = 0
-    estimator: Literal["nearest_neighbor", "gaussian_mixture_upper", "gaussian_mixture_lower"] = (
-        "nearest_neighbor"
+    estimator: Literal["gaussian_mixture_upper", "gaussian_mixture_lower", "nearest_neighbor"] = (
+        "gaussian_mixture_upper"
     )
     actions: Literal["commanded", "executed"] = "commanded"
     resolution: Positive | None = None

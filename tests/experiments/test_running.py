@@ -111,7 +111,10 @@ class TestTasks:
             run_task(Task(kind="dance", parameters={}))
 
     def test_what_a_trial_is_refused_for_names_it(self) -> None:
-        planning = {"active_sensing": {"num_nearest_neighbors": 100}}
+        planning = {
+            "active_sensing": {"num_nearest_neighbors": 100},
+            "selector": {"estimator": "nearest_neighbor"},
+        }
         task = next(trial_tasks(series(planning=planning), 100))
         with pytest.raises(TaskError, match=r"trial 0 \(seed 4\) of peg_in_hole_2d: .*neighbors"):
             run_task(task)

@@ -33,7 +33,12 @@ from holdfast.problems.peg_in_hole_3d import PegInHole3D
 from holdfast.problems.problem import FloatArray, Problem
 from holdfast.randomness import Purpose, stream
 from holdfast.runtime.environment import SimulatedEnvironment
-from holdfast.settings import ActiveSensingSettings, ParticleFilterSettings, PlanningSettings
+from holdfast.settings import (
+    ActiveSensingSettings,
+    ParticleFilterSettings,
+    PlanningSettings,
+    SelectorSettings,
+)
 
 # The sum of some thousand terms of about 10 nats, each with a relative error of a few 1e-15.
 TOLERANCE = 1e-9
@@ -45,6 +50,7 @@ def settings_of(num_particles: int) -> PlanningSettings:
     return PlanningSettings(
         particle_filter=ParticleFilterSettings(num_particles=num_particles),
         active_sensing=ActiveSensingSettings(num_cores=1),
+        selector=SelectorSettings(estimator="nearest_neighbor"),
     )
 
 

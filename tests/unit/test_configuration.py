@@ -559,15 +559,17 @@ class TestKeysAndValues:
 
 class TestTwoKeys:
     def test_neighbours_need_as_many_other_particles(self, write: Write) -> None:
-        text = "problem: peg_in_hole_2d\nparticle_filter: {num_particles: %d}\n"
+        text = "problem: peg_in_hole_2d\nselector: {estimator: nearest_neighbor}\n"
+        text += "particle_filter: {num_particles: %d}\n"
         message = complaint(write(text % 5 + "active_sensing:\n  num_nearest_neighbors: 5"))
-        assert "line 4: active_sensing.num_nearest_neighbors is 5;" in message
+        assert "line 5: active_sensing.num_nearest_neighbors is 5;" in message
         assert "below particle_filter.num_particles, which is 5" in message
         assert "is 5;" in complaint(write(text % 4))  # The default breaks it as well.
         assert load(write(text % 6)).planning.particle_filter.num_particles == 6
 
     @pytest.mark.parametrize(
-        "selector", ["{estimator: gaussian_mixture_upper}", "{method: random}", "{method: fixed}"]
+        "selector",
+        ["{estimator: gaussian_mixture_upper}", "{method: random}", "{method: fixed}", "{}"],
     )
     def test_where_neighbours_are_not_counted_one_particle_is_enough(
         self, selector: str, write: Write

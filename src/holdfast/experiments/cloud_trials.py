@@ -433,6 +433,7 @@ class _Processes:
                 "num_nearest_neighbors": wanted.num_nearest_neighbors,
                 "num_cores": wanted.num_cores,
             },
+            "selector": {"estimator": "nearest_neighbor"},  # the thesis's
             "simulator": {
                 "num_trials": num_trials,
                 "max_steps": wanted.max_steps,

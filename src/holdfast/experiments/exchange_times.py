@@ -45,7 +45,7 @@ from holdfast.session.messages import (
     encode,
     numbers_to,
 )
-from holdfast.settings import ParticleFilterSettings, PlanningSettings
+from holdfast.settings import ParticleFilterSettings, PlanningSettings, SelectorSettings
 
 __all__ = ["COLUMNS", "Exchange", "measure_exchange"]
 
@@ -121,7 +121,8 @@ def measure_exchange(**exchange: Any) -> Table:
     if wanted.way not in ways:
         raise TaskError(f"way {wanted.way!r}: there are {', '.join(ways)}")
     settings = PlanningSettings(
-        particle_filter=ParticleFilterSettings(num_particles=wanted.particles)
+        particle_filter=ParticleFilterSettings(num_particles=wanted.particles),
+        selector=SelectorSettings(estimator="nearest_neighbor"),
     )
     opening = Opening(wanted.problem, {}, {}, settings, wanted.seed)
     turns = [turn for trial in range(wanted.num_trials) for turn in _turns(wanted, settings, trial)]

@@ -46,7 +46,12 @@ from holdfast.experiments.thesis_measurements import (
 )
 from holdfast.experiments.trial_batches import TrialSeries, trial_tasks
 from holdfast.recording.tables import wilson_interval
-from holdfast.settings import ActiveSensingSettings, ParticleFilterSettings, PlanningSettings
+from holdfast.settings import (
+    ActiveSensingSettings,
+    ParticleFilterSettings,
+    PlanningSettings,
+    SelectorSettings,
+)
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -91,6 +96,7 @@ def series_of(particles: int, num_trials: int, seed: int) -> TrialSeries:
             active_sensing=ActiveSensingSettings(
                 num_observation_samples=10, num_nearest_neighbors=5, num_cores=1
             ),
+            selector=SelectorSettings(estimator="nearest_neighbor"),
             sensing_interval=8,
         ),
         max_steps=_MAX_STEPS,

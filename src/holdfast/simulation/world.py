@@ -17,7 +17,7 @@ from holdfast.session.effects import Effect
 from holdfast.session.events import Ended, Replied, TransportEvent
 from holdfast.session.messages import MessageError, decode_reply
 from holdfast.session.status import IllegalTransitionError
-from holdfast.settings import ParticleFilterSettings, PlanningSettings
+from holdfast.settings import ParticleFilterSettings, PlanningSettings, SelectorSettings
 from holdfast.simulation.agenda import Agenda, Clock
 from holdfast.simulation.checkers import WireChecker, check_size
 from holdfast.simulation.disk import Disk
@@ -125,7 +125,8 @@ class Simulator:
     def __init__(self) -> None:
         problem = PegInHole2D()
         planning = PlanningSettings(
-            particle_filter=ParticleFilterSettings(num_particles=_NUM_PARTICLES)
+            particle_filter=ParticleFilterSettings(num_particles=_NUM_PARTICLES),
+            selector=SelectorSettings(estimator="nearest_neighbor"),
         )
         self._twins = Twins(problem, planning, _SEED)
         self._planner = RememberingPlanner(Planner(problem, planning))
