@@ -17,7 +17,7 @@ PACKAGE_SOURCES := $(shell find cmake src -type f -not -name '*.pyc')
 CPP_FILES := $(shell find cpp -name '*.hpp' -o -name '*.cpp')
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-slow test-compiled lint format simulate chaos fuzz soak bench clean
+.PHONY: help demo test test-slow test-compiled lint format simulate chaos fuzz soak bench results clean
 
 help: ## what there is to make
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-13s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -63,6 +63,13 @@ bench: $(INSTALLED_DEV) $(INSTALLED_COMPILED) ## the benchmarks
 chaos: $(INSTALLED_FIGURES) ## 500 runs with real faults, about 25 minutes; see chaos-run
 	rm -rf chaos-run
 	$(BIN)/holdfast chaos --trials 500 --jobs 2 --out chaos-run
+
+results: $(INSTALLED_DEV) ## the experiments behind docs/results.md: hours, the last half hour with the machine to itself
+	$(BIN)/holdfast experiment all --out runs/experiments
+	for study in runs/experiments/*/origin.json; do \
+	    name=$$(basename $$(dirname $$study)); mkdir -p docs/results/$$name; \
+	    find runs/experiments/$$name -maxdepth 1 -type f -not -name '*_trials.csv' -exec cp {} docs/results/$$name/ \; ; \
+	done
 
 clean: ## remove what was built or run here, but keep .venv
 	rm -rf build dist demo-run chaos-run .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis
