@@ -23,6 +23,9 @@ __all__ = ["experiment"]
 
 _DEFAULT_DIRECTORY = Path("runs") / "experiments"
 
+_MOST_FINDINGS = 20
+"""Sentences of a study that are printed; all of them are kept."""
+
 _NOTE = "all kept"
 """What is to be said of the trials that are finished."""
 
@@ -161,7 +164,10 @@ def _report(study: Study, scale: Scale, workload: Workload, directory: Path) -> 
     report = study.report(scale, workload.results)
     names = write_report(study, scale, report, directory)
     sys.stdout.write(f"\n{study.title}\n\n")
-    for finding in report.findings:
+    for finding in report.findings[:_MOST_FINDINGS]:
         sys.stdout.write(f"- {finding}\n")
+    if len(report.findings) > _MOST_FINDINGS:
+        others = len(report.findings) - _MOST_FINDINGS
+        sys.stdout.write(f"- {others} more: {directory / 'origin.json'}\n")
     sys.stdout.write(f"\n{directory}/\n  {'  '.join(names)}\n")
     sys.stdout.flush()

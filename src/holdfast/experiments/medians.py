@@ -24,8 +24,8 @@ FloatArray = npt.NDArray[np.float64]
 _LEVEL = 0.95
 _RESAMPLES = 1000
 _LARGEST_ARRAY = 2_000_000
-_FEWEST_GROUPS = 5
-"""Of fewer there are too few ways to draw them anew."""
+_FEWEST_GROUPS = 10
+"""Of fewer there are too few ways to draw them anew, and the interval is too short."""
 
 
 def median_interval(values: FloatArray) -> Interval:
@@ -84,7 +84,7 @@ def median_interval_of_groups(values: FloatArray, groups: FloatArray) -> Interva
     Returns
     -------
     Interval
-        NaN where there are no values; without bounds for fewer than five groups.
+        NaN where there are no values; without bounds for fewer than ten groups.
 
     Raises
     ------

@@ -1,13 +1,13 @@
 """What the parameters do: each of them changed alone, on the same worlds.
 
-Where a parameter makes no difference beyond noise, the cheapest value will do; where it does, the
-default is what this study says.
+That no difference is found does not mean that there is none: the intervals say how large one could
+be. Where they exclude all that would matter, the cheapest value will do.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
@@ -29,7 +29,8 @@ if TYPE_CHECKING:
 __all__ = ["Parameters", "Variant", "variants"]
 
 LEVEL = 0.01
-"""Of all tests together: the probability that any difference is claimed where there is none."""
+"""Of the tests of steps, and of those of successes: the probability that any difference is claimed
+where there is none."""
 
 _TRIALS = 200
 _QUICK_TRIALS = 6
@@ -65,8 +66,8 @@ class Variant(NamedTuple):
     estimator : {"gaussian_mixture_upper", "nearest_neighbor"}
     active_sensing : ActiveSensingSettings
     particle_filter : ParticleFilterSettings
-    resolution : float
-        In units of the problem's own.
+    resolution : float, optional
+        In units of the problem's own; None for the motion noise.
     """
 
     parameter: str = ""
@@ -74,7 +75,7 @@ class Variant(NamedTuple):
     estimator: Estimator = "gaussian_mixture_upper"
     active_sensing: ActiveSensingSettings = ActiveSensingSettings()
     particle_filter: ParticleFilterSettings = ParticleFilterSettings()
-    resolution: float = 1.0
+    resolution: float | None = None
 
 
 def variants() -> list[Variant]:
@@ -101,20 +102,21 @@ def variants() -> list[Variant]:
             ParticleFilterSettings(estimate="most_likely", resampling_threshold=threshold)
         ]
     ]
-    found += _resolutions("gaussian_mixture_upper")
+    # The same in all directions, as the motion noise itself need not be: so 1 is another, too.
+    found += _resolutions("gaussian_mixture_upper", (0.1, 0.3, 1.0, 3.0, 10.0))
     found.append(Variant(estimator="nearest_neighbor"))
     for neighbors in (1, 3, 10, 20):
         sensing = ActiveSensingSettings(num_nearest_neighbors=neighbors)
         found.append(
             Variant("k", str(neighbors), estimator="nearest_neighbor", active_sensing=sensing)
         )
-    return found + _resolutions("nearest_neighbor")
+    return found + _resolutions("nearest_neighbor", (0.1, 0.3, 3.0, 10.0))
 
 
-def _resolutions(estimator: Estimator) -> list[Variant]:
+def _resolutions(estimator: Estimator, factors: Sequence[float]) -> list[Variant]:
     return [
         Variant("resolution", f"x {factor:g}", estimator=estimator, resolution=factor)
-        for factor in (0.1, 0.3, 3.0, 10.0)
+        for factor in factors
     ]
 
 
@@ -170,7 +172,7 @@ def _cells() -> Iterator[tuple[str, Variant]]:
 def _tasks(name: str, variant: Variant, scale: Scale) -> list[Task]:
     case = _CASES[name]
     selector = SelectorSettings(estimator=variant.estimator)
-    if variant.resolution != 1.0:
+    if variant.resolution is not None:
         own = problem_of(case.problem, case.model, {}).resolution
         selector = msgspec.structs.replace(selector, resolution=variant.resolution * own)
     series = case.series(
@@ -188,7 +190,7 @@ def _compared(table: Table, reference: Table) -> dict[str, Cell]:
     success, other = (each.numbers("success") == 1.0 for each in (table, reference))
     low, high = wilson_interval(int(success.sum()), success.size)
     steps = statistics.mean_interval(table.numbers("steps"))
-    _, success_p_value = statistics.paired_rates(success, other)
+    gain, success_p_value = statistics.paired_rates(success, other)
     difference, steps_p_value = statistics.paired_difference(
         np.log(table.numbers("steps")), np.log(reference.numbers("steps"))
     )
@@ -201,6 +203,7 @@ def _compared(table: Table, reference: Table) -> dict[str, Cell]:
         "mean_reward": float(np.mean(table.numbers("reward"))),
         "mean_sensing_ms": float(np.nanmean(table.numbers("mean_sensing_ms"))),
         **statistics.cells_of("steps_ratio", statistics.ratio_of(difference)),
+        **statistics.cells_of("success_gain", gain),
         "success_p_value": success_p_value,
         "steps_p_value": steps_p_value,
     }
@@ -209,17 +212,23 @@ def _compared(table: Table, reference: Table) -> dict[str, Cell]:
 def _findings(summary: Table) -> list[str]:
     findings = []
     for row in summary.rows():
-        if not row["parameter"]:
-            continue
-        level = float(row["steps_adjusted_p_value"] or 0.0)
-        if level < LEVEL:
+        where = f"{row['problem']}, {row['estimator']}, {row['parameter']} {row['value']}"
+        level = _number(row["steps_adjusted_p_value"])
+        if row["parameter"] and level < LEVEL:
+            ends = (_number(row[f"steps_ratio{end}"]) for end in ("", "_low", "_high"))
+            findings.append(
+                f"{where}: {statistics.Interval(*ends)} times the steps of the reference "
+                f"(geometric mean, n = {row['trials']}, paired t-test, Holm-adjusted p "
+                f"{level:.2g})"
+            )
+        level = _number(row["success_adjusted_p_value"])
+        if row["parameter"] and level < LEVEL:
             value, low, high = (
-                float(row[f"steps_ratio{end}"] or 0.0) for end in ("", "_low", "_high")
+                100.0 * _number(row[f"success_gain{end}"]) for end in ("", "_low", "_high")
             )
             findings.append(
-                f"{row['problem']}, {row['estimator']}, {row['parameter']} {row['value']}: "
-                f"{value:.3g} [{low:.3g}, {high:.3g}] times the steps of the reference (n = "
-                f"{row['trials']}, paired t-test, Holm-adjusted p {level:.2g})"
+                f"{where}: {value:+.1f} points of success [{low:+.1f}, {high:+.1f}] (n = "
+                f"{row['trials']}, McNemar's test, Holm-adjusted p {level:.2g})"
             )
     least: dict[str, float] = {}
     for row in summary.rows():

@@ -256,8 +256,9 @@ def _findings(summary: Table) -> list[str]:
             tested = levels[~np.isnan(levels)]
             agreeing = int(np.count_nonzero(tested >= LEVEL))
             findings.append(
-                f"{problem}, emulated and logged {what}: {agreeing} of {tested.size} rows agree "
-                f"({test}, Holm-adjusted level {LEVEL:g}; least adjusted p {tested.min():.2g})"
+                f"{problem}, emulated and logged {what}: no difference found in {agreeing} of "
+                f"{tested.size} rows ({test}, Holm-adjusted level {LEVEL:g}; least adjusted p "
+                f"{tested.min():.2g})"
                 if tested.size
                 else f"{problem}, {what}: too few successes to compare"
             )

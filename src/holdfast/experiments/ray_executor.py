@@ -196,7 +196,9 @@ def _compute(
     except BaseException:
         # Nobody waits for what they still compute.
         for reference in running:
-            ray.cancel(reference, force=True)
+            # Whatever becomes of one, the others are cancelled, and the first error is told.
+            with contextlib.suppress(Exception):
+                ray.cancel(reference, force=True)
         raise
 
 

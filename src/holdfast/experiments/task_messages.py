@@ -92,9 +92,10 @@ def _check_code(asked: _Request) -> None:
     own = code_digest(kind)
     if own != asked.code:
         raise TaskError(
-            f"{socket.gethostname()} has other code for tasks of the kind {kind!r} (digest {own}, "
-            f"of holdfast {__version__}) than the machine that asks (digest {asked.code}), so the "
-            "results would not belong together: install the same holdfast on every node"
+            f"a process on {socket.gethostname()} has other code for tasks of the kind {kind!r} "
+            f"(digest {own}, of holdfast {__version__}) than the one that asks (digest "
+            f"{asked.code}), so the results would not belong together: install the same holdfast "
+            "on every node, and edit nothing meanwhile"
         )
 
 

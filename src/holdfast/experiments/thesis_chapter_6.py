@@ -515,15 +515,18 @@ def _findings_of_faults(rows: MeasuredRows) -> list[str]:
         ),
     ):
         times = rows.number(name)[chosen]
+        total = times.size
         times = times[~np.isnan(times)]
         if not times.size:
             continue
+        # A run that ended before counts as one in which it took too long.
         below = int(np.count_nonzero(times < limit_ms))
-        low, high = wilson_interval(below, times.size)
+        low, high = wilson_interval(below, total)
         findings.append(
             f"{what}: median {_told(median_interval(times))} (95 % interval of order statistics), "
-            f"n = {times.size}; under the thesis's {limit_ms:g} ms in {below} of {times.size} "
+            f"n = {times.size}; under the thesis's {limit_ms:g} ms in {below} of {total} "
             f"({100.0 * low:.0f} to {100.0 * high:.0f} %, Wilson)"
+            + (f"; {total - times.size} runs ended before" if total > times.size else "")
         )
     return findings
 
@@ -557,7 +560,8 @@ _EMULATIONS = {
     "nothing": "not at all (same machine)",
     "packets": (
         "as packets between two networks on one machine, each delayed by half the round trip and "
-        "dropped at random each way, with the system's own TCP and Zenoh's own QUIC at both ends"
+        "dropped at random each way (independently, in order, without jitter or a limit on "
+        "bandwidth), with the system's own TCP and Zenoh's own QUIC at both ends"
     ),
     "tcp proxy": (
         "by a proxy where TCP ends; a lost packet is a piece that comes later by 200 ms, because a "

@@ -130,7 +130,8 @@ def _medians(
 
 
 def _length(value: float) -> float:
-    return max(0.0, value) if math.isfinite(value) else 0.0
+    """Return a bar's length; none, not even its caps, is drawn where there is no bound."""
+    return max(0.0, value) if math.isfinite(value) else math.nan
 
 
 def _dots(
@@ -554,7 +555,7 @@ def cloud_dies(table: Table) -> Figure:
     what = np.array(table.columns["what"], dtype=object)
     at_s = table.numbers("at_s")
     bands = _status_bands(table, kill)
-    figure = figure_of(9.6, 5.6, "The cloud dies, the robot goes on, and no decision changes")
+    figure = figure_of(9.6, 5.6, _title(table))
     with mpl.rc_context(STYLE):
         motion, answers = figure.subplots(2, 1, sharex=True, height_ratios=(1.0, 1.15))
         for panel in (motion, answers):
@@ -580,6 +581,13 @@ def cloud_dies(table: Table) -> Figure:
         figure.align_ylabels()
         figure.supxlabel(_verdict(table, kill), x=0.012, ha="left", fontsize=9.5)
     return figure
+
+
+def _title(table: Table) -> str:
+    same = all(table.columns["identical"])
+    return "The cloud dies, the robot goes on, " + (
+        "and no decision changes" if same else "BUT DECISIONS CHANGE"
+    )
 
 
 def _status_bands(table: Table, kill: Mapping[str, Cell] | None) -> list[tuple[float, float, str]]:
