@@ -25,7 +25,7 @@ def selector_of(task: Task) -> dict[str, object]:
 def compared() -> Iterator[Report]:
     """Worlds differ by a factor; whoever asks for the mixture of actions takes four fifths.
 
-    Whoever asks for the mixture of states fails in every fourth trial.
+    Whoever asks for the mixture of states fails in every second trial.
     """
 
     def trial(task: Task, number: int) -> tuple[bool, int, float]:
@@ -39,7 +39,7 @@ def compared() -> Iterator[Report]:
             factor = 3.0
         steps = round(10_000 * world * own * factor)
         fails = chosen["method"] == "state_entropy" and chosen["estimator"] != "nearest_neighbor"
-        success = chosen["method"] != "fixed" and not (fails and number % 4 == 0)
+        success = chosen["method"] != "fixed" and not (fails and number % 2 == 0)
         return success, steps, -0.01 * steps
 
     study = selectors.Selectors()
@@ -88,10 +88,14 @@ def test_rivals_and_sentences(compared: Report) -> None:
     for begin, inside in (
         ("all problems (mean), fixed: ", "times the steps of random"),
         ("busy room, action entropy, mixture against action entropy, neighbours: 0.", "paired"),
-        ("tight hole, action entropy, mixture against state entropy, mixture: +25", "of success"),
+        ("tight hole, action entropy, mixture against state entropy, mixture: +50", "of success"),
     ):
-        assert any(told.startswith(begin) and inside in told for told in compared.findings)
-    assert not [told for told in compared.findings if told.startswith("capsule robot, state")]
+        found = [told for told in compared.findings if told.startswith(begin)]
+        assert any(inside in told for told in found), begin
+    # Where nothing differs but by chance nothing is said.
+    assert not [
+        told for told in compared.findings if "covariance against action entropy, n" in told
+    ]
 
 
 def test_groups_of_problems() -> None:
