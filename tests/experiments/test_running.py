@@ -91,6 +91,14 @@ class TestTasks:
         )
         assert task_key(task) != before
 
+    def test_the_key_of_times_names_the_machine(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        task = next(trial_tasks(series(), 100))
+        timed = msgspec.structs.replace(task, exclusive=True)
+        before = task_key(task), task_key(timed)
+        monkeypatch.setattr(tasks, "_machine", lambda: {"processor": "another"})
+        assert task_key(task) == before[0]
+        assert task_key(timed) != before[1]
+
     def test_the_sources_behind_a_task(self) -> None:
         """What a trial is made of is among them; what only shows or moves it is not."""
         package = Path(holdfast.__file__).parent

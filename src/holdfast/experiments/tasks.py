@@ -23,6 +23,7 @@ import holdfast
 from holdfast import _kernel
 from holdfast.errors import HoldfastError
 from holdfast.experiments.tables import Table
+from holdfast.recording.machine import describe
 
 __all__ = ["Task", "TaskError", "code_digest", "run_task", "task_key"]
 
@@ -41,6 +42,9 @@ _OF_PROCESSES = frozenset({"exchange_times", "cloud_trials"})
 _PLACE = re.compile(r"\w+(\.\w+)+:\w+")
 
 _KEY_SIZE = 16
+
+_OF_THE_DAY = ("date", "holdfast")
+"""What is said of a machine that is no part of it."""
 
 
 class TaskError(HoldfastError):
@@ -70,12 +74,22 @@ class Task(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def task_key(task: Task) -> str:
-    """Return the digest of all that a task's outcome depends on, in hexadecimal."""
+    """Return the digest of all that a task's outcome depends on, in hexadecimal.
+
+    Times depend on the machine as well.
+    """
     content = [task.kind, task.parameters, code_digest(task.kind)]
     # Problems that are named by their place are code, too.
     content += [_digest_behind(place) for place in _places_in(task.parameters)]
+    if task.exclusive:
+        content.append(_machine())
     plain = msgspec.json.encode(content, order="sorted")
     return hashlib.blake2b(plain, digest_size=_KEY_SIZE).hexdigest()
+
+
+@functools.cache
+def _machine() -> dict[str, str]:
+    return {name: value for name, value in describe().items() if name not in _OF_THE_DAY}
 
 
 @functools.cache
