@@ -105,9 +105,9 @@ class SelectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
         the limits leave of it.
     resolution : float or None
         Distance below which two actions (or states) do not differ in practice, in their unit; for
-        a mixture, the standard deviation of the noise that blurs them. None takes the problem's own:
-        its motion noise for a mixture (where that has no noise for a coordinate, or there are more
-        coordinates of a state than of an action, the problem's resolution), else its resolution.
+        a mixture, the standard deviation of the noise that blurs them. None takes the problem's
+        resolution, and for a mixture its motion noise, unless that has none for a coordinate or
+        there are more coordinates of a state than of an action.
     """
 
     method: Literal["action_entropy", "state_entropy", "action_covariance", "random", "fixed"] = (

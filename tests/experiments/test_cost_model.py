@@ -11,7 +11,6 @@ from holdfast.experiments.cost_model import (
     Scaling,
     break_even,
     busy_cores,
-    median_interval,
     parallel_share,
     power_law,
 )
@@ -27,24 +26,6 @@ def scaling(share: float = 0.9, pieces: int | None = None) -> Scaling:
         tuple(Interval(share, share - 0.1, min(share + 0.1, 1.0)) for _ in particles),
         pieces,
     )
-
-
-class TestMedianInterval:
-    @pytest.mark.parametrize(("count", "below"), [(6, 0), (9, 1), (20, 5), (100, 39)])
-    def test_it_ends_where_the_tables_say(self, count: int, below: int) -> None:
-        found = median_interval(np.random.default_rng(count).permutation(count).astype(float))
-        assert found == ((count - 1) / 2, below, count - 1 - below)
-
-    def test_few(self) -> None:
-        assert median_interval(np.array([3.0, 1.0, 2.0, np.nan])) == (2.0, -math.inf, math.inf)
-        assert all(math.isnan(end) for end in median_interval(np.array([np.nan])))
-
-    def test_it_holds_the_truth_as_often_as_it_says(self) -> None:
-        # Of 9 values it holds the median with 96.1 %: fewer than 1,870 or more than 1,960 of 2,000
-        # have a probability below 1e-6 (binomial).
-        samples = np.random.default_rng(7).exponential(size=(2000, 9))
-        held = sum(f.low <= math.log(2.0) <= f.high for f in map(median_interval, samples))
-        assert 1870 <= held <= 1960
 
 
 class TestShare:

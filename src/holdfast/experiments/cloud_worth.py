@@ -29,12 +29,12 @@ from holdfast.experiments.cost_model import (
     BreakEven,
     Scaling,
     break_even,
-    median_interval,
     power_law,
 )
 from holdfast.experiments.exchange_times import Exchange
+from holdfast.experiments.medians import median_interval
 from holdfast.experiments.sensing_times import Measurement
-from holdfast.experiments.statistics import Interval
+from holdfast.experiments.statistics import Interval, cells_of
 from holdfast.experiments.study import Report, Results, Scale
 from holdfast.experiments.tables import Cell, Table
 from holdfast.experiments.tasks import Task
@@ -279,17 +279,6 @@ def scaling_of(kind: Kind, table: Table) -> Scaling:
 # -- tables ------------------------------------------------------------------------------------
 
 
-def _ends(name: str, interval: Interval) -> dict[str, Cell]:
-    return {
-        f"{name}{end}": value if math.isfinite(value) else None
-        for end, value in zip(("", "_low", "_high"), interval, strict=True)
-    }
-
-
-def _of_cells(cells: Sequence[dict[str, Cell]]) -> Table:
-    return Table({name: [each[name] for each in cells] for name in cells[0]})
-
-
 def _times_table(of_beliefs: dict[Kind, Table], scalings: dict[Kind, Scaling]) -> Table:
     """Return the median times by kind, particles and threads, with the share that is divided."""
     cells: list[dict[str, Cell]] = []
@@ -308,13 +297,13 @@ def _times_table(of_beliefs: dict[Kind, Table], scalings: dict[Kind, Scaling]) -
                         "threads": int(each),
                         "beliefs": int(those.sum()),
                         "repetitions": int(table.numbers("repetitions")[those][0]),
-                        **_ends("ms", median_interval(table.numbers("median_ms")[those])),
-                        **_ends("divided_share", share),
+                        **cells_of("ms", median_interval(table.numbers("median_ms")[those])),
+                        **cells_of("divided_share", share),
                         "mapping_share": float(np.median(mapping)),
                         "others_cores": _found(table.numbers("others_cores")[those][0]),
                     }
                 )
-    return _of_cells(cells)
+    return Table.of_records(cells)
 
 
 def _found(value: float) -> Cell:
@@ -332,12 +321,12 @@ def _exchange_table(asked: dict[tuple[str, int], Table]) -> Table:
                 "way": way,
                 "particles": particles,
                 "questions": table.num_rows,
-                **_ends("task_exchange_ms", median_interval(task)),
-                **_ends("sensing_exchange_ms", median_interval(both)),
-                **_ends("task_computed_ms", median_interval(table.numbers("task_computed_ms"))),
+                **cells_of("task_exchange_ms", median_interval(task)),
+                **cells_of("sensing_exchange_ms", median_interval(both)),
+                **cells_of("task_computed_ms", median_interval(table.numbers("task_computed_ms"))),
             }
         )
-    return _of_cells(cells)
+    return Table.of_records(cells)
 
 
 def _exchange_ms(asked: dict[tuple[str, int], Table]) -> float:
@@ -378,7 +367,7 @@ def _growth_table(of_beliefs: dict[Kind, Table]) -> Table:
                     if at in times:
                         of_each.setdefault(belief, {})[getattr(other, changed)] = times[at]
             cells += _exponents(changed, kind, of_each, f"at {at:,} particles")
-    return _of_cells(cells)
+    return Table.of_records(cells)
 
 
 def _exponents(
@@ -405,7 +394,7 @@ def _exponents(
             "smallest": sizes[0],
             "largest": sizes[-1],
             "beliefs": len(slopes),
-            **_ends("exponent", median_interval(np.array(slopes))),
+            **cells_of("exponent", median_interval(np.array(slopes))),
             "n_log_n": _exponent_of_n_log_n(sizes[0], sizes[-1]) if what == "particles" else None,
         }
     ]
@@ -463,7 +452,7 @@ def _whole(found: BreakEven) -> Cell:
 
 def _break_even_table(scalings: dict[Kind, Scaling], exchange_ms: float) -> Table:
     """Return from where on a service is faster for a robot that waits for each decision."""
-    return _of_cells(
+    return Table.of_records(
         [
             {
                 **kind.names(),
@@ -485,7 +474,7 @@ def _break_even_table(scalings: dict[Kind, Scaling], exchange_ms: float) -> Tabl
 
 def _ahead_table(scalings: dict[Kind, Scaling], exchange_ms: float) -> Table:
     """Return the same for a robot that decides ahead, by its rate."""
-    return _of_cells(
+    return Table.of_records(
         [
             {
                 **kind.names(),

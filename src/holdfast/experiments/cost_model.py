@@ -36,7 +36,6 @@ __all__ = [
     "Scaling",
     "break_even",
     "busy_cores",
-    "median_interval",
     "parallel_share",
     "power_law",
 ]
@@ -44,40 +43,6 @@ __all__ = [
 FloatArray = npt.NDArray[np.float64]
 
 _LEVEL = 0.95
-
-
-def median_interval(values: FloatArray) -> Interval:
-    """Return the median of independent values with its interval by order statistics.
-
-    The interval ends at two of the values, the innermost pair that holds the median with at least
-    95 %, whatever the distribution.
-
-    Parameters
-    ----------
-    values : array
-        NaN for none, which is left out.
-
-    Returns
-    -------
-    Interval
-        NaN where there are no values; without bounds where there are fewer than six, of which even
-        the outermost hold it less surely.
-    """
-    ordered = np.sort(values[~np.isnan(values)])
-    count = ordered.size
-    if count == 0:
-        return Interval(math.nan, math.nan, math.nan)
-    median = float(np.median(ordered))
-    # The median is below the (r + 1)-th value with P(Binomial(count, 1/2) <= r).
-    below, rank = 0.0, -1
-    for r in range(count // 2):
-        below += math.comb(count, r) * 0.5**count
-        if 2.0 * below > 1.0 - _LEVEL:
-            break
-        rank = r
-    if rank < 0:
-        return Interval(median, -math.inf, math.inf)
-    return Interval(median, float(ordered[rank]), float(ordered[count - 1 - rank]))
 
 
 def parallel_share(times: Mapping[int, float]) -> float:

@@ -148,7 +148,7 @@ class Parameters:
             if not variant.parameter:
                 reference = table
             rows.append({**names, **_compared(table, reference)})
-        summary = Table({name: [row[name] for row in rows] for name in rows[0]})
+        summary = Table.of_records(rows)
         varied = np.array([bool(name) for name in summary.columns["parameter"]])
         for name in ("success", "steps"):
             adjusted = np.ones(varied.size)

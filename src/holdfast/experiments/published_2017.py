@@ -153,7 +153,7 @@ class Published2017:
             for way, table in (("emulated", emulated), ("sound", sound)):
                 raw.extend(_outcomes(table), **_names(row), way=way)
             cells.append({**_names(row), **_compared(row, emulated, sound)})
-        summary = Table({name: [each[name] for each in cells] for name in cells[0]})
+        summary = Table.of_records(cells)
         _adjust(summary)
         report.summary["published_2017"] = summary
         report.raw["published_2017"] = raw

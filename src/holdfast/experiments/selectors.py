@@ -184,7 +184,7 @@ def _summary(tables: Mapping[_Cell, Table]) -> Table:
         )
         row |= statistics.cells_of("steps_ratio", statistics.ratio_of(difference))
         rows.append(row)
-    summary = Table({name: [row[name] for row in rows] for name in rows[0]})
+    summary = Table.of_records(rows)
     compared = np.array([way != BASELINE for way in summary.columns["way"]])
     for name in ("success", "reward", "steps"):
         adjusted = np.ones(compared.size)
@@ -275,7 +275,7 @@ def _compared(
                 "p_value": p_value,
             }
         )
-    table = Table({name: [row[name] for row in rows] for name in rows[0]})
+    table = Table.of_records(rows)
     adjusted = statistics.smallest_levels(table.numbers("p_value"))
     table.columns["adjusted_p_value"] = adjusted.tolist()
     return table
@@ -309,7 +309,7 @@ def _costs(tables: Mapping[_Cell, Table]) -> Table:
                         "p_value": p_value,
                     }
                 )
-    table = Table({name: [row[name] for row in rows] for name in rows[0]})
+    table = Table.of_records(rows)
     compared = np.array([way != BASELINE for way in table.columns["way"]])
     adjusted = np.ones(compared.size)
     adjusted[compared] = statistics.smallest_levels(table.numbers("p_value")[compared])

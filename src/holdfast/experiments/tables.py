@@ -45,6 +45,12 @@ class Table(msgspec.Struct):
                 table.columns[name].append(cell)
         return table
 
+    @classmethod
+    def of_records(cls, records: Sequence[Mapping[str, Cell]]) -> Table:
+        """Return the table of rows that name their cells; all have those of the first."""
+        names = records[0] if records else {}
+        return cls({name: [record[name] for record in records] for name in names})
+
     @property
     def num_rows(self) -> int:
         """Rows of the table."""

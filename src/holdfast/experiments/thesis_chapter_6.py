@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -23,7 +23,7 @@ import numpy as np
 
 from holdfast.experiments.cloud_trials import CloudTrials
 from holdfast.experiments.medians import median_interval
-from holdfast.experiments.statistics import Interval
+from holdfast.experiments.statistics import Interval, cells_of
 from holdfast.experiments.study import Report, Results, Scale
 from holdfast.experiments.tables import Cell, Table
 from holdfast.experiments.tasks import Task
@@ -273,14 +273,16 @@ def _decisions(rows: MeasuredRows) -> Table:
                         "service": service,
                         "runs": len(set(rows.runs[here].tolist())),
                         "sensing_decisions": int(sensing.sum()),
-                        **_ends("computed_ms", rows.median(rows.number("computed_ms"), sensing)),
-                        **_ends("answered_ms", rows.median(rows.number("round_trip_ms"), sensing)),
-                        **_ends("round_trip_ms", rows.median(rows.round_trips, here)),
+                        **cells_of("computed_ms", rows.median(rows.number("computed_ms"), sensing)),
+                        **cells_of(
+                            "answered_ms", rows.median(rows.number("round_trip_ms"), sensing)
+                        ),
+                        **cells_of("round_trip_ms", rows.median(rows.round_trips, here)),
                         "round_trip_p95_ms": _percentile(rows.round_trips[here], 95.0),
-                        **_ends("waited_ms", rows.median(rows.number("waited_ms"), sensing)),
+                        **cells_of("waited_ms", rows.median(rows.number("waited_ms"), sensing)),
                     }
                 )
-    return _table_of(cells)
+    return Table.of_records(cells)
 
 
 def _faults(rows: MeasuredRows) -> Table:
@@ -301,15 +303,17 @@ def _faults(rows: MeasuredRows) -> Table:
                     "runs": len(runs),
                     "runs_as_their_twins": len(runs) - len(_diverged(rows, here)),
                     "kills": int(kills.sum()),
-                    **_ends("found_ms", median_interval(rows.number("found_ms")[kills])),
+                    **cells_of("found_ms", median_interval(rows.number("found_ms")[kills])),
                     "launches": int(cold.sum()),
-                    **_ends("launch_ms", median_interval(rows.number("launch_ms")[cold])),
-                    **_ends("first_local_ms", median_interval(rows.number("first_local_ms")[cold])),
-                    **_ends("failback_ms", median_interval(rows.number("failback_ms")[kills])),
-                    **_ends("longest_wait_ms", median_interval(rows.number("waited_ms")[kills])),
+                    **cells_of("launch_ms", median_interval(rows.number("launch_ms")[cold])),
+                    **cells_of(
+                        "first_local_ms", median_interval(rows.number("first_local_ms")[cold])
+                    ),
+                    **cells_of("failback_ms", median_interval(rows.number("failback_ms")[kills])),
+                    **cells_of("longest_wait_ms", median_interval(rows.number("waited_ms")[kills])),
                 }
             )
-    return _table_of(cells)
+    return Table.of_records(cells)
 
 
 def _diverged(rows: MeasuredRows, here: BoolArray) -> set[float]:
@@ -327,20 +331,9 @@ def _names(path: NetworkPath, rows: MeasuredRows, here: BoolArray) -> dict[str, 
     }
 
 
-def _ends(name: str, interval: Interval) -> dict[str, Cell]:
-    return {
-        f"{name}{end}": round(value, 4) if math.isfinite(value) else None
-        for end, value in zip(("", "_low", "_high"), interval, strict=True)
-    }
-
-
 def _percentile(values: FloatArray, share: float) -> float | None:
     known = values[~np.isnan(values)]
     return round(float(np.percentile(known, share)), 4) if known.size else None
-
-
-def _table_of(cells: Sequence[dict[str, Cell]]) -> Table:
-    return Table({name: [each[name] for each in cells] for name in cells[0]} if cells else {})
 
 
 def _successes(trials: Table) -> Table:
@@ -362,7 +355,7 @@ def _successes(trials: Table) -> Table:
                     "success_thesis": _success_of_thesis(count),
                 }
             )
-    return _table_of(cells)
+    return Table.of_records(cells)
 
 
 def _success_of_thesis(particles: int) -> float:
