@@ -93,3 +93,18 @@ def test_interrupted_and_gone_on_with(tmp_path: Path) -> None:
         "origin.json",
     }
     assert "no difference found in" in done.stdout
+
+
+@pytest.mark.slow
+def test_quick_makes_every_figure_that_is_shown(tmp_path: Path) -> None:
+    """Whatever docs/results.md shows is made by one command, from few trials."""
+    command = [sys.executable, "-m", "holdfast", "experiment", "all", "--quick"]
+    command += ["--jobs", "2", "--out", str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=2400)
+    assert done.returncode == 0, done.stderr
+    results = Path(__file__).parents[2] / "docs" / "results"
+    shown = {str(path.relative_to(results)) for path in results.rglob("*.*")}
+    made = {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*.*")}
+    assert shown
+    assert shown <= made
+    assert {path.parent.name for path in tmp_path.glob("*/origin.json")} == set(study_names())
