@@ -175,6 +175,7 @@ class TestWhatLoads:
     def test_the_thesis_example_has_exactly_the_thesis_keys_and_values(self) -> None:
         example = yaml.safe_load((EXAMPLES / "thesis.yaml").read_text(encoding="utf-8"))
         assert example.pop("problem") == "peg_in_hole_2d"
+        assert example.pop("selector") == {"estimator": "nearest_neighbor"}
         assert example == yaml.safe_load(THESIS)
 
     @pytest.mark.parametrize("path", sorted(EXAMPLES.rglob("*.yaml")), ids=lambda path: path.stem)
