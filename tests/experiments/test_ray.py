@@ -164,7 +164,7 @@ def test_other_code_is_refused(cluster: RayCluster) -> None:
         text = told.result(PATIENCE_S)
     own = code_digest("trials")
     assert f"has other code for tasks of the kind 'trials' (digest {own}, of holdfast" in text
-    assert "than the machine that asks (digest 0123)" in text
+    assert "than the one that asks (digest 0123)" in text
 
 
 @with_ray

@@ -81,6 +81,11 @@ def test_smallest_levels_are_holms() -> None:
     assert smallest_levels(np.array([0.9, 0.8])).max() == 1.0
 
 
+def test_means_of_equal_values_are_not_compared() -> None:
+    assert math.isnan(agreement_of_means(np.full(3, -2.0), -2.5, 800))
+    assert math.isnan(agreement_of_means(np.array([-2.0]), -2.5, 800))
+
+
 def test_ratios_of_differences_of_logarithms() -> None:
     difference = Interval(math.log(0.5), math.log(0.25), math.log(2.0))
     assert ratio_of(difference) == pytest.approx((0.5, 0.25, 2.0))

@@ -140,11 +140,14 @@ def agreement_of_rates(successes: int, trials: int, others: int, other_trials: i
 def agreement_of_means(values: FloatArray, other_mean: float, other_count: int) -> float:
     """Return the p-value that a mean is one of which only the number of values is known.
 
-    Both are taken as normal, with the standard deviation of our values.
+    Both are taken as normal, with the standard deviation of our values; NaN if these are too few to
+    have one, or all the same.
     """
     if values.size < 2 or other_count < 1:
         return math.nan
     error = float(np.std(values, ddof=1)) * math.sqrt(1 / values.size + 1 / other_count)
+    if error == 0.0:
+        return math.nan
     return math.erfc(abs(float(np.mean(values)) - other_mean) / error / math.sqrt(2.0))
 
 
