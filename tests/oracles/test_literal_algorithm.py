@@ -89,7 +89,7 @@ def test_every_decision_of_a_trial(problem: Problem, num_particles: int) -> None
 
 
 @pytest.mark.parametrize("deviation", [0.3, 0.05, 0.002])
-@pytest.mark.parametrize("num_particles", [30, 1200])
+@pytest.mark.parametrize("num_particles", [30, pytest.param(1200, marks=pytest.mark.slow)])
 def test_concentrated_beliefs(deviation: float, num_particles: int) -> None:
     problem, settings = PegInHole2D(), settings_of(num_particles)
     draws = stream(5, 0, 0, Purpose.INITIAL_BELIEF)

@@ -297,6 +297,7 @@ class TestOutput:
 
 
 class TestInterruption:
+    @pytest.mark.slow
     def test_ctrl_c_ends_promptly_and_resume_ends_as_if_nothing_was(
         self, workplace: Path, slow_run: SlowRun
     ) -> None:

@@ -353,6 +353,7 @@ class TestCommand:
         assert (done.returncode, done.stdout) == (2, "")
         assert done.stderr.startswith(f"holdfast: error: {tmp_path}: holds no journal.sqlite")
 
+    @pytest.mark.slow
     def test_real_runs(self, tmp_path: Path) -> None:
         configuration = tmp_path / "peg.yaml"
         configuration.write_text(
