@@ -101,7 +101,7 @@ CASES = (
         problem="peg_in_hole_3d",
         num_particles=200,
         max_steps=700,
-        share=0.75,
+        share=0.5,
     ),
     Case(
         name="light and dark",
