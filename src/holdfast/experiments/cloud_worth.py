@@ -36,7 +36,7 @@ from holdfast.experiments.medians import median_interval
 from holdfast.experiments.sensing_times import Measurement
 from holdfast.experiments.statistics import Interval, cells_of
 from holdfast.experiments.study import Report, Results, Scale
-from holdfast.experiments.tables import Cell, Table
+from holdfast.experiments.tables import Cell, Table, number_of
 from holdfast.experiments.tasks import Task
 from holdfast.experiments.trial_batches import problem_of
 from holdfast.planning import encode_checkpoint, initial_state
@@ -927,10 +927,10 @@ def _draw_all(table: Table) -> Figure:
             mine = [
                 row for row in rows if row["service_cores"] == cores and row["path_ms"] == path_ms
             ]
-            values = [_number(row["particles"]) for row in mine]
-            lows = [_number(row["particles_low"]) for row in mine]
-            highs = [_number(row["particles_high"]) for row in mine]
-            to = [_number(row["measured_to"]) for row in mine]
+            values = [number_of(row["particles"]) for row in mine]
+            lows = [number_of(row["particles_low"]) for row in mine]
+            highs = [number_of(row["particles_high"]) for row in mine]
+            to = [number_of(row["measured_to"]) for row in mine]
             dots.append(
                 plots.Dots(
                     f"{cores} cores, path of {path_ms:g} ms",
@@ -946,7 +946,7 @@ def _draw_all(table: Table) -> Figure:
     panel.set_xscale("log")
     plots.dot_rows(panel, [kind.label for kind in kinds], dots)
     for place, kind in enumerate(kinds):
-        end = max(_number(row["measured_to"]) for row in rows if _kind_of(row) == kind)
+        end = max(number_of(row["measured_to"]) for row in rows if _kind_of(row) == kind)
         panel.plot([end, end], [place - 0.4, place + 0.4], color="#8A9099", linewidth=1.2)
     panel.set_xlabel("particles at break-even, with bounds; grey: measured up to here")
     legend = panel.get_legend()
@@ -959,10 +959,6 @@ def _draw_all(table: Table) -> Figure:
 
 def _kind_of(row: Mapping[str, Cell]) -> Kind:
     return msgspec.convert([row[name] for name in _SHOWN.names()], Kind)
-
-
-def _number(cell: Cell) -> float:
-    return math.nan if cell is None else float(cell)
 
 
 def _draw_waiting(scalings: dict[Kind, Scaling], exchange_ms: float) -> Figure:

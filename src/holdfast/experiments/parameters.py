@@ -6,7 +6,6 @@ be. Where they exclude all that would matter, the cheapest value will do.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Literal, NamedTuple
@@ -17,7 +16,7 @@ import numpy as np
 from holdfast.experiments import statistics
 from holdfast.experiments.cases import CASES
 from holdfast.experiments.study import Report, Results, Scale
-from holdfast.experiments.tables import Cell, Table
+from holdfast.experiments.tables import Cell, Table, number_of
 from holdfast.experiments.tasks import Task
 from holdfast.experiments.trial_batches import problem_of, trial_tasks
 from holdfast.recording.tables import wilson_interval
@@ -213,18 +212,18 @@ def _findings(summary: Table) -> list[str]:
     findings = []
     for row in summary.rows():
         where = f"{row['problem']}, {row['estimator']}, {row['parameter']} {row['value']}"
-        level = _number(row["steps_adjusted_p_value"])
+        level = number_of(row["steps_adjusted_p_value"])
         if row["parameter"] and level < LEVEL:
-            ends = (_number(row[f"steps_ratio{end}"]) for end in ("", "_low", "_high"))
+            ends = (number_of(row[f"steps_ratio{end}"]) for end in ("", "_low", "_high"))
             findings.append(
                 f"{where}: {statistics.Interval(*ends)} times the steps of the reference "
                 f"(geometric mean, n = {row['trials']}, paired t-test, Holm-adjusted p "
                 f"{level:.2g})"
             )
-        level = _number(row["success_adjusted_p_value"])
+        level = number_of(row["success_adjusted_p_value"])
         if row["parameter"] and level < LEVEL:
             value, low, high = (
-                100.0 * _number(row[f"success_gain{end}"]) for end in ("", "_low", "_high")
+                100.0 * number_of(row[f"success_gain{end}"]) for end in ("", "_low", "_high")
             )
             findings.append(
                 f"{where}: {value:+.1f} points of success [{low:+.1f}, {high:+.1f}] (n = "
@@ -262,13 +261,9 @@ def _draw(summary: Table) -> Figure:
         rows = [row for row in summary.rows() if row["problem"] == case and row["parameter"]]
         labels = [f"{row['estimator']}: {row['parameter']} {row['value']}" for row in rows]
         values, lows, highs = (
-            [_number(row[f"steps_ratio{end}"]) for row in rows] for end in ("", "_low", "_high")
+            [number_of(row[f"steps_ratio{end}"]) for row in rows] for end in ("", "_low", "_high")
         )
         plots.dot_rows(panel, labels, [plots.Dots("", values, lows, highs)])
     plots.ratio_axes(panels.values())
     plots.label_grid(figure, panels, "steps, relative to the reference", "")
     return figure
-
-
-def _number(cell: Cell) -> float:
-    return math.nan if cell is None else float(cell)

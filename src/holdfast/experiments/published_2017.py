@@ -205,16 +205,14 @@ def _compared(row: PublishedRow, emulated: Table, sound: Table) -> dict[str, Cel
     for way, table in (("emulated", emulated), ("sound", sound)):
         earned = table.numbers("reward")[table.numbers("success") == 1.0]
         interval = statistics.mean_interval(earned)
-        for end, value in zip(("", "_low", "_high"), interval, strict=True):
-            cells[f"reward_of_successes_{way}{end}"] = value if math.isfinite(value) else None
+        cells |= statistics.cells_of(f"reward_of_successes_{way}", interval)
         if way == "emulated":
             p_value = statistics.agreement_of_means(
                 earned, row.mean_reward_of_successes, row.successes
             )
             cells["reward_p_value"] = None if math.isnan(p_value) else p_value
     interval = statistics.mean_interval(sound.numbers("reward"))
-    for end, value in zip(("", "_low", "_high"), interval, strict=True):
-        cells[f"mean_reward_sound{end}"] = value
+    cells |= statistics.cells_of("mean_reward_sound", interval)
     cells["mean_sensing_ms_logged"] = 1e3 * row.mean_sensing_seconds
     cells["mean_sensing_ms_sound"] = float(np.nanmean(sound.numbers("mean_sensing_ms")))
     return cells

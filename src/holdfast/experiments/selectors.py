@@ -10,7 +10,6 @@ hundred.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import partial
 from typing import TYPE_CHECKING
@@ -21,7 +20,7 @@ import numpy.typing as npt
 from holdfast.experiments import statistics
 from holdfast.experiments.cases import CASES, Case
 from holdfast.experiments.study import Report, Results, Scale
-from holdfast.experiments.tables import Cell, Table
+from holdfast.experiments.tables import Cell, Table, number_of
 from holdfast.experiments.tasks import Task
 from holdfast.experiments.trial_batches import trial_tasks
 from holdfast.recording.tables import wilson_interval
@@ -348,17 +347,17 @@ def _findings(
     ]
     findings += [
         f"{_place(row)}, {row['way']} against {row['rival']}: "
-        f"{100.0 * _number(row['success_gain']):+.1f} points of success "
-        f"[{100.0 * _number(row['success_gain_low']):+.1f}, "
-        f"{100.0 * _number(row['success_gain_high']):+.1f}] ({every}; n = {row['trials']}, paired "
-        f"t-test, {_level(row)})"
+        f"{100.0 * number_of(row['success_gain']):+.1f} points of success "
+        f"[{100.0 * number_of(row['success_gain_low']):+.1f}, "
+        f"{100.0 * number_of(row['success_gain_high']):+.1f}] ({every}; n = {row['trials']}, "
+        f"paired t-test, {_level(row)})"
         for row in rivals_in_success.rows()
         if _is_sure(row)
     ]
     findings += [
         f"{row['problem']}, a look costs {row['cost_of_a_look']}, {_SHOWN[str(row['way'])]} at its "
-        f"best interval: {_number(row['gain']):+.3g} [{_number(row['gain_low']):+.3g}, "
-        f"{_number(row['gain_high']):+.3g}] of reward beyond random at its best (n = "
+        f"best interval: {number_of(row['gain']):+.3g} [{number_of(row['gain_low']):+.3g}, "
+        f"{number_of(row['gain_high']):+.3g}] of reward beyond random at its best (n = "
         f"{row['trials']}, paired t-test, {_level(row)})"
         for row in costs.rows()
         if row["cost_of_a_look"] in (0.1, 1.0) and row["way"] != BASELINE and _is_sure(row)
@@ -367,15 +366,11 @@ def _findings(
 
 
 def _is_sure(row: Mapping[str, Cell]) -> bool:
-    return _number(row["adjusted_p_value"]) < LEVEL
+    return number_of(row["adjusted_p_value"]) < LEVEL
 
 
 def _level(row: Mapping[str, Cell]) -> str:
-    return f"Holm-adjusted p {_number(row['adjusted_p_value']):.2g}"
-
-
-def _number(cell: Cell) -> float:
-    return math.nan if cell is None else float(cell)
+    return f"Holm-adjusted p {number_of(row['adjusted_p_value']):.2g}"
 
 
 def _ratio(row: Mapping[str, Cell]) -> str:

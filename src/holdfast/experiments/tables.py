@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 import msgspec
@@ -12,7 +13,7 @@ import numpy.typing as npt
 
 from holdfast.errors import InvalidValueError
 
-__all__ = ["Cell", "Table"]
+__all__ = ["Cell", "Table", "number_of"]
 
 Cell = bool | int | float | str | None
 
@@ -116,6 +117,11 @@ class Table(msgspec.Struct):
             for row in zip(*self.columns.values(), strict=True)
         ]
         return "\n".join(lines) + "\n"
+
+
+def number_of(cell: Cell) -> float:
+    """Return a cell as a number; NaN where there is nothing."""
+    return math.nan if cell is None else float(cell)
 
 
 def _plain(cell: Cell) -> Cell:
