@@ -6,23 +6,26 @@ from typing import Any
 import numpy as np
 import pytest
 
+from holdfast.belief import Belief
 from holdfast.errors import InvalidValueError
 from holdfast.experiments import cloud_worth
 from holdfast.experiments.cloud_worth import CloudWorth, Kind, scaling_of
 from holdfast.experiments.exchange_times import measure_exchange
 from holdfast.experiments.executors import LocalExecutor
 from holdfast.experiments.running import Workload, compute, write_report
-from holdfast.experiments.sensing_times import Sensed, history_of, measure_sensing, states_in
+from holdfast.experiments.sensing_times import Sensed, history_of, measure_sensing, state_in
 from holdfast.experiments.study import Scale
 from holdfast.experiments.tables import Table
 from holdfast.experiments.tasks import TaskError
 from holdfast.experiments.trial_batches import problem_of
+from holdfast.planning import initial_state
+from holdfast.problems.problem import FloatArray
 from holdfast.settings import ParticleFilterSettings, PlanningSettings
 
 BRIEF: dict[str, Any] = {
     "problem": "peg_in_hole_2d",
     "particles": (50, 100),
-    "num_trials": 1,
+    "num_trials": 3,
     "seed": 3,
     "repeat_s": 0.001,
     "least_repetitions": 1,
@@ -35,18 +38,23 @@ def planning(num_particles: int) -> PlanningSettings:
 
 def test_a_story_is_told_to_beliefs_of_any_size() -> None:
     problem = problem_of("peg_in_hole_2d", {}, {})
-    story = history_of(problem, planning(200), 3, 0)
-    decisions = sum(isinstance(event, Sensed) for event in story)
-    found = {n: states_in(problem, planning(n), 3, 0, story) for n in (2000, 5000)}
-    places = [int(part * decisions) * 9 for part in (0.25, 0.5, 0.75)]
-    for states in found.values():
-        assert [state.step for state in states] == places
-    # They approximate the same posteriors: the means differ by less than the states are spread.
-    for few, many in zip(*found.values(), strict=True):
-        means = [state.belief.weights @ state.belief.states for state in (few, many)]
-        spread = np.sqrt(many.belief.weights @ (many.belief.states - means[1]) ** 2)
-        assert (np.abs(means[0] - means[1]) < spread).all()
-        assert (spread[:2] < 1.0).all()
+
+    def spread(belief: Belief) -> FloatArray:
+        mean = belief.weights @ belief.states
+        return np.sqrt(belief.weights @ (belief.states - mean) ** 2)
+
+    for trial, place in enumerate((0.25, 0.5, 0.75)):
+        story = history_of(problem, planning(200), 3, trial)
+        decisions = sum(isinstance(event, Sensed) for event in story)
+        found = [state_in(problem, planning(n), 3, trial, story) for n in (20_000, 50_000)]
+        assert [state.step for state in found] == [int(place * decisions) * 9] * 2
+        # They approximate the same posterior: the means differ by less than the states are spread.
+        few, many = (state.belief for state in found)
+        means = [belief.weights @ belief.states for belief in (few, many)]
+        assert (np.abs(means[0] - means[1]) < spread(many)).all()
+        # And know more than at first.
+        first = initial_state(problem, planning(50_000), 3, trial).belief
+        assert spread(many)[:2].prod() < 0.5 * spread(first)[:2].prod()
 
 
 def test_what_is_measured() -> None:

@@ -127,7 +127,8 @@ def made_up(task: Task) -> Table:
     chance = np.random.default_rng(wanted.particles)
     rows: list[tuple[Any, ...]] = []
     for run in range(wanted.first_run, wanted.first_run + wanted.runs):
-        end = (None, None, None, None, None, True, "packets", 0.5)
+        rate_hz = 50.0 if wanted.particles == 500 else 100.0
+        end = (None, None, None, None, None, True, "packets", 0.5, rate_hz)
         for number in range(40):
             away = 10 <= number < 25
             service = "local" if away else "cloud"
@@ -136,11 +137,11 @@ def made_up(task: Task) -> Table:
             for what, computed_ms in (("sensing", 0.002 * wanted.particles), ("task", 0.1)):
                 times = (0.0, trip_ms + computed_ms, computed_ms)
                 rows.append((run, what, 0.1 * number, 0, 9 * number, service, status, *times, *end))
-        fault = (120.0, None, None, 45.0, 150.0, 120.0, 1100.0, 60.0, True, "packets", 0.5)
+        fault = (120.0, None, None, 45.0, 150.0, 120.0, 1100.0, 60.0, True, "packets", 0.5, rate_hz)
         rows.append((run, "kill", 1.05, None, None, None, None, *fault))
         if wanted.actions:
             rows += [
-                (run, "action", 0.011 * number, 0, number, *[None] * 10, True, "packets", 0.5)
+                (run, "action", 0.011 * number, 0, number, *[None] * 10, True, "packets", 0.5, rate_hz)
                 for number in range(360)
             ]
     return Table.of_rows(COLUMNS, rows)
@@ -155,6 +156,9 @@ def report() -> Any:
 
 
 class TestReport:
+    def test_a_slowed_robot_is_told_of(self, report: Any) -> None:
+        assert any("ran at 100 Hz, but 1 of 10 slower, down to 50" in f for f in report.findings)
+
     def test_the_tables_say_what_was_measured(self, report: Any) -> None:
         decisions = list(report.summary["decisions"].rows())
         near = [row for row in decisions if row["path"] == "same machine"]

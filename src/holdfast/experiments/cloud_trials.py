@@ -73,6 +73,7 @@ COLUMNS = (
     "identical",
     "emulated_by",
     "load",
+    "rate_hz",
 )
 """Of the table of such trials: a row for each decision, each kill and, if wanted, each task action.
 
@@ -83,7 +84,8 @@ cloud; ``first_local_ms``, from then until it carries out a decision of the loca
 before); ``away_ms``, from the kill until the ready line of the cloud that was started again;
 ``failback_ms``, from that line until the robot carries out a decision of it; and ``waited_ms``, the
 longest time that it stood still for a decision until then. ``load`` is how many processes wanted a
-core when the run began, over the minute before: times on a busy machine say little.
+core when the run began, over the minute before: times on a busy machine say little. ``rate_hz`` is
+at how many task actions a second the robot really ran.
 """
 
 _PROBLEM = "peg_in_hole_2d"
@@ -198,6 +200,7 @@ def rows_of_run(
     identical: bool,
     emulated_by: str,
     load: float | None = None,
+    rate_hz: float | None = None,
     performed: Iterable[Performance] = (),
 ) -> Table:
     """Return the rows of a run: its decisions, its kill, if there was one, and its actions.
@@ -215,11 +218,18 @@ def rows_of_run(
     emulated_by : str
     load : float or None
         Of the machine.
+    rate_hz : float or None
+        Of the robot.
     performed : iterable of Performance
         Task actions to be listed.
     """
     began = table.rows[0].at
-    ends: dict[str, Cell] = {"identical": identical, "emulated_by": emulated_by, "load": load}
+    ends: dict[str, Cell] = {
+        "identical": identical,
+        "emulated_by": emulated_by,
+        "load": load,
+        "rate_hz": rate_hz,
+    }
     rows: list[dict[str, Cell]] = [
         {
             "run": run,
@@ -352,6 +362,7 @@ class _Processes:
                 identical=comparison.identical and difference is None,
                 emulated_by=self._path.emulated_by,
                 load=round(load, 2),
+                rate_hz=round(rate_hz, 2),
                 performed=(
                     list(performances(directory / f"{_DISTURBED}.txt"))
                     if self._wanted.actions
@@ -507,8 +518,10 @@ class _Processes:
             now = time.monotonic()
             if progress() != seen:
                 seen, moved_at = progress(), now
-            if now - moved_at > limit_s or now - began > _LONGEST_S:
+            if now - moved_at > limit_s:
                 raise TaskError(f"{self._named()}: {what} did not go on for {now - moved_at:.0f} s")
+            if now - began > _LONGEST_S:
+                raise TaskError(f"{self._named()}: {what} was not done within {_LONGEST_S:.0f} s")
             for happened in self._news():
                 self._note(happened)
 

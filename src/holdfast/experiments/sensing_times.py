@@ -46,7 +46,7 @@ from holdfast.settings import (
     SelectorSettings,
 )
 
-__all__ = ["Measurement", "Sensed", "history_of", "measure_sensing", "states_in"]
+__all__ = ["Measurement", "Sensed", "history_of", "measure_sensing", "state_in"]
 
 _TOLD_WITH = 500
 """Particles of the trials whose story is told."""
@@ -54,7 +54,8 @@ _TOLD_WITH = 500
 _MAX_STEPS = 200
 _MOST_REPETITIONS = 15
 _PLACES = (0.25, 0.5, 0.75)
-"""Of a trial's sensing decisions, from which beliefs are taken."""
+"""In a trial's sensing decisions, from which its belief is taken: one of each trial, so that all
+beliefs are independent."""
 
 _SCHEDULING = Path("/proc/thread-self/schedstat")
 
@@ -86,7 +87,7 @@ class Measurement(msgspec.Struct, frozen=True, kw_only=True):
     threads : tuple of int
         Numbers of threads, 1 among them.
     num_trials : int
-        From each come three beliefs.
+        From each comes one belief.
     seed : int
     repeat_s : float
         Decisions of one number of particles are repeated for about this long.
@@ -104,7 +105,7 @@ class Measurement(msgspec.Struct, frozen=True, kw_only=True):
     horizon: int = 1
     particles: tuple[int, ...] = (100, 300, 1000)
     threads: tuple[int, ...] = (1, 2)
-    num_trials: int = 3
+    num_trials: int = 9
     seed: int = 0
     repeat_s: float = 0.5
     least_repetitions: int = 3
@@ -167,9 +168,8 @@ def measure_sensing(**measurement: Any) -> Table:
             break
         settings = _settings(wanted, particles, 1)
         states = [
-            state
+            state_in(problem, settings, wanted.seed, trial, story)
             for trial, story in enumerate(stories)
-            for state in states_in(problem, settings, wanted.seed, trial, story)
         ]
         load = _Load()
         states = _few_enough(wanted, problem, settings, states)
@@ -206,33 +206,30 @@ def history_of(
     return story
 
 
-def states_in(
+def state_in(
     problem: Problem,
     settings: PlanningSettings,
     seed: int,
     trial: int,
     story: Sequence[Sensed | FloatArray],
-) -> list[PlanningState]:
-    """Tell a trial's story to another belief; return its states before some sensing decisions.
+) -> PlanningState:
+    """Tell a trial's story to another belief; return its state before one sensing decision.
 
-    They are a quarter, half and three quarters through: neither the first belief, which nothing
-    has narrowed yet, nor the last.
+    By the trial's number it is a quarter, half or three quarters through: neither the first belief,
+    which nothing has narrowed yet, nor the last.
     """
     decisions = sum(isinstance(event, Sensed) for event in story)
-    wanted = [int(place * decisions) for place in _PLACES]
-    found = []
-    number = 0
+    left = int(_PLACES[trial % len(_PLACES)] * decisions)
     state = initial_state(problem, settings, seed, trial)
     for event in story:
         if not isinstance(event, Sensed):
             state = advance(problem, settings, state, event)
             continue
-        found += [state] * wanted.count(number)
-        if len(found) == len(wanted):
+        if left == 0:
             break
         state, _ = observe(problem, settings, state, *event)
-        number += 1
-    return found
+        left -= 1
+    return state
 
 
 _COLUMNS = (

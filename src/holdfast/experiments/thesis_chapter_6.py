@@ -581,5 +581,14 @@ def _finding_of_load(rows: MeasuredRows) -> str:
         "processes that wanted a core when a run began, over the minute before: median "
         f"{np.nanmedian(loads):.1f}, from {np.nanmin(loads):.1f} to {np.nanmax(loads):.1f}, "
         f"n = {loads.size} (our own processes, from the run before, are among them; with many more "
-        "than there are cores, times are those of a busy machine)"
+        "than there are cores, times are those of a busy machine); the robots ran at "
+        f"{_rates(rows.number('rate_hz')[first])}"
     )
+
+
+def _rates(rates_hz: FloatArray) -> str:
+    """Say how fast the robots ran: where services start slowly they are slowed."""
+    slowed = int(np.count_nonzero(rates_hz < _RATE_HZ))
+    if not slowed:
+        return f"{_RATE_HZ:g} Hz"
+    return f"{_RATE_HZ:g} Hz, but {slowed} of {rates_hz.size} slower, down to {rates_hz.min():.0f}"
