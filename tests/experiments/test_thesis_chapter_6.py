@@ -141,7 +141,18 @@ def made_up(task: Task) -> Table:
         rows.append((run, "kill", 1.05, None, None, None, None, *fault))
         if wanted.actions:
             rows += [
-                (run, "action", 0.011 * number, 0, number, *[None] * 10, True, "packets", 0.5, rate_hz)
+                (
+                    run,
+                    "action",
+                    0.011 * number,
+                    0,
+                    number,
+                    *[None] * 10,
+                    True,
+                    "packets",
+                    0.5,
+                    rate_hz,
+                )
                 for number in range(360)
             ]
     return Table.of_rows(COLUMNS, rows)
