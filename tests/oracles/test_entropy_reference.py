@@ -247,6 +247,22 @@ def test_lists_that_end_before_the_last_neighbour(neighbors: int, dimension: int
             assert found.visits > lists + 3 * posteriors * survivors
 
 
+@pytest.mark.parametrize(("posteriors", "survivors"), [(1, 2200), (12, 2000)])
+@pytest.mark.parametrize("neighbors", [1, 5, 9])
+def test_more_candidates_than_numbers(neighbors: int, posteriors: int, survivors: int) -> None:
+    """In six dimensions each leaf is near to most others, and its lists have seen more points than
+    there are numbers for them. Numbers are given anew then, so that nothing is searched: no pair of
+    points is looked at twice."""
+    rng = np.random.default_rng([9, neighbors])
+    points = draw_points(rng, "spread", 2200, 6)
+    weights = draw_weights(rng, "similar", posteriors, 2200, survivors)
+    found = find(points, weights, NearestNeighbor(neighbors, 1e-9))
+    assert found.ways == (Ways(own_tree=1) if posteriors == 1 else Ways(grouped=posteriors))
+    assert 1024 * 2200 < found.visits <= 2208**2
+    expected = nearest_neighbor_entropy(points, weights[-1], neighbors, 1e-9)
+    assert abs(found.entropies[-1] - expected) <= TOLERANCE
+
+
 def test_all_ways_in_one_call() -> None:
     """Posteriors of every size, each in its own place of the result."""
     rng = np.random.default_rng(8)

@@ -72,6 +72,7 @@ for count, dimension, kept, posteriors, way in (
     (3000, 6, 3000, 1, 1),
     (200, 3, 190, 7, 2), (300, 2, 300, 13, 2), (300, 6, 200, 20, 2), (300, 3, 150, 30, 2),
     (64, 4, 64, 32, 2), (600, 5, 220, 20, 2), (300, 3, 270, 33, 2), (1500, 1, 1400, 12, 2),
+    (2500, 6, 2400, 9, 2),
 ):
     draw = stream.substream(1000 * count + kept)
     points = draw.normal((count, dimension))

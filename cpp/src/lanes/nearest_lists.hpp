@@ -17,14 +17,17 @@ namespace holdfast::inline HOLDFAST_ISA {
 /// that numbers travel with distances through the sorting. The distance that is left is right
 /// to 2.3e-13 of its size, a quarter of what counts as a tie anyway.
 inline constexpr std::int64_t number_bits = 1023;
-inline constexpr std::size_t max_candidate_leaves = (number_bits + 1) / leaf_size;
+inline constexpr std::size_t max_candidates = number_bits + 1;
+/// Renumbering must make room for so many, or it would be done for each leaf.
+inline constexpr std::size_t worth_renumbering = 8 * leaf_size;
 inline constexpr double far_away = 1e300;
 
 template <std::size_t length>
 struct NearestLists {
     Lanes keys[query_vectors][length];
-    std::uint32_t leaves[max_candidate_leaves];  // number / leaf_size -> leaf
-    double complete_below;                       // no point nearer than this was left out
+    std::uint32_t slots[max_candidates];  // of each number
+    std::size_t candidates;               // numbers in use
+    double complete_below;                // no point nearer than this was left out
 };
 
 /// Sorts `block` and keeps in the sorted `best` the least of both, sorted: for eight lists at once.
@@ -54,6 +57,42 @@ HOLDFAST_INLINE double furthest(const NearestLists<length>& lists) {
     return maximum_of(largest);
 }
 
+/// Takes the numbers of candidates that are in no list any more for others to come.
+///
+/// Candidates keep their order, and the query leaf's own points, which came first, their numbers.
+template <std::size_t length>
+static void renumber(NearestLists<length>& lists) {
+    std::uint16_t number_of[max_candidates] = {};
+    const double nobody = detail::from_bits<double>(detail::bits(far_away) & ~number_bits);
+    for (std::size_t number = 0; number < leaf_size; ++number) number_of[number] = 1;
+    for (std::size_t v = 0; v < query_vectors; ++v) {
+        for (std::size_t rank = 0; rank < length; ++rank) {
+            for (std::size_t lane = 0; lane < lane_count; ++lane) {
+                const double key = lists.keys[v][rank][lane];
+                if (key < nobody) number_of[detail::bits(key) & number_bits] = 1;
+            }
+        }
+    }
+    std::size_t kept = 0;
+    for (std::size_t number = 0; number < lists.candidates; ++number) {
+        if (number_of[number] == 0) continue;
+        lists.slots[kept] = lists.slots[number];
+        number_of[number] = static_cast<std::uint16_t>(kept++);
+    }
+    lists.candidates = kept;
+    for (std::size_t v = 0; v < query_vectors; ++v) {
+        for (std::size_t rank = 0; rank < length; ++rank) {
+            for (std::size_t lane = 0; lane < lane_count; ++lane) {
+                const double key = lists.keys[v][rank][lane];
+                if (!(key < nobody)) continue;
+                const std::int64_t number = number_of[detail::bits(key) & number_bits];
+                lists.keys[v][rank][lane] =
+                    detail::from_bits<double>((detail::bits(key) & ~number_bits) | number);
+            }
+        }
+    }
+}
+
 template <std::size_t length>
 static void find_nearest(const TreeView& tree, const QueryLeaf& query, NearestLists<length>& lists,
                          std::uint64_t* visits) {
@@ -61,12 +100,14 @@ static void find_nearest(const TreeView& tree, const QueryLeaf& query, NearestLi
         std::uint32_t node;
         double least;
     } stack[stack_size];
-    std::size_t depth = 0, leaves = 0, in_block = 0;
+    std::size_t depth = 0, in_block = 0;
     Lanes block[query_vectors][length];
     for (std::size_t v = 0; v < query_vectors; ++v) {
         for (std::size_t i = 0; i < length; ++i) lists.keys[v][i] = splat(far_away);
     }
+    lists.candidates = 0;
     lists.complete_below = __builtin_inf();
+    bool full = false;
     double bound = far_away;
     // Lists of unused query slots would keep the bound up: they ask for nothing.
     for (std::size_t i = query.used; i < leaf_size; ++i) {
@@ -74,12 +115,26 @@ static void find_nearest(const TreeView& tree, const QueryLeaf& query, NearestLi
             lists.keys[i / lane_count][rank][i % lane_count] = -1.0;
         }
     }
+    // Takes what is in the block, whole or not, into the lists.
+    const auto merge = [&] {
+        for (std::size_t v = 0; v < query_vectors; ++v) {
+            for (std::size_t i = in_block; i < length; ++i) block[v][i] = splat(far_away);
+            merge_block<length>(lists.keys[v], block[v]);
+        }
+        in_block = 0;
+    };
     stack[depth++] = {0, 0.0};
     while (depth > 0) {
         const Pending pending = stack[--depth];
         if (pending.least >= bound) continue;
         const TreeNode& node = tree.nodes[pending.node];
-        if (leaves == max_candidate_leaves) {
+        if (!full && lists.candidates + leaf_size > max_candidates) {
+            if (in_block > 0) merge();
+            bound = furthest(lists);
+            renumber<length>(lists);
+            full = lists.candidates + worth_renumbering > max_candidates;
+        }
+        if (full) {
             if (pending.least < lists.complete_below) lists.complete_below = pending.least;
             continue;
         }
@@ -102,7 +157,9 @@ static void find_nearest(const TreeView& tree, const QueryLeaf& query, NearestLi
         }
         const std::uint32_t leaf = node.first_leaf;
         for (std::size_t other = 0; other < leaf_size; ++other) {
-            const auto number = static_cast<std::int64_t>(leaves * leaf_size + other);
+            const auto number = static_cast<std::int64_t>(lists.candidates);
+            lists.slots[lists.candidates++] =
+                static_cast<std::uint32_t>(leaf * leaf_size + other);
             for (std::size_t v = 0; v < query_vectors; ++v) {
                 Lanes distance{};
                 for (std::size_t c = 0; c < tree.dimension; ++c) {
@@ -122,20 +179,12 @@ static void find_nearest(const TreeView& tree, const QueryLeaf& query, NearestLi
             ++in_block;
         }
         *visits += query.used * leaf_size;
-        lists.leaves[leaves++] = leaf;
         if (in_block == length) {
-            for (std::size_t v = 0; v < query_vectors; ++v)
-                merge_block<length>(lists.keys[v], block[v]);
+            merge();
             bound = furthest(lists);
-            in_block = 0;
         }
     }
-    if (in_block > 0) {
-        for (std::size_t v = 0; v < query_vectors; ++v) {
-            for (std::size_t i = in_block; i < length; ++i) block[v][i] = splat(far_away);
-            merge_block<length>(lists.keys[v], block[v]);
-        }
-    }
+    if (in_block > 0) merge();
 }
 
 /// The terms of one point under every posterior, walking outwards through its list.
@@ -158,8 +207,7 @@ static void walk_outwards(const PosteriorGroup& group, const QueryLeaf& query, s
         const double key = lists.keys[i / lane_count][rank][i % lane_count];
         if (key >= limit) break;
         const auto number = static_cast<std::size_t>(detail::bits(key) & number_bits);
-        const std::size_t leaf = lists.leaves[number / leaf_size], other = number % leaf_size;
-        const std::size_t other_slot = leaf * leaf_size + other;
+        const std::size_t other_slot = lists.slots[number];
         if (other_slot == slot) continue;
         const double distance = detail::from_bits<double>(detail::bits(key) & ~number_bits);
         const double reached_radius =
@@ -224,9 +272,7 @@ static unsigned walk_single(const PosteriorGroup& group, const QueryLeaf& query,
             const auto number = static_cast<std::size_t>(detail::bits(key[lane]) & number_bits);
             // The own leaf is the first one visited, so a point's own number is its place in it.
             if (number == v * lane_count + lane) continue;
-            const std::size_t other =
-                lists.leaves[number / leaf_size] * leaf_size + number % leaf_size;
-            weight[lane] = group.weights[other * lane_count];
+            weight[lane] = group.weights[lists.slots[number] * lane_count];
         }
         if (bits_of(known & (distance <= radius)) == 0) break;
         const IntLanes open = (distance <= radius) & (weight > 0.0);
