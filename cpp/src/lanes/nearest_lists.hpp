@@ -158,8 +158,7 @@ static void find_nearest(const TreeView& tree, const QueryLeaf& query, NearestLi
         const std::uint32_t leaf = node.first_leaf;
         for (std::size_t other = 0; other < leaf_size; ++other) {
             const auto number = static_cast<std::int64_t>(lists.candidates);
-            lists.slots[lists.candidates++] =
-                static_cast<std::uint32_t>(leaf * leaf_size + other);
+            lists.slots[lists.candidates++] = static_cast<std::uint32_t>(leaf * leaf_size + other);
             for (std::size_t v = 0; v < query_vectors; ++v) {
                 Lanes distance{};
                 for (std::size_t c = 0; c < tree.dimension; ++c) {
