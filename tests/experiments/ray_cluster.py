@@ -157,6 +157,11 @@ class RayCluster:
         node.kill()
         self._nodes.remove(node)
 
+    def kill_workers(self) -> None:
+        """Kill all nodes but the head."""
+        while len(self._nodes) > 1:
+            self._nodes.pop().kill()
+
     def __enter__(self) -> Self:
         return self
 

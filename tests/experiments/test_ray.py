@@ -192,6 +192,22 @@ def test_interrupted_and_gone_on_with(cluster: RayCluster, tmp_path: Path) -> No
             sleep(0.1)
 
 
+def refusal_of_the_impatient(address: str) -> str:
+    """Return why tasks cannot be computed if there may be no core for five seconds at most."""
+    for name, seconds in (("_WITHOUT_CORES_S", 5.0), ("_LOOK_INTERVAL_S", 1.0)):
+        setattr(ray_executor, name, seconds)
+    return refusal(address, tasks()[:5], None)
+
+
+@with_ray
+def test_a_cluster_that_has_lost_its_last_core(cluster: RayCluster) -> None:
+    cluster.kill_workers()
+    with alone(refusal_of_the_impatient, cluster.address) as told:
+        text = told.result(PATIENCE_S)
+    assert text.startswith(f"TaskError: the Ray cluster at {cluster.address[6:]} has had no core")
+    assert text.endswith("for 5 s: start a node (ray start --address HOST:PORT); 5 tasks are left")
+
+
 @with_ray
 @pytest.mark.parametrize("how", ["client", "environment", "file"])
 def test_no_cluster(how: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -46,6 +46,9 @@ _LONGEST_WAIT_S = 1.0
 _LOOK_INTERVAL_S = 10.0
 """Between two looks at how large the cluster is; it may grow."""
 
+_WITHOUT_CORES_S = 120.0
+"""For so long a cluster may have no core at all, as while its only node is replaced."""
+
 _CONNECT_S = 10.0
 _SHOWN_CHARACTERS = 500
 
@@ -103,7 +106,7 @@ class RayExecutor:
         ray = _imported()
         try:
             self._join(ray)
-            _compute(ray, tasks, on_result)
+            _compute(ray, self._place, tasks, on_result)
         except ConnectionError as error:
             raise TaskError(
                 f"the connection to the Ray cluster at {self._place} was lost: {_line_of(error)}"
@@ -175,18 +178,49 @@ def _own_handler_of_sigterm() -> Iterator[None]:
         signal.raise_signal(signal.SIGTERM)
 
 
+class _Size:
+    """How many cores a cluster has; it may grow and shrink."""
+
+    def __init__(self, ray: ModuleType, place: str) -> None:
+        self._ray = ray
+        self._place = place
+        self._cores = 0
+        self._looked_at = -math.inf
+        self._had_some_at = monotonic()
+
+    def cores(self, tasks_left: int) -> int:
+        """Return how many there are, as of late.
+
+        Raises
+        ------
+        TaskError
+            If there has been none for long: Ray itself would wait for ever, and say nothing.
+        """
+        now = monotonic()
+        if now > self._looked_at + _LOOK_INTERVAL_S:
+            self._cores = int(self._ray.cluster_resources().get("CPU", 0))
+            self._looked_at = now
+        if self._cores:
+            self._had_some_at = now
+        elif now > self._had_some_at + _WITHOUT_CORES_S:
+            raise TaskError(
+                f"the Ray cluster at {self._place} has had no core for {_WITHOUT_CORES_S:g} s: "
+                f"start a node (ray start --address HOST:PORT); {tasks_left} tasks are left"
+            )
+        return self._cores
+
+
 def _compute(
-    ray: ModuleType, tasks: Sequence[Task], on_result: Callable[[Task, Table], None]
+    ray: ModuleType, place: str, tasks: Sequence[Task], on_result: Callable[[Task, Table], None]
 ) -> None:
     remote = ray.remote(num_cpus=1, max_retries=MOST_ATTEMPTS - 1)(compute_encoded)
     pending = deque(tasks)
     running: dict[Any, Task] = {}
-    room, looked_at = 0, -math.inf
+    size = _Size(ray, place)
     try:
         while pending or running:
-            if pending and monotonic() > looked_at + _LOOK_INTERVAL_S:
-                room, looked_at = _room(ray), monotonic()
-            while pending and len(running) < room:
+            cores = size.cores(len(pending) + len(running))
+            while pending and len(running) < max(1, _AHEAD * cores):
                 task = pending.popleft()
                 running[remote.remote(encode_task(task, code_digest(task.kind)))] = task
             done, _ = ray.wait(list(running), timeout=_LONGEST_WAIT_S)
@@ -200,11 +234,6 @@ def _compute(
             with contextlib.suppress(Exception):
                 ray.cancel(reference, force=True)
         raise
-
-
-def _room(ray: ModuleType) -> int:
-    """Return how many tasks the cluster may have."""
-    return max(1, _AHEAD * int(ray.cluster_resources().get("CPU", 0)))
 
 
 def _answer(ray: ModuleType, reference: object, task: Task) -> bytes:
