@@ -382,10 +382,6 @@ def _build(
     schemas = {**_SETTINGS, **_schemas_of(problem_class)}
     particle_filter = _convert(source, "particle_filter", ParticleFilterSettings, schemas)
     active_sensing = _convert(source, "active_sensing", ActiveSensingSettings, schemas)
-    # Who says how many neighbours means the estimate that has any: the thesis's files do so, and
-    # name no estimate because theirs had no other.
-    if "num_nearest_neighbors" in source.sections["active_sensing"]:
-        source.sections["selector"].setdefault("estimator", "nearest_neighbor")
     selector = _convert(source, "selector", SelectorSettings, schemas)
     simulator = _convert(source, "simulator", SimulatorSettings, schemas)
     recovery = _convert(source, "recovery", RecoverySettings, schemas)

@@ -74,8 +74,7 @@ class ActiveSensingSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=T
     num_observation_samples : int
         Number M of hypothetical observations of each sensing action.
     num_nearest_neighbors : int
-        The k of the nearest-neighbour estimate, below ``num_particles``; without effect for the
-        others. A file that says it and no ``selector.estimator`` means ``nearest_neighbor``.
+        The k of the nearest-neighbour estimate; below ``num_particles``.
     num_cores : int
         Threads of a decision; 0 means all cores (or what ``OMP_NUM_THREADS`` says). Changes time
         only, never a result. Moving 4,096 particles or more always uses all cores.

@@ -167,7 +167,6 @@ class TestWhatLoads:
         assert configuration.problem.name == "peg_in_hole_2d"
         assert configuration.planning.particle_filter.num_particles == 100
         assert configuration.planning.active_sensing.num_nearest_neighbors == 5
-        assert configuration.planning.selector.estimator == "nearest_neighbor"
         assert configuration.planning.active_sensing.num_cores == 8
         assert configuration.planning.sensing_interval == 8
         assert configuration.simulator.max_steps == 700
@@ -178,27 +177,6 @@ class TestWhatLoads:
         assert example.pop("problem") == "peg_in_hole_2d"
         assert example.pop("selector") == {"estimator": "nearest_neighbor"}
         assert example == yaml.safe_load(THESIS)
-
-    @pytest.mark.parametrize(
-        ("text", "estimator"),
-        [
-            ("", "gaussian_mixture_upper"),
-            ("active_sensing: {num_observation_samples: 20}", "gaussian_mixture_upper"),
-            ("active_sensing: {num_nearest_neighbors: 7}", "nearest_neighbor"),
-            (
-                "active_sensing: {num_nearest_neighbors: 7}\n"
-                "selector: {estimator: gaussian_mixture_lower}",
-                "gaussian_mixture_lower",
-            ),
-        ],
-    )
-    def test_who_counts_neighbours_wants_that_estimate(
-        self, text: str, estimator: str, write: Write
-    ) -> None:
-        configuration = load(write(f"problem: peg_in_hole_2d\n{text}"))
-        assert configuration.planning.selector.estimator == estimator
-        again = load(write(configuration.to_yaml()))
-        assert again == configuration
 
     @pytest.mark.parametrize("path", sorted(EXAMPLES.rglob("*.yaml")), ids=lambda path: path.stem)
     def test_an_example_loads_and_is_told_by_its_keys(self, path: Path, write: Write) -> None:
