@@ -74,7 +74,8 @@ class ActiveSensingSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=T
     num_observation_samples : int
         Number M of hypothetical observations of each sensing action.
     num_nearest_neighbors : int
-        The k of the nearest-neighbour estimate; below ``num_particles``.
+        The k of the nearest-neighbour estimate, below ``num_particles``; without effect for the
+        others.
     num_cores : int
         Threads of a decision; 0 means all cores (or what ``OMP_NUM_THREADS`` says). Changes time
         only, never a result. Moving 4,096 particles or more always uses all cores.
@@ -97,9 +98,10 @@ class SelectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
         ``fixed`` look at no belief.
     sensing_action : int
         Index of the sensing action that ``fixed`` chooses.
-    estimator : {"gaussian_mixture_upper", "gaussian_mixture_lower", "nearest_neighbor"}
-        The estimate of the two entropies. (The thesis's is the nearest neighbour; docs/results.md
-        says why it is not the default.)
+    estimator : {"nearest_neighbor", "gaussian_mixture_upper", "gaussian_mixture_lower"}
+        The estimate of the two entropies. A mixture takes few particles, as a sharp look leaves
+        them, for certainty: use it with so many that they lie closer than its noise
+        (docs/results.md).
     actions : {"commanded", "executed"}
         Whether ``action_entropy`` and ``action_covariance`` look at what the policy says or at what
         the limits leave of it.
@@ -114,8 +116,8 @@ class SelectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
         "action_entropy"
     )
     sensing_action: NonNegativeCount = 0
-    estimator: Literal["gaussian_mixture_upper", "gaussian_mixture_lower", "nearest_neighbor"] = (
-        "gaussian_mixture_upper"
+    estimator: Literal["nearest_neighbor", "gaussian_mixture_upper", "gaussian_mixture_lower"] = (
+        "nearest_neighbor"
     )
     actions: Literal["commanded", "executed"] = "commanded"
     resolution: Positive | None = None

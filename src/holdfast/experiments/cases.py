@@ -114,5 +114,6 @@ CASES = (
         num_particles=200,
         state_resolution=0.1,
     ),
+    Case(name="passer-by", problem="holdfast.experiments.passer_by:PasserBy"),
 )
 """In the order in which they are shown."""

@@ -40,6 +40,7 @@ _INTERVALS: Mapping[str, int] = {
     "three plates": 8,
     "peg in space": 4,
     "light and dark": 4,
+    "passer-by": 8,
 }
 """Steps between two looks, in the problems in which sensing decides about the outcome."""
 
@@ -66,20 +67,23 @@ class Variant(NamedTuple):
     active_sensing : ActiveSensingSettings
     particle_filter : ParticleFilterSettings
     resolution : float, optional
-        In units of the problem's own; None for the motion noise.
+        In units of the problem's own; None for that, and for a mixture the motion noise.
+    times_the_particles : float
+        As many as the problem has.
     """
 
     parameter: str = ""
     value: str = ""
-    estimator: Estimator = "gaussian_mixture_upper"
+    estimator: Estimator = "nearest_neighbor"
     active_sensing: ActiveSensingSettings = ActiveSensingSettings()
     particle_filter: ParticleFilterSettings = ParticleFilterSettings()
     resolution: float | None = None
+    times_the_particles: float = 1.0
 
 
 def variants() -> list[Variant]:
     """Return each estimator's reference, followed by all that differ from it."""
-    found = [Variant()]
+    found = [Variant(), *_numbers_of_particles("nearest_neighbor")]
     for samples in (1, 3, 30, 100):
         sensing = ActiveSensingSettings(num_observation_samples=samples)
         found.append(Variant("M", str(samples), active_sensing=sensing))
@@ -101,15 +105,21 @@ def variants() -> list[Variant]:
             ParticleFilterSettings(estimate="most_likely", resampling_threshold=threshold)
         ]
     ]
-    # The same in all directions, as the motion noise itself need not be: so 1 is another, too.
-    found += _resolutions("gaussian_mixture_upper", (0.1, 0.3, 1.0, 3.0, 10.0))
-    found.append(Variant(estimator="nearest_neighbor"))
     for neighbors in (1, 3, 10, 20):
         sensing = ActiveSensingSettings(num_nearest_neighbors=neighbors)
-        found.append(
-            Variant("k", str(neighbors), estimator="nearest_neighbor", active_sensing=sensing)
-        )
-    return found + _resolutions("nearest_neighbor", (0.1, 0.3, 3.0, 10.0))
+        found.append(Variant("k", str(neighbors), active_sensing=sensing))
+    found += _resolutions("nearest_neighbor", (0.1, 0.3, 3.0, 10.0))
+    found.append(Variant(estimator="gaussian_mixture_upper"))
+    found += _numbers_of_particles("gaussian_mixture_upper")
+    # The same in all directions, as the motion noise itself need not be: so 1 is another, too.
+    return found + _resolutions("gaussian_mixture_upper", (0.1, 0.3, 1.0, 3.0, 10.0))
+
+
+def _numbers_of_particles(estimator: Estimator) -> list[Variant]:
+    return [
+        Variant("particles", f"x {times:g}", estimator=estimator, times_the_particles=times)
+        for times in (0.5, 3.0, 10.0)
+    ]
 
 
 def _resolutions(estimator: Estimator, factors: Sequence[float]) -> list[Variant]:
@@ -123,7 +133,7 @@ class Parameters:
     """The study ``parameters``."""
 
     name = "parameters"
-    title = "What the parameters do: M, k, resolution, horizon, estimate, resampling"
+    title = "What the parameters do: particles, M, k, resolution, horizon, estimate, resampling"
 
     def tasks(self, scale: Scale) -> list[Task]:
         """Return all that is to be computed, in the order in which to begin."""
@@ -170,6 +180,9 @@ def _cells() -> Iterator[tuple[str, Variant]]:
 
 def _tasks(name: str, variant: Variant, scale: Scale) -> list[Task]:
     case = _CASES[name]
+    case = msgspec.structs.replace(
+        case, num_particles=round(variant.times_the_particles * case.num_particles)
+    )
     selector = SelectorSettings(estimator=variant.estimator)
     if variant.resolution is not None:
         own = problem_of(case.problem, case.model, {}).resolution

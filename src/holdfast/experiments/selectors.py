@@ -61,23 +61,23 @@ that they are the executed ones."""
 
 BASELINE = "random"
 
-_MADE_FOR_IT = "busy room"
+_DISTRACTING = ("busy room", "passer-by")
 """Made so that asking for the state and asking for the action differ."""
 
 _GROUPS: Mapping[str, tuple[str, ...]] = {
     "all problems": tuple(case.name for case in CASES),
-    "all but the busy room": tuple(case.name for case in CASES if case.name != _MADE_FOR_IT),
+    "without distractions": tuple(case.name for case in CASES if case.name not in _DISTRACTING),
 }
 """Problems that are taken together, each with the same weight."""
 
 _SHOWN = {
     "random": "random",
     "fixed": "fixed",
-    "state entropy, mixture": "state entropy",
-    "action entropy, mixture": "action entropy",
+    "state entropy, neighbours": "state entropy",
+    "action entropy, neighbours": "action entropy",
 }
 """Ways in the figures for a first look, and what they are called there: both entropies by the same
-estimate."""
+estimate, the default."""
 
 _TRIALS = 200
 _QUICK_TRIALS = 8
@@ -88,7 +88,7 @@ class Selectors:
     """The study ``selectors``."""
 
     name = "selectors"
-    title = "What is really best: choosing what to sense, on seven problems"
+    title = "What is really best: choosing what to sense, on eight problems"
 
     def tasks(self, scale: Scale) -> list[Task]:
         """Return all that is to be computed, in the order in which to begin."""
@@ -355,7 +355,7 @@ def _findings(
         if _is_sure(row)
     ]
     findings += [
-        f"{row['problem']}, a look costs {row['cost_of_a_look']}, {_SHOWN[str(row['way'])]} at its "
+        f"{row['problem']}, a look costs {row['cost_of_a_look']}, {row['way']} at its "
         f"best interval: {number_of(row['gain']):+.3g} [{number_of(row['gain_low']):+.3g}, "
         f"{number_of(row['gain_high']):+.3g}] of reward beyond random at its best (n = "
         f"{row['trials']}, paired t-test, {_level(row)})"
@@ -388,7 +388,10 @@ def _draw_choice(summary: Table) -> Figure:
     figure, panels = plots.grid_of_panels(
         list(_CASES),
         columns=4,
-        title="What choosing the sensing action gains (entropies by the mixture estimate)",
+        title=(
+            "What choosing the sensing action gains (entropies by nearest neighbours; means, 95 % "
+            "intervals)"
+        ),
         width=11.0,
     )
     for case, panel in panels.items():
@@ -415,7 +418,10 @@ def _draw_relative_steps(relative_steps: Table) -> Figure:
     figure, panels = plots.grid_of_panels(
         [*_CASES, *_GROUPS],
         columns=3,
-        title="Steps relative to random looks (geometric mean; failures count as the limit)",
+        title=(
+            "Steps relative to random looks (geometric mean, 95 % intervals; failures count as the "
+            "limit)"
+        ),
         width=10.0,
         same_rows=True,
     )
@@ -436,7 +442,7 @@ def _draw_costs(costs: Table) -> Figure:
     figure, panels = plots.grid_of_panels(
         list(_CASES),
         columns=4,
-        title="Where a look costs: reward at the best of the intervals",
+        title="Where a look costs: reward at the best of the intervals (means, 95 % intervals)",
         width=11.0,
     )
     for case, panel in panels.items():
