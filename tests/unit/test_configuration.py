@@ -570,7 +570,7 @@ class TestTwoKeys:
 
     @pytest.mark.parametrize(
         "selector",
-        ["{estimator: gaussian_mixture_upper}", "{method: random}", "{method: fixed}", "{}"],
+        ["{estimator: gaussian_mixture_upper}", "{method: random}", "{method: fixed}"],
     )
     def test_where_neighbours_are_not_counted_one_particle_is_enough(
         self, selector: str, write: Write
