@@ -170,7 +170,9 @@ def line_with_intervals(
     panel.grid(axis="y")
 
 
-def dot_rows(panel: Axes, labels: Sequence[str], kinds: Sequence[Dots]) -> None:
+def dot_rows(
+    panel: Axes, labels: Sequence[str], kinds: Sequence[Dots], *, legend: bool = True
+) -> None:
     """Draw rows of values with intervals, a mark for each kind, the first row on top.
 
     Parameters
@@ -180,6 +182,8 @@ def dot_rows(panel: Axes, labels: Sequence[str], kinds: Sequence[Dots]) -> None:
         Of the rows.
     kinds : sequence of Dots
         The first one's marks are hollow.
+    legend : bool
+        Whether there is one, above the rows, if a kind has a label.
     """
     step = 0.7 / len(kinds)
     for number, kind in enumerate(kinds):
@@ -203,7 +207,7 @@ def dot_rows(panel: Axes, labels: Sequence[str], kinds: Sequence[Dots]) -> None:
     panel.set_ylim(len(labels) - 0.4, -0.6)
     panel.grid(axis="x")
     panel.tick_params(axis="y", length=0)
-    if any(kind.label for kind in kinds):
+    if legend and any(kind.label for kind in kinds):
         # Above the rows, where it covers none.
         panel.legend(
             loc="lower right",
