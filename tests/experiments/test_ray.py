@@ -28,7 +28,7 @@ from holdfast.experiments import ray_executor
 from holdfast.experiments.executors import LocalExecutor
 from holdfast.experiments.ray_executor import RayExecutor
 from holdfast.experiments.tables import Table
-from holdfast.experiments.tasks import Task, code_digest, task_key
+from holdfast.experiments.tasks import Task, code_of, task_key
 from holdfast.experiments.trial_batches import TrialSeries, trial_tasks
 
 P = ParamSpec("P")
@@ -87,7 +87,7 @@ def on_cluster(address: str | None) -> Outcome:
 def refusal(address: str | None, wanted: list[Task], code: str | None) -> str:
     """Return why tasks cannot be computed; if ``code`` is given, as if that were ours."""
     if code is not None:
-        setattr(ray_executor, "code_digest", lambda _: code)  # noqa: B010
+        setattr(ray_executor, "code_of", lambda _: code)  # noqa: B010
     try:
         RayExecutor(address).run(wanted, lambda *_: None)
     except HoldfastError as error:
@@ -162,7 +162,7 @@ def test_what_a_task_is_refused_for_comes_back(cluster: RayCluster) -> None:
 def test_other_code_is_refused(cluster: RayCluster) -> None:
     with alone(refusal, cluster.address, tasks()[:1], "0123") as told:
         text = told.result(PATIENCE_S)
-    own = code_digest("trials")
+    own = code_of(tasks()[0])
     assert f"has other code for tasks of the kind 'trials' (digest {own}, of holdfast" in text
     assert "than the one that asks (digest 0123)" in text
 

@@ -3,23 +3,29 @@
 import contextlib
 import multiprocessing
 import os
+import shutil
 import signal
+import subprocess
+import sys
 import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import msgspec
 import pytest
+from matplotlib.figure import Figure
 
 import holdfast
-from holdfast.errors import InvalidValueError
+from holdfast import _kernel
+from holdfast.errors import HoldfastError, InvalidValueError
 from holdfast.experiments import executors, tasks
 from holdfast.experiments.executors import LocalExecutor
 from holdfast.experiments.result_cache import ResultCache
-from holdfast.experiments.running import Workload, compute, write_report
+from holdfast.experiments.running import Workload, check_packages, compute, write_report
 from holdfast.experiments.study import Report, Results, Scale
 from holdfast.experiments.tables import Table
-from holdfast.experiments.tasks import Task, TaskError, run_task, task_key
+from holdfast.experiments.task_messages import compute_encoded, encode_task, table_of
+from holdfast.experiments.tasks import Task, TaskError, code_of, run_task, task_key
 from holdfast.experiments.trial_batches import TrialSeries, trial_tasks
 from holdfast.files import OutputError
 
@@ -76,7 +82,7 @@ class TestTasks:
     def test_the_key_names_the_code(self, monkeypatch: pytest.MonkeyPatch) -> None:
         task = next(trial_tasks(series(), 100))
         before = task_key(task)
-        monkeypatch.setattr(tasks, "code_digest", lambda kind: f"another {kind}")
+        monkeypatch.setattr(tasks, "code_of", lambda task: f"another {task.kind}")
         assert task_key(task) != before
 
     def test_the_key_names_the_sources_of_a_problem(self, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -90,6 +96,56 @@ class TestTasks:
             lambda at, whole=False: "another" if at == place else found(at, whole),
         )
         assert task_key(task) != before
+
+    def test_an_edited_source_is_noticed(self, tmp_path: Path) -> None:
+        """In a process of its own, whose package is a copy."""
+        package = tmp_path / "holdfast"
+        shutil.copytree(
+            Path(holdfast.__file__).parent, package, ignore=shutil.ignore_patterns("__pycache__")
+        )
+        for kernel in Path(_kernel.__file__).parent.glob("_kernel*.so"):
+            shutil.copy(kernel, package)
+        program = """
+from pathlib import Path
+import holdfast
+from holdfast.experiments.tasks import Task, code_of
+def digests():
+    places = ("peg_in_hole_2d", "holdfast.experiments.light_dark:LightDark")
+    return [code_of(Task(kind="trials", parameters={"problem": place})) for place in places]
+first = digests()
+assert digests() == first
+package = Path(holdfast.__file__).parent
+for number, name in enumerate(("experiments/light_dark.py", "belief.py", "chaos/trial.py")):
+    with (package / name).open("a") as source:
+        source.write("# edited")
+    second = digests()
+    print(name, [before != now for before, now in zip(first, second)])
+    first = second
+"""
+        done = subprocess.run(
+            [sys.executable, "-S", "-c", program],
+            env={
+                "PYTHONPATH": os.pathsep.join([str(tmp_path), *filter(None, sys.path)]),
+                "PYTHONDONTWRITEBYTECODE": "1",
+            },
+            capture_output=True,
+            text=True,
+        )
+        assert done.returncode == 0, done.stderr
+        assert done.stdout.splitlines() == [
+            "experiments/light_dark.py [False, True]",
+            "belief.py [True, True]",
+            "chaos/trial.py [False, False]",
+        ]
+
+    def test_who_has_other_code_for_the_problem_refuses(self) -> None:
+        place = "holdfast.experiments.light_dark:LightDark"
+        task, other = (
+            next(trial_tasks(series(problem=each), 100)) for each in (place, "peg_in_hole_2d")
+        )
+        assert table_of(compute_encoded(encode_task(task, code_of(task)))).num_rows == 7
+        with pytest.raises(TaskError, match="has other code for tasks of the kind 'trials'"):
+            table_of(compute_encoded(encode_task(task, code_of(other))))
 
     def test_the_key_of_times_names_the_machine(self, monkeypatch: pytest.MonkeyPatch) -> None:
         task = next(trial_tasks(series(), 100))
@@ -143,6 +199,21 @@ class TestCache:
         cache.store(task, Table({"reward": [1.5]}))
         (file,) = (path for path in tmp_path.rglob("*") if path.is_file())
         file.write_bytes(damage or file.read_bytes()[:-9])
+        assert cache.load(task) is None
+
+    def test_what_is_of_another_task_is_computed_again(self, tmp_path: Path) -> None:
+        cache = ResultCache(tmp_path)
+        one, other = (Task(kind="trials", parameters={"a": (n, 2.5)}) for n in (1, 2))
+        for task in (one, other):
+            cache.store(task, Table({"a": [task.parameters["a"][0]]}))
+        first, second = (cache._path_of(task) for task in (one, other))
+        first.write_bytes(second.read_bytes())
+        assert cache.load(one) is None
+        assert cache.load(other) == Table({"a": [2]})
+
+    def test_columns_that_do_not_fit_are_computed_again(self, tmp_path: Path) -> None:
+        cache, task = ResultCache(tmp_path), Task(kind="trials", parameters={})
+        cache.store(task, Table({"a": [1], "b": [1, 2]}))
         assert cache.load(task) is None
 
     def test_what_cannot_be_kept_says_where(self, tmp_path: Path) -> None:
@@ -269,6 +340,48 @@ class TestWorkload:
         assert (origin["seed"], origin["quick"]) == (4, False)
         assert origin["findings"] == report.findings
         assert "processor" in origin["machine"]
+
+    def test_what_was_computed_by_edited_code_is_not_kept(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        workload = Workload([OneSeries()], Scale(seed=4), tmp_path)
+        monkeypatch.setattr(tasks, "code_of", lambda _: "edited")
+        with pytest.raises(TaskError, match="'trials' was edited while they were computed"):
+            compute(workload, LocalExecutor(1), lambda _: None)
+        assert not list(tmp_path.rglob("*.table"))
+
+    @pytest.mark.skipif(not Path("/proc/self").exists(), reason="nothing can be made in /proc")
+    def test_where_nothing_can_be_kept_nothing_is_computed(self) -> None:
+        with pytest.raises(OutputError, match="/proc/results: cannot be written in: No such"):
+            Workload([OneSeries()], Scale(), Path("/proc/results"))
+
+    def test_what_killed_writers_left_is_removed(self, tmp_path: Path) -> None:
+        old, young, other = (tmp_path / name for name in (".a.csv.12.tmp", ".b.csv.13.tmp", ".c"))
+        for path in (old, young, other):
+            path.write_text("")
+        os.utime(old, (0, 0))
+        os.utime(other, (0, 0))
+        Workload([OneSeries()], Scale(), tmp_path)
+        assert not old.exists()
+        assert young.exists()
+        assert other.exists()
+
+    def test_an_interrupted_report_has_no_origin(self, tmp_path: Path) -> None:
+        def interrupted() -> Figure:
+            raise KeyboardInterrupt
+
+        report = Report(summary={"means": Table({"reward": [1.0]})}, figures={"means": interrupted})
+        (tmp_path / "origin.json").write_text("of the run before")
+        with pytest.raises(KeyboardInterrupt):
+            write_report(OneSeries(), Scale(), report, tmp_path)
+        assert [path.name for path in tmp_path.iterdir()] == ["means.csv"]
+
+
+def test_missing_packages_are_told_of_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    check_packages()
+    monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
+    with pytest.raises(HoldfastError, match=r"need scipy and matplotlib.*holdfast\[experiments\]"):
+        check_packages()
 
 
 def test_exclusive_tasks_come_last_and_here(

@@ -26,6 +26,8 @@ _DEFAULT_DIRECTORY = Path("runs") / "experiments"
 _MOST_FINDINGS = 20
 """Sentences of a study that are printed; all of them are kept."""
 
+_LARGEST_SEED = 2**63 - 1
+
 _NOTE = "all kept"
 """What is to be said of the trials that are finished."""
 
@@ -45,7 +47,8 @@ def experiment(
         Path, typer.Option("--out", "-o", metavar="DIR", help="Directory for the results.")
     ] = _DEFAULT_DIRECTORY,
     seed: Annotated[
-        int, typer.Option("--seed", metavar="S", min=0, help="Seed of all trials.")
+        int,
+        typer.Option("--seed", metavar="S", min=0, max=_LARGEST_SEED, help="Seed of all trials."),
     ] = 2017,
     jobs: Annotated[
         int,
@@ -82,6 +85,8 @@ def experiment(
     from holdfast.experiments.study import Scale
 
     if list_names:
+        if names:
+            raise InvalidValueError(f"--list: lists all; {' '.join(names)} has no effect")
         for study in studies_of(["all"]):
             sys.stdout.write(f"{study.name:18} {study.title}\n")
         sys.stdout.flush()
@@ -95,7 +100,8 @@ def experiment(
     words += ["--jobs", str(jobs)] if jobs else []
     words += ["--executor", place] if place != "local" else []
     again = shlex.join([*words, "--out", str(out)])
-    with ended_by_signals():
+    # One signal is enough: another would cut short what ends the processes.
+    with ended_by_signals(once=True):
         _run(studies, Scale(quick=quick, seed=seed), out, _executor_of(place, jobs), again)
 
 
@@ -120,24 +126,26 @@ def _executor_of(place: str, jobs: int) -> Executor:
 def _run(
     studies: list[Study], scale: Scale, directory: Path, executor: Executor, again: str
 ) -> None:
-    from holdfast.experiments.running import Workload
+    from holdfast.experiments.running import Workload, check_packages
 
-    workload = Workload(studies, scale, directory)
+    check_packages()
+    workload: Workload | None = None
     try:
+        workload = Workload(studies, scale, directory)
         _compute(workload, directory, executor)
+        for study in studies:
+            _report(study, scale, workload, directory / study.name)
     except KeyboardInterrupt as interruption:
         ended = signal_of(interruption)
         how = "Interrupted" if ended == signal.SIGINT else f"Ended by {ended.name}"
         with contextlib.suppress(OSError):
-            sys.stderr.write(
-                f"\n{how}; {workload.finished_units:,} of {workload.units:,} trials are kept.\n"
-                f"Go on with: {again}\n"
-            )
+            kept = "all that was finished is kept"
+            if workload is not None:
+                kept = f"{workload.finished_units:,} of {workload.units:,} trials are kept"
+            sys.stderr.write(f"\n{how}; {kept}.\nGo on with: {again}\n")
         raise
     except HoldfastError as error:
         raise ResumableError(error, again) from error
-    for study in studies:
-        _report(study, scale, workload, directory / study.name)
 
 
 def _compute(workload: Workload, directory: Path, executor: Executor) -> None:

@@ -15,7 +15,7 @@ from typing import Protocol
 from holdfast.errors import InvalidValueError
 from holdfast.experiments.tables import Table
 from holdfast.experiments.task_messages import compute_encoded, encode_task, table_of
-from holdfast.experiments.tasks import Task, TaskError, code_digest, run_task
+from holdfast.experiments.tasks import Task, TaskError, code_of, run_task
 from holdfast.runtime.command_line import MAX_JOBS
 from holdfast.runtime.workers import WorkerProcess, end_workers
 
@@ -125,7 +125,7 @@ class _Worker(WorkerProcess):
     def give(self, number: int, task: Task) -> None:
         self.number, self.task = number, task
         # A worker imports what is on the disk by then: somebody may have edited it.
-        self.send(encode_task(task, code_digest(task.kind)))
+        self.send(encode_task(task, code_of(task)))
 
 
 def _work(connection: Connection) -> None:

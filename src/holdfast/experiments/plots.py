@@ -28,6 +28,7 @@ __all__ = [
     "grid_of_panels",
     "label_grid",
     "line_with_intervals",
+    "mark",
     "ratio_axes",
     "save",
     "stacked_panels",
@@ -232,6 +233,11 @@ def ratio_axes(panels: Iterable[Axes]) -> None:
         panel.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
         panel.minorticks_off()
         panel.axvline(1.0, color="black", linewidth=0.8)
+
+
+def mark(figure: Figure, words: str) -> None:
+    """Say something about a figure, beside its title."""
+    figure.text(0.988, 0.995, words, ha="right", va="top", fontsize=8.0, color="#B5342B")
 
 
 def save(figure: Figure, directory: Path, name: str) -> list[str]:

@@ -30,7 +30,7 @@ from holdfast.errors import HoldfastError, InvalidValueError
 from holdfast.experiments.executors import MOST_ATTEMPTS
 from holdfast.experiments.tables import Table
 from holdfast.experiments.task_messages import compute_encoded, encode_task, table_of
-from holdfast.experiments.tasks import Task, TaskError, code_digest
+from holdfast.experiments.tasks import Task, TaskError, code_of
 
 __all__ = ["RayExecutor"]
 
@@ -222,7 +222,7 @@ def _compute(
             cores = size.cores(len(pending) + len(running))
             while pending and len(running) < max(1, _AHEAD * cores):
                 task = pending.popleft()
-                running[remote.remote(encode_task(task, code_digest(task.kind)))] = task
+                running[remote.remote(encode_task(task, code_of(task)))] = task
             done, _ = ray.wait(list(running), timeout=_LONGEST_WAIT_S)
             for reference in done:
                 task = running.pop(reference)

@@ -1,7 +1,7 @@
 """What tasks came to, kept under the digest of all that they depend on.
 
 A file each, written whole or not at all. What cannot be read, because it was damaged or is of an
-earlier format, is as good as not there: the task is computed again.
+earlier format, or what is of another task, is as good as not there: the task is computed again.
 """
 
 from __future__ import annotations
@@ -57,9 +57,11 @@ class ResultCache:
         if zlib.crc32(payload).to_bytes(_CHECKSUM_BYTES, "little") != checksum:
             return None
         try:
-            return self._decoder.decode(payload).table
+            kept = self._decoder.decode(payload)
         except msgspec.DecodeError:
             return None
+        rows = {len(cells) for cells in kept.table.columns.values()}
+        return kept.table if _plain(kept.task) == _plain(task) and len(rows) <= 1 else None
 
     def store(self, task: Task, table: Table) -> None:
         """Keep what a task came to.
@@ -81,3 +83,7 @@ class ResultCache:
     def _path_of(self, task: Task) -> Path:
         key = task_key(task)
         return self._directory / task.kind / key[:2] / f"{key}.table"
+
+
+def _plain(task: Task) -> bytes:
+    return msgspec.json.encode(task, order="sorted")

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+import importlib.util
+import tempfile
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -13,13 +17,14 @@ from holdfast.experiments.executors import Executor, LocalExecutor
 from holdfast.experiments.result_cache import ResultCache
 from holdfast.experiments.study import Report, Results, Scale, Study
 from holdfast.experiments.tables import Table
-from holdfast.experiments.tasks import Task, task_key
+from holdfast.experiments.tasks import Task, TaskError, task_key
 from holdfast.files import OutputError, write_atomically
 from holdfast.recording.machine import describe
 
-__all__ = ["Workload", "compute", "write_report"]
+__all__ = ["Workload", "check_packages", "compute", "write_report"]
 
 _CACHE = "cache"
+_LONGEST_WRITE_S = 600.0
 
 
 class Workload:
@@ -45,8 +50,10 @@ class Workload:
     def __init__(self, studies: Sequence[Study], scale: Scale, directory: Path) -> None:
         self._cache = ResultCache(directory / _CACHE)
         self._tables: dict[str, Table] = {}
+        _sweep(directory)
         tasks = {task_key(task): task for study in studies for task in study.tasks(scale)}
         self.tasks = list(tasks.values())
+        self._keys = frozenset(tasks)
         self.pending: list[Task] = []
         for key, task in tasks.items():
             table = self._cache.load(task)
@@ -56,11 +63,28 @@ class Workload:
                 self._tables[key] = table
         self.units = sum(task.units for task in self.tasks)
         self.finished_units = self.units - sum(task.units for task in self.pending)
+        if self.pending:
+            _check_room(directory)
 
     def keep(self, task: Task, table: Table) -> None:
-        """Take what a task came to."""
+        """Take what a task came to.
+
+        Raises
+        ------
+        TaskError
+            If its code was edited since this was made: it came of one or the other.
+        OutputError
+            If it cannot be kept.
+        """
+        key = task_key(task)
+        if key not in self._keys:
+            raise TaskError(
+                f"the code of tasks of the kind {task.kind!r} was edited while they were computed, "
+                "so nobody knows which code this result is of; it is not kept. Edit nothing "
+                "meanwhile"
+            )
         self._cache.store(task, table)
-        self._tables[task_key(task)] = table
+        self._tables[key] = table
         self.finished_units += task.units
 
     @property
@@ -110,6 +134,8 @@ class _Origin(msgspec.Struct, kw_only=True):
 def write_report(study: Study, scale: Scale, report: Report, directory: Path) -> list[str]:
     """Write a study's tables, figures and findings.
 
+    ``origin.json`` comes last: where it is not there, the rest may be of two runs.
+
     Parameters
     ----------
     study : Study
@@ -132,6 +158,11 @@ def write_report(study: Study, scale: Scale, report: Report, directory: Path) ->
         directory.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(f"{directory}: cannot be made: {error.strerror}") from error
+    origin_path = directory / "origin.json"
+    try:
+        origin_path.unlink(missing_ok=True)
+    except OSError as error:
+        raise OutputError(f"{origin_path}: cannot be replaced: {error.strerror}") from error
     names = []
     for name, table in report.summary.items():
         write_atomically(directory / f"{name}.csv", table.to_csv().encode())
@@ -139,6 +170,13 @@ def write_report(study: Study, scale: Scale, report: Report, directory: Path) ->
     for name, table in report.raw.items():
         write_atomically(directory / f"{name}_trials.csv", table.to_csv().encode())
         names.append(f"{name}_trials.csv")
+    if report.figures:
+        from holdfast.experiments import plots
+    for name, draw in report.figures.items():
+        figure = draw()
+        if scale.quick:
+            plots.mark(figure, "quick: few trials, no evidence")
+        names += plots.save(figure, directory, name)
     origin = _Origin(
         study=study.name,
         quick=scale.quick,
@@ -148,16 +186,40 @@ def write_report(study: Study, scale: Scale, report: Report, directory: Path) ->
         findings=report.findings,
     )
     text = msgspec.json.format(msgspec.json.encode(origin), indent=2)
-    write_atomically(directory / "origin.json", text + b"\n")
+    write_atomically(origin_path, text + b"\n")
     names.append("origin.json")
-    try:
-        from holdfast.experiments import plots
-    except ImportError as error:
-        if error.name is None or error.name.split(".")[0] != "matplotlib":
-            raise
-        raise HoldfastError(
-            "figures need matplotlib, which is not installed: pip install 'holdfast[experiments]'"
-        ) from error
-    for name, draw in report.figures.items():
-        names += plots.save(draw(), directory, name)
     return names
+
+
+def check_packages() -> None:
+    """Make sure that what studies need is installed, before anything is computed for them.
+
+    Raises
+    ------
+    HoldfastError
+        If a package is missing.
+    """
+    missing = [name for name in ("scipy", "matplotlib") if importlib.util.find_spec(name) is None]
+    if missing:
+        raise HoldfastError(
+            f"experiments need {' and '.join(missing)}, not installed here: pip install "
+            "'holdfast[experiments]'"
+        )
+
+
+def _check_room(directory: Path) -> None:
+    """Make sure that results can be kept, before there are any."""
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=directory).close()
+    except OSError as error:
+        raise OutputError(f"{directory}: cannot be written in: {error.strerror}") from error
+
+
+def _sweep(directory: Path) -> None:
+    """Remove what writers left that were killed; what is young may be of one that writes."""
+    latest = time.time() - _LONGEST_WRITE_S
+    for path in directory.rglob(".*.tmp"):
+        with contextlib.suppress(OSError):
+            if path.stat().st_mtime < latest:
+                path.unlink()

@@ -15,7 +15,7 @@ import msgspec
 from holdfast import __version__
 from holdfast.errors import HoldfastError
 from holdfast.experiments.tables import Table
-from holdfast.experiments.tasks import Task, TaskError, code_digest, run_task
+from holdfast.experiments.tasks import Task, TaskError, code_of, run_task
 
 __all__ = ["TaskCrashError", "compute_encoded", "encode_task", "table_of"]
 
@@ -54,7 +54,7 @@ def encode_task(task: Task, code: str | None = None) -> bytes:
     ----------
     task : Task
     code : str, optional
-        The digest of the code that may compute it, as :func:`~.tasks.code_digest` has it. Without
+        The digest of the code that may compute it, as :func:`~.tasks.code_of` has it. Without
         it, whoever gets the task is known to have the same code.
     """
     return msgspec.msgpack.encode(_Request(task, code))
@@ -77,7 +77,10 @@ def compute_encoded(request: bytes) -> bytes:
     try:
         asked = _REQUEST_DECODER.decode(request)
         _check_code(asked)
-        answer = _Computed(run_task(asked.task))
+        table = run_task(asked.task)
+        # What it needed was imported on the way, and may have been edited just before.
+        _check_code(asked)
+        answer = _Computed(table)
     except HoldfastError as error:
         answer = _Refused(str(error))
     except Exception:  # noqa: BLE001 - whatever it is, whoever asked raises it again
@@ -89,7 +92,7 @@ def _check_code(asked: _Request) -> None:
     if asked.code is None:
         return
     kind = asked.task.kind
-    own = code_digest(kind)
+    own = code_of(asked.task)
     if own != asked.code:
         raise TaskError(
             f"a process on {socket.gethostname()} has other code for tasks of the kind {kind!r} "

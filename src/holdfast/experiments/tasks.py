@@ -13,9 +13,9 @@ import functools
 import hashlib
 import importlib
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import msgspec
 
@@ -25,7 +25,7 @@ from holdfast.errors import HoldfastError
 from holdfast.experiments.tables import Table
 from holdfast.recording.machine import describe
 
-__all__ = ["Task", "TaskError", "code_digest", "run_task", "task_key"]
+__all__ = ["Task", "TaskError", "code_of", "run_task", "task_key"]
 
 _FUNCTIONS: Mapping[str, str] = {
     "trials": "holdfast.experiments.trial_batches:run_trials_of",
@@ -78,9 +78,7 @@ def task_key(task: Task) -> str:
 
     Times depend on the machine as well.
     """
-    content = [task.kind, task.parameters, code_digest(task.kind)]
-    # Problems that are named by their place are code, too.
-    content += [_digest_behind(place) for place in _places_in(task.parameters)]
+    content: list[Any] = [task.kind, task.parameters, code_of(task)]
     if task.exclusive:
         content.append(_machine())
     plain = msgspec.json.encode(content, order="sorted")
@@ -92,36 +90,62 @@ def _machine() -> dict[str, str]:
     return {name: value for name, value in describe().items() if name not in _OF_THE_DAY}
 
 
-@functools.cache
-def code_digest(kind: str) -> str:
-    """Return the digest of the code that computes a kind of task, in hexadecimal.
+def code_of(task: Task) -> str:
+    """Return the digest of the code that computes a task, in hexadecimal.
 
     The version of holdfast alone would not tell what a developer has changed since: what is hashed
-    are the sources of the function's module and of all modules that it imports, directly or not,
-    and the compiled kernel; if the function starts processes, all that these may be made of.
+    are the sources of the function's module, of the problems that the parameters name by their
+    place, and of all modules that these import, directly or not, and the compiled kernel; if the
+    function starts processes, all that these may be made of. It is what is on the disk now.
 
     Raises
     ------
     TaskError
-        If there is no such kind.
+        If there is no such kind, or a source cannot be read.
     """
-    return _digest_behind(_place_of(kind), kind in _OF_PROCESSES)
+    # A list of digests would do; one is easier to compare and to show.
+    digests = [_digest_behind(_place_of(task.kind), task.kind in _OF_PROCESSES)]
+    digests += [_digest_behind(place) for place in _places_in(task.parameters)]
+    return hashlib.blake2b("".join(digests).encode(), digest_size=_KEY_SIZE).hexdigest()
 
 
-@functools.cache
+class _Hashed(NamedTuple):
+    """A digest, and what the files looked like that it is of."""
+
+    digest: str
+    files: tuple[Path, ...]
+    looks: tuple[tuple[int, int], ...]
+
+
+_HASHED: dict[tuple[str, bool], _Hashed] = {}
+
+
 def _digest_behind(place: str, whole_program: bool = False) -> str:
-    package = Path(holdfast.__file__).parent
-    digest = hashlib.blake2b(holdfast.__version__.encode(), digest_size=_KEY_SIZE)
-    sources = _sources_behind(place.partition(":")[0], package)
-    if whole_program:
-        studies = package / "experiments"
-        sources |= {path for path in package.rglob("*.py") if studies not in path.parents}
-    for path in sorted(sources):
-        inside = path.relative_to(package)
-        digest.update(str(inside).encode() + b"\0" + path.read_bytes() + b"\0")
-    if _kernel.__file__:
-        digest.update(Path(_kernel.__file__).read_bytes())
-    return digest.hexdigest()
+    known = _HASHED.get((place, whole_program))
+    try:
+        if known is not None and known.looks == _looks_of(known.files):
+            return known.digest
+        package = Path(holdfast.__file__).parent
+        sources = _sources_behind(place.partition(":")[0], package)
+        if whole_program:
+            studies = package / "experiments"
+            sources |= {path for path in package.rglob("*.py") if studies not in path.parents}
+        files = (*sorted(sources), *([Path(_kernel.__file__)] if _kernel.__file__ else ()))
+        looks = _looks_of(files)
+        digest = hashlib.blake2b(holdfast.__version__.encode(), digest_size=_KEY_SIZE)
+        for path in files:
+            name = str(path.relative_to(package)) if path in sources else "kernel"
+            digest.update(name.encode() + b"\0" + path.read_bytes() + b"\0")
+    except OSError as error:
+        raise TaskError(f"{error.filename}: cannot be read: {error.strerror}") from error
+    found = _Hashed(digest.hexdigest(), files, looks)
+    _HASHED[place, whole_program] = found
+    return found.digest
+
+
+def _looks_of(files: Iterable[Path]) -> tuple[tuple[int, int], ...]:
+    """Return what changes when a file is edited, without reading it."""
+    return tuple((stat.st_mtime_ns, stat.st_size) for stat in (path.stat() for path in files))
 
 
 def run_task(task: Task) -> Table:

@@ -7,10 +7,12 @@ processes: a worker that is not wanted any more is killed, and nothing is left t
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import multiprocessing
 import os
 import signal
+import weakref
 from collections.abc import Callable, Iterable, Iterator
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
@@ -23,6 +25,20 @@ __all__ = ["WorkerProcess", "end_workers"]
 _ENDING_SIGNALS = frozenset({signal.SIGINT, signal.SIGTERM, signal.SIGHUP})
 
 _END_S = 10.0
+
+_STARTED: weakref.WeakSet[WorkerProcess] = weakref.WeakSet()
+
+
+@atexit.register
+def _end_what_is_left() -> None:
+    """Kill workers that nobody ended.
+
+    The package multiprocessing would ask them to end, which they do not hear, and wait.
+    """
+    for worker in list(_STARTED):
+        if worker._process.pid is not None:
+            with contextlib.suppress(ValueError):
+                worker._process.kill()
 
 
 class WorkerProcess:
@@ -62,6 +78,7 @@ class WorkerProcess:
         """Start it, once."""
         # Its start would undo the mask set below, so it must have been started before.
         resource_tracker.ensure_running()
+        _STARTED.add(self)
         with _inherited_by_children(self._threads):
             self._process.start()
         # Only the child must hold this end, else its death would not close the pipe.
@@ -76,7 +93,8 @@ class WorkerProcess:
         """Return its next message once it is there; None if it has ended."""
         try:
             return self.connection.recv_bytes()
-        except (EOFError, ConnectionResetError):
+        except (EOFError, OSError):
+            # It ended before it sent anything, or in the middle of sending.
             return None
 
     def how_it_ended(self) -> tuple[str, bool]:
@@ -94,12 +112,9 @@ def end_workers(workers: Iterable[WorkerProcess]) -> None:
     # There is nothing to wait for: each result is sent whole or not wanted any more. They block the
     # gentler signals.
     started = [worker for worker in workers if worker._process.pid is not None]
-    mask = signal.pthread_sigmask(signal.SIG_BLOCK, _ENDING_SIGNALS)
-    try:
+    with _no_signals():
         for worker in started:
             worker._process.kill()
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
     for worker in started:
         worker._process.join()
     for worker in workers:
@@ -118,16 +133,33 @@ def _inherited_by_children(threads: int) -> Iterator[None]:
     variables = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
     saved = {name: os.environ.get(name) for name in variables}
     os.environ.update(dict.fromkeys(variables, str(threads)))
-    mask = signal.pthread_sigmask(signal.SIG_BLOCK, _ENDING_SIGNALS)
     try:
-        yield
+        with _no_signals():
+            yield
     finally:
         for name, value in saved.items():
             if value is None:
                 del os.environ[name]
             else:
                 os.environ[name] = value
-        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+
+
+@contextlib.contextmanager
+def _no_signals() -> Iterator[None]:
+    """Do what is inside without being interrupted."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, ())
+    late: KeyboardInterrupt | None = None
+    try:
+        # Of a signal that has just come, Python tells here, when they are blocked already.
+        try:
+            signal.pthread_sigmask(signal.SIG_BLOCK, _ENDING_SIGNALS)
+        except KeyboardInterrupt as interruption:
+            late = interruption
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    if late is not None:
+        raise late
 
 
 def _begin(
