@@ -8,7 +8,9 @@ error that names the function, what came and what was needed.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import functools
+import inspect
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -36,6 +38,22 @@ FloatArray = npt.NDArray[np.float64]
 # may not fulfil it.
 MAX_OBSERVATION_SIZE = 1024
 
+PARAMETERS: Mapping[str, tuple[str, ...]] = {
+    "initial_states": ("stream", "count"),
+    "move": ("states", "actions", "stream"),
+    "observation_mean": ("states", "sensing_action"),
+    "observation_variance": ("states", "sensing_action"),
+    "policy": ("states", "stage"),
+    "next_stage": ("estimates", "stage"),
+    "execute": ("actions",),
+    "reward": ("states", "actions"),
+    "is_goal": ("states",),
+    "scene": (),
+    "log_likelihood": ("states", "sensing_action", "observation"),
+    "sample_observation": ("state", "sensing_action", "stream"),
+}
+"""What a problem's functions are called with, by position."""
+
 
 def check_problem(problem: Any) -> None:
     """Check what can be checked without calling anything.
@@ -43,8 +61,8 @@ def check_problem(problem: Any) -> None:
     Raises
     ------
     ProblemError
-        If an attribute is missing or out of bounds, or only one of ``log_likelihood`` and
-        ``sample_observation`` is there.
+        If an attribute is missing or out of bounds, a function cannot be called as it will be, or
+        only one of ``log_likelihood`` and ``sample_observation`` is there.
     """
     kind = type(problem).__name__
     name = getattr(problem, "name", "")
@@ -82,6 +100,36 @@ def check_problem(problem: Any) -> None:
         raise ProblemError(
             f"{name} has {given[0]} alone: log_likelihood and sample_observation go together"
         )
+    for function, parameters in PARAMETERS.items():
+        if hasattr(problem, function):
+            _check_parameters(name, function, getattr(problem, function), parameters)
+
+
+def _check_parameters(name: str, function: str, own: Any, parameters: tuple[str, ...]) -> None:
+    wanted = f"{function}({', '.join(parameters)})"
+    if not callable(own):
+        raise ProblemError(f"{function} of {name} is {own!r}: must be a function, {wanted}")
+    # What a class has is looked at once, and not again for each trial.
+    if inspect.ismethod(own):
+        takes = _takes(own.__func__, (None, *parameters))
+    else:
+        takes = _takes.__wrapped__(own, parameters)
+    if takes is not None:
+        raise ProblemError(f"{function} of {name} takes {takes}: it is called as {wanted}")
+
+
+@functools.lru_cache(maxsize=1000)
+def _takes(function: Any, arguments: tuple[str | None, ...]) -> str | None:
+    """Return what a function takes, if it cannot be called with so many arguments."""
+    try:
+        signature = inspect.signature(function)
+    except (TypeError, ValueError):
+        return None  # Of some compiled functions nobody knows.
+    try:
+        signature.bind(*arguments)
+    except TypeError:
+        return str(signature)
+    return None
 
 
 def has_general_observations(problem: object) -> bool:

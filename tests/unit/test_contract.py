@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import inspect
 from typing import Any
 
 import numpy as np
 import pytest
 
-from holdfast import planning
+from holdfast import contract, planning
 from holdfast.errors import InvalidValueError, ProblemError
-from holdfast.problems.problem import FloatArray, IntArray, ProblemBase
+from holdfast.problems.problem import (
+    FloatArray,
+    GeneralObservationProblem,
+    IntArray,
+    Problem,
+    ProblemBase,
+)
 from holdfast.randomness import Stream
 from holdfast.runtime.environment import SimulatedEnvironment
 from holdfast.settings import (
@@ -173,3 +180,37 @@ def test_settings_made_in_python_are_checked(settings: PlanningSettings, message
         check_settings(settings)
     with pytest.raises(InvalidValueError, match=message):
         planning.initial_state(Line(), settings, 0, 0)
+
+
+@pytest.mark.parametrize(
+    ("function", "own", "message"),
+    [
+        (
+            "policy",
+            Line.is_goal,
+            r"takes \(self, states: .*: it is called as policy\(states, stage\)",
+        ),
+        (
+            "move",
+            Line.policy,
+            r"move of line takes .*it is called as move\(states, actions, stream\)",
+        ),
+        ("is_goal", 1.0, r"is_goal of line is 1.0: must be a function, is_goal\(states\)"),
+    ],
+)
+def test_a_function_that_takes_something_else_is_named(
+    function: str, own: object, message: str
+) -> None:
+    broken: Any = type("Broken", (Line,), {function: own})()
+    with pytest.raises(ProblemError, match=message):
+        planning.initial_state(broken, SETTINGS, 0, 0)
+
+
+def test_the_parameters_are_those_of_the_contract() -> None:
+    members = {**vars(Problem), **vars(GeneralObservationProblem)}
+    functions = {
+        name: tuple(inspect.signature(member).parameters)[1:]
+        for name, member in members.items()
+        if inspect.isfunction(member) and not name.startswith("_")
+    }
+    assert functions == contract.PARAMETERS
