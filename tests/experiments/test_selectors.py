@@ -92,10 +92,20 @@ def test_rivals_and_sentences(compared: Report) -> None:
     ):
         found = [told for told in compared.findings if told.startswith(begin)]
         assert any(inside in told for told in found), begin
-    # Where nothing differs but by chance nothing is said.
-    assert not [
-        told for told in compared.findings if "covariance against action entropy, n" in told
-    ]
+    # Where nothing differs but by chance nothing is said, except of the default.
+    assert any(
+        told.startswith("all problems (mean), action covariance against action entropy, n")
+        for told in compared.findings
+    )
+    assert not [told for told in compared.findings if "covariance against state entropy, n" in told]
+
+
+def test_how_each_problem_is_posed(compared: Report) -> None:
+    rows = list(compared.summary["cases"].rows())
+    assert [row["problem"] for row in rows] == [case.name for case in CASES]
+    assert rows[1]["model"] == "hole_tolerance 0.05"
+    assert {row["M"] for row in rows} == {10}
+    assert [row["trials"] for row in rows] == [round(case.share * 40) for case in CASES]
 
 
 def test_groups_of_problems() -> None:
