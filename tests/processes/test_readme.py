@@ -24,6 +24,8 @@ COMMANDS = [
     if line.strip()
 ]
 PROGRAMS = [text for language, text in BLOCKS if language == "python"]
+ALONE = [program for program in PROGRAMS if "runs/" not in program]
+"""Programs that read nothing that a command has written."""
 
 
 @pytest.fixture(scope="module")
@@ -84,6 +86,11 @@ def test_holdfast_commands(clone: Path) -> None:
                 continue
             done = run(words, clone)
             assert done.returncode == 0, f"{command}\n{done.stdout}{done.stderr}"
+    for program in PROGRAMS:
+        if program not in ALONE:
+            done = run([sys.executable, "-W", "error", "-c", program], clone)
+            assert done.returncode == 0, done.stderr
+            assert done.stdout.strip()
     for name in ("trials.csv", "summary.json", "config.yaml", "journal.sqlite", "trial.png"):
         assert (clone / "runs" / "first" / name).stat().st_size > 0
 
@@ -115,7 +122,7 @@ def test_nothing_is_left_to_fill_in(name: str) -> None:
     assert left == []
 
 
-@pytest.mark.parametrize("program", PROGRAMS, ids=[f"program-{i}" for i in range(len(PROGRAMS))])
+@pytest.mark.parametrize("program", ALONE, ids=[f"program-{i}" for i in range(len(ALONE))])
 def test_programs(program: str, clone: Path) -> None:
     done = run([sys.executable, "-W", "error", "-c", program], clone)
     assert done.returncode == 0, done.stderr

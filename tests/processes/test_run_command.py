@@ -577,3 +577,40 @@ def test_of_two_runs_at_once_in_one_directory_one_is_done(tmp_path: Path) -> Non
         winner = 1 + codes.index(0)
         assert f"seed: {winner}\n" in (directory / "config.yaml").read_text(encoding="utf-8")
         assert f'"seed": {winner},' in (directory / "summary.json").read_text(encoding="utf-8")
+
+
+def test_values_instead_of_the_files(workplace: Path) -> None:
+    """And they are in the configuration that the run leaves, which runs again by itself."""
+    chosen = ["--set", "selector.method=random", "--set", "model.init_mean=[3, 1, 0]"]
+    done = holdfast(workplace, "run", "peg.yaml", "--out", "random", *chosen)
+    assert done.returncode == 0, done.stderr
+    again = holdfast(workplace, "run", "random/config.yaml", "--out", "again")
+    assert again.returncode == 0, again.stderr
+    assert decided(workplace / "again") == decided(workplace / "random")
+    resumed = holdfast(workplace, "run", "peg.yaml", "--out", "random", "--resume", *chosen)
+    assert resumed.returncode == 0, resumed.stderr
+    other = holdfast(workplace, "run", "peg.yaml", "--out", "random", "--resume")
+    assert other.returncode != 0
+    assert "model.init_mean[0] is 3.0 there and 4.0 here" in other.stderr
+
+
+@pytest.mark.parametrize(
+    ("assignment", "message"),
+    [
+        ("selector=random", "--set selector=random: must be SECTION.KEY=VALUE, such as"),
+        ("selector.method", "--set selector.method: must be SECTION.KEY=VALUE, such as"),
+        (".method=random", "must be SECTION.KEY=VALUE"),
+        ("selector.resolution=null", "--set selector.resolution=null: has no value"),
+        ("simulator.seed={", "--set simulator.seed, line 1, column 2: not YAML"),
+        (
+            "selector.method=dance",
+            'selector.method, given instead of what peg.yaml says, is "dance',
+        ),
+        ("selektor.method=random", "selektor is not a known section; did you mean selector?"),
+    ],
+)
+def test_a_wrong_value_instead_of_the_files(workplace: Path, assignment: str, message: str) -> None:
+    done = holdfast(workplace, "run", "peg.yaml", "--out", "wrong", "--set", assignment)
+    assert done.returncode != 0
+    assert message in done.stderr
+    assert not (workplace / "wrong").exists()

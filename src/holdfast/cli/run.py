@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -59,6 +59,15 @@ def run(
             "--problem",
             metavar="NAME",
             help="Problem to run, instead of the file's: a registered name or module:Class.",
+        ),
+    ] = None,
+    assignments: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="SECTION.KEY=VALUE",
+            help="A value instead of the file's, as YAML: selector.method=random. May be repeated.",
+            show_default=False,
         ),
     ] = None,
     jobs: Annotated[
@@ -184,6 +193,7 @@ def run(
         trials=trials,
         seed=seed,
         problem=problem,
+        assignments=tuple(assignments or ()),
         jobs=jobs,
         out=out,
         resume=resume,
@@ -207,6 +217,7 @@ class _Options:
     trials: int | None
     seed: int | None
     problem: str | None
+    assignments: tuple[str, ...]
     jobs: int | None
     out: Path | None
     resume: bool
@@ -225,6 +236,7 @@ class _Options:
             ("--trials", self.trials),
             ("--seed", self.seed),
             ("--problem", self.problem),
+            *(("--set", assignment) for assignment in self.assignments),
             ("--jobs", self.jobs),
             *(("--service", service) for service in self.services),
             ("--recovery", self.recovery),
@@ -249,12 +261,29 @@ class _Options:
             num_trials=self.trials,
             seed=self.seed,
             overrides={
+                **dict(map(_assigned, self.assignments)),
                 "offload.services": list(self.services) or None,
                 "offload.tls": None if self.tls is None else str(self.tls),
                 "recovery.launch": self.recovery,
                 "environment.object": self.environment,
             },
         )
+
+
+def _assigned(assignment: str) -> tuple[str, Any]:
+    """Return the key, ``section.key``, and the value that ``--set`` gives it."""
+    from holdfast.yaml_document import read
+
+    name, equals, text = assignment.partition("=")
+    section, dot, key = name.strip().partition(".")
+    if not (equals and dot and section and key):
+        raise InvalidValueError(
+            f"--set {assignment}: must be SECTION.KEY=VALUE, such as selector.method=random"
+        )
+    value = read(text.encode(), f"--set {name}").data
+    if value is None:
+        raise InvalidValueError(f"--set {assignment}: has no value")
+    return f"{section}.{key}", value
 
 
 def _run(options: _Options) -> None:
