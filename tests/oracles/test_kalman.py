@@ -119,7 +119,9 @@ def moments(states: FloatArray, weights: FloatArray) -> tuple[FloatArray, FloatA
     return mean, np.einsum("n,ni,nj->ij", weights, centred, centred)
 
 
-@pytest.mark.parametrize("resampling_threshold", [1.0, 0.5, 0.0])
+@pytest.mark.parametrize(
+    "resampling_threshold", [1.0, pytest.param(0.5, marks=pytest.mark.slow), 0.0]
+)
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_mean_and_covariance(name: str, resampling_threshold: float) -> None:
     """After every update and every prediction; resampled always, sometimes, and never.

@@ -54,7 +54,7 @@ SERVES_GATED = ("--problem", "gated_problem:GatedPeg", "--problem-directory", st
 
 
 class TestCloud:
-    @pytest.mark.parametrize("problem", PROBLEMS)
+    @pytest.mark.parametrize("problem", PEG_AND_SLOWLY_ALL)
     def test_killed_and_started_again(
         self, problem: str, site: Site, references: References
     ) -> None:
@@ -71,7 +71,7 @@ class TestCloud:
         assert robot.matching("launched")[0]["launch_ms"] > 0.0
         assert robot.matching("status")[1]["outage_ms"] > 0.0
 
-    @pytest.mark.parametrize("problem", PROBLEMS)
+    @pytest.mark.parametrize("problem", PEG_AND_SLOWLY_ALL)
     def test_stopped_for_longer_than_the_timeout(
         self, problem: str, site: Site, references: References
     ) -> None:

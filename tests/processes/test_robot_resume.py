@@ -54,7 +54,7 @@ def rows_of(run: Path) -> list[str]:
 
 
 class TestKilled:
-    @pytest.mark.parametrize("problem", PROBLEMS)
+    @pytest.mark.parametrize("problem", PEG_AND_SLOWLY_ALL)
     def test_and_resumed_again_and_again(
         self, problem: str, site: Site, references: References
     ) -> None:

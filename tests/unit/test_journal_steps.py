@@ -426,7 +426,9 @@ class TestDamage:
         assert unfinished is not None
         assert unfinished.records == [*all_records(6)[:kept], *records_of(7)]
 
-    @pytest.mark.parametrize("name", ["journal.sqlite", "journal.sqlite-wal"])
+    @pytest.mark.parametrize(
+        "name", [pytest.param("journal.sqlite", marks=pytest.mark.slow), "journal.sqlite-wal"]
+    )
     @pytest.mark.parametrize("read", [False, True], ids=["resumed", "read"])
     def test_cut_off_anywhere(self, killed: Path, memory_path: Path, name: str, read: bool) -> None:
         whole = killed.with_name(name).read_bytes()
