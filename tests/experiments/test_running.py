@@ -356,15 +356,19 @@ class TestWorkload:
             Workload([OneSeries()], Scale(), Path("/proc/results"))
 
     def test_what_killed_writers_left_is_removed(self, tmp_path: Path) -> None:
-        old, young, other = (tmp_path / name for name in (".a.csv.12.tmp", ".b.csv.13.tmp", ".c"))
-        for path in (old, young, other):
+        ours = (tmp_path / "cache" / "trials" / "ab", tmp_path / "one_series")
+        for folder in ours:
+            folder.mkdir(parents=True)
+        old = [folder / ".a.csv.12.tmp" for folder in ours]
+        kept = [tmp_path / ".a.csv.12.tmp", ours[1] / ".a.tmp", ours[1] / "b.csv"]
+        young = ours[1] / ".b.csv.13.tmp"
+        for path in (*old, *kept, young):
             path.write_text("")
-        os.utime(old, (0, 0))
-        os.utime(other, (0, 0))
+            if path != young:
+                os.utime(path, (0, 0))
         Workload([OneSeries()], Scale(), tmp_path)
-        assert not old.exists()
-        assert young.exists()
-        assert other.exists()
+        assert [path.exists() for path in old] == [False, False]
+        assert all(path.exists() for path in (*kept, young))
 
     def test_an_interrupted_report_has_no_origin(self, tmp_path: Path) -> None:
         def interrupted() -> Figure:
