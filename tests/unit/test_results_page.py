@@ -26,6 +26,7 @@ def test_results_are_of_full_runs_with_seed_version_and_machine() -> None:
         assert origin["seed"] == 2017
         assert origin["holdfast_version"]
         assert {"processor", "cores", "system", "holdfast"} <= set(origin["machine"])
+        assert re.fullmatch(r"0\.\d+\.\d+, commit [0-9a-f]{7,}", origin["machine"]["holdfast"])
 
 
 def test_what_is_quoted_was_found() -> None:

@@ -171,7 +171,7 @@ def _cases_table(tables: Mapping[_Cell, Table]) -> Table:
                 "M": sensing.num_observation_samples,
                 "k": sensing.num_nearest_neighbors,
                 "horizon": sensing.horizon,
-                "resolution": problem_of(case.problem, case.model, {}).resolution,
+                "resolution": float(f"{problem_of(case.problem, case.model, {}).resolution:.4g}"),
                 "max_steps": case.max_steps,
                 "trials": tables[name, INTERVALS[0], _DEFAULT].num_rows,
             }
