@@ -261,13 +261,13 @@ def _draw(summary: Table) -> Figure:
 
     figure, panels = plots.grid_of_panels(
         list(_CASES),
-        columns=4,
+        columns=len(_CASES),
         title=(
             "Steps, against each estimator's reference: M = 10, horizon 1, the mean, resampling "
             "always, k = 5"
         ),
-        width=11.0,
-        row_height=6.0,
+        width=13.0,
+        row_height=8.4,
         same_rows=True,
     )
     for case, panel in panels.items():
@@ -278,5 +278,6 @@ def _draw(summary: Table) -> Figure:
         )
         plots.dot_rows(panel, labels, [plots.Dots("", values, lows, highs)])
     plots.ratio_axes(panels.values())
-    plots.label_grid(figure, panels, "steps, relative to the reference", "")
+    plots.label_grid(figure, panels, "", "")
+    figure.supxlabel("steps, relative to the estimator's reference (95 % intervals)", fontsize=10.0)
     return figure

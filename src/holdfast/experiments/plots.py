@@ -28,6 +28,7 @@ __all__ = [
     "grid_of_panels",
     "label_grid",
     "line_with_intervals",
+    "mark",
     "ratio_axes",
     "save",
     "stacked_panels",
@@ -170,7 +171,9 @@ def line_with_intervals(
     panel.grid(axis="y")
 
 
-def dot_rows(panel: Axes, labels: Sequence[str], kinds: Sequence[Dots]) -> None:
+def dot_rows(
+    panel: Axes, labels: Sequence[str], kinds: Sequence[Dots], *, legend: bool = True
+) -> None:
     """Draw rows of values with intervals, a mark for each kind, the first row on top.
 
     Parameters
@@ -180,6 +183,8 @@ def dot_rows(panel: Axes, labels: Sequence[str], kinds: Sequence[Dots]) -> None:
         Of the rows.
     kinds : sequence of Dots
         The first one's marks are hollow.
+    legend : bool
+        Whether there is one, above the rows, if a kind has a label.
     """
     step = 0.7 / len(kinds)
     for number, kind in enumerate(kinds):
@@ -203,7 +208,7 @@ def dot_rows(panel: Axes, labels: Sequence[str], kinds: Sequence[Dots]) -> None:
     panel.set_ylim(len(labels) - 0.4, -0.6)
     panel.grid(axis="x")
     panel.tick_params(axis="y", length=0)
-    if any(kind.label for kind in kinds):
+    if legend and any(kind.label for kind in kinds):
         # Above the rows, where it covers none.
         panel.legend(
             loc="lower right",
@@ -228,6 +233,11 @@ def ratio_axes(panels: Iterable[Axes]) -> None:
         panel.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
         panel.minorticks_off()
         panel.axvline(1.0, color="black", linewidth=0.8)
+
+
+def mark(figure: Figure, words: str) -> None:
+    """Say something about a figure, beside its title."""
+    figure.text(0.988, 0.995, words, ha="right", va="top", fontsize=8.0, color="#B5342B")
 
 
 def save(figure: Figure, directory: Path, name: str) -> list[str]:

@@ -255,8 +255,10 @@ def _findings(summary: Table) -> list[str]:
             agreeing = int(np.count_nonzero(tested >= LEVEL))
             findings.append(
                 f"{problem}, emulated and logged {what}: no difference found in {agreeing} of "
-                f"{tested.size} rows ({test}, Holm-adjusted level {LEVEL:g}; least adjusted p "
-                f"{tested.min():.2g})"
+                f"{tested.size} rows"
+                + (f", one in {tested.size - agreeing}" if agreeing < tested.size else "")
+                + f" ({test}, Holm-adjusted level {LEVEL:g}; least adjusted p "
+                f"{_level(tested.min())})"
                 if tested.size
                 else f"{problem}, {what}: too few successes to compare"
             )
@@ -269,7 +271,20 @@ def _findings(summary: Table) -> list[str]:
             f"{100 * logged.max():.1f} %; in {above} of {int(here.sum())} rows its 95 % interval "
             "(Wilson) is above the logged one"
         )
+        selectors = np.array(summary.columns["selector"])
+        ranges = []
+        for selector in dict.fromkeys(selectors[here]):
+            values = 100.0 * sound[here & (selectors == selector)]
+            ranges.append(f"{selector} {values.min():.1f} to {values.max():.1f} %")
+        findings.append(
+            f"{problem}, true filter, by what chooses: success {', '.join(ranges)} (over the rows; "
+            "intervals are in the table)"
+        )
     return findings
+
+
+def _level(p_value: float) -> str:
+    return f"{p_value:.2g}" if p_value > 0.0 else "below 1e-300"
 
 
 def _draw(summary: Table) -> Figure:
@@ -282,23 +297,25 @@ def _draw(summary: Table) -> Figure:
     }
     figure, panels = plots.stacked_panels(
         [len(rows) for rows in rows_of.values()],
-        title="Success, three ways",
-        width=8.0,
+        title="Successes of 2017: as logged, with the resampler of then emulated, with a true one",
+        width=8.4,
     )
-    for panel, (problem, rows) in zip(panels, rows_of.items(), strict=True):
+    ways = {"logged": "as logged", "emulated": "emulated", "sound": "true filter"}
+    for number, (panel, (problem, rows)) in enumerate(zip(panels, rows_of.items(), strict=True)):
         labels = [f"{row['logged']}, every {_steps(row)}, {row['selector']}" for row in rows]
         plots.dot_rows(
             panel,
             labels,
             [
                 plots.Dots(
-                    way,
+                    label,
                     [100.0 * float(row[f"success_{way}"] or 0.0) for row in rows],
                     [100.0 * float(row[f"success_{way}_low"] or 0.0) for row in rows],
                     [100.0 * float(row[f"success_{way}_high"] or 0.0) for row in rows],
                 )
-                for way in ("logged", "emulated", "sound")
+                for way, label in ways.items()
             ],
+            legend=number == 0,
         )
         panel.set_title(problem, loc="left")
     panels[-1].set_xlabel("trials that reach the goal (%), with 95 % intervals")

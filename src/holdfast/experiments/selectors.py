@@ -22,7 +22,7 @@ from holdfast.experiments.cases import CASES, Case
 from holdfast.experiments.study import Report, Results, Scale
 from holdfast.experiments.tables import Cell, Table, number_of
 from holdfast.experiments.tasks import Task
-from holdfast.experiments.trial_batches import trial_tasks
+from holdfast.experiments.trial_batches import problem_of, trial_tasks
 from holdfast.recording.tables import wilson_interval
 from holdfast.settings import SelectorSettings
 
@@ -60,6 +60,9 @@ WAYS: Mapping[str, SelectorSettings] = {
 that they are the executed ones."""
 
 BASELINE = "random"
+
+_DEFAULT = "action entropy, neighbours"
+"""The project's; how it compares is told whether or not a difference was found."""
 
 _DISTRACTING = ("busy room", "passer-by")
 """Made so that asking for the state and asking for the action differ."""
@@ -110,6 +113,7 @@ class Selectors:
         costs = _costs(tables)
         report.raw["selectors"] = raw
         report.summary |= {
+            "cases": _cases_table(tables),
             "selectors": summary,
             "relative_steps": relative_steps,
             "rivals": rivals,
@@ -149,6 +153,30 @@ def _tasks(case: str, interval: int, way: str, scale: Scale) -> list[Task]:
         num_trials=_QUICK_TRIALS if scale.quick else _TRIALS,
     )
     return list(trial_tasks(series, _TRIALS_IN_EACH))
+
+
+def _cases_table(tables: Mapping[_Cell, Table]) -> Table:
+    """Return how each problem is posed, so that others can pose it."""
+    rows: list[dict[str, Cell]] = []
+    for name, case in _CASES.items():
+        series = case.series(WAYS[_DEFAULT], INTERVALS[0], seed=0, num_trials=_TRIALS)
+        sensing = series.planning.active_sensing
+        rows.append(
+            {
+                "problem": name,
+                "class": case.problem,
+                "model": ", ".join(f"{key} {value}" for key, value in case.model.items()),
+                "particles": series.planning.particle_filter.num_particles,
+                "resampling_threshold": series.planning.particle_filter.resampling_threshold,
+                "M": sensing.num_observation_samples,
+                "k": sensing.num_nearest_neighbors,
+                "horizon": sensing.horizon,
+                "resolution": float(f"{problem_of(case.problem, case.model, {}).resolution:.4g}"),
+                "max_steps": case.max_steps,
+                "trials": tables[name, INTERVALS[0], _DEFAULT].num_rows,
+            }
+        )
+    return Table.of_records(rows)
 
 
 def _summary(tables: Mapping[_Cell, Table]) -> Table:
@@ -343,7 +371,7 @@ def _findings(
         f"{_place(row)}, {row['way']} against {row['rival']}: {_ratio(row)} times the steps "
         f"({every}; n = {row['trials']}, paired t-test, {_level(row)})"
         for row in rivals.rows()
-        if _is_sure(row)
+        if _is_sure(row) or _is_about_the_default(row)
     ]
     findings += [
         f"{_place(row)}, {row['way']} against {row['rival']}: "
@@ -352,7 +380,7 @@ def _findings(
         f"{100.0 * number_of(row['success_gain_high']):+.1f}] ({every}; n = {row['trials']}, "
         f"paired t-test, {_level(row)})"
         for row in rivals_in_success.rows()
-        if _is_sure(row)
+        if _is_sure(row) or _is_about_the_default(row)
     ]
     findings += [
         f"{row['problem']}, a look costs {row['cost_of_a_look']}, {row['way']} at its "
@@ -360,9 +388,16 @@ def _findings(
         f"{number_of(row['gain_high']):+.3g}] of reward beyond random at its best (n = "
         f"{row['trials']}, paired t-test, {_level(row)})"
         for row in costs.rows()
-        if row["cost_of_a_look"] in (0.1, 1.0) and row["way"] != BASELINE and _is_sure(row)
+        if row["cost_of_a_look"] in (0.1, 1.0)
+        and row["way"] != BASELINE
+        and (_is_sure(row) or row["way"] == _DEFAULT)
     ]
     return findings
+
+
+def _is_about_the_default(row: Mapping[str, Cell]) -> bool:
+    """Tell whether a row compares the default over several problems."""
+    return row["problem"] in _GROUPS and _DEFAULT in (row["way"], row["rival"])
 
 
 def _is_sure(row: Mapping[str, Cell]) -> bool:

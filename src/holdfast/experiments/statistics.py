@@ -86,6 +86,7 @@ def paired_difference(first: FloatArray, second: FloatArray) -> tuple[Interval, 
     Interval
     p_value : float
         Of Student's paired test, two-sided; 1 if all differences are zero, NaN for a single pair.
+        If all are equal otherwise, they say nothing about how they scatter: that of the sign test.
 
     Raises
     ------
@@ -104,7 +105,7 @@ def paired_difference(first: FloatArray, second: FloatArray) -> tuple[Interval, 
         return interval, math.nan
     error = float(difference.std(ddof=1)) / math.sqrt(difference.size)
     if error == 0.0:
-        return interval, 0.0
+        return interval, 2.0 * 0.5**difference.size
     return interval, float(2.0 * stats.t.sf(abs(interval.value) / error, difference.size - 1))
 
 
