@@ -41,6 +41,7 @@ MARKERS = ("s", "o", "D", "^", "v", "P", "X", "*")
 _RATIOS = {
     1.6: (0.8, 0.9, 1.0, 1.1, 1.25),
     8.0: (0.3, 0.5, 0.7, 1.0, 1.4, 2.0, 3.0),
+    20.0: (0.2, 0.5, 1.0, 2.0, 5.0, 10.0),
     math.inf: (0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0),
 }
 """Ticks of an axis of ratios, by how many times its low end the high end is at most."""

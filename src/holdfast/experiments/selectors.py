@@ -452,15 +452,15 @@ def _draw_relative_steps(relative_steps: Table) -> Figure:
 
     figure, panels = plots.grid_of_panels(
         [*_CASES, *_GROUPS],
-        columns=3,
+        columns=5,
         title=(
             "Steps relative to random looks (geometric mean, 95 % intervals; failures count as the "
             "limit)"
         ),
-        width=10.0,
+        width=12.0,
         same_rows=True,
     )
-    ways = [way for way in WAYS if way not in (BASELINE, "fixed")]
+    ways = [way for way in WAYS if way != BASELINE]
     for case, panel in panels.items():
         rows = [
             row for row in relative_steps.rows() if row["problem"] == case and row["way"] in ways
