@@ -33,6 +33,9 @@ where there is none."""
 
 _TRIALS = 200
 _QUICK_TRIALS = 6
+_MOST_QUICK_PARTICLES = 3.0
+"""In a quick run, as a multiple of a problem's."""
+
 _TRIALS_IN_EACH = 20
 
 _INTERVALS: Mapping[str, int] = {
@@ -137,7 +140,7 @@ class Parameters:
 
     def tasks(self, scale: Scale) -> list[Task]:
         """Return all that is to be computed, in the order in which to begin."""
-        return [task for case, variant in _cells() for task in _tasks(case, variant, scale)]
+        return [task for case, variant in _cells(scale) for task in _tasks(case, variant, scale)]
 
     def report(self, scale: Scale, results: Results) -> Report:
         """Return what it comes to, from the results of all its tasks."""
@@ -145,7 +148,7 @@ class Parameters:
         raw = Table({})
         rows: list[dict[str, Cell]] = []
         reference = Table({})
-        for case, variant in _cells():
+        for case, variant in _cells(scale):
             table = results.of(_tasks(case, variant, scale))
             names: dict[str, Cell] = {
                 "problem": case,
@@ -172,10 +175,12 @@ class Parameters:
         return report
 
 
-def _cells() -> Iterator[tuple[str, Variant]]:
+def _cells(scale: Scale) -> Iterator[tuple[str, Variant]]:
     for case in _CASES:
         for variant in variants():
-            yield case, variant
+            # Ten times the particles alone would take as long as all the rest.
+            if not scale.quick or variant.times_the_particles <= _MOST_QUICK_PARTICLES:
+                yield case, variant
 
 
 def _tasks(name: str, variant: Variant, scale: Scale) -> list[Task]:
