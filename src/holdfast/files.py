@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import shutil
+import time
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import NamedTuple
@@ -21,10 +23,14 @@ __all__ = [
     "OutputError",
     "claim_directory",
     "create_directory_atomically",
+    "remove_unfinished",
     "write_atomically",
 ]
 
 _MAX_DEFAULT_DIRECTORIES = 10_000
+
+_UNFINISHED = re.compile(r"\..+\.\d+\.tmp")
+_LONGEST_WRITE_S = 600.0
 
 
 class OutputError(HoldfastError):
@@ -66,7 +72,7 @@ def write_atomically(path: Path, content: bytes | Iterable[str]) -> None:
     else:
         pieces = (piece.encode() for piece in ((content,) if isinstance(content, str) else content))
     # In the same folder, because a rename is atomic only within one file system.
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    temporary = _unfinished(path)
     try:
         with temporary.open("wb") as file:
             file.writelines(pieces)
@@ -79,6 +85,30 @@ def write_atomically(path: Path, content: bytes | Iterable[str]) -> None:
         if isinstance(error, OSError):
             raise OutputError(f"{path}: cannot be written: {error.strerror}") from error
         raise
+
+
+def remove_unfinished(directory: Path, *, below: bool = False) -> None:
+    """Remove what writers left that were killed; what is young may be of one that writes.
+
+    Parameters
+    ----------
+    directory : Path
+        Need not be there.
+    below : bool
+        Whether its directories are looked through, too.
+    """
+    latest = time.time() - _LONGEST_WRITE_S
+    for path in directory.rglob(".*.tmp") if below else directory.glob(".*.tmp"):
+        if not _UNFINISHED.fullmatch(path.name):
+            continue
+        with contextlib.suppress(OSError):
+            if path.stat().st_mtime < latest:
+                path.unlink()
+
+
+def _unfinished(path: Path) -> Path:
+    """Return where a file or directory is made, before it gets its name."""
+    return path.with_name(f".{path.name}.{os.getpid()}.tmp")
 
 
 def create_directory_atomically(path: Path, files: Mapping[str, NewFile]) -> None:
@@ -96,7 +126,7 @@ def create_directory_atomically(path: Path, files: Mapping[str, NewFile]) -> Non
     OutputError
         If something is there already, or it cannot be written; then nothing is changed.
     """
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    temporary = _unfinished(path)
     try:
         temporary.mkdir(mode=0o700)
         for name, new in files.items():

@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import importlib.util
-import itertools
-import re
 import tempfile
-import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import msgspec
@@ -20,15 +16,12 @@ from holdfast.experiments.result_cache import ResultCache
 from holdfast.experiments.study import Report, Results, Scale, Study
 from holdfast.experiments.tables import Table
 from holdfast.experiments.tasks import Task, TaskError, task_key
-from holdfast.files import OutputError, write_atomically
+from holdfast.files import OutputError, remove_unfinished, write_atomically
 from holdfast.recording.machine import describe
 
 __all__ = ["Workload", "check_packages", "compute", "write_report"]
 
 _CACHE = "cache"
-_LONGEST_WRITE_S = 600.0
-_UNFINISHED = re.compile(r"\..+\.\d+\.tmp")
-"""What :func:`~holdfast.files.write_atomically` writes to first."""
 
 
 class Workload:
@@ -54,7 +47,10 @@ class Workload:
     def __init__(self, studies: Sequence[Study], scale: Scale, directory: Path) -> None:
         self._cache = ResultCache(directory / _CACHE)
         self._tables: dict[str, Table] = {}
-        _sweep(directory, [study.name for study in studies])
+        # Only where nobody but this program writes: the directory itself may be anybody's.
+        remove_unfinished(directory / _CACHE, below=True)
+        for study in studies:
+            remove_unfinished(directory / study.name)
         tasks = {task_key(task): task for study in studies for task in study.tasks(scale)}
         self.tasks = list(tasks.values())
         self._keys = frozenset(tasks)
@@ -218,19 +214,3 @@ def _check_room(directory: Path) -> None:
         tempfile.TemporaryFile(dir=directory).close()
     except OSError as error:
         raise OutputError(f"{directory}: cannot be written in: {error.strerror}") from error
-
-
-def _sweep(directory: Path, names: Iterable[str]) -> None:
-    """Remove what writers left that were killed; what is young may be of one that writes.
-
-    Only where nobody but this program writes: the directory itself may be anybody's.
-    """
-    latest = time.time() - _LONGEST_WRITE_S
-    found = [(directory / _CACHE).rglob(".*.tmp")]
-    found += [(directory / name).glob(".*.tmp") for name in names]
-    for path in itertools.chain.from_iterable(found):
-        if not _UNFINISHED.fullmatch(path.name):
-            continue
-        with contextlib.suppress(OSError):
-            if path.stat().st_mtime < latest:
-                path.unlink()
