@@ -11,6 +11,7 @@ import shutil
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -50,6 +51,7 @@ GATED = {
     "problem": "gated_problem:GatedPeg",
     "problem_directory": str(HERE),
 }
+SIMULATOR = GATED["simulator"]
 SERVES_GATED = ("--problem", "gated_problem:GatedPeg", "--problem-directory", str(HERE))
 
 
@@ -446,13 +448,21 @@ class TestAnotherService:
         self, site: Site, references: References
     ) -> None:
         cloud = site.service(*SERVES_GATED).start()
-        steps = sensing_steps(GATED)
-        story = Story(site, references, GATED)
+        # Something is asked at each step.
+        story = Story(
+            site, references, GATED | {"simulator": {**SIMULATOR, "sensing_intervals": 0}}
+        )
+        last = SIMULATOR["max_steps"] - 10
 
         def start_without_the_problem() -> None:
             cloud.options = tuple(each for each in cloud.options if each not in SERVES_GATED)
             cloud.start()
-            story.running.wait_for("service_appeared", 2)
+            story.running.wait_for("service_appeared", 2, service=cloud.endpoint)
+
+        def give_time() -> None:
+            # Who just started may ask for patience, and is then asked with a later question.
+            if not story.running.matching("refused", service=cloud.endpoint):
+                time.sleep(0.1)
 
         def start_the_right_one() -> None:
             cloud.kill()
@@ -460,12 +470,14 @@ class TestAnotherService:
             cloud.start()
 
         # The next decision is awaited as soon as the robot has sensed.
-        story.at("sense", steps[1], cloud.kill, start_without_the_problem)
-        story.at("perform", steps[3], start_the_right_one, story.status(KEEP_ALIVE))
+        story.at("sense", 1, cloud.kill, start_without_the_problem)
+        for step in range(2, last):
+            story.at("perform", step, give_time)
+        story.at("perform", last, start_the_right_one, story.status(KEEP_ALIVE))
         robot = story.run(cloud)
         assert robot.statuses() == [LOST, RESTORED]
         told = robot.matching("refused", service=cloud.endpoint)
-        assert told
+        assert told, robot.account()
         assert all("gated_problem:GatedPeg" in event["reason"] for event in told)
 
     def test_without_a_local_service_the_run_ends_says_why_and_can_go_on(
@@ -478,7 +490,7 @@ class TestAnotherService:
         def start_without_the_problem() -> None:
             cloud.options = tuple(each for each in cloud.options if each not in SERVES_GATED)
             cloud.start()
-            story.running.wait_for("service_appeared", 2)
+            story.running.wait_for("service_appeared", 2, service=cloud.endpoint)
 
         story.at("sense", steps[1], cloud.kill, start_without_the_problem)
         robot = site.run(story.file, services=[cloud])
