@@ -47,7 +47,8 @@ class ParticleFilterSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=
     Attributes
     ----------
     num_particles : int
-        Number of particles, at least 1.
+        Number of particles, at least 1. The more the fewer steps a task takes: of all parameters it
+        is the one that matters most (``docs/results.md``). The thesis has 100.
     resampling_threshold : float
         Resample after an observation when the effective sample size is at most this fraction of
         the number of particles. 1 (the default) resamples after every observation.
@@ -57,7 +58,7 @@ class ParticleFilterSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=
         no more than a draw from the belief.
     """
 
-    num_particles: Annotated[int, msgspec.Meta(ge=1, le=MAX_PARTICLES)] = 100
+    num_particles: Annotated[int, msgspec.Meta(ge=1, le=MAX_PARTICLES)] = 300
     resampling_threshold: Annotated[float, msgspec.Meta(ge=0.0, le=1.0)] = 1.0
     estimate: Literal["mean", "most_likely"] = "mean"
 

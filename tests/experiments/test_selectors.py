@@ -14,6 +14,7 @@ from holdfast.experiments.study import Report, Scale
 from holdfast.experiments.tasks import Task
 
 SCALE = Scale(seed=5)
+PEG_IN_SPACE = "peg_in_hole_3d"
 
 
 def selector_of(task: Task) -> dict[str, object]:
@@ -133,16 +134,37 @@ def test_what_a_parameter_does(monkeypatch: pytest.MonkeyPatch) -> None:
     def trial(task: Task, number: int) -> tuple[bool, int, float]:
         world = math.exp(0.3 * noise(task, number, ["problem", "model"]))
         own = math.exp(0.05 * noise(task, number, ["problem", "model", "planning"]))
-        horizon = task.parameters["planning"]["active_sensing"]["horizon"]
-        return True, round(10_000 * world * own * (0.5 if horizon == 3 else 1.0)), 0.0
+        sensing = task.parameters["planning"]["active_sensing"]
+        factor = 0.5 if sensing["horizon"] == 3 else 1.0
+        if sensing["num_nearest_neighbors"] == 20 and task.parameters["problem"] == PEG_IN_SPACE:
+            factor = 0.25
+        if selector_of(task)["estimator"] != "nearest_neighbor":
+            factor = 2.0
+        return True, round(10_000 * world * own * factor), 0.0
 
     study = parameters.Parameters()
     report = study.report(SCALE, results_of(study, SCALE, trial))
     for row in report.summary["parameters"].rows():
-        longer = (row["parameter"], row["value"]) != ("horizon", "3")
-        assert row["steps_ratio"] == pytest.approx(1.0 if longer else 0.5, rel=0.08)
+        expected = 1.0
+        if (row["parameter"], row["value"]) == ("horizon", "3"):
+            expected = 0.5
+        if (row["problem"], row["parameter"], row["value"]) == ("peg in space", "k", "20"):
+            expected = 0.25
+        assert row["steps_ratio"] == pytest.approx(expected, rel=0.08)
+    # In each problem, and over all of them, each with the same weight.
     told = [finding for finding in report.findings if "horizon 3:" in finding]
-    assert len(told) == len(parameters._CASES)
+    assert len(told) == len(parameters._CASES) + 1
+    together = {
+        (row["estimator"], row["parameter"], row["value"], row["reference"]): row["steps_ratio"]
+        for row in report.summary["together"].rows()
+    }
+    assert together["neighbours", "horizon", "3", "neighbours"] == pytest.approx(0.5, rel=0.04)
+    fifth_root = 0.25 ** (1 / len(parameters._CASES))
+    assert together["neighbours", "k", "20", "neighbours"] == pytest.approx(fifth_root, rel=0.04)
+    assert together["mixture", "", "", "neighbours"] == pytest.approx(2.0, rel=0.04)
+    assert together["mixture", "resolution", "x 3", "mixture"] == pytest.approx(1.0, rel=0.04)
+    (said,) = [each for each in report.findings if "(mean), mixture, reference" in each]
+    assert "points of success of the neighbours' reference (geometric mean and mean, n = 20" in said
     assert report.findings[-1].startswith("no difference in steps beyond noise")
     assert "horizon (neighbours)" not in report.findings[-1]
     assert "M (neighbours) (least p" in report.findings[-1]
