@@ -164,7 +164,10 @@ def test_what_a_parameter_does(monkeypatch: pytest.MonkeyPatch) -> None:
     assert together["mixture", "", "", "neighbours"] == pytest.approx(2.0, rel=0.04)
     assert together["mixture", "resolution", "x 3", "mixture"] == pytest.approx(1.0, rel=0.04)
     (said,) = [each for each in report.findings if "(mean), mixture, reference" in each]
-    assert "points of success of the neighbours' reference (geometric mean and mean, n = 20" in said
+    assert (
+        "points of success of the reference of the neighbours (geometric mean and mean, n = 20"
+        in said
+    )
     assert report.findings[-1].startswith("no difference in steps beyond noise")
     assert "horizon (neighbours)" not in report.findings[-1]
     assert "M (neighbours) (least p" in report.findings[-1]
