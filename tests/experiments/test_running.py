@@ -176,7 +176,7 @@ for number, name in enumerate(("experiments/light_dark.py", "belief.py", "chaos/
 
     def test_what_a_trial_is_refused_for_names_it(self) -> None:
         planning = {
-            "active_sensing": {"num_nearest_neighbors": 100},
+            "active_sensing": {"num_nearest_neighbors": 300},
             "selector": {"estimator": "nearest_neighbor"},
         }
         task = next(trial_tasks(series(planning=planning), 100))

@@ -55,6 +55,8 @@ class Client:
         self._events: SimpleQueue[TransportEvent] = SimpleQueue()
         self._transport = ZenohRobotTransport(
             {"cloud": ServiceAddress(service.endpoint)},
+            # Where cores are taken away for a while, it is not to be given up.
+            lease_ms=PATIENT["lease_ms"],
             # It is the service that is to refuse.
             max_message_bytes=8 * DEFAULT_MAX_MESSAGE_BYTES,
         )

@@ -191,7 +191,7 @@ class TestWhatLoads:
     def test_nothing_but_the_name(self, name: str, write: Write) -> None:
         configuration = load(write(f"problem: {name}"))
         assert configuration.problem.name == name
-        assert configuration.planning.particle_filter.num_particles == 100
+        assert configuration.planning.particle_filter.num_particles == 300
 
     def test_the_argument_rules_over_the_file(self, write: Write) -> None:
         path = write("problem: peg_in_hole_2d\nsimulator: {num_trials: 3, seed: 4}")

@@ -637,5 +637,5 @@ class TestCheckState:
         with pytest.raises(InvalidValueError, match=r"of 3 coordinates: capsule_robot has 2"):
             planning.check_state(CapsuleRobot(), settings, state)
         other = PlanningSettings(particle_filter=ParticleFilterSettings(num_particles=7))
-        with pytest.raises(InvalidValueError, match=r"of 100 particles.*num_particles is 7"):
+        with pytest.raises(InvalidValueError, match=r"of 300 particles.*num_particles is 7"):
             planning.check_state(problem, other, state)
