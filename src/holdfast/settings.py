@@ -47,8 +47,9 @@ class ParticleFilterSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=
     Attributes
     ----------
     num_particles : int
-        Number of particles, at least 1. The more the fewer steps a task takes: of all parameters it
-        is the one that matters most (``docs/results.md``). The thesis has 100.
+        Number of particles, at least 1. The more the fewer steps a task takes; no other
+        change of the defaults was found to help over several problems (``docs/results.md``). The
+        thesis has 100.
     resampling_threshold : float
         Resample after an observation when the effective sample size is at most this fraction of
         the number of particles. 1 (the default) resamples after every observation.
