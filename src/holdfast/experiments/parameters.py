@@ -292,8 +292,8 @@ def _findings(summary: Table, together: Table) -> list[str]:
     findings = [
         f"{_TOGETHER}, {_told(row)}: {_interval(row, 'steps_ratio')} times the steps and "
         f"{_interval(row, 'success_gain', percent=True)} points of success of the "
-        f"reference of the {row['reference']} (geometric mean and mean, n = {row['trials']}, paired "
-        f"t-tests, Holm-adjusted p {number_of(row['steps_adjusted_p_value']):.2g} and "
+        f"reference of the {row['reference']} (geometric mean and mean, n = {row['trials']}, "
+        f"paired t-tests, Holm-adjusted p {number_of(row['steps_adjusted_p_value']):.2g} and "
         f"{number_of(row['success_adjusted_p_value']):.2g})"
         for row in together.rows()
         if _is_told(row)

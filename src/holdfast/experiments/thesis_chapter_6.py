@@ -492,36 +492,42 @@ def _findings_of_faults(rows: MeasuredRows) -> list[str]:
         "from the kill until the robot has found the cloud dead (median, 95 % interval of order "
         f"statistics): {'; '.join(found)} (the thesis: a timeout of {THESIS_TIMEOUT_MS:g} ms)"
     ]
-    for name, what, limit_ms, chosen in (
-        (
-            "first_local_ms",
-            "from the cloud found dead until the first decision of a local service that had to be "
-            "launched",
-            THESIS_LAUNCH_MS,
-            cold,
-        ),
-        (
-            "failback_ms",
-            "from the ready line of the cloud that was started again until its first decision",
-            THESIS_FAILBACK_MS,
-            kills,
-        ),
-    ):
-        times = rows.number(name)[chosen]
-        total = times.size
-        times = times[~np.isnan(times)]
-        if not times.size:
-            continue
-        # A run that ended before counts as one in which it took too long.
-        below = int(np.count_nonzero(times < limit_ms))
-        low, high = wilson_interval(below, total)
+    first_local_ms = rows.number("first_local_ms")[cold]
+    if np.isfinite(first_local_ms).any():
         findings.append(
-            f"{what}: median {_told(median_interval(times))} (95 % interval of order statistics), "
-            f"n = {times.size}; under the thesis's {limit_ms:g} ms in {below} of {total} "
-            f"({100.0 * low:.0f} to {100.0 * high:.0f} %, Wilson)"
-            + (f"; {total - times.size} runs ended before" if total > times.size else "")
+            "from the cloud found dead until the first decision of a local service that had to be "
+            f"launched (all paths): median {_told(median_interval(_known(first_local_ms)))} (95 % "
+            f"interval of order statistics); {_share_below(THESIS_LAUNCH_MS, first_local_ms)}"
+        )
+    failbacks = [
+        f"{path.label} {_told(median_interval(_known(times)))}, "
+        f"{_share_below(THESIS_FAILBACK_MS, times)}"
+        for path in rows.paths
+        if path.loss == 0.0
+        for times in [rows.number("failback_ms")[kills & rows.where(path=path)]]
+        if np.isfinite(times).any()
+    ]
+    if failbacks:
+        findings.append(
+            "from the ready line of the cloud that was started again until its first decision "
+            f"(median, 95 % interval of order statistics): {'; '.join(failbacks)}"
         )
     return findings
+
+
+def _known(times: FloatArray) -> FloatArray:
+    return times[~np.isnan(times)]
+
+
+def _share_below(limit_ms: float, times: FloatArray) -> str:
+    """Say how many are below; those are not of which it is not known, because a run had ended."""
+    below = int(np.count_nonzero(times < limit_ms))
+    low, high = wilson_interval(below, times.size)
+    ended = int(np.count_nonzero(np.isnan(times)))
+    return (
+        f"under the thesis's {limit_ms:g} ms in {below} of {times.size} ({100.0 * low:.0f} to "
+        f"{100.0 * high:.0f} %, Wilson)" + (f", and {ended} ended before" if ended else "")
+    )
 
 
 def _findings_of_loss(rows: MeasuredRows) -> list[str]:

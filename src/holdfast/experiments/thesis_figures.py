@@ -272,7 +272,7 @@ def round_trips(rows: MeasuredRows) -> Figure:
     panels = _panels(
         10.5,
         4.6,
-        "Round trip with the computation taken out (Figure 12)",
+        "Round trip with the computation taken out; 20 and 87 ms are set, not measured (Figure 12)",
         2,
         sharey=True,
         width_ratios=(1.25, 1.0),
@@ -322,7 +322,8 @@ def _path_looks(rows: MeasuredRows) -> dict[NetworkPath, _Series]:
         marker = "s" if not far else "^" if path.transport == "tcp" else "v"
         offset = 9.0 if not far else -7.0 if path.transport == "tcp" else 7.0
         filled = path.transport == "tcp"
-        looks[path] = _Series(f"cloud, {path.label}", COLORS[color], marker, filled, offset)
+        label = f"cloud, {path.label}" + (" set" if far else "")
+        looks[path] = _Series(label, COLORS[color], marker, filled, offset)
     return looks
 
 
@@ -343,7 +344,13 @@ def _draw_loss(panel: Axes, rows: MeasuredRows, looks: dict[NetworkPath, _Series
         _medians(panel, places, medians, shifted)
         at = [place + shifted.offset for place in places]
         panel.plot(
-            at, tails, linestyle=(0, (1, 1.5)), color=series.color, marker="_", markersize=9.0
+            at,
+            tails,
+            linestyle=(0, (1, 1.5)),
+            color=series.color,
+            marker=series.marker,
+            markersize=4.0,
+            markerfacecolor=series.color if series.filled else "white",
         )
     panel.set_xlim(-0.4, len(losses) - 0.6)
     panel.set_xticks(range(len(losses)), [f"{100.0 * loss:g}" for loss in losses])
