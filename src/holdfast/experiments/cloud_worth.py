@@ -784,7 +784,7 @@ def _draw_lines(panel: Axes, scaling: Scaling, path_ms: float, exchange_ms: floa
         at = np.array([found.particles])
         height = float(scaling.on_cores(1).at(at)[0])
         panel.plot(at, [height], mark, color=color, markeredgecolor="#1A1D21", zorder=4)
-        # One above the other, where nothing is drawn: decisions of many particles are never that fast.
+        # Where nothing is drawn: decisions of many particles are never that fast.
         panel.text(
             0.98,
             0.12 if cores == _LINES[0][0] else 0.05,

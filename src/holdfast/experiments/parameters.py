@@ -25,6 +25,8 @@ from holdfast.settings import ActiveSensingSettings, ParticleFilterSettings, Sel
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from holdfast.experiments.statistics import BoolArray, FloatArray
+
 __all__ = ["Parameters", "Variant", "variants"]
 
 LEVEL = 0.01
@@ -49,6 +51,7 @@ _INTERVALS: Mapping[str, int] = {
 
 _CASES = {case.name: case for case in CASES if case.name in _INTERVALS}
 
+_TOGETHER = "all five problems (mean)"
 
 Estimator = Literal["gaussian_mixture_upper", "nearest_neighbor"]
 
@@ -82,6 +85,14 @@ class Variant(NamedTuple):
     particle_filter: ParticleFilterSettings = ParticleFilterSettings()
     resolution: float | None = None
     times_the_particles: float = 1.0
+
+    def names(self) -> dict[str, Cell]:
+        """Return the cells of a table that name it."""
+        return {
+            "estimator": _ESTIMATORS[self.estimator],
+            "parameter": self.parameter,
+            "value": self.value,
+        }
 
 
 def variants() -> list[Variant]:
@@ -144,34 +155,20 @@ class Parameters:
 
     def report(self, scale: Scale, results: Results) -> Report:
         """Return what it comes to, from the results of all its tasks."""
+        tables = {
+            (case, variant): results.of(_tasks(case, variant, scale))
+            for case, variant in _cells(scale)
+        }
+        summary, together = _alone(tables), _together(tables)
         report = Report()
         raw = Table({})
-        rows: list[dict[str, Cell]] = []
-        reference = Table({})
-        for case, variant in _cells(scale):
-            table = results.of(_tasks(case, variant, scale))
-            names: dict[str, Cell] = {
-                "problem": case,
-                "estimator": _ESTIMATORS[variant.estimator],
-                "parameter": variant.parameter,
-                "value": variant.value,
-            }
-            raw.extend(table, **names)
-            if not variant.parameter:
-                reference = table
-            rows.append({**names, **_compared(table, reference)})
-        summary = Table.of_records(rows)
-        varied = np.array([bool(name) for name in summary.columns["parameter"]])
-        for name in ("success", "steps"):
-            adjusted = np.ones(varied.size)
-            adjusted[varied] = statistics.smallest_levels(
-                summary.numbers(f"{name}_p_value")[varied]
-            )
-            summary.columns[f"{name}_adjusted_p_value"] = [float(value) for value in adjusted]
+        for (case, variant), table in tables.items():
+            raw.extend(table, problem=case, **variant.names())
         report.raw["parameters"] = raw
         report.summary["parameters"] = summary
-        report.figures["parameters"] = partial(_draw, summary)
-        report.findings = _findings(summary)
+        report.summary["together"] = together
+        report.figures["parameters"] = partial(_draw, summary, together)
+        report.findings = _findings(summary, together)
         return report
 
 
@@ -203,6 +200,22 @@ def _tasks(name: str, variant: Variant, scale: Scale) -> list[Task]:
     return list(trial_tasks(series, _TRIALS_IN_EACH))
 
 
+_Tables = Mapping[tuple[str, Variant], Table]
+
+
+def _alone(tables: _Tables) -> Table:
+    """Return how each variant differs from its estimator's reference, in each problem."""
+    rows: list[dict[str, Cell]] = []
+    reference = Table({})
+    for (case, variant), table in tables.items():
+        if not variant.parameter:
+            reference = table
+        rows.append({"problem": case, **variant.names(), **_compared(table, reference)})
+    summary = Table.of_records(rows)
+    _adjust(summary, np.array([bool(name) for name in summary.columns["parameter"]]))
+    return summary
+
+
 def _compared(table: Table, reference: Table) -> dict[str, Cell]:
     success, other = (each.numbers("success") == 1.0 for each in (table, reference))
     low, high = wilson_interval(int(success.sum()), success.size)
@@ -226,25 +239,78 @@ def _compared(table: Table, reference: Table) -> dict[str, Cell]:
     }
 
 
-def _findings(summary: Table) -> list[str]:
-    findings = []
+def _together(tables: _Tables) -> Table:
+    """Return how variants differ over all problems, each with the same weight.
+
+    Each is compared with its estimator's reference, and a mixture with the neighbours' as well. The
+    value of a trial is the mean over the problems' trials of its number, of which all have one.
+    """
+    fewest = min(table.num_rows for table in tables.values())
+
+    def means(variant: Variant, column: str) -> FloatArray:
+        numbers = [tables[case, variant].numbers(column)[:fewest] for case in _CASES]
+        return np.asarray(np.mean(np.log(numbers) if column == "steps" else numbers, axis=0))
+
+    varied = list(dict.fromkeys(variant for _, variant in tables))
+    references = {each.estimator: each for each in varied if not each.parameter}
+    rows: list[dict[str, Cell]] = []
+    for variant in varied:
+        for estimator, reference in references.items():
+            if variant == reference or estimator not in ("nearest_neighbor", variant.estimator):
+                continue
+            difference, steps_p_value = statistics.paired_difference(
+                means(variant, "steps"), means(reference, "steps")
+            )
+            gain, success_p_value = statistics.paired_difference(
+                means(variant, "success"), means(reference, "success")
+            )
+            rows.append(
+                {
+                    **variant.names(),
+                    "reference": _ESTIMATORS[estimator],
+                    "trials": fewest,
+                    **statistics.cells_of("steps_ratio", statistics.ratio_of(difference)),
+                    **statistics.cells_of("success_gain", gain),
+                    "success_p_value": success_p_value,
+                    "steps_p_value": steps_p_value,
+                }
+            )
+    table = Table.of_records(rows)
+    _adjust(table, np.ones(table.num_rows, dtype=np.bool_))
+    return table
+
+
+def _adjust(table: Table, compared: BoolArray) -> None:
+    """Add p-values adjusted for the number of rows that are compared with something."""
+    for name in ("success", "steps"):
+        adjusted = np.ones(compared.size)
+        adjusted[compared] = statistics.smallest_levels(table.numbers(f"{name}_p_value")[compared])
+        table.columns[f"{name}_adjusted_p_value"] = [float(value) for value in adjusted]
+
+
+def _findings(summary: Table, together: Table) -> list[str]:
+    findings = [
+        f"{_TOGETHER}, {_told(row)}: {_interval(row, 'steps_ratio')} times the steps and "
+        f"{_interval(row, 'success_gain', percent=True)} points of success of the "
+        f"reference of the {row['reference']} (geometric mean and mean, n = {row['trials']}, "
+        f"paired t-tests, Holm-adjusted p {number_of(row['steps_adjusted_p_value']):.2g} and "
+        f"{number_of(row['success_adjusted_p_value']):.2g})"
+        for row in together.rows()
+        if _is_told(row)
+    ]
     for row in summary.rows():
-        where = f"{row['problem']}, {row['estimator']}, {row['parameter']} {row['value']}"
+        where = f"{row['problem']}, {_told(row)}"
         level = number_of(row["steps_adjusted_p_value"])
         if row["parameter"] and level < LEVEL:
-            ends = (number_of(row[f"steps_ratio{end}"]) for end in ("", "_low", "_high"))
             findings.append(
-                f"{where}: {statistics.Interval(*ends)} times the steps of the reference "
+                f"{where}: {_interval(row, 'steps_ratio')} times the steps of the reference "
                 f"(geometric mean, n = {row['trials']}, paired t-test, Holm-adjusted p "
                 f"{level:.2g})"
             )
         level = number_of(row["success_adjusted_p_value"])
         if row["parameter"] and level < LEVEL:
-            value, low, high = (
-                100.0 * number_of(row[f"success_gain{end}"]) for end in ("", "_low", "_high")
-            )
             findings.append(
-                f"{where}: {value:+.1f} points of success [{low:+.1f}, {high:+.1f}] (n = "
+                f"{where}: {_interval(row, 'success_gain', percent=True)} points of success (n = "
                 f"{row['trials']}, McNemar's test, Holm-adjusted p {level:.2g})"
             )
     least: dict[str, float] = {}
@@ -261,22 +327,52 @@ def _findings(summary: Table) -> list[str]:
     return findings
 
 
-def _draw(summary: Table) -> Figure:
+def _is_told(row: Mapping[str, Cell]) -> bool:
+    """Tell whether a row over all problems is told of even if no difference was found."""
+    return (
+        row["parameter"] == "particles"
+        or row["estimator"] != row["reference"]
+        or min(number_of(row[f"{each}_adjusted_p_value"]) for each in ("success", "steps")) < LEVEL
+    )
+
+
+def _told(row: Mapping[str, Cell]) -> str:
+    changed = f"{row['parameter']} {row['value']}" if row["parameter"] else "reference"
+    return f"{row['estimator']}, {changed}"
+
+
+def _interval(row: Mapping[str, Cell], name: str, *, percent: bool = False) -> str:
+    value, low, high = (number_of(row[f"{name}{end}"]) for end in ("", "_low", "_high"))
+    if percent:
+        return f"{100.0 * value:+.1f} [{100.0 * low:+.1f}, {100.0 * high:+.1f}]"
+    return str(statistics.Interval(value, low, high))
+
+
+def _draw(summary: Table, together: Table) -> Figure:
     from holdfast.experiments import plots
 
     figure, panels = plots.grid_of_panels(
-        list(_CASES),
-        columns=len(_CASES),
+        [*_CASES, _TOGETHER],
+        columns=len(_CASES) + 1,
         title=(
             "Steps, against each estimator's reference: M = 10, horizon 1, the mean, resampling "
             "always, k = 5"
         ),
-        width=13.0,
+        width=14.5,
         row_height=8.4,
         same_rows=True,
     )
-    for case, panel in panels.items():
-        rows = [row for row in summary.rows() if row["problem"] == case and row["parameter"]]
+    for name, panel in panels.items():
+        rows = [
+            row
+            for row in (together if name == _TOGETHER else summary).rows()
+            if row["parameter"]
+            and (
+                row["reference"] == row["estimator"]
+                if name == _TOGETHER
+                else row["problem"] == name
+            )
+        ]
         labels = [f"{row['estimator']}: {row['parameter']} {row['value']}" for row in rows]
         values, lows, highs = (
             [number_of(row[f"steps_ratio{end}"]) for row in rows] for end in ("", "_low", "_high")

@@ -344,7 +344,13 @@ def _draw_loss(panel: Axes, rows: MeasuredRows, looks: dict[NetworkPath, _Series
         _medians(panel, places, medians, shifted)
         at = [place + shifted.offset for place in places]
         panel.plot(
-            at, tails, linestyle=(0, (1, 1.5)), color=series.color, marker="_", markersize=9.0
+            at,
+            tails,
+            linestyle=(0, (1, 1.5)),
+            color=series.color,
+            marker=series.marker,
+            markersize=4.0,
+            markerfacecolor=series.color if series.filled else "white",
         )
     panel.set_xlim(-0.4, len(losses) - 0.6)
     panel.set_xticks(range(len(losses)), [f"{100.0 * loss:g}" for loss in losses])
