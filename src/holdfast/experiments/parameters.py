@@ -34,7 +34,7 @@ LEVEL = 0.01
 where there is none."""
 
 _TRIALS = 200
-_QUICK_TRIALS = 4
+_QUICK_TRIALS = 6
 _MOST_QUICK_PARTICLES = 3.0
 """In a quick run, as a multiple of a problem's."""
 
