@@ -25,7 +25,7 @@ from holdfast.settings import ActiveSensingSettings, ParticleFilterSettings, Sel
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from holdfast.experiments.statistics import BoolArray, FloatArray
+    from holdfast.experiments.statistics import FloatArray
 
 __all__ = ["Parameters", "Variant", "variants"]
 
@@ -202,6 +202,8 @@ def _tasks(name: str, variant: Variant, scale: Scale) -> list[Task]:
 
 _Tables = Mapping[tuple[str, Variant], Table]
 
+_P_VALUES = ("success_p_value", "steps_p_value")
+
 
 def _alone(tables: _Tables) -> Table:
     """Return how each variant differs from its estimator's reference, in each problem."""
@@ -212,7 +214,8 @@ def _alone(tables: _Tables) -> Table:
             reference = table
         rows.append({"problem": case, **variant.names(), **_compared(table, reference)})
     summary = Table.of_records(rows)
-    _adjust(summary, np.array([bool(name) for name in summary.columns["parameter"]]))
+    varied = np.array([bool(name) for name in summary.columns["parameter"]])
+    statistics.add_adjusted(summary, *_P_VALUES, compared=varied)
     return summary
 
 
@@ -220,10 +223,6 @@ def _compared(table: Table, reference: Table) -> dict[str, Cell]:
     success, other = (each.numbers("success") == 1.0 for each in (table, reference))
     low, high = wilson_interval(int(success.sum()), success.size)
     steps = statistics.mean_interval(table.numbers("steps"))
-    gain, success_p_value = statistics.paired_rates(success, other)
-    difference, steps_p_value = statistics.paired_difference(
-        np.log(table.numbers("steps")), np.log(reference.numbers("steps"))
-    )
     return {
         "trials": table.num_rows,
         "success": float(success.mean()),
@@ -232,10 +231,12 @@ def _compared(table: Table, reference: Table) -> dict[str, Cell]:
         **statistics.cells_of("mean_steps", steps),
         "mean_reward": float(np.mean(table.numbers("reward"))),
         "mean_sensing_ms": float(np.nanmean(table.numbers("mean_sensing_ms"))),
-        **statistics.cells_of("steps_ratio", statistics.ratio_of(difference)),
-        **statistics.cells_of("success_gain", gain),
-        "success_p_value": success_p_value,
-        "steps_p_value": steps_p_value,
+        **_differences(
+            statistics.paired_difference(
+                np.log(table.numbers("steps")), np.log(reference.numbers("steps"))
+            ),
+            statistics.paired_rates(success, other),
+        ),
     }
 
 
@@ -258,34 +259,33 @@ def _together(tables: _Tables) -> Table:
         for estimator, reference in references.items():
             if variant == reference or estimator not in ("nearest_neighbor", variant.estimator):
                 continue
-            difference, steps_p_value = statistics.paired_difference(
-                means(variant, "steps"), means(reference, "steps")
-            )
-            gain, success_p_value = statistics.paired_difference(
-                means(variant, "success"), means(reference, "success")
+            steps, success = (
+                statistics.paired_difference(means(variant, column), means(reference, column))
+                for column in ("steps", "success")
             )
             rows.append(
                 {
                     **variant.names(),
                     "reference": _ESTIMATORS[estimator],
                     "trials": fewest,
-                    **statistics.cells_of("steps_ratio", statistics.ratio_of(difference)),
-                    **statistics.cells_of("success_gain", gain),
-                    "success_p_value": success_p_value,
-                    "steps_p_value": steps_p_value,
+                    **_differences(steps, success),
                 }
             )
     table = Table.of_records(rows)
-    _adjust(table, np.ones(table.num_rows, dtype=np.bool_))
+    statistics.add_adjusted(table, *_P_VALUES)
     return table
 
 
-def _adjust(table: Table, compared: BoolArray) -> None:
-    """Add p-values adjusted for the number of rows that are compared with something."""
-    for name in ("success", "steps"):
-        adjusted = np.ones(compared.size)
-        adjusted[compared] = statistics.smallest_levels(table.numbers(f"{name}_p_value")[compared])
-        table.columns[f"{name}_adjusted_p_value"] = [float(value) for value in adjusted]
+def _differences(
+    steps: tuple[statistics.Interval, float], success: tuple[statistics.Interval, float]
+) -> dict[str, Cell]:
+    """Return the cells of differences in the logarithm of steps and in success, with p-values."""
+    return {
+        **statistics.cells_of("steps_ratio", statistics.ratio_of(steps[0])),
+        **statistics.cells_of("success_gain", success[0]),
+        "success_p_value": success[1],
+        "steps_p_value": steps[1],
+    }
 
 
 def _findings(summary: Table, together: Table) -> list[str]:
@@ -362,17 +362,13 @@ def _draw(summary: Table, together: Table) -> Figure:
         row_height=8.4,
         same_rows=True,
     )
+    shown = {
+        case: [row for row in summary.rows() if row["problem"] == case and row["parameter"]]
+        for case in _CASES
+    }
+    shown[_TOGETHER] = [row for row in together.rows() if row["reference"] == row["estimator"]]
     for name, panel in panels.items():
-        rows = [
-            row
-            for row in (together if name == _TOGETHER else summary).rows()
-            if row["parameter"]
-            and (
-                row["reference"] == row["estimator"]
-                if name == _TOGETHER
-                else row["problem"] == name
-            )
-        ]
+        rows = shown[name]
         labels = [f"{row['estimator']}: {row['parameter']} {row['value']}" for row in rows]
         values, lows, highs = (
             [number_of(row[f"steps_ratio{end}"]) for row in rows] for end in ("", "_low", "_high")

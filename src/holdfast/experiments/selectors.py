@@ -213,12 +213,9 @@ def _summary(tables: Mapping[_Cell, Table]) -> Table:
         rows.append(row)
     summary = Table.of_records(rows)
     compared = np.array([way != BASELINE for way in summary.columns["way"]])
-    for name in ("success", "reward", "steps"):
-        adjusted = np.ones(compared.size)
-        adjusted[compared] = statistics.smallest_levels(
-            summary.numbers(f"{name}_p_value")[compared]
-        )
-        summary.columns[f"{name}_adjusted_p_value"] = [float(value) for value in adjusted]
+    statistics.add_adjusted(
+        summary, "success_p_value", "reward_p_value", "steps_p_value", compared=compared
+    )
     return summary
 
 
@@ -303,8 +300,7 @@ def _compared(
             }
         )
     table = Table.of_records(rows)
-    adjusted = statistics.smallest_levels(table.numbers("p_value"))
-    table.columns["adjusted_p_value"] = adjusted.tolist()
+    statistics.add_adjusted(table, "p_value")
     return table
 
 
@@ -338,9 +334,7 @@ def _costs(tables: Mapping[_Cell, Table]) -> Table:
                 )
     table = Table.of_records(rows)
     compared = np.array([way != BASELINE for way in table.columns["way"]])
-    adjusted = np.ones(compared.size)
-    adjusted[compared] = statistics.smallest_levels(table.numbers("p_value")[compared])
-    table.columns["adjusted_p_value"] = [float(value) for value in adjusted]
+    statistics.add_adjusted(table, "p_value", compared=compared)
     return table
 
 

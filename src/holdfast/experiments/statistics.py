@@ -10,15 +10,19 @@ SciPy takes a second to import, so that is done where it is needed.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from holdfast.errors import InvalidValueError
 
+if TYPE_CHECKING:
+    from holdfast.experiments.tables import Table
+
 __all__ = [
     "Interval",
+    "add_adjusted",
     "agreement_of_means",
     "agreement_of_rates",
     "cells_of",
@@ -180,3 +184,22 @@ def smallest_levels(p_values: FloatArray) -> FloatArray:
     adjusted = np.empty(count)
     adjusted[order] = np.minimum(np.maximum.accumulate(stepped), 1.0)
     return adjusted
+
+
+def add_adjusted(table: Table, *columns: str, compared: BoolArray | None = None) -> None:
+    """Add p-values that are adjusted for the number of rows (:func:`smallest_levels`).
+
+    Parameters
+    ----------
+    table : Table
+    *columns : str
+        Those that have p-values; what is added to ``steps_p_value`` is ``steps_adjusted_p_value``.
+    compared : array of shape (rows,), optional
+        Which rows are compared with something; the others get 1. All if None.
+    """
+    rows = np.ones(table.num_rows, dtype=np.bool_) if compared is None else compared
+    for column in columns:
+        adjusted = np.ones(rows.size)
+        adjusted[rows] = smallest_levels(table.numbers(column)[rows])
+        name = f"{column.removesuffix('p_value')}adjusted_p_value"
+        table.columns[name] = [float(value) for value in adjusted]
