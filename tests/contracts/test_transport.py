@@ -41,7 +41,12 @@ from holdfast.session.events import Appeared, Ended, Replied, TransportEvent, Va
 from holdfast.session.messages import Refused, decode_reply
 
 PATIENCE_S = 30.0
+PATIENT_LEASE_MS = 30_000.0
+"""What is closed or killed is found at once; a machine that stands still is no lost link."""
+
 LEASE_MS = 400.0
+"""For what is found by its silence."""
+
 MAX_BYTES = 4_000_000
 TWO_MEGABYTES = 2_000_000
 
@@ -117,12 +122,14 @@ class ZenohWire:
         robot_tls: TlsFiles | None = None,
         service_tls: TlsFiles | None = None,
         robot_listens: bool = False,
+        lease_ms: float = PATIENT_LEASE_MS,
     ) -> None:
         self.protocol = protocol
         self._directory = directory
         self._robot_tls = robot_tls
         self.service_tls = service_tls
         self.robot_listens = robot_listens
+        self.lease_ms = lease_ms
         self._endpoints: dict[str, str] = {}
         self.ends: list[RobotTransport | ServiceTransport] = []
 
@@ -134,7 +141,7 @@ class ZenohWire:
     def robot(self, *services: str, max_message_bytes: int = MAX_BYTES) -> ZenohRobotTransport:
         robot = ZenohRobotTransport(
             {name: ServiceAddress(self.endpoint(name), self.robot_listens) for name in services},
-            lease_ms=LEASE_MS,
+            lease_ms=self.lease_ms,
             decision_timeout_ms=PATIENCE_S * 1e3,
             max_message_bytes=max_message_bytes,
             tls=self._robot_tls,
@@ -149,7 +156,7 @@ class ZenohWire:
             boot=boot,
             listen=[] if self.robot_listens else endpoints,
             connect=endpoints if self.robot_listens else [],
-            lease_ms=LEASE_MS,
+            lease_ms=self.lease_ms,
             max_message_bytes=MAX_BYTES,
             tls=self.service_tls,
         )
@@ -770,16 +777,16 @@ class TestZenoh:
         """Although it takes several leases; a link that carries it is no broken one."""
         tcp.service("cloud", "b1").start(echo_of_size)
         port = int(tcp.endpoint("cloud").rpartition(":")[2])
-        with slow_proxy(port, bytes_per_second=130_000) as slow_port:
+        with slow_proxy(port, bytes_per_second=40_000) as slow_port:
             address = ServiceAddress(f"tcp/127.0.0.1:{slow_port}")
             # What Zenoh sends at once takes half of it, so that the machine may falter meanwhile.
-            robot = ZenohRobotTransport({"cloud": address}, lease_ms=1.5 * LEASE_MS)
+            robot = ZenohRobotTransport({"cloud": address}, lease_ms=2000.0)
             inbox = Inbox()
             robot.start(inbox)
             inbox.wait_for(Appeared("cloud", "b1"))
-            robot.call("cloud", 1, bytes(300_000))
+            robot.call("cloud", 1, bytes(200_000))
             robot.call("cloud", 2, b"small")
-            assert inbox.of_call(1) == [Replied(1, b"300000"), Ended(1)]
+            assert inbox.of_call(1) == [Replied(1, b"200000"), Ended(1)]
             assert inbox.of_call(2) == [Replied(2, b"5"), Ended(2)]
             assert Vanished("cloud", "b1") not in inbox
             robot.close()
@@ -1012,6 +1019,7 @@ class TestProcesses:
             wire = ZenohWire("unixsock-stream", socket_directory, robot_listens=True)
         else:
             wire = ZenohWire(kind, socket_directory)
+        wire.lease_ms = LEASE_MS
         yield wire
         close_all(wire.ends)
 

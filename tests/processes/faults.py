@@ -51,8 +51,8 @@ PATIENT = {
 }
 """What is dead is still found by its broken link, and what is only slow is never taken for dead."""
 
-QUICK = {"detection_timeout_ms": 600.0, "lease_ms": 1000.0}
-"""For what is found by its silence."""
+QUICK = {"detection_timeout_ms": 1500.0, "lease_ms": 4000.0}
+"""For what is found by its silence; longer than a busy machine stands still."""
 
 LOST = (STANDARD, LOCAL_RECOVERY)
 RESTORED = (LOCAL_RECOVERY, KEEP_ALIVE)

@@ -79,7 +79,7 @@ class TestCloud:
     ) -> None:
         document = document_of(problem)
         struck, later = sensing_steps(document)[2:5:2]
-        cloud = site.service(lease_ms=1000.0).start()
+        cloud = site.service(lease_ms=QUICK["lease_ms"]).start()
         story = Story(site, references, document, offload=QUICK)
         story.at("sense", struck, cloud.stop)
         story.at("perform", later, cloud.resume, story.status(KEEP_ALIVE))
@@ -246,7 +246,7 @@ class TestCloud:
     ) -> None:
         document = document_of(problem, trials=2)
         random = np.random.default_rng([seed, PROBLEMS.index(problem)])
-        cloud = site.service(lease_ms=1000.0).start()
+        cloud = site.service(lease_ms=QUICK["lease_ms"]).start()
         story = Story(site, references, document, offload=QUICK)
         for trial in range(2):
             steps = np.sort(random.choice(np.arange(1, 55), 6, replace=False)).tolist()

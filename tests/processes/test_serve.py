@@ -36,6 +36,9 @@ from holdfast.session.messages import (
 )
 
 PATIENCE_S = 30.0
+LEASE_MS = 30_000.0
+"""Long: a machine that stands still for a moment is no lost link."""
+
 COMMAND = [sys.executable, "-m", "holdfast", "serve"]
 ANYWHERE = ["--listen", "tcp/127.0.0.1:0"]
 
@@ -65,7 +68,7 @@ class Served:
         self, *arguments: str, directory: Path | None = None, ready: bool = True, **popen: Any
     ) -> None:
         self.process = subprocess.Popen(
-            [*COMMAND, *arguments],
+            [*COMMAND, "--lease-ms", str(LEASE_MS), *arguments],
             cwd=directory,
             stdin=popen.pop("stdin", subprocess.DEVNULL),
             stdout=subprocess.PIPE,
@@ -116,7 +119,7 @@ class End:
     ) -> None:
         self.events: SimpleQueue[TransportEvent] = SimpleQueue()
         address = ServiceAddress(endpoint, listens=listens, name=name)
-        self.transport = ZenohRobotTransport({"service": address}, tls=tls)
+        self.transport = ZenohRobotTransport({"service": address}, lease_ms=LEASE_MS, tls=tls)
         self.transport.start(self.events.put)
         self.calls = 0
 
