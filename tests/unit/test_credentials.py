@@ -489,7 +489,7 @@ class End(NamedTuple):
 
 @pytest.fixture
 def open_end() -> Iterator[Callable[..., End]]:
-    """Open sessions with the settings of the transport, and close them afterwards."""
+    """Open sessions much as the transport does, and close them afterwards."""
     opened: list[Any] = []
 
     def open_one(
@@ -519,7 +519,8 @@ def open_end() -> Iterator[Callable[..., End]]:
             },
             "open/return_conditions/connect_scouted": False,
             "transport/unicast/open_timeout": 1000,
-            "transport/link/tx/lease": 400,
+            # Long, for a machine that stands still for a moment: the handshakes are what is tested.
+            "transport/link/tx/lease": 10_000,
             "transport/shared_memory/enabled": False,
             "transport/link/tls": tls,
         }
