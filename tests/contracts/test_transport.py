@@ -44,7 +44,7 @@ PATIENCE_S = 30.0
 PATIENT_LEASE_MS = 30_000.0
 """What is closed or killed is found at once; a machine that stands still is no lost link."""
 
-LEASE_MS = 400.0
+LEASE_MS = 2000.0
 """For what is found by its silence."""
 
 MAX_BYTES = 4_000_000
@@ -969,9 +969,11 @@ def serve(call):
     else:
         call.reply(b"begun")  # and is never heard of again
 
-endpoint, boot, direction, *files = sys.argv[1:]
+endpoint, boot, direction, lease_ms, *files = sys.argv[1:]
 tls = TlsFiles(*map(Path, files)) if files else None
-service = ZenohServiceTransport("cloud", boot=boot, tls=tls, **{direction: [endpoint]})
+service = ZenohServiceTransport(
+    "cloud", boot=boot, lease_ms=float(lease_ms), tls=tls, **{direction: [endpoint]}
+)
 service.start(serve)
 print("ready", flush=True)
 sys.stdin.read()
@@ -981,11 +983,16 @@ service.close()
 
 @contextlib.contextmanager
 def service_process(
-    endpoint: str, boot: str, direction: str = "listen", tls: TlsFiles | None = None
+    endpoint: str,
+    boot: str,
+    direction: str = "listen",
+    *,
+    lease_ms: float = LEASE_MS,
+    tls: TlsFiles | None = None,
 ) -> Iterator[subprocess.Popen[bytes]]:
     files = [] if tls is None else [str(tls.authority), str(tls.certificate), str(tls.key)]
     process = subprocess.Popen(
-        [sys.executable, "-c", SERVICE, endpoint, boot, direction, *files],
+        [sys.executable, "-c", SERVICE, endpoint, boot, direction, str(lease_ms), *files],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
     )
@@ -1029,7 +1036,7 @@ class TestProcesses:
     ) -> Callable[[str], contextlib.AbstractContextManager[subprocess.Popen[bytes]]]:
         direction = "connect" if wire.robot_listens else "listen"
         return lambda boot: service_process(
-            wire.endpoint("cloud"), boot, direction, wire.service_tls
+            wire.endpoint("cloud"), boot, direction, tls=wire.service_tls
         )
 
     def test_kill_in_mid_call_ends_the_call_and_the_next_process_is_seen(
@@ -1158,7 +1165,7 @@ def test_a_process_ends_quietly_whatever_its_links_do(
 ) -> None:
     """With replies coming in, with or without ``close``, with a peer that has stopped."""
     endpoint = tcp.endpoint("cloud")
-    with service_process(endpoint, "b1") as service:
+    with service_process(endpoint, "b1", lease_ms=400.0) as service:
         robot = subprocess.Popen(
             [sys.executable, "-c", ROBOT_THAT_ENDS, endpoint, manner, str(after_s)],
             stdout=subprocess.PIPE,

@@ -144,8 +144,8 @@ def run_soak(
     findings: list[str] = []
     with Site(directory) as site:
         visited = {
-            "small": site.service("--max-sessions", _SMALL, lease_ms=400.0).start(),
-            "big": site.service("--max-sessions", _BIG, lease_ms=400.0).start(),
+            "small": site.service("--max-sessions", _SMALL).start(),
+            "big": site.service("--max-sessions", _BIG).start(),
         }
         own = [site.service(lease_ms=400.0).start() for _ in range(2)]
         document = document_of("peg_in_hole_2d", trials=1_000_000, max_steps=40, seed=seed)

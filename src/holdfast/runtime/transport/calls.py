@@ -13,6 +13,7 @@ from queue import SimpleQueue
 from time import monotonic
 
 from holdfast.errors import InvalidValueError
+from holdfast.runtime.last_threads import join_until
 from holdfast.session.events import Appeared, Ended, Replied, TransportEvent, Vanished
 
 __all__ = ["DEFAULT_MAX_MESSAGE_BYTES", "CallTable", "Courier", "PendingCall", "too_large"]
@@ -175,7 +176,7 @@ class Courier:
                 self._errands.put(None)
             thread = self._thread
         if thread is not None and thread is not threading.current_thread():
-            thread.join(max(0.0, deadline_s - monotonic()))
+            join_until((thread,), deadline_s)
 
     def _run(self) -> None:
         while (errand := self._errands.get()) is not None:

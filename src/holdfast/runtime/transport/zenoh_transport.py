@@ -40,7 +40,6 @@ import os
 import re
 import struct
 import threading
-import weakref
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -57,6 +56,7 @@ from holdfast.runtime.endpoints import (
     free_port,
     parse_endpoint,
 )
+from holdfast.runtime.last_threads import join_until
 from holdfast.runtime.senders import NOBODY, Senders
 from holdfast.runtime.transport.calls import (
     DEFAULT_MAX_MESSAGE_BYTES,
@@ -118,9 +118,6 @@ _UPLOADED_MESSAGES = 2
 _PART = struct.Struct("<16sQII")  # request, its size, number of this part, number of parts
 
 _FREE_PORT_ATTEMPTS = 8
-
-_EXIT_TIMEOUT_S = 2.0
-"""How long a process that ends waits for links that are still being closed."""
 
 _MAX_BOOTS = 64
 """Incarnations of one service that a robot takes note of at the same time."""
@@ -310,7 +307,7 @@ class ZenohRobotTransport:
             self._put_aside(link)
         for courier in [self._courier, *(link.sender for link in links)]:
             courier.stop(max(0.0, deadline_s - monotonic()))
-        _wait_for(self._threads, deadline_s)
+        join_until(self._threads, deadline_s)
 
     def _link(self, service: str) -> _Link:
         try:
@@ -733,7 +730,7 @@ class ZenohServiceTransport:
             self._closing = _closed_aside(session, partial(_take_leave, token, calls))
         self._senders.close(deadline_s)
         if self._closing is not None:
-            _wait_for([self._closing], deadline_s)
+            join_until([self._closing], deadline_s)
 
     def _received(self, query: zenoh.Query) -> None:
         payload = query.payload
@@ -819,26 +816,6 @@ def _closed_aside(
     thread = threading.Thread(target=close, name="holdfast-close", daemon=True)
     thread.start()
     return thread
-
-
-_still_closing: weakref.WeakSet[threading.Thread] = weakref.WeakSet()
-
-
-def _wait_for(threads: Iterable[threading.Thread], deadline_s: float) -> None:
-    """Wait for sessions to be closed; those that are not in time are waited for again at exit."""
-    for thread in threads:
-        thread.join(max(0.0, deadline_s - monotonic()))
-        if thread.is_alive():
-            if not _still_closing:
-                atexit.register(_wait_at_exit)
-            _still_closing.add(thread)
-
-
-def _wait_at_exit() -> None:
-    # A thread that comes back from Zenoh while the interpreter goes down aborts the process.
-    deadline_s = monotonic() + _EXIT_TIMEOUT_S
-    for thread in list(_still_closing):
-        thread.join(max(0.0, deadline_s - monotonic()))
 
 
 def _numbered(endpoint: Endpoint, generation: int) -> Endpoint:
