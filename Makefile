@@ -30,7 +30,7 @@ test: $(INSTALLED_DEV) ## the quick tests
 	$(BIN)/pytest -q -n 2 --dist loadfile
 
 test-slow: $(INSTALLED_DEV) ## the tests that take minutes
-	$(BIN)/pytest -q -m slow
+	$(BIN)/pytest -q -m slow -n 2 --dist worksteal
 
 test-compiled: $(INSTALLED_COMPILED) ## the simulator's tests and 10,000 seeds through compiled machines
 	$(COMPILED)/bin/pytest -q -m "slow or not slow" tests/scenarios tests/simulation/test_world.py \

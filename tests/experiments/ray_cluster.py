@@ -72,6 +72,7 @@ class _Node:
                     os.kill(number, signal.SIGKILL)
             with contextlib.suppress(subprocess.TimeoutExpired):
                 self._process.wait(0.1)
+        self._process.wait(_END_S)
 
     def close(self) -> None:
         """Ask it to end; then it is killed."""
