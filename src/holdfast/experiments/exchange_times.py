@@ -38,6 +38,8 @@ from holdfast.session.messages import (
     PROTOCOL_VERSION,
     Observed,
     Opening,
+    Progress,
+    Reply,
     Request,
     SensingAnswer,
     TaskAnswer,
@@ -58,6 +60,9 @@ _PATIENCE_S = 20.0
 _READY_S = 20.0
 _END_S = 3.0
 _SWITCH_INTERVAL_S = 0.0005
+
+_LEASE_MS = 30_000.0
+"""Of both ends: a machine that stands still for a moment does not end the study."""
 
 
 class Exchange(msgspec.Struct, frozen=True, kw_only=True):
@@ -196,6 +201,7 @@ class _Asking:
         self._transport.call(self._service, number, encode(request))
         task_ms = task_computed_ms = None
         answer: SensingAnswer | None = None
+        said: list[Reply] = []
         computed_ms = sensing_ms = 0.0
         while not isinstance(event := self._next(), Ended):
             if not isinstance(event, Replied):
@@ -208,10 +214,12 @@ class _Asking:
             elif isinstance(reply, SensingAnswer):
                 sensing_ms, answer = elapsed_ms, reply
                 computed_ms += 1e-3 * reply.computed_us
+            if not isinstance(reply, Progress):
+                said.append(reply)
         if answer is None or answer.sensing_action != turn.sensing_action:
             raise TaskError(
-                f"trial {turn.trial}, step {turn.step}: the service answered {answer}, which is "
-                f"not sensing action {turn.sensing_action}"
+                f"trial {turn.trial}, step {turn.step}: the service answered "
+                f"{said or 'nothing'}, which is not sensing action {turn.sensing_action}"
             )
         return task_ms, task_computed_ms, sensing_ms, computed_ms
 
@@ -237,7 +245,10 @@ def _over_tcp(wanted: Exchange) -> Iterator[tuple[str, RobotTransport]]:
     happened: queue.SimpleQueue[Written | ProcessEnded] = queue.SimpleQueue()
     with tempfile.TemporaryDirectory(prefix="holdfast-") as directory:
         child = ChildProcess(
-            ["serve", "--listen", endpoint, "--problem", wanted.problem, "--until-stdin-closes"],
+            [
+                *("serve", "--listen", endpoint, "--lease-ms", str(_LEASE_MS)),
+                *("--problem", wanted.problem, "--until-stdin-closes"),
+            ],
             Path(directory) / "service.log",
             dict(os.environ),
             happened.put,
@@ -245,7 +256,9 @@ def _over_tcp(wanted: Exchange) -> Iterator[tuple[str, RobotTransport]]:
         )
         try:
             _await_ready(child, happened)
-            transport = ZenohRobotTransport({endpoint: ServiceAddress(endpoint)})
+            transport = ZenohRobotTransport(
+                {endpoint: ServiceAddress(endpoint)}, lease_ms=_LEASE_MS
+            )
             try:
                 yield endpoint, transport
             finally:
