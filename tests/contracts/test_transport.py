@@ -31,6 +31,7 @@ from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509 import oid
+from tests.processes.faults import PATIENT
 
 from holdfast.errors import InvalidValueError, TransportError
 from holdfast.runtime.endpoints import PrivateSocket, ServiceAddress, TlsFiles
@@ -41,9 +42,6 @@ from holdfast.session.events import Appeared, Ended, Replied, TransportEvent, Va
 from holdfast.session.messages import Refused, decode_reply
 
 PATIENCE_S = 30.0
-PATIENT_LEASE_MS = 30_000.0
-"""What is closed or killed is found at once; a machine that stands still is no lost link."""
-
 LEASE_MS = 2000.0
 """For what is found by its silence."""
 
@@ -122,14 +120,14 @@ class ZenohWire:
         robot_tls: TlsFiles | None = None,
         service_tls: TlsFiles | None = None,
         robot_listens: bool = False,
-        lease_ms: float = PATIENT_LEASE_MS,
     ) -> None:
         self.protocol = protocol
         self._directory = directory
         self._robot_tls = robot_tls
         self.service_tls = service_tls
         self.robot_listens = robot_listens
-        self.lease_ms = lease_ms
+        # What is closed or killed is found at once; a machine that stands still is no lost link.
+        self.lease_ms = PATIENT["lease_ms"]
         self._endpoints: dict[str, str] = {}
         self.ends: list[RobotTransport | ServiceTransport] = []
 

@@ -18,6 +18,7 @@ from queue import Empty, SimpleQueue
 from typing import Any
 
 from tests.fuzz import corpus
+from tests.processes.faults import PATIENT
 from tests.questions import request_of
 from tests.unit.test_session_service import Robot as ReferenceRobot
 from tests.unit.test_session_service import content
@@ -59,7 +60,8 @@ class _Link:
     def __init__(self, endpoint: str) -> None:
         self.events: SimpleQueue[TransportEvent] = SimpleQueue()
         # Long, for a machine that stands still for a moment; the service is asked to be as patient.
-        self.transport = ZenohRobotTransport({"cloud": ServiceAddress(endpoint)}, lease_ms=30_000.0)
+        address = ServiceAddress(endpoint)
+        self.transport = ZenohRobotTransport({"cloud": address}, lease_ms=PATIENT["lease_ms"])
         self.transport.start(self.events.put)
         self._calls = 0
         while not isinstance(self.events.get(timeout=_PATIENCE_S), Appeared):

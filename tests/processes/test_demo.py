@@ -12,10 +12,12 @@ import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 import uuid
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Self
 
 import msgspec
 import pytest
@@ -25,6 +27,9 @@ from holdfast.recording.compare import compare_runs
 
 COMMAND = [sys.executable, "-c", "from holdfast.cli import main; main()"]
 PATIENCE_S = 240.0
+ATTEMPTS = 3
+STANDSTILL_S = 0.1
+"""The shortest that is told from a machine that is merely busy; a service has 0.25 s."""
 
 
 class Demo:
@@ -92,30 +97,65 @@ def directory() -> Iterator[Path]:
         yield Path(path)
 
 
+class Standstill:
+    """Finds out for how long the machine has stood still at most."""
+
+    def __init__(self) -> None:
+        self.longest_s = 0.0
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._watch, daemon=True)
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self._ended.set()
+        self._thread.join()
+
+    def _watch(self) -> None:
+        before = time.monotonic()
+        while not self._ended.wait(0.005):
+            now = time.monotonic()
+            self.longest_s = max(self.longest_s, now - before)
+            before = now
+
+
+STATUSES = (
+    ("standard", "local_recovery", "keep_alive", "local_recovery", "keep_alive"),
+    ("standard",),
+)
+
+
+def told(directory: Path) -> tuple[Demo, Findings, str, str]:
+    """Return a demo that has ended well, what it found, and what it wrote."""
+    for attempt in range(ATTEMPTS):
+        place = directory / str(attempt)
+        place.mkdir()
+        with Standstill() as standstill:
+            demo = Demo(place)
+            try:
+                output, story = demo.process.communicate(timeout=PATIENCE_S)
+                assert demo.process.returncode == 0, output + story
+                demo.wait_until_all_are_gone()
+            finally:
+                demo.close()
+        found = msgspec.json.decode((demo.out / "findings.json").read_bytes(), type=Findings)
+        # With the usual timeouts a machine that stands still is taken for a dead service.
+        if found.statuses == STATUSES or standstill.longest_s < STANDSTILL_S:
+            break
+    return demo, found, output, story
+
+
 @pytest.mark.slow
 def test_the_whole_story(directory: Path) -> None:
-    demo = Demo(directory)
-    try:
-        output, story = demo.process.communicate(timeout=PATIENCE_S)
-        assert demo.process.returncode == 0, output + story
-        demo.wait_until_all_are_gone()
-    finally:
-        demo.close()
-
-    found = msgspec.json.decode((demo.out / "findings.json").read_bytes(), type=Findings)
-    before, after = found.statuses  # the robot's own death
-    recovered = ("local_recovery", "keep_alive")
-    assert before[:5] == ("standard", *recovered, *recovered)
-    # On a busy machine a quarter of a second may also pass without a fault.
-    for statuses in found.statuses:
-        assert statuses == ("standard", *recovered * len(statuses))[: len(statuses)]
-    changes = [*before[1:], *after[1:]]
+    demo, found, output, story = told(directory)
+    assert found.statuses == STATUSES
     assert found.comparison.identical
     assert found.comparison.task_actions == found.steps >= 240
     cold, warm = found.outages
     assert cold.launched_ms is not None
-    launches = (demo.out / "killed" / "events.jsonl").read_text().count('"event":"launched"')
-    assert launches > 1 or warm.launched_ms is None
+    assert warm.launched_ms is None
     for outage in found.outages:
         assert outage.found_ms > 0.0
         assert outage.first_local_decision_ms > 0.0
@@ -129,15 +169,17 @@ def test_the_whole_story(directory: Path) -> None:
     verdict = f"The decisions are those of the run without kills:\n{again.describe()}\n"
     assert verdict in output
     journal_of_robot = (demo.out / "killed" / "events.jsonl").read_text()
-    assert re.findall(r'"event":"status".*?"to":"(\w+)"', journal_of_robot) == changes
+    assert re.findall(r'"event":"status".*?"to":"(\w+)"', journal_of_robot) == list(
+        found.statuses[0][1:]
+    )
     assert journal_of_robot.count('"event":"resumed_trial"') == 1
 
     # A line for each thing that happened, with the time, and the bars in plain characters.
     lines = story.splitlines()
     kills = [line for line in lines if re.fullmatch(r" *\d+\.\d\d s  demo   kill -9 \d+: .*", line)]
     assert len(kills) == 3
-    for status in recovered:
-        assert sum(f"status {status}" in line for line in lines) == changes.count(status)
+    assert sum("status local_recovery, " in line for line in lines) == 2
+    assert sum("status keep_alive" in line for line in lines) == 2
     bars = {line.split()[0]: line for line in lines if re.match(r"(cloud|local|robot)  ", line)}
     assert bars["cloud"].count("X") == 2
     assert bars["cloud"].count("^") == 3

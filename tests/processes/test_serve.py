@@ -19,6 +19,7 @@ from typing import Any
 
 import msgspec
 import pytest
+from tests.processes.faults import PATIENT
 from tests.unit.test_session_service import Robot, content, planning_of
 
 from holdfast.runtime.endpoints import PrivateSocket, ServiceAddress, TlsFiles
@@ -36,9 +37,6 @@ from holdfast.session.messages import (
 )
 
 PATIENCE_S = 30.0
-LEASE_MS = 30_000.0
-"""Long: a machine that stands still for a moment is no lost link."""
-
 COMMAND = [sys.executable, "-m", "holdfast", "serve"]
 ANYWHERE = ["--listen", "tcp/127.0.0.1:0"]
 
@@ -68,7 +66,7 @@ class Served:
         self, *arguments: str, directory: Path | None = None, ready: bool = True, **popen: Any
     ) -> None:
         self.process = subprocess.Popen(
-            [*COMMAND, "--lease-ms", str(LEASE_MS), *arguments],
+            [*COMMAND, "--lease-ms", str(PATIENT["lease_ms"]), *arguments],
             cwd=directory,
             stdin=popen.pop("stdin", subprocess.DEVNULL),
             stdout=subprocess.PIPE,
@@ -119,7 +117,9 @@ class End:
     ) -> None:
         self.events: SimpleQueue[TransportEvent] = SimpleQueue()
         address = ServiceAddress(endpoint, listens=listens, name=name)
-        self.transport = ZenohRobotTransport({"service": address}, lease_ms=LEASE_MS, tls=tls)
+        self.transport = ZenohRobotTransport(
+            {"service": address}, lease_ms=PATIENT["lease_ms"], tls=tls
+        )
         self.transport.start(self.events.put)
         self.calls = 0
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Hashable
 from queue import SimpleQueue
-from time import monotonic
 
 from holdfast.errors import InvalidValueError
 from holdfast.runtime.last_threads import join_until
@@ -167,16 +166,15 @@ class Courier:
             self._waiting += 1
             self._errands.put(errand)
 
-    def stop(self, timeout_s: float) -> None:
-        """Let the thread end after what it is doing, and wait so long for that."""
-        deadline_s = monotonic() + timeout_s
+    def stop(self, until: float) -> None:
+        """Let the thread end after what it is doing; that is not waited for beyond this time."""
         with self._lock:
             if not self._stopped:
                 self._stopped = True
                 self._errands.put(None)
             thread = self._thread
         if thread is not None and thread is not threading.current_thread():
-            join_until((thread,), deadline_s)
+            join_until((thread,), until)
 
     def _run(self) -> None:
         while (errand := self._errands.get()) is not None:

@@ -146,7 +146,7 @@ class InProcessRobotTransport:
         """Leave the network. May be repeated."""
         self._network._leave_robot(self)
         self._calls.close()
-        self._courier.stop(timeout_s)
+        self._courier.stop(monotonic() + timeout_s)
 
     def _appeared(self, service: InProcessServiceTransport) -> None:
         if service.name in self._services:
@@ -199,7 +199,7 @@ class InProcessServiceTransport:
             self._closed = True
             self._deliver = None
         self._network._leave_service(self)
-        self._courier.stop(max(0.0, deadline_s - monotonic()))
+        self._courier.stop(deadline_s)
 
     def _received(self, call: _InProcessCall) -> None:
         self._courier.post(partial(self._hand_over, call))

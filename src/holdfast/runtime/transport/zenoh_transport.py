@@ -303,10 +303,10 @@ class ZenohRobotTransport:
         self._calls.close()
         links = list(self._links.values())
         for link in links:
-            link.keeper.stop(max(0.0, deadline_s - monotonic()))
+            link.keeper.stop(deadline_s)
             self._put_aside(link)
         for courier in [self._courier, *(link.sender for link in links)]:
-            courier.stop(max(0.0, deadline_s - monotonic()))
+            courier.stop(deadline_s)
         join_until(self._threads, deadline_s)
 
     def _link(self, service: str) -> _Link:
