@@ -45,27 +45,24 @@ Output<Value> make_array(std::initializer_list<std::size_t> shape, Value*& data)
 /// Lets other Python threads run while it lives.
 ///
 /// When the interpreter has begun to end, Python up to 3.13 ends a thread that asks for it back, by
-/// unwinding its stack, which aborts the process where that meets a noexcept destructor. So such a
-/// thread (a daemon, since the others have been joined) waits here for the process to end.
+/// unwinding its stack, which aborts the process at the first noexcept function on the way. Nobody
+/// can ask beforehand whether that will happen: it may begin while the thread waits its turn. So a
+/// thread that is being unwound (a daemon, since the others have been joined) stops right here, and
+/// sleeps until the process has ended, as Python 3.14 does of itself.
 class WithoutInterpreter {
   public:
     WithoutInterpreter() : state_(PyEval_SaveThread()) {}
     ~WithoutInterpreter() {
-        while (finalizing()) std::this_thread::sleep_for(std::chrono::hours(1));
-        PyEval_RestoreThread(state_);
+        try {
+            PyEval_RestoreThread(state_);
+        } catch (...) {
+            for (;;) std::this_thread::sleep_for(std::chrono::hours(1));
+        }
     }
     WithoutInterpreter(const WithoutInterpreter&) = delete;
     WithoutInterpreter& operator=(const WithoutInterpreter&) = delete;
 
   private:
-    static bool finalizing() {
-#if PY_VERSION_HEX >= 0x030D0000
-        return Py_IsFinalizing() != 0;
-#else
-        return _Py_IsFinalizing() != 0;
-#endif
-    }
-
     PyThreadState* state_;
 };
 
