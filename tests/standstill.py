@@ -79,8 +79,18 @@ def held_back(group: Path, core: int) -> Iterator[None]:
     try:
         yield
     finally:
-        for thread, signal in held.items():
-            trace(DETACH, thread, None, signal)
+        killed = {
+            thread for thread, signal in held.items() if trace(DETACH, thread, None, signal) != 0
+        }
+        # Before its parent, it is we who have to hear of its end.
+        while killed:
+            for thread in list(killed):
+                try:
+                    ended, _ = os.waitpid(thread, WAIT_ALL | os.WNOHANG)
+                except OSError:
+                    ended = thread
+                killed -= {ended}
+            time.sleep(0.001)
 
 
 WAIT_ALL = 0x40000000
