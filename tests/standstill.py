@@ -54,14 +54,16 @@ trace.restype = ctypes.c_long
 
 
 def running_on(group: Path, core: int) -> Iterator[int]:
-    """Threads of a control group that have, or wait for, a processor."""
+    """Threads of a control group that have, or wait for, a processor, or may use no other."""
     for pid in (group / "cgroup.procs").read_text().split():
         for thread in Path(f"/proc/{pid}/task").glob("*"):
             with contextlib.suppress(OSError):
                 # After the name, which may hold anything: the state is the first, from 0 on.
                 fields = (thread / "stat").read_text().rpartition(")")[2].split()
-                if fields[0] == "R" and int(fields[36]) == core:
-                    yield int(thread.name)
+                name = int(thread.name)
+                running = fields[0] == "R" and int(fields[36]) == core
+                if running or os.sched_getaffinity(name) == {core}:
+                    yield name
 
 
 @contextlib.contextmanager

@@ -98,22 +98,29 @@ def directory() -> Iterator[Path]:
 
 
 class Standstill:
-    """Finds out for how long the machine has stood still at most."""
+    """Finds out for how long the machine, or one of its processors, has stood still at most."""
 
     def __init__(self) -> None:
         self.longest_s = 0.0
         self._ended = threading.Event()
-        self._thread = threading.Thread(target=self._watch, daemon=True)
+        self._threads = [
+            threading.Thread(target=self._watch, args=[processor], daemon=True)
+            for processor in os.sched_getaffinity(0)
+        ]
 
     def __enter__(self) -> Self:
-        self._thread.start()
+        for thread in self._threads:
+            thread.start()
         return self
 
     def __exit__(self, *exception: object) -> None:
         self._ended.set()
-        self._thread.join()
+        for thread in self._threads:
+            thread.join()
 
-    def _watch(self) -> None:
+    def _watch(self, processor: int) -> None:
+        # Of this thread alone: elsewhere it would go on while the processor is held back.
+        os.sched_setaffinity(0, {processor})
         before = time.monotonic()
         while not self._ended.wait(0.005):
             now = time.monotonic()
