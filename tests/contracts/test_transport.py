@@ -31,6 +31,7 @@ from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509 import oid
+from tests.ports import free_port
 from tests.processes.faults import PATIENT
 
 from holdfast.errors import InvalidValueError, TransportError
@@ -165,10 +166,7 @@ class ZenohWire:
 def unused_endpoint(protocol: str, directory: Path) -> str:
     if protocol == "unixsock-stream":
         return f"{protocol}/{directory}/{len(list(directory.iterdir()))}-{os.urandom(4).hex()}"
-    kind = socket.SOCK_DGRAM if protocol == "quic" else socket.SOCK_STREAM
-    with socket.socket(socket.AF_INET, kind) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"{protocol}/127.0.0.1:{probe.getsockname()[1]}"
+    return f"{protocol}/127.0.0.1:{free_port()}"
 
 
 def close_all(ends: Sequence[RobotTransport | ServiceTransport]) -> None:

@@ -26,6 +26,7 @@ from typing import IO, Any
 import numpy as np
 import numpy.typing as npt
 import yaml
+from tests.ports import free_port
 
 from holdfast.configuration import Configuration, load
 from holdfast.outcome import TaskDecision
@@ -79,14 +80,6 @@ def in_order(*hooks: Hook) -> Hook:
             hook()
 
     return call
-
-
-def free_port() -> int:
-    """Return a port that nobody uses."""
-    with socket.socket() as sock:
-        sock.bind(("127.0.0.1", 0))
-        port: int = sock.getsockname()[1]
-        return port
 
 
 def wait_until(condition: Callable[[], bool], what: str) -> None:
@@ -341,7 +334,7 @@ class World:
         self.performed: dict[int, list[bytes]] = {}
         self.moments_s: list[float] = []
         self.wrongs: list[str] = []
-        self._listener = socket.create_server(("127.0.0.1", 0))
+        self._listener = socket.create_server(("127.0.0.1", free_port()))
         self.port: int = self._listener.getsockname()[1]
         self._start(self._accept)
 
@@ -503,7 +496,7 @@ class Gate:
         self._opened = threading.Event()
         self._reached = threading.Event()
         self._arrivals = 0
-        self._listener = socket.create_server(("127.0.0.1", 0))
+        self._listener = socket.create_server(("127.0.0.1", free_port()))
         self.port: int = self._listener.getsockname()[1]
         self._held: list[socket.socket] = []
         self._thread = threading.Thread(target=self._accept)

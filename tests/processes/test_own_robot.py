@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.ports import free_port
 
 from holdfast.configuration import Configuration, load
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
@@ -329,9 +330,7 @@ class TestFailures:
         again.performer.close()
 
     def test_no_controller_at_all(self, controller: Controller) -> None:
-        with socket.socket() as free:
-            free.bind(("127.0.0.1", 0))
-            controller.port = free.getsockname()[1]
+        controller.port = free_port()
         maker = load_environment(configuration_for(controller, {"connect_timeout_s": 0.2}))
         watched = Watched(maker)
         failed = watched.begin()

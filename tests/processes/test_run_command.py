@@ -7,7 +7,6 @@ import csv
 import json
 import os
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -15,6 +14,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from tests.ports import free_port
 
 from holdfast import __version__
 from holdfast.recording.machine import machines
@@ -191,9 +191,7 @@ class TestOutput:
         assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
     def test_with_log_json_the_standard_error_has_nothing_else(self, workplace: Path) -> None:
-        with socket.socket() as probe:
-            probe.bind(("127.0.0.1", 0))
-            service = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+        service = f"tcp/127.0.0.1:{free_port()}"
         arguments = ("run", "peg.yaml", "--trials", "1", "--log", "json", "--service", service)
         done = holdfast(workplace, *arguments, "--out", "out")
         assert done.returncode == 0, done.stderr

@@ -7,6 +7,7 @@ import ssl
 from pathlib import Path
 
 import pytest
+from tests.ports import free_port
 from tests.processes.faults import (
     KEEP_ALIVE,
     LOCAL_RECOVERY,
@@ -20,7 +21,6 @@ from tests.processes.faults import (
     Story,
     document_of,
     events_of,
-    free_port,
     sensing_steps,
 )
 

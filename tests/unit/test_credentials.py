@@ -27,6 +27,7 @@ import zenoh
 from cryptography import x509
 from cryptography.hazmat.primitives import serialization
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+from tests.ports import free_port
 
 from holdfast.files import NewFile, OutputError, create_directory_atomically
 from holdfast.runtime.credentials import (
@@ -541,10 +542,7 @@ def open_end() -> Iterator[Callable[..., End]]:
 
 
 def free_endpoint(protocol: str, host: str = "127.0.0.1") -> str:
-    kind = socket.SOCK_DGRAM if protocol == "quic" else socket.SOCK_STREAM
-    with socket.socket(type=kind) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"{protocol}/{host}:{probe.getsockname()[1]}"
+    return f"{protocol}/{host}:{free_port()}"
 
 
 def wait_until(condition: Callable[[], bool], timeout_s: float = 30.0) -> None:

@@ -14,6 +14,7 @@ import pytest
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
+from tests.ports import free_port
 
 from holdfast.runtime.credentials import make_credentials
 from holdfast.runtime.diagnosis import MissingServices, why_unreachable
@@ -115,13 +116,6 @@ def tls_service(keys: Path, authority: str, *, names_another: bool = False) -> I
         yield port
 
 
-def closed_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
-
-
 class TestWhyUnreachable:
     def test_what_is_no_endpoint_has_no_reason(self) -> None:
         assert why_unreachable("in_process", None, TIMEOUT_S) is None
@@ -129,7 +123,7 @@ class TestWhyUnreachable:
     @pytest.mark.parametrize("protocol", ["tcp", "tls"])
     def test_nobody_listens(self, protocol: str, keys: Path) -> None:
         files = files_of(keys / "ours" / "robot")
-        endpoint = f"{protocol}/127.0.0.1:{closed_port()}"
+        endpoint = f"{protocol}/127.0.0.1:{free_port()}"
         assert why_unreachable(endpoint, files, TIMEOUT_S) == "connection refused"
 
     @pytest.mark.parametrize("protocol", ["tcp", "tls", "quic"])
@@ -234,7 +228,7 @@ class Notes:
 
 class TestMissingServices:
     def test_each_that_is_absent_is_reported_once(self) -> None:
-        first, second = (f"tcp/127.0.0.1:{closed_port()}" for _ in range(2))
+        first, second = (f"tcp/127.0.0.1:{free_port()}" for _ in range(2))
         notes = Notes()
         missing = MissingServices((first, second), None, notes)
         missing.heard("service_appeared", {"service": second})
@@ -266,7 +260,7 @@ class TestMissingServices:
 
     def test_nothing_is_examined_while_the_cloud_decides(self) -> None:
         notes = Notes()
-        missing = MissingServices((f"tcp/127.0.0.1:{closed_port()}",), None, notes)
+        missing = MissingServices((f"tcp/127.0.0.1:{free_port()}",), None, notes)
         missing.heard("status", {"from": "local_recovery", "to": "keep_alive"})
         missing.heard("retry", {})
         missing.wait(TIMEOUT_S)
