@@ -48,6 +48,9 @@ def frozen(group: Path) -> Iterator[None]:
 SEIZE, INTERRUPT, DETACH = 0x4206, 0x4207, 17
 """Of ``ptrace``: which stops single threads, where signals stop processes."""
 
+WAIT_ALL = 0x40000000
+"""Of ``waitpid``: for threads, too."""
+
 trace = ctypes.CDLL(None, use_errno=True).ptrace
 trace.argtypes = [ctypes.c_long, ctypes.c_long, ctypes.c_void_p, ctypes.c_void_p]
 trace.restype = ctypes.c_long
@@ -93,10 +96,6 @@ def held_back(group: Path, core: int) -> Iterator[None]:
                     ended = thread
                 killed -= {ended}
             time.sleep(0.001)
-
-
-WAIT_ALL = 0x40000000
-"""Of ``waitpid``: for threads, too."""
 
 
 def run(

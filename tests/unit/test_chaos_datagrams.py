@@ -10,6 +10,7 @@ import time
 from collections.abc import Iterator
 
 import pytest
+from tests.ports import free_port
 
 from holdfast.chaos.datagrams import DatagramProxy, DelayLine
 from holdfast.chaos.processes import CannotStartError
@@ -106,12 +107,6 @@ def echo() -> Iterator[Echo]:
         yield echo
 
 
-def free_udp_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
 def client_of(port: int) -> socket.socket:
     client = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     client.connect(("127.0.0.1", port))
@@ -121,7 +116,7 @@ def client_of(port: int) -> socket.socket:
 
 class TestDatagramProxy:
     def test_it_changes_nothing_and_confuses_nobody(self, echo: Echo) -> None:
-        port = free_udp_port()
+        port = free_port()
         with (
             DatagramProxy(port, echo.port, round_trip_s=0.01, loss=0.0, seed="s"),
             client_of(port) as first,
@@ -134,7 +129,7 @@ class TestDatagramProxy:
                 assert [first.recv(65_536), second.recv(65_536)] == contents
 
     def test_it_is_never_early(self, echo: Echo) -> None:
-        port = free_udp_port()
+        port = free_port()
         with (
             DatagramProxy(port, echo.port, round_trip_s=0.05, loss=0.0, seed="s"),
             client_of(port) as client,
@@ -146,7 +141,7 @@ class TestDatagramProxy:
             assert time.monotonic() - began >= 0.05
 
     def test_what_is_lost_is_lost_whole(self, echo: Echo) -> None:
-        port = free_udp_port()
+        port = free_port()
         sent = [number.to_bytes(2, "big") * 300 for number in range(200)]
         with (
             DatagramProxy(port, echo.port, round_trip_s=0.0, loss=0.3, seed="s"),
@@ -166,7 +161,7 @@ class TestDatagramProxy:
         assert arrived == sorted(arrived)
 
     def test_nobody_behind_it(self) -> None:
-        port, nobody = free_udp_port(), free_udp_port()
+        port, nobody = free_port(), free_port()
         with (
             DatagramProxy(port, nobody, round_trip_s=0.0, loss=0.0, seed="s") as proxy,
             client_of(port) as client,
