@@ -1,0 +1,149 @@
+"""What is decided, pinned: ``digests.csv`` has the digest of every kind of run.
+
+All other tests of "the same bits" compare runs of one and the same code, so a change of what is
+decided passes them. Here each row names a run, the command that makes it, and the digest that
+``summary.json`` has after it: a hash of every decision of every trial. A digest changes only with
+a reason, which stands in CHANGELOG.md. ::
+
+    python -m tests.golden.table
+
+writes the table anew and says which rows changed.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple, get_args, get_type_hints
+
+from holdfast.configuration import Configuration, load
+from holdfast.experiments.cases import CASES
+from holdfast.outcome import TrialResult
+from holdfast.problems import registry
+from holdfast.recording.tables import SummaryBuilder
+from holdfast.runtime.trials import run_trials
+from holdfast.settings import SelectorSettings
+
+ROOT = Path(__file__).parents[2]
+TABLE = Path(__file__).with_name("digests.csv")
+REWRITE = "python -m tests.golden.table"
+COLUMNS = ("name", "command", "digest")
+PLAIN = "tests/golden/plain.yaml"
+
+
+class Run(NamedTuple):
+    """A batch run of a configuration file, with values instead of the file's."""
+
+    name: str
+    file: str
+    trials: int
+    changes: dict[str, Any]
+    problem: str | None = None
+
+    def command(self) -> str:
+        """Return the command that makes this run, from the root of the repository."""
+        problem = [] if self.problem is None else ["--problem", self.problem]
+        changes = [f"--set {key}={value}" for key, value in self.changes.items()]
+        words = ["holdfast run", self.file, *problem, "--trials", str(self.trials), *changes]
+        return " ".join(words)
+
+    def configuration(self) -> Configuration:
+        """Return what the command would run."""
+        return load(
+            ROOT / self.file,
+            problem=self.problem,
+            num_trials=self.trials,
+            overrides=self.changes,
+        )
+
+    def digest(self) -> str:
+        """Run it and return the ``digest`` of its summary."""
+        results: list[TrialResult] = []
+        run_trials(self.configuration(), 1, (), results.append)
+        summary = SummaryBuilder()
+        for result in results:
+            summary.add(result)
+        return summary.build(
+            problem="", seed=0, version="", trials=self.trials, wall_time_s=0.0
+        ).digest
+
+
+def runs() -> list[Run]:
+    """Return every run that is pinned; what is new in the product appears here by itself."""
+    return [*_examples(), *_problems(), *_selectors(), *_estimates()]
+
+
+def _examples() -> Iterator[Run]:
+    for path in sorted((ROOT / "examples").rglob("*.yaml")):
+        file = path.relative_to(ROOT).as_posix()
+        yield Run(file, file, 3, {"simulator.max_steps": 300})
+
+
+def _problems() -> Iterator[Run]:
+    """holdfast's own, and those that only its studies have."""
+    for problem in dict.fromkeys((*registry.BUILT_IN, *(case.problem for case in CASES))):
+        for count in (100, 300):
+            changes = {"particle_filter.num_particles": count, "simulator.max_steps": 60}
+            yield Run(f"{problem}, {count} particles", PLAIN, 3, changes, problem)
+
+
+def _selectors() -> Iterator[Run]:
+    """Every way of choosing, and two steps ahead; long enough that no two of them decide alike."""
+    short = {"particle_filter.num_particles": 100, "simulator.max_steps": 200}
+    ahead = {"active_sensing.horizon": 2, "active_sensing.discount": 0.5}
+    for method in _choices("method"):
+        for estimator in _choices("estimator") if method.endswith("_entropy") else (None,):
+            for actions in _choices("actions") if method.startswith("action_") else (None,):
+                chosen = {"method": method, "estimator": estimator, "actions": actions}
+                selector = {f"selector.{key}": value for key, value in chosen.items() if value}
+                name = ", ".join(selector.values())
+                yield Run(name, PLAIN, 4, {**selector, **short})
+                if method not in {"random", "fixed"}:
+                    yield Run(f"{name}, horizon 2", PLAIN, 4, {**selector, **ahead, **short})
+
+
+def _estimates() -> Iterator[Run]:
+    """Weights that last, the other estimate of the state, stages ahead, a general likelihood."""
+    weighted = {"particle_filter.resampling_threshold": 0.4, "simulator.max_steps": 100}
+    most_likely = {"particle_filter.estimate": "most_likely"}
+    ahead = {"active_sensing.horizon": 2, "simulator.max_steps": 100}
+    yield Run("few resamplings", PLAIN, 2, weighted)
+    yield Run("most likely particle", PLAIN, 2, {**most_likely, **weighted})
+    yield Run("stages ahead", PLAIN, 2, ahead, "capsule_robot")
+    sonar = "tests/golden/sonar_room.yaml"
+    short = {"particle_filter.num_particles": 100, "simulator.max_steps": 100}
+    yield Run("general likelihood", sonar, 6, short)
+    yield Run("general likelihood, horizon 2", sonar, 6, {"active_sensing.horizon": 2, **short})
+    yield Run("general likelihood, few resamplings", sonar, 6, {**short, **weighted})
+
+
+def _choices(key: str) -> tuple[str, ...]:
+    """Return what a key of the section ``selector`` may be."""
+    choices: tuple[str, ...] = get_args(get_type_hints(SelectorSettings)[key])
+    return choices
+
+
+def pinned() -> dict[str, tuple[str, str]]:
+    """Return the table: command and digest by name."""
+    with TABLE.open(encoding="utf-8", newline="") as file:
+        return {row["name"]: (row["command"], row["digest"]) for row in csv.DictReader(file)}
+
+
+def rewrite() -> None:
+    """Run everything and write the table anew."""
+    before = pinned() if TABLE.exists() else {}
+    now = {run.name: (run.command(), run.digest()) for run in runs()}
+    with TABLE.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(COLUMNS)
+        writer.writerows((name, *row) for name, row in now.items())
+    for name in sorted(before.keys() | now.keys()):
+        if before.get(name) != now.get(name):
+            was, is_now = (rows.get(name, ("", "no row"))[1] for rows in (before, now))
+            print(f"{name}: {was} -> {is_now}")
+    print(f"{TABLE}: {len(now)} rows; a changed digest needs its reason in CHANGELOG.md")
+
+
+if __name__ == "__main__":
+    rewrite()
