@@ -223,8 +223,8 @@ def load(
     num_trials, seed : int, optional
         Instead of the file's ``simulator.num_trials`` and ``simulator.seed``.
     overrides : mapping, optional
-        Further values instead of the file's, by ``section.key`` (``offload.services``). None leaves
-        the file's. Paths among them are relative to the current directory.
+        Further values instead of the file's, by ``section.key`` (``offload.services``). None is a
+        value, too. Paths among them are relative to the current directory.
 
     Returns
     -------
@@ -240,16 +240,14 @@ def load(
     """
     path = Path(path)
     document = read(_content(path), str(path))
-    given = {
-        "simulator.num_trials": num_trials,
-        "simulator.seed": seed,
-        **(overrides or {}),
-    }
+    given: dict[str, Any] = {}
+    if num_trials is not None:
+        given["simulator.num_trials"] = num_trials
+    if seed is not None:
+        given["simulator.seed"] = seed
+    given |= overrides or {}
     return _build(
-        document,
-        path,
-        problem,
-        {_section_and_key(name): value for name, value in given.items() if value is not None},
+        document, path, problem, {_section_and_key(name): value for name, value in given.items()}
     )
 
 
@@ -561,9 +559,12 @@ def _located_environment(source: _Source, settings: EnvironmentSettings) -> Envi
     key = ("environment", "object")
     module, colon, class_name = name.partition(":")
     if not colon:
-        if settings.directory is not None and not source.is_overridden(key):
+        directory_key = ("environment", "directory")
+        if settings.directory is not None and (
+            source.is_overridden(directory_key) or not source.is_overridden(key)
+        ):
             raise source.error(
-                ("environment", "directory"),
+                directory_key,
                 f"is {_shown(settings.directory)}; only an environment that is named module:Class"
                 " has one",
             )

@@ -10,11 +10,12 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from holdfast.cli.endings import ResumableError, ended_by_signals, signal_of
+from holdfast.cli.overrides import Override, combined, parse_assignment
 from holdfast.cli.terminal import duration, print_files, print_summary, run_display
 from holdfast.errors import HoldfastError, InvalidValueError
 from holdfast.runtime.command_line import MAX_JOBS
@@ -30,6 +31,9 @@ __all__ = ["run"]
 
 _RUNS = Path("runs")
 _MAX_RATE_HZ = 10_000.0
+_OF_SERVICES = ("recovery.launch", "offload.tls")
+"""Keys without effect where no service is named."""
+
 _LONGEST_REPETITION_S = 30.0
 """A trial that took longer is not run again for its figure."""
 
@@ -251,39 +255,32 @@ class _Options:
             words += ["--log", self.log]
         return shlex.join([*words, "--out", str(directory), "--resume"])
 
+    def overrides(self) -> list[Override]:
+        """Return what was given instead of values of the file."""
+        options = [
+            ("--trials", "simulator.num_trials", self.trials),
+            ("--seed", "simulator.seed", self.seed),
+            ("--recovery", "recovery.launch", self.recovery),
+            ("--tls", "offload.tls", None if self.tls is None else str(self.tls)),
+            ("--environment", "environment.object", self.environment),
+        ]
+        given = [
+            Override(f"{name} {value}", key, value)
+            for name, key, value in options
+            if value is not None
+        ]
+        if self.services:
+            words = " ".join(f"--service {service}" for service in self.services)
+            given.append(Override(words, "offload.services", list(self.services)))
+        return [*map(parse_assignment, self.assignments), *given]
+
     def load(self) -> Configuration:
         """Read the configuration, with what was said instead."""
         from holdfast.configuration import load
 
         return load(
-            self.configuration_path,
-            problem=self.problem,
-            num_trials=self.trials,
-            seed=self.seed,
-            overrides={
-                **dict(map(_assigned, self.assignments)),
-                "offload.services": list(self.services) or None,
-                "offload.tls": None if self.tls is None else str(self.tls),
-                "recovery.launch": self.recovery,
-                "environment.object": self.environment,
-            },
+            self.configuration_path, problem=self.problem, overrides=combined(self.overrides())
         )
-
-
-def _assigned(assignment: str) -> tuple[str, Any]:
-    """Return the key, ``section.key``, and the value that ``--set`` gives it."""
-    from holdfast.yaml_document import read
-
-    name, equals, text = assignment.partition("=")
-    section, dot, key = name.strip().partition(".")
-    if not (equals and dot and section and key):
-        raise InvalidValueError(
-            f"--set {assignment}: must be SECTION.KEY=VALUE, such as selector.method=random"
-        )
-    value = read(text.encode(), f"--set {name}").data
-    if value is None:
-        raise InvalidValueError(f"--set {assignment}: has no value")
-    return f"{section}.{key}", value
 
 
 def _run(options: _Options) -> None:
@@ -423,10 +420,10 @@ def _require_effect(options: _Options, configuration: Configuration, *, as_robot
             tls = load_credentials(directory, "robot", warn=lambda _: None)
         for endpoint in endpoints:
             check_credentials(endpoint, tls)
-    for option, value in (("--recovery", options.recovery), ("--tls", options.tls)):
-        if value is not None and not configuration.offload.services:
+    for given in options.overrides():
+        if given.key in _OF_SERVICES and given.value and not configuration.offload.services:
             raise InvalidValueError(
-                f"{option} {value} needs --service (or offload.services in "
+                f"{given.words} needs --service (or offload.services in "
                 f"{options.configuration_path}): without a service it would do nothing"
             )
     if options.log == "json" and not as_robot:

@@ -1,0 +1,87 @@
+"""What a command line says instead of the configuration file, by key.
+
+A key can be given twice: by ``--set SECTION.KEY=VALUE``, and by the option that is there for it.
+Whoever does that and means two things shall hear of it, whichever of both would win. An option that
+was not given says nothing, so that it can take nothing away.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any, NamedTuple
+
+from holdfast.errors import InvalidValueError
+
+__all__ = ["Override", "combined", "parse_assignment"]
+
+
+class Override(NamedTuple):
+    """A value that is given instead of the file's.
+
+    Attributes
+    ----------
+    words : str
+        What stands on the command line.
+    key : str
+        ``section.key``.
+    value : object
+        Plain data.
+    """
+
+    words: str
+    key: str
+    value: Any
+
+
+def parse_assignment(assignment: str) -> Override:
+    """Read ``SECTION.KEY=VALUE``, as ``--set`` takes it.
+
+    Parameters
+    ----------
+    assignment : str
+        The value is YAML; ``null`` is one, too.
+
+    Raises
+    ------
+    InvalidValueError
+        If it is not of that form, or no value stands there.
+    ConfigurationError
+        If the value is no YAML.
+    """
+    from holdfast.yaml_document import read
+
+    name, equals, text = assignment.partition("=")
+    section, dot, key = name.strip().partition(".")
+    if not (equals and dot and section and key):
+        raise InvalidValueError(
+            f"--set {assignment}: must be SECTION.KEY=VALUE, such as selector.method=random"
+        )
+    value = read(text.encode(), f"--set {name}").data
+    if value is None and text.strip() not in ("null", "~"):
+        raise InvalidValueError(f"--set {assignment}: has no value")
+    return Override(f"--set {assignment}", f"{section}.{key}", value)
+
+
+def combined(overrides: Iterable[Override]) -> dict[str, Any]:
+    """Return the values by key.
+
+    Parameters
+    ----------
+    overrides : iterable of Override
+        Those that were given, and no others.
+
+    Raises
+    ------
+    InvalidValueError
+        If two of them give different values to one key.
+    """
+    by_key: dict[str, Override] = {}
+    for override in overrides:
+        other = by_key.setdefault(override.key, override)
+        # As text, because 1 and true are equal but not the same.
+        if repr(other.value) != repr(override.value):
+            raise InvalidValueError(
+                f"{other.words} and {override.words} contradict each other: both say what "
+                f"{override.key} is; leave one of them out"
+            )
+    return {key: override.value for key, override in by_key.items()}

@@ -1,0 +1,164 @@
+"""Values that a command line gives instead of the file's: none is lost or contradicted."""
+
+from __future__ import annotations
+
+import typing
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from holdfast import configuration
+from holdfast.cli.application import run_application
+from holdfast.cli.overrides import combined, parse_assignment
+from holdfast.configuration import load
+from holdfast.errors import HoldfastError
+from holdfast.problems.peg_in_hole_2d import PegInHole2D
+
+SECTIONS: dict[str, type[msgspec.Struct]] = {
+    **configuration._SETTINGS,
+    **configuration._schemas_of(PegInHole2D),
+}
+KEYS = [
+    (section, field.encode_name)
+    for section, schema in SECTIONS.items()
+    for field in msgspec.structs.fields(schema)
+    if field.encode_name != "state_size"  # which has one value
+]
+# Where a value next to the default would not do.
+CHOSEN = {
+    "offload.services": ["tcp/127.0.0.1:7001"],
+    "offload.decision_deadline_ms": 17,
+    "offload.tls": "credentials",
+    "environment.object": "somebodys_robot",
+    "environment.directory": "robots",
+    "environment.arguments": {"port": 7},
+    "selector.resolution": 0.25,
+    "model.init_mean": [1, 2, 3],
+    "model.init_cov": [1, 2, 3],
+    "model.motion_cov": [1, 2, 3],
+}
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    (tmp_path / "peg.yaml").write_text("problem: peg_in_hole_2d\n")
+    return tmp_path / "peg.yaml"
+
+
+def another_value(section: str, key: str, value: Any) -> Any:
+    """Return a value that is allowed and is not the default."""
+    if f"{section}.{key}" in CHOSEN:
+        return CHOSEN[f"{section}.{key}"]
+    hint = typing.get_type_hints(SECTIONS[section])[key]
+    if typing.get_origin(hint) is typing.Literal:
+        return typing.get_args(hint)[-1]
+    if isinstance(value, bool):
+        return not value
+    if isinstance(value, int):
+        return value + 1
+    assert isinstance(value, float), f"{section}.{key} needs an entry in CHOSEN"
+    return value / 2
+
+
+def plain(loaded: configuration.Configuration) -> dict[str, Any]:
+    sections = msgspec.json.decode(msgspec.json.encode(loaded.plain()["configuration"]))
+    assert isinstance(sections, dict)
+    return sections
+
+
+@pytest.mark.parametrize(("section", "key"), KEYS, ids=[".".join(names) for names in KEYS])
+class TestEachKey:
+    def test_a_value_arrives(self, section: str, key: str, path: Path) -> None:
+        default = plain(load(path))
+        value = another_value(section, key, default[section][key])
+        assert value != default[section][key]
+        text = msgspec.json.encode(value).decode()
+        overrides = combined([parse_assignment(f"{section}.{key}={text}")])
+        loaded = plain(load(path, overrides=overrides))
+        if (section, key) == ("offload", "tls"):
+            value = str(Path.cwd() / value)
+        assert loaded[section][key] == value
+        loaded[section][key] = default[section][key]
+        assert loaded == default
+
+    def test_the_command_refuses_a_value_that_is_not_allowed(
+        self, section: str, key: str, path: Path
+    ) -> None:
+        value = "3" if (section, key) == ("environment", "arguments") else "{not: allowed}"
+        with pytest.raises(HoldfastError, match=rf"^{section}\.{key}(\.not)?, given instead of "):
+            run_application(["run", str(path), "--set", f"{section}.{key}={value}"])
+
+
+OPTIONS = [
+    ("--trials", "3", "simulator.num_trials", "4"),
+    ("--seed", "0", "simulator.seed", "1"),
+    ("--recovery", "never", "recovery.launch", "at_start"),
+    ("--tls", "keys", "offload.tls", "other"),
+    ("--environment", "robot", "environment.object", "other"),
+    ("--service", "tcp/127.0.0.1:7001", "offload.services", "[tcp/127.0.0.1:7002]"),
+]
+
+
+@pytest.mark.parametrize(("option", "given", "key", "other"), OPTIONS)
+class TestAnOptionAndAnAssignment:
+    def test_contradict_each_other(
+        self, option: str, given: str, key: str, other: str, path: Path
+    ) -> None:
+        with pytest.raises(HoldfastError) as refused:
+            run_application(["run", str(path), option, given, "--set", f"{key}={other}"])
+        assert str(refused.value) == (
+            f"--set {key}={other} and {option} {given} contradict each other: both say what {key} "
+            "is; leave one of them out"
+        )
+
+    def test_may_say_the_same(
+        self, option: str, given: str, key: str, other: str, path: Path
+    ) -> None:
+        del other
+        same = f"[{given}]" if option == "--service" else given
+        arguments = ["run", str(path), option, given, "--set", f"{key}={same}"]
+        # Refused for another reason, for nothing shall run.
+        with pytest.raises(HoldfastError, match="is_missing"):
+            run_application([*arguments, "--set", "simulator.is_missing=1"])
+
+
+@pytest.mark.parametrize(
+    ("assignments", "expected"),
+    [
+        (["selector.method=random"], {"selector.method": "random"}),
+        (["offload.tls=null"], {"offload.tls": None}),
+        (["a.b=1", "a.b=1", "a.c=[x, 2]"], {"a.b": 1, "a.c": ["x", 2]}),
+        ([" a.b =text=1"], {"a.b": "text=1"}),
+    ],
+)
+def test_assignments(assignments: list[str], expected: dict[str, object]) -> None:
+    assert combined(map(parse_assignment, assignments)) == expected
+
+
+@pytest.mark.parametrize(
+    ("assignments", "message"),
+    [
+        (
+            ["a.b=1", "a.b=2"],
+            "--set a.b=1 and --set a.b=2 contradict each other: both say",
+        ),
+        (["a.b=1", "a.b=true"], "contradict each other"),
+        (["a.b"], "--set a.b: must be SECTION.KEY=VALUE"),
+        (["a=1"], "must be SECTION.KEY=VALUE"),
+        (["a.b="], "--set a.b=: has no value"),
+        (["a.b= # nothing"], "has no value"),
+        (["a.b=[1"], "--set a.b, line 1"),
+    ],
+)
+def test_assignments_that_are_refused(assignments: list[str], message: str) -> None:
+    with pytest.raises(HoldfastError) as refused:
+        combined(map(parse_assignment, assignments))
+    assert message in str(refused.value)
+
+
+def test_what_needs_a_service_is_refused_without_one(path: Path) -> None:
+    for words in (["--recovery", "never"], ["--set", "recovery.launch=never"]):
+        with pytest.raises(HoldfastError, match=f"^{' '.join(words)} needs --service"):
+            run_application(["run", str(path), *words])
