@@ -31,6 +31,7 @@ from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509 import oid
+from tests.intruder import MODES, Intruder, Mode, open_session
 from tests.ports import free_port
 from tests.processes.faults import PATIENT
 
@@ -930,6 +931,74 @@ class TestCertificates:
         robot.start(inbox)
         time.sleep(0.5)
         assert inbox.events == []
+        close_all(wire.ends)
+
+
+@pytest.mark.parametrize("mode", MODES)
+class TestOtherClients:
+    """What a client of an honest service can do to the service's robots: nothing."""
+
+    @pytest.mark.parametrize("protocol", ["tcp", "tls", "quic", "unixsock-stream"])
+    def test_nobody_passes_for_the_service(
+        self,
+        protocol: str,
+        mode: Mode,
+        socket_directory: Path,
+        robot_tls: TlsFiles,
+        service_tls: TlsFiles,
+    ) -> None:
+        encrypted = protocol in ("tls", "quic")
+        stolen = robot_tls if encrypted else None
+        wire = ZenohWire(
+            protocol,
+            socket_directory,
+            robot_tls=stolen,
+            service_tls=service_tls if encrypted else None,
+        )
+        wire.service("cloud", "b1").start(echo)
+        endpoint = wire.endpoint("cloud")
+        robot, inbox = wire.robot("cloud"), Inbox()
+        with Intruder(endpoint, mode, lambda _: b"forged", tls=stolen) as before:
+            assert before.boots == [("cloud", "b1")]
+            robot.start(inbox)
+            inbox.wait_for(Appeared("cloud", "b1"))
+            with Intruder(endpoint, mode, lambda _: b"forged", tls=stolen) as after:
+                for number in range(20):
+                    robot.call("cloud", number, b"%d" % number)
+                for number in range(20):
+                    question = b"%d" % number
+                    assert inbox.of_call(number) == [Replied(number, question), Ended(number)]
+                after.session.put("holdfast/1/cloud/b1/decide", b"published")
+                assert after.ask("holdfast/1/cloud/b1/decide") == [b"question"]
+                assert before.received == after.received == []
+                assert before.overheard == after.overheard == []
+        # Both have hung up, and took with them whatever they had said was there.
+        robot.call("cloud", 20, b"and now?")
+        assert inbox.of_call(20) == [Replied(20, b"and now?"), Ended(20)]
+        seen = [event for event in inbox.events if isinstance(event, Appeared | Vanished)]
+        assert seen == [Appeared("cloud", "b1")]
+        close_all(wire.ends)
+
+    def test_a_robot_that_listens_hands_nothing_on(
+        self, mode: Mode, socket_directory: Path
+    ) -> None:
+        wire = ZenohWire("unixsock-stream", socket_directory, robot_listens=True)
+        received: list[bytes] = []
+
+        def serve(call: IncomingCall) -> None:
+            received.append(call.payload)
+            echo(call)
+
+        robot, inbox = wire.robot("cloud"), Inbox()
+        robot.start(inbox)
+        wire.service("cloud", "b1").start(serve)
+        inbox.wait_for(Appeared("cloud", "b1"))
+        with open_session(wire.endpoint("cloud"), mode) as other:
+            for key in ("holdfast/1/cloud/b1/decide", "**"):
+                assert list(other.get(key, payload=b"stranger", timeout=PATIENCE_S)) == []
+            robot.call("cloud", 1, b"friend")
+            assert inbox.of_call(1) == [Replied(1, b"friend"), Ended(1)]
+        assert received == [b"friend"]
         close_all(wire.ends)
 
 

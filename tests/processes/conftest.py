@@ -35,3 +35,14 @@ def site(tmp_path: Path) -> Iterator[Site]:
 def references(tmp_path_factory: pytest.TempPathFactory) -> References:
     """Return the runs without faults."""
     return References(tmp_path_factory.mktemp("references"))
+
+
+@pytest.fixture(scope="session")
+def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a directory with the keys of a robot and a service, and of strangers."""
+    directory = tmp_path_factory.mktemp("keys")
+    with Site(directory) as site:
+        for name in ("ours", "theirs"):
+            made = site.holdfast("keys", directory / name)
+            assert made.process.returncode == 0, made.account()
+    return directory

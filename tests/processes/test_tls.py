@@ -27,17 +27,6 @@ from tests.processes.faults import (
 PEG = "peg_in_hole_2d"
 
 
-@pytest.fixture(scope="module")
-def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a directory with the keys of a robot and a service, and of strangers."""
-    directory = tmp_path_factory.mktemp("keys")
-    with Site(directory) as site:
-        for name in ("ours", "theirs"):
-            made = site.holdfast("keys", directory / name)
-            assert made.process.returncode == 0, made.account()
-    return directory
-
-
 def secure(site: Site, keys: Path, protocol: str, authority: str = "ours") -> Service:
     directory = keys / authority / "service"
     return site.service(

@@ -27,6 +27,12 @@ What holds here was measured, not read:
   price: while callbacks block, nothing is seen of other links (two clients that did not read what
   was sent to them from a callback cut all others off); so callbacks send nothing.
 - ``connect/timeout_ms`` stays at its default: 0 would mean one attempt and no other.
+- A session passes on to the others what one client declares. So a client of an honest service, with
+  any robot's certificate, could declare the service's own keys and answer other robots in its
+  place. Zenoh's access control prevents that at both ends: what is not needed to see a service, to
+  ask it and to be answered is dropped, in both directions (``_access``). Its rules cannot be
+  changed while a session is open, and a rule for some clients applies only to those that match all
+  that it says of them; so these rules are the same for everybody.
 - ``close`` can take ten seconds when a peer has vanished, so it runs aside and is not waited for. A
   process that ends without it can be aborted in a callback, so it is also called at exit.
 """
@@ -72,6 +78,13 @@ __all__ = ["KEY_VERSION", "ZenohRobotTransport", "ZenohServiceTransport"]
 
 KEY_VERSION = 1
 """Of the keys. The messages have a version of their own, which can be told to the other end."""
+
+_PREFIX = f"holdfast/{KEY_VERSION}"
+"""Of all keys."""
+
+_FROM_ROBOT = ("query", "liveliness_query", "declare_liveliness_subscriber")
+_FROM_SERVICE = ("declare_queryable", "liveliness_token", "reply")
+"""Kinds of message, in the words of Zenoh's access control, that either end has use for."""
 
 _THREADS = (
     "(acc: (handover: app), net: (handover: app), rx: (handover: app), app: (worker_threads: 2))"
@@ -333,6 +346,7 @@ class ZenohRobotTransport:
         session, _ = _opened(
             listen=[place] if listens else [],
             connect=[] if listens else [place],
+            access=_access(coming=_FROM_SERVICE, going=_FROM_ROBOT),
             lease_ms=self._lease_ms,
             max_received_bytes=self._max_message_bytes + _HEADER_BYTES,
             tls=self._tls,
@@ -340,7 +354,7 @@ class ZenohRobotTransport:
         with self._calls.lock:
             link.session = session  # before anybody can appear and be called
         session.liveliness().declare_subscriber(
-            f"holdfast/{KEY_VERSION}/{link.address.name or '*'}/*/alive",
+            f"{_PREFIX}/{link.address.name or '*'}/*/alive",
             zenoh.handlers.Callback(partial(self._token_changed, link, generation), indirect=False),
             history=True,
         )
@@ -668,7 +682,7 @@ class ZenohServiceTransport:
             )
         self._listen = [_checked(endpoint, tls, listens=True) for endpoint in listen]
         self._connect = [_checked(endpoint, tls, listens=False) for endpoint in connect]
-        self._prefix = f"holdfast/{KEY_VERSION}/{name}/{boot}"
+        self._prefix = f"{_PREFIX}/{name}/{boot}"
         self._key = zenoh.KeyExpr(f"{self._prefix}/decide")
         self._lease_ms = lease_ms
         self._max_message_bytes = max_message_bytes
@@ -705,6 +719,7 @@ class ZenohServiceTransport:
         self._session, self._listen = _opened(
             listen=self._listen,
             connect=self._connect,
+            access=_access(coming=_FROM_ROBOT, going=_FROM_SERVICE),
             lease_ms=self._lease_ms,
             max_received_bytes=_LARGEST_MESSAGE_BYTES,
             tls=self._tls,
@@ -864,6 +879,7 @@ def _opened(
     *,
     listen: list[Endpoint],
     connect: list[Endpoint],
+    access: dict[str, object],
     lease_ms: float,
     max_received_bytes: int,
     tls: TlsFiles | None,
@@ -877,7 +893,7 @@ def _opened(
             each if each.port or each.is_local_socket else each.with_port(free_port(each))
             for each in listen
         ]
-        configuration = _configuration(places, connect, lease_ms, max_received_bytes, tls)
+        configuration = _configuration(places, connect, access, lease_ms, max_received_bytes, tls)
         try:
             return zenoh.open(configuration), places
         except zenoh.ZError as error:
@@ -899,9 +915,36 @@ def _reason(error: zenoh.ZError) -> str:
     return found[1].strip() if found else re.sub(r" at /\S+", "", text)
 
 
+def _access(*, coming: Sequence[str], going: Sequence[str]) -> dict[str, object]:
+    """Return Zenoh's access control: these kinds of message, on our keys, and nothing else.
+
+    Parameters
+    ----------
+    coming, going : sequence of str
+        Kinds of message from the other ends, and to them.
+    """
+    return {
+        "enabled": True,
+        "default_permission": "deny",
+        "rules": [
+            {
+                "id": flow,
+                "flows": [flow],
+                "messages": list(messages),
+                "key_exprs": [f"{_PREFIX}/**"],
+                "permission": "allow",
+            }
+            for flow, messages in (("ingress", coming), ("egress", going))
+        ],
+        "subjects": [{"id": "everybody"}],
+        "policies": [{"rules": ["ingress", "egress"], "subjects": ["everybody"]}],
+    }
+
+
 def _configuration(
     listen: list[Endpoint],
     connect: list[Endpoint],
+    access: dict[str, object],
     lease_ms: float,
     max_received_bytes: int,
     tls: TlsFiles | None,
@@ -945,6 +988,7 @@ def _configuration(
             "retry": retry,
         },
         "open": {"return_conditions": {"connect_scouted": False}},
+        "access_control": access,
         "transport": {
             "unicast": {
                 "open_timeout": _OPEN_TIMEOUT_MS,
