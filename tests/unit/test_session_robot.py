@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+import itertools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -649,6 +650,87 @@ def test_a_problem_that_every_service_refuses_stops_the_robot() -> None:
     assert world.stopped is not None
     assert isinstance(world.stopped.error, ServiceRefusedError)
     assert "policy gives nan" in str(world.stopped.error)
+
+
+def fails_in_its_sensing_part(service: SmallService, code: str, calls: int = 10**9) -> None:
+    """Let a service give the task part and refuse the sensing part after it, for so many calls."""
+    left = [calls]
+
+    def rule(request: Request) -> list[Reply] | None:
+        service.rule = lambda _: None
+        replies = service.answer(encode(request))
+        service.requests.pop()
+        service.rule = rule
+        if left[0] > 0 and isinstance(replies[0], TaskAnswer):
+            left[0] -= 1
+            return [replies[0], Refused(request.number, code, "observation_mean raised")]
+        return replies
+
+    service.rule = rule
+
+
+@pytest.mark.parametrize("code", ["failed", "out_of_memory"])
+@pytest.mark.parametrize("launch", ["on_failure", "never"])
+def test_a_sensing_part_that_fails_after_its_task_part_stops_the_robot(
+    code: str, launch: str
+) -> None:
+    world = World(launch=launch)
+    for service in world.services.values():
+        fails_in_its_sensing_part(service, code)
+    world.start()
+    world.run()
+    assert world.stopped is not None
+    assert isinstance(world.stopped.error, ServiceRefusedError)
+    asked = ["cloud"] if launch == "never" else ["cloud", LOCAL]
+    for name in asked:
+        assert f"{name}: {code}: observation_mean raised" in str(world.stopped.error)
+        told = [each for each in world.reports("refused") if each["service"] == name]
+        assert [each["final"] for each in told] == [False] * (len(told) - 1) + [True]
+        assert len(told) <= 5
+    # What was not refused was performed, and nobody guessed the rest.
+    assert [step for step, _ in world.acted] == list(range(4))
+
+
+def test_who_fails_in_its_sensing_part_leaves_the_rest_to_another_service() -> None:
+    world = World(services=("broken", "sound"))
+    fails_in_its_sensing_part(world.services["broken"], "failed")
+    world.start()
+    world.run()
+    world.assert_same_as_without_faults()
+    told = world.reports("refused")
+    assert [(each["service"], each["final"]) for each in told] == [
+        ("broken", False),
+        ("broken", False),
+        ("broken", True),
+    ]
+    assert world.statuses() == []
+
+
+def test_out_of_memory_for_a_while_is_asked_again_ever_later() -> None:
+    world = World(launch="never")
+    fails_in_its_sensing_part(world.services["cloud"], "out_of_memory", calls=4)
+    world.start()
+    world.run()
+    world.assert_same_as_without_faults()
+    told = [at for at, e in world.trace if isinstance(e, Report) and e.name == "refused"]
+    waits = [after - before for before, after in itertools.pairwise(told)]
+    assert len(waits) == 3
+    assert all(later > 1.5 * wait for wait, later in itertools.pairwise(waits))
+    assert waits[0] > 0.1
+    reasons = {str(each["reason"]) for each in world.reports("holding")}
+    assert reasons == {"cloud: out_of_memory: observation_mean raised"}
+
+
+def test_an_answer_clears_earlier_refusals_of_the_same_part() -> None:
+    world = World(launch="never")
+    refuse = {5, 6, 8, 9, 11, 12}
+    world.services["cloud"].rule = lambda r: (
+        [Refused(r.number, "failed", "policy gives nan")] if nth(r) in refuse else None
+    )
+    world.start()
+    world.run()
+    world.assert_same_as_without_faults()
+    assert len(world.reports("refused")) == len(refuse)
 
 
 def test_a_stale_epoch_stops_the_robot() -> None:

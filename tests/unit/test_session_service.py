@@ -747,6 +747,13 @@ class TestRefusals:
             ),
             (RuntimeError("\ud800 half a pair"), "failed", "RuntimeError: ? half a pair"),
             (ValueError("x" * 10_000), "failed", "ValueError: xxx"),
+            (
+                MemoryError("Unable to allocate 7 GiB"),
+                "out_of_memory",
+                "out of memory for a decision of particle_filter.num_particles 20 x "
+                "active_sensing.num_observation_samples 2 x 2 sensing actions x "
+                "active_sensing.horizon 1: MemoryError: Unable to allocate 7 GiB",
+            ),
         ],
     )
     @pytest.mark.parametrize("where", ["policy", "observation_mean"])

@@ -88,12 +88,15 @@ class Call:
         return self.task or self.sensing
 
     @property
+    def lacks_sensing(self) -> bool:
+        """Whether the sensing part is what comes next of it."""
+        return self.task or self.question.task_count == 0
+
+    @property
     def finished(self) -> bool:
         """Whether all of it has."""
         question = self.question
-        return (self.task or question.task_count == 0) and (
-            self.sensing or question.sensing_step is None
-        )
+        return self.lacks_sensing and (self.sensing or question.sensing_step is None)
 
 
 class Calls:

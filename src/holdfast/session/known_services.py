@@ -25,6 +25,11 @@ _FIRST_RETRY_S = 0.02
 _LAST_RETRY_S = 1.0
 _MAX_REFUSALS = 3
 
+_OUT_OF_MEMORY = "out_of_memory"
+_MAX_OUT_OF_MEMORY = 5
+_OUT_OF_MEMORY_RETRY_S = 0.1
+"""What another robot's decision takes is given back soon: more tries, further apart."""
+
 _MAX_REPLAYED_STEPS = 1024
 """A trial longer than this is not planned again for a service that knows nothing of it."""
 
@@ -84,8 +89,11 @@ class KnownService:
         The trial and the number of observations of the last state that it is known to hold.
     drifts : int
         Times in a row that it came to another state than the robot.
-    refusals : int
-        Since its last answer.
+    task_refusals, sensing_refusals : int
+        Of each part of an answer, since it last gave that part. A problem can fail in one part
+        alone, so the other part says nothing of it.
+    complaint : str or None
+        What it refused last with, since such a part.
     refused, refused_code : str or None, str
         Why it is asked no more.
     retry_at : float
@@ -100,6 +108,7 @@ class KnownService:
     __slots__ = (
         "acknowledged",
         "backoff_s",
+        "complaint",
         "detector",
         "drifts",
         "last_boot",
@@ -110,10 +119,11 @@ class KnownService:
         "name",
         "num_busy",
         "opened",
-        "refusals",
         "refused",
         "refused_code",
         "retry_at",
+        "sensing_refusals",
+        "task_refusals",
         "tell_busy_at",
     )
 
@@ -134,7 +144,8 @@ class KnownService:
         self.opened = False
         self.acknowledged: tuple[int, int] | None = None
         self.drifts = 0
-        self.refusals = 0
+        self.task_refusals = self.sensing_refusals = 0
+        self.complaint: str | None = None
         self.refused: str | None = None
         self.refused_code = ""
         self.retry_at = 0.0
@@ -181,21 +192,28 @@ class KnownService:
                 return self.late_soonest_s
         return None
 
-    def note_answer(self, question: Question, now: float, *, restored: bool) -> None:
-        """Take note of an answer: it lives and holds the question's state.
+    def note_answer(self, question: Question, now: float, *, sensing: bool, restored: bool) -> None:
+        """Take note of a part of an answer: it lives and holds the question's state.
 
         Parameters
         ----------
         question : Question
         now : float
+        sensing : bool
+            Whether it is the sensing part.
         restored : bool
             Whether it was sent the state.
         """
         self.detector.heard(now)
         self.opened = True
-        self.refusals = 0
+        if sensing:
+            self.sensing_refusals = 0
+        else:
+            self.task_refusals = 0
         self.retry_at = 0.0
-        self.backoff_s = _FIRST_RETRY_S
+        if not self.task_refusals and not self.sensing_refusals:
+            self.backoff_s = _FIRST_RETRY_S
+            self.complaint = None
         if not restored:
             self.drifts = 0
         holds = (question.state.trial, question.num_observations)
@@ -217,10 +235,28 @@ class KnownService:
         if differs:
             self.drifts += 1
 
-    def note_refusal(self, code: str, text: str) -> bool:
-        """Take note of a refusal; True if it is asked no more."""
-        self.refusals += 1
-        final = code in _FINAL_REFUSALS or self.refusals >= _MAX_REFUSALS
+    def note_refusal(self, code: str, text: str, now: float, *, sensing: bool) -> bool:
+        """Take note of a refusal, which delays it; True if it is asked no more.
+
+        Parameters
+        ----------
+        code, text : str
+        now : float
+        sensing : bool
+            Whether it refuses the sensing part; the task part may have come.
+        """
+        most = _MAX_REFUSALS
+        if code == _OUT_OF_MEMORY:
+            most = _MAX_OUT_OF_MEMORY
+            self.backoff_s = max(self.backoff_s, _OUT_OF_MEMORY_RETRY_S)
+        self.delay(now)
+        if sensing:
+            self.sensing_refusals += 1
+        else:
+            self.task_refusals += 1
+        self.complaint = f"{code}: {text}"
+        refusals = self.sensing_refusals if sensing else self.task_refusals
+        final = code in _FINAL_REFUSALS or refusals >= most
         if final:
             self.refused = text
             self.refused_code = code
@@ -329,7 +365,7 @@ class KnownServices:
                 absent = "is not there" if service.detector.seen else "has not appeared"
                 why = "is being launched" if service is self.local else absent
             else:
-                why = service.detector.suspicion or "is busy"
+                why = service.detector.suspicion or service.complaint or "is busy"
             reasons.append(f"{service.name}: {why}")
         return "; ".join(reasons)
 
@@ -340,6 +376,7 @@ class KnownServices:
             + (
                 service.refused
                 or service.detector.suspicion
+                or service.complaint
                 or ("is busy" if service.detector.present else None)
                 or ("is gone" if service.detector.seen else "has not appeared")
             )

@@ -312,8 +312,9 @@ class Refused(msgspec.Struct, array_like=True, frozen=True, tag=6):
         Of the request; 0 if that could not be read.
     code : str
         ``damaged`` (on its way: it may be sent again), ``malformed``, ``too_large``, ``version``,
-        ``stale_epoch``, ``unknown_problem``, ``invalid`` (settings or state out of bounds) or
-        ``failed`` (the problem's own functions failed in this state).
+        ``stale_epoch``, ``unknown_problem``, ``invalid`` (settings or state out of bounds),
+        ``out_of_memory`` (it may be asked again) or ``failed`` (the problem's own functions failed
+        in this state).
     text : str
         For a person.
     """

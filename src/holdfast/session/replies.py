@@ -124,7 +124,7 @@ class Replies:
         if isinstance(reply, Busy):
             self._was_busy(service, reply, now)
         else:
-            self._was_refused(service, reply, now)
+            self._was_refused(call, reply, now)
         return News.NOTHING
 
     def _note_lateness(self, call: Call, now: float) -> None:
@@ -170,7 +170,8 @@ class Replies:
             call.task = True
         else:
             call.sensing = True
-        service.note_answer(question, now, restored=call.restores)
+        sensing = isinstance(reply, SensingAnswer)
+        service.note_answer(question, now, sensing=sensing, restored=call.restores)
         for earlier in self._calls.to(service):
             if earlier.number < call.number:
                 # Whatever became of it, nothing is awaited of it any more.
@@ -192,8 +193,7 @@ class Replies:
         service.note_lost_state(differs=reply.differs)
         if call.opens and call.restores:
             # It was handed everything and asks for it again.
-            service.delay(now)
-            self._refusal(service, "need_state", "asks again for a state that it was sent")
+            self._refusal(call, "need_state", "asks again for a state that it was sent", now)
             return News.NOTHING
         # Told everything but the state, it came to another one: only the state will do.
         return News.LACKS_STATE if reply.differs or call.opens else News.LACKS
@@ -209,21 +209,23 @@ class Replies:
                 times=service.num_busy,
             )
 
-    def _was_refused(self, service: KnownService, reply: Refused, now: float) -> None:
+    def _was_refused(self, call: Call, reply: Refused, now: float) -> None:
+        service = call.service
         if reply.code == "stale_epoch":
             raise StaleEpochError(
                 f"{service.name}: {reply.text}; another process has resumed this run, "
                 "so this one stops"
             )
-        service.delay(now)
         if reply.code == "damaged":
+            service.delay(now)
             self._report("damaged_request", service=service.name, reason=reply.text)
             return
         service.note_lost_state(differs=False)
-        self._refusal(service, reply.code, reply.text)
+        self._refusal(call, reply.code, reply.text, now)
 
-    def _refusal(self, service: KnownService, code: str, text: str) -> None:
-        final = service.note_refusal(code, text)
+    def _refusal(self, call: Call, code: str, text: str, now: float) -> None:
+        service = call.service
+        final = service.note_refusal(code, text, now, sensing=call.lacks_sensing)
         self._report("refused", service=service.name, code=code, reason=text, final=final)
 
     def _report(self, name: str, **fields: object) -> None:

@@ -184,7 +184,7 @@ class Service:
             typical = session.built
             session.built = session.built or outcome.problem is not None
             if outcome.failure is not None or outcome.lacks_state:
-                self._failed(work, outcome, now)
+                self._failed(work, outcome)
             else:
                 if typical:
                     computed_s = now - work.started_at
@@ -450,18 +450,13 @@ class Service:
 
     # -- outcomes --------------------------------------------------------------------------------
 
-    def _failed(self, work: Work, outcome: Outcome, now: float) -> None:
+    def _failed(self, work: Work, outcome: Outcome) -> None:
         session = work.session
         for record in self._calls.released(work):
             if outcome.failure is None:
                 self._calls.need_state(record.call, record.number, differs=outcome.differs)
             else:
-                code, text = outcome.failure
-                if code == "busy":
-                    number, key = record.number, session.key
-                    self._turn_away(record.call, number, key, now, _NO_ROOM_RETRY_MS)
-                else:
-                    self._calls.refuse(record.call, record.number, code, text)
+                self._calls.refuse(record.call, record.number, *outcome.failure)
         if not session.built:
             # Nothing can ever come of it.
             self._forget(session, "refused")

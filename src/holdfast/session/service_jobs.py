@@ -196,8 +196,11 @@ class Job:
         except _LacksStateError as lack:
             differs = lack.differs or self._state is not None
             return Outcome(lacks_state=True, differs=differs, problem=problem)
-        except MemoryError:
-            return Outcome(failure=("busy", ""), problem=problem)
+        except MemoryError as error:
+            text = _account(error, self._describe_error)
+            asked = _work_in_words(problem, self._planning)
+            text = f"out of memory for a decision of {asked}: {text}"
+            return Outcome(failure=("out_of_memory", text), problem=problem)
         except MessageError as error:
             return Outcome(failure=(error.code, str(error)), problem=problem)
         except HoldfastError as error:
@@ -293,9 +296,7 @@ def _check_work(problem: Problem, planning: PlanningSettings, limits: ServiceLim
     work = count * sensing.num_observation_samples * actions * sensing.horizon
     if work > limits.max_work:
         raise InvalidValueError(
-            f"a decision of {work} units of work (particle_filter.num_particles {count} x "
-            f"active_sensing.num_observation_samples {sensing.num_observation_samples} x "
-            f"{actions} sensing actions x active_sensing.horizon {sensing.horizon}): this "
+            f"a decision of {work} units of work ({_work_in_words(problem, planning)}): this "
             f"service takes at most {limits.max_work} (max_work)"
         )
     if problem.action_size > _MAX_ACTION_SIZE:
@@ -303,6 +304,17 @@ def _check_work(problem: Problem, planning: PlanningSettings, limits: ServiceLim
             f"action_size of {problem.name} is {problem.action_size}: a service takes at most "
             f"{_MAX_ACTION_SIZE}"
         )
+
+
+def _work_in_words(problem: Problem | None, planning: PlanningSettings) -> str:
+    """Say what a decision's size follows from, by the keys of the configuration."""
+    sensing = planning.active_sensing
+    actions = "" if problem is None else f"{len(problem.sensing_actions)} sensing actions x "
+    return (
+        f"particle_filter.num_particles {planning.particle_filter.num_particles} x "
+        f"active_sensing.num_observation_samples {sensing.num_observation_samples} x "
+        f"{actions}active_sensing.horizon {sensing.horizon}"
+    )
 
 
 def _account(error: BaseException, describe: Callable[[BaseException], str]) -> str:
