@@ -113,7 +113,8 @@ def test_random_is_a_rival_in_success(compared: Report) -> None:
     for (_, way), row in against_random.items():
         gain = -0.5 if way == "state entropy, mixture" else 0.0
         assert row["success_gain"] == pytest.approx(gain)
-        assert (number_of(row["adjusted_p_value"]) < selectors.LEVEL) == (gain != 0.0)
+        # Half of 20 trials, by the t-test, among 280 rows.
+        assert (number_of(row["adjusted_p_value"]) < 0.1) == (gain != 0.0)
     # What the default gains is told of each problem, whether or not a difference was found.
     told = [
         finding
