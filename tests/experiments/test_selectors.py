@@ -11,6 +11,7 @@ from tests.experiments.made_up import noise, results_of
 from holdfast.experiments import parameters, selectors
 from holdfast.experiments.cases import CASES
 from holdfast.experiments.study import Report, Scale
+from holdfast.experiments.tables import number_of
 from holdfast.experiments.tasks import Task
 
 SCALE = Scale(seed=5)
@@ -101,6 +102,28 @@ def test_rivals_and_sentences(compared: Report) -> None:
     assert not [told for told in compared.findings if "covariance against state entropy, n" in told]
 
 
+def test_random_is_a_rival_in_success(compared: Report) -> None:
+    """Whoever chooses by the entropy of states by a mixture fails in every second trial."""
+    against_random = {
+        (row["problem"], row["way"]): row
+        for row in compared.summary["rivals_in_success"].rows()
+        if row["rival"] == selectors.BASELINE
+    }
+    assert len(against_random) == 7 * (len(CASES) + len(selectors._GROUPS))
+    for (_, way), row in against_random.items():
+        gain = -0.5 if way == "state entropy, mixture" else 0.0
+        assert row["success_gain"] == pytest.approx(gain)
+        # Half of 20 trials, by the t-test, among 280 rows.
+        assert (number_of(row["adjusted_p_value"]) < 0.1) == (gain != 0.0)
+    # What the default gains is told of each problem, whether or not a difference was found.
+    told = [
+        finding
+        for finding in compared.findings
+        if "action entropy, neighbours against random: +0.0 points of success" in finding
+    ]
+    assert len(told) == len(CASES) + len(selectors._GROUPS)
+
+
 def test_how_each_problem_is_posed(compared: Report) -> None:
     rows = list(compared.summary["cases"].rows())
     assert [row["problem"] for row in rows] == [case.name for case in CASES]
@@ -128,6 +151,46 @@ def test_costs_of_looks(compared: Report) -> None:
         assert cheap["trials"] == round(case.share * 40) // 2
 
 
+def begins_in_the_goal(task: Task, number: int) -> bool:
+    return number == 3 and task.parameters["model"] == {"hole_tolerance": 0.05}
+
+
+def test_a_trial_that_begins_in_the_goal_says_nothing_of_steps(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """It takes no step, whatever is sensed; every other trial is compared as ever."""
+
+    def trial(task: Task, number: int) -> tuple[bool, int, float]:
+        steps = round(10_000 * math.exp(0.3 * noise(task, number, ["problem", "planning"])))
+        return True, 0 if begins_in_the_goal(task, number) else steps, 0.0
+
+    def without_it(task: Task, number: int) -> tuple[bool, int, float]:
+        success, steps, reward = trial(task, number)
+        return success, steps or 10_000, reward
+
+    for study, module, tables in (
+        (selectors.Selectors(), selectors, ("selectors", "relative_steps", "rivals")),
+        (parameters.Parameters(), parameters, ("parameters", "together")),
+    ):
+        monkeypatch.setattr(module, "_TRIALS", 40)
+        report, other = (
+            study.report(SCALE, results_of(study, SCALE, each)) for each in (trial, without_it)
+        )
+        for name in tables:
+            rows = zip(report.summary[name].rows(), other.summary[name].rows(), strict=True)
+            for row, whole in rows:
+                ratio = number_of(row["steps_ratio"])
+                assert math.isfinite(ratio), row
+                levels = [number_of(row[each]) for each in row if each.endswith("p_value")]
+                assert all(0.0 <= level <= 1.0 for level in levels), row
+                if "problem" in row and row["problem"] not in (*selectors._GROUPS, "tight hole"):
+                    assert ratio == whole["steps_ratio"]
+        for finding in report.findings:
+            assert "nan" not in finding
+        if name == "rivals":
+            assert {row["trials"] for row in report.summary[name].rows()} == {19, 20, 39, 40}
+
+
 def test_what_a_parameter_does(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(parameters, "_TRIALS", 40)
 
@@ -140,6 +203,10 @@ def test_what_a_parameter_does(monkeypatch: pytest.MonkeyPatch) -> None:
             factor = 0.25
         if selector_of(task)["estimator"] != "nearest_neighbor":
             factor = 2.0
+        # Ten times what the problem has; the fewest are 100.
+        particles = task.parameters["planning"]["particle_filter"]["num_particles"]
+        if factor == 1.0 and particles in (1000, 2000, 5000):
+            factor = 0.9
         return True, round(10_000 * world * own * factor), 0.0
 
     study = parameters.Parameters()
@@ -150,6 +217,8 @@ def test_what_a_parameter_does(monkeypatch: pytest.MonkeyPatch) -> None:
             expected = 0.5
         if (row["problem"], row["parameter"], row["value"]) == ("peg in space", "k", "20"):
             expected = 0.25
+        if row["value"] == "x 10" and row["parameter"] == "particles":
+            expected = {"neighbours": 0.9}.get(str(row["estimator"]), 1.0)
         assert row["steps_ratio"] == pytest.approx(expected, rel=0.08)
     # In each problem, and over all of them, each with the same weight.
     told = [finding for finding in report.findings if "horizon 3:" in finding]
@@ -168,6 +237,12 @@ def test_what_a_parameter_does(monkeypatch: pytest.MonkeyPatch) -> None:
         "points of success of the reference of the neighbours (geometric mean and mean, n = 20"
         in said
     )
+    more = list(report.summary["more_particles"].rows())
+    assert [row["problem"] for row in more] == [*parameters._CASES, parameters._TOGETHER]
+    assert {(row["from"], row["to"]) for row in more} == {("x 3", "x 10")}
+    for row in more:
+        assert row["steps_ratio"] == pytest.approx(0.9, rel=0.08)
+    assert any("particles x 10 instead of x 3: 0.9" in each for each in report.findings)
     assert report.findings[-1].startswith("no difference in steps beyond noise")
     assert "horizon (neighbours)" not in report.findings[-1]
     assert "M (neighbours) (least p" in report.findings[-1]

@@ -12,6 +12,7 @@ from holdfast.experiments.statistics import (
     agreement_of_means,
     agreement_of_rates,
     cells_of,
+    logarithms_of_steps,
     mean_interval,
     paired_difference,
     paired_rates,
@@ -52,6 +53,27 @@ def test_paired_difference_takes_the_worlds_out() -> None:
     assert paired_difference(worlds, worlds) == ((0.0, 0.0, 0.0), 1.0)
     with pytest.raises(InvalidValueError, match="400 and 399"):
         paired_difference(worlds, worlds[1:])
+
+
+def test_trials_that_begin_in_the_goal_do_not_take_part_in_ratios() -> None:
+    """They take no step whatever is sensed, and have no ratio."""
+    first = np.array([0.0, 12.0, 20.0, 0.0, 9.0])
+    second = np.array([0.0, 24.0, 30.0, 0.0, 18.0])
+    moved = first > 0.0
+    found = paired_difference(logarithms_of_steps(first), logarithms_of_steps(second))
+    assert found == paired_difference(np.log(first[moved]), np.log(second[moved]))
+    assert found[0].low < math.log(0.55) < found[0].high
+    assert 0.0 < found[1] < 0.05
+    # Where no step is taken at all there is nothing to compare, which is not the same as no
+    # difference.
+    interval, p_value = paired_difference(*(logarithms_of_steps(np.zeros(3)) for _ in range(2)))
+    assert all(map(math.isnan, (*interval, p_value)))
+
+
+def test_the_same_world_begins_in_the_goal_for_both() -> None:
+    first, second = (logarithms_of_steps(np.array(steps)) for steps in ([3.0, 0.0], [3.0, 5.0]))
+    with pytest.raises(InvalidValueError, match="pair 1 has one number"):
+        paired_difference(first, second)
 
 
 def test_paired_rates_are_mcnemars() -> None:

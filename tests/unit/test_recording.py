@@ -13,12 +13,13 @@ import msgspec
 import numpy as np
 import pytest
 import scipy.stats
+from matplotlib.figure import Figure
 from matplotlib.image import imread
 
 from holdfast.configuration import Configuration, load
 from holdfast.files import OutputError, write_atomically
 from holdfast.outcome import Decisions, TrialResult
-from holdfast.recording.figure import trial_figure
+from holdfast.recording.figure import _draw_workspace, trial_figure
 from holdfast.recording.journal import Journal
 from holdfast.recording.recorder import MAX_PARTICLES_KEPT, Recorder
 from holdfast.recording.run_directory import (
@@ -549,3 +550,30 @@ class TestFigure:
         recorder = TestRecorder.record(configuration, trial=0)
         trial_figure(configuration, recorder.record, tmp_path / "trial.png")
         assert (tmp_path / "trial.png").read_bytes().startswith(b"\x89PNG\r\n")
+
+    @pytest.mark.parametrize(
+        "points",
+        [
+            pytest.param([(4.5, 3.5), (-0.9, -0.9)], id="far from where anything happened"),
+            pytest.param([(30.0, 1.0), (2.0, -12.0)], id="outside the scene's limits"),
+        ],
+    )
+    def test_points_of_interest_are_seen(
+        self, tmp_path: Path, points: list[tuple[float, float]]
+    ) -> None:
+        configuration = load(EXAMPLES / "light_dark_room.yaml")
+        record = TestRecorder.record(configuration, trial=0).record
+        scene = configuration.problem.scene()
+        assert scene is not None
+        # Short of the lamp and of the door: nothing but the points makes the drawn part large.
+        for rows in (record.true_states, record.estimates, record.standard_deviations):
+            del rows[3:]
+        del record.sensing[1:]
+        scene.points, scene.goal = np.array(points), None
+        panel = Figure().subplots()
+        _draw_workspace(panel, configuration.problem, scene, record)
+        (x_min, x_max), (y_min, y_max) = panel.get_xlim(), panel.get_ylim()
+        for x, y in points:
+            # The whole of the mark, not its edge.
+            assert x_min < x < x_max
+            assert y_min < y < y_max

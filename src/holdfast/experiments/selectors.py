@@ -10,7 +10,7 @@ hundred.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -61,6 +61,8 @@ that they are the executed ones."""
 
 BASELINE = "random"
 
+_CHOOSING = tuple(way for way in WAYS if WAYS[way].method not in ("random", "fixed"))
+
 _DEFAULT = "action entropy, neighbours"
 """The project's; how it compares is told whether or not a difference was found."""
 
@@ -107,9 +109,10 @@ class Selectors:
         summary = _summary(tables)
         logarithms = _of_trials(tables, _logarithms)
         relative_steps = _relative_steps(logarithms)
-        rivals = _rivals(logarithms, "steps_ratio", statistics.ratio_of)
+        rivals = _rivals(_CHOOSING, logarithms, "steps_ratio", statistics.ratio_of)
         successes = _of_trials(tables, lambda table: table.numbers("success"))
-        rivals_in_success = _rivals(successes, "success_gain", _as_it_is)
+        # In steps all are compared with the baseline already.
+        rivals_in_success = _rivals((BASELINE, *_CHOOSING), successes, "success_gain", _as_it_is)
         costs = _costs(tables)
         report.raw["selectors"] = raw
         report.summary |= {
@@ -207,7 +210,7 @@ def _summary(tables: Mapping[_Cell, Table]) -> Table:
         )
         row |= statistics.cells_of("reward_gain", difference)
         difference, row["steps_p_value"] = statistics.paired_difference(
-            np.log(table.numbers("steps")), np.log(baseline.numbers("steps"))
+            _logarithms(table), _logarithms(baseline)
         )
         row |= statistics.cells_of("steps_ratio", statistics.ratio_of(difference))
         rows.append(row)
@@ -245,7 +248,7 @@ def _of_trials(
 
 
 def _logarithms(table: Table) -> FloatArray:
-    return np.asarray(np.log(table.numbers("steps")))
+    return statistics.logarithms_of_steps(table.numbers("steps"))
 
 
 def _relative_steps(logarithms: _Trials) -> Table:
@@ -263,9 +266,8 @@ def _relative_steps(logarithms: _Trials) -> Table:
     )
 
 
-def _rivals(trials: _Trials, name: str, shown: _Shown) -> Table:
-    """Return how each way that chooses differs from each other one, everywhere."""
-    choosing = [way for way in WAYS if WAYS[way].method not in ("random", "fixed")]
+def _rivals(ways: Sequence[str], trials: _Trials, name: str, shown: _Shown) -> Table:
+    """Return how each of some ways differs from each of those before it, everywhere."""
     return _compared(
         (
             {"problem": case, "way": way, "rival": rival},
@@ -275,8 +277,8 @@ def _rivals(trials: _Trials, name: str, shown: _Shown) -> Table:
             trials[case, rival],
         )
         for case in (*_CASES, *_GROUPS)
-        for number, way in enumerate(choosing)
-        for rival in choosing[:number]
+        for number, way in enumerate(ways)
+        for rival in ways[:number]
     )
 
 
@@ -294,7 +296,7 @@ def _compared(
         rows.append(
             {
                 **names,
-                "trials": own.size,
+                "trials": int(np.count_nonzero(~np.isnan(own))),
                 **statistics.cells_of(name, shown(difference)),
                 "p_value": p_value,
             }
@@ -390,8 +392,9 @@ def _findings(
 
 
 def _is_about_the_default(row: Mapping[str, Cell]) -> bool:
-    """Tell whether a row compares the default over several problems."""
-    return row["problem"] in _GROUPS and _DEFAULT in (row["way"], row["rival"])
+    """Tell whether a row compares the default over several problems, or anywhere with random."""
+    pair = (row["way"], row["rival"])
+    return _DEFAULT in pair and (row["problem"] in _GROUPS or BASELINE in pair)
 
 
 def _is_sure(row: Mapping[str, Cell]) -> bool:

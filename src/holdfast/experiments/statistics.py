@@ -26,6 +26,7 @@ __all__ = [
     "agreement_of_means",
     "agreement_of_rates",
     "cells_of",
+    "logarithms_of_steps",
     "mean_interval",
     "paired_difference",
     "paired_rates",
@@ -78,30 +79,62 @@ def mean_interval(values: FloatArray) -> Interval:
     return Interval(mean, mean - half, mean + half)
 
 
+def logarithms_of_steps(steps: FloatArray) -> FloatArray:
+    """Return the logarithms of numbers of steps, whose paired differences are ratios.
+
+    A trial that begins in the goal takes no step, whatever would have been sensed. So it takes none
+    in any run of the same worlds: it has no ratio, and says nothing about how runs differ. It is
+    left out, here as NaN. A constant added to all numbers would keep it, but would draw the ratios
+    of all other trials towards 1.
+
+    Parameters
+    ----------
+    steps : array
+        Not negative.
+
+    Returns
+    -------
+    array
+        NaN where there is no step.
+    """
+    return np.log(np.where(steps == 0.0, math.nan, steps))
+
+
 def paired_difference(first: FloatArray, second: FloatArray) -> tuple[Interval, float]:
     """Return the mean of ``first - second`` over the same trials, and how likely it is by chance.
 
     Parameters
     ----------
     first, second : array of shape (trials,)
+        NaN in both for a trial that is left out.
 
     Returns
     -------
     Interval
+        NaN if no trial is left.
     p_value : float
-        Of Student's paired test, two-sided; 1 if all differences are zero, NaN for a single pair.
-        If all are equal otherwise, they say nothing about how they scatter: that of the sign test.
+        Of Student's paired test, two-sided; 1 if all differences are zero, NaN for a single pair
+        or none. If all are equal otherwise, they say nothing about how they scatter: that of the
+        sign test.
 
     Raises
     ------
     InvalidValueError
-        If they are not as many.
+        If they are not as many, or one of a pair alone is NaN.
     """
     from scipy import stats
 
     if first.shape != second.shape:
         raise InvalidValueError(f"{first.size} and {second.size} trials cannot be paired")
-    difference = first - second
+    unpaired = np.isnan(first) != np.isnan(second)
+    if np.any(unpaired):
+        raise InvalidValueError(
+            f"pair {int(np.argmax(unpaired))} has one number alone: the trials are not of the same "
+            "worlds"
+        )
+    difference = (first - second)[~np.isnan(first)]
+    if difference.size == 0:
+        return mean_interval(difference), math.nan
     if not np.any(difference):
         return Interval(0.0, 0.0, 0.0), 1.0
     interval = mean_interval(difference)

@@ -62,7 +62,8 @@ class Scene:
     obstacles : array of shape (m, 4)
         Rectangles as ``x_min, y_min, x_max, y_max`` in that plane.
     limits : tuple of float
-        The part of the plane to show, ``x_min, y_min, x_max, y_max``.
+        The part of the plane to show, ``x_min, y_min, x_max, y_max``. A figure shows less of it
+        where nothing happened, and more where ``goal`` or ``points`` lie outside.
     body : array of shape (p, 2), or float, or None
         Outline of the robot's body about its centre at angle zero, or the radius of a disc.
     angle : int or None
@@ -70,7 +71,7 @@ class Scene:
     goal : array of shape (2,) or None
         Centre of the goal.
     points : array of shape (q, 2) or None
-        Places of interest (via points, lamps).
+        Places of interest (via points, lamps); all of them are shown.
     """
 
     def __init__(

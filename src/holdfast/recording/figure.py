@@ -52,6 +52,9 @@ _NUM_CLOUDS = 4
 _DISC_CORNERS = 48
 _NARROWEST, _WIDEST = 1.0, 1.35
 _HIGHEST_WORKSPACE = 8.0
+_ROOM_FOR_A_MARK = 0.02
+"""From its centre to the end of the drawn part, by the size of that."""
+
 _MAX_MARKS = 120
 """With more sensing steps than this, marks on the paths would hide them; the strip has them all."""
 
@@ -238,11 +241,10 @@ def _draw_workspace(panel: Axes, problem: Problem, scene: Scene, record: TrialRe
 
 
 def _shown_part(scene: Scene, points: Sequence[FloatArray]) -> FloatArray:
-    """Return the part of the plane where something happened, with a margin, within the limits."""
-    limits = np.array(scene.limits)
+    """Return the part of the plane that has all marks and all that happened within the limits."""
+    limits = _limits(scene)
     low, high = limits[:2], limits[2:]
-    marks = [] if scene.goal is None else [scene.goal.reshape(1, 2)]
-    happened = np.concatenate([*points, *marks])
+    happened = np.concatenate([*points, _marks(scene)])
     if not len(happened):
         return limits
     margin = 0.12 * (happened.max(axis=0) - happened.min(axis=0)).max()
@@ -257,9 +259,28 @@ def _shown_part(scene: Scene, points: Sequence[FloatArray]) -> FloatArray:
     return np.concatenate([lower, upper]) if np.all(upper > lower) else limits
 
 
+def _marks(scene: Scene) -> FloatArray:
+    """Return the goal and the places of interest, shape ``(m, 2)``."""
+    places = [each for each in (scene.goal, scene.points) if each is not None]
+    return np.concatenate([np.empty((0, 2)), *(each.reshape(-1, 2) for each in places)])
+
+
+def _limits(scene: Scene) -> FloatArray:
+    """Return the scene's limits, made wider where a mark lies on them or beyond."""
+    limits = np.array(scene.limits, dtype=np.float64)
+    low, high = limits[:2], limits[2:]
+    marks = _marks(scene)
+    if len(marks):
+        low, high = np.minimum(low, marks.min(axis=0)), np.maximum(high, marks.max(axis=0))
+        room = _ROOM_FOR_A_MARK * (high - low).max()
+        low = np.minimum(low, marks.min(axis=0) - room)
+        high = np.maximum(high, marks.max(axis=0) + room)
+    return np.concatenate([low, high])
+
+
 def _draw_obstacles(panel: Axes, scene: Scene) -> None:
     # Cut to a little more than what is shown: some obstacles reach to the end of the world.
-    x_min, y_min, x_max, y_max = scene.limits
+    x_min, y_min, x_max, y_max = _limits(scene)
     reach = 0.05 * max(x_max - x_min, y_max - y_min)
     low = np.array([x_min - reach, y_min - reach])
     high = np.array([x_max + reach, y_max + reach])
