@@ -134,11 +134,16 @@ class UpdateInfo(NamedTuple):
         ``1 / sum(weights**2)`` after the update, from 1 to the number of particles.
     explained : bool
         False if the observation is more than eight standard deviations from what every particle
-        expects (or, for a general likelihood, impossible under all of them).
+        expects (or, for a general likelihood, impossible under all of them): it lies outside the
+        validation gate.
+    mahalanobis_distance : float or None
+        How far, in standard deviations, the observation is from what the nearest particle expects;
+        None for a general likelihood, which has no such thing.
     """
 
     effective_sample_size: float
     explained: bool
+    mahalanobis_distance: float | None = None
 
 
 def estimate(belief: Belief, kind: Literal["mean", "most_likely"] = "mean") -> FloatArray:
@@ -207,24 +212,30 @@ def update(
                 f"observation of {observed.shape[0]} coordinates: sensing action {sensing_action} "
                 f"gives {mean.shape[-1]}"
             )
-        log_likelihood, explained = _gaussian_log_likelihood(
+        log_likelihood, squared_distance = _gaussian_log_likelihood(
             observed, mean, variance, belief.weights
         )
+        explained = squared_distance <= UNEXPLAINED_DEVIATIONS_SQUARED
+        distance = float(np.sqrt(squared_distance))
     else:
+        distance = None
         log_likelihood = contract.log_likelihood(problem, belief.states, sensing_action, observed)
         explained = bool(((log_likelihood > -np.inf) & (belief.weights > 0.0)).any())
     weights, survivors = _kernel.normalize(numerics.log(belief.weights) + log_likelihood, False)
     if survivors == 0:
-        return belief, UpdateInfo(effective_sample_size(belief), explained=False)
+        return belief, UpdateInfo(effective_sample_size(belief), False, distance)
     weights.setflags(write=False)
     after = Belief(belief.states, weights)
-    return after, UpdateInfo(effective_sample_size(after), explained)
+    return after, UpdateInfo(effective_sample_size(after), explained, distance)
 
 
 def _gaussian_log_likelihood(
     observed: FloatArray, mean: FloatArray, variance: FloatArray, weights: FloatArray
-) -> tuple[FloatArray, bool]:
-    """Return log p(observed | state) up to a constant, and whether a particle explains it."""
+) -> tuple[FloatArray, float]:
+    """Return log p(observed | state) up to a constant, and the least squared distance.
+
+    The distance is Mahalanobis's, from what a particle expects; particles of weight 0 do not count.
+    """
     if not numerics.all_finite(mean):
         raise ProblemError("observation_mean is not finite for a particle")
     if not (variance > 0.0).all() or not numerics.all_finite(variance):
@@ -237,13 +248,12 @@ def _gaussian_log_likelihood(
         distance = squares[..., 0].copy()
         for coordinate in range(1, squares.shape[-1]):
             distance += squares[..., coordinate]
-    nearest = np.where(weights > 0.0, distance, np.inf).min()
-    explained = bool(nearest <= UNEXPLAINED_DEVIATIONS_SQUARED)
+    nearest = float(np.where(weights > 0.0, distance, np.inf).min())
     log_likelihood = -0.5 * distance
     if variance.ndim > 1:
         for coordinate in range(variance.shape[-1]):
             log_likelihood -= 0.5 * numerics.log(variance[..., coordinate])
-    return log_likelihood, explained
+    return log_likelihood, nearest
 
 
 def resample(belief: Belief, stream: Stream) -> Belief:

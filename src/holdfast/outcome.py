@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import struct
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Literal, NamedTuple, TypeAlias
 
 import msgspec
 import numpy as np
@@ -18,9 +18,23 @@ import numpy.typing as npt
 
 from holdfast.errors import InvalidValueError
 
-__all__ = ["DecisionLog", "Decisions", "SensingDecision", "TaskDecision", "TrialResult"]
+__all__ = [
+    "DecisionLog",
+    "Decisions",
+    "Done",
+    "Outcome",
+    "SensingDecision",
+    "TaskDecision",
+    "TrialResult",
+]
 
 FloatArray = npt.NDArray[np.float64]
+
+Done: TypeAlias = bool | Literal["failed"]
+"""What an environment says of its task: it goes on, it has succeeded, or it has failed."""
+
+Outcome: TypeAlias = Literal["succeeded", "failed", "truncated"]
+"""How a trial ended: the environment terminated it, or it ran out of steps (truncated)."""
 
 _DIGEST_SIZE = 32
 _SENSING = struct.Struct(f"<cQI{_DIGEST_SIZE}s")
@@ -134,6 +148,8 @@ class TrialResult(msgspec.Struct, frozen=True, kw_only=True):
         Seed of the run; the trial's random streams follow from it and from ``trial``.
     success : bool
         Whether the goal was reached.
+    failed : bool
+        Whether the task ended in failure. If neither, the trial ran out of steps.
     steps : int
         Task actions performed.
     reward : float
@@ -158,6 +174,8 @@ class TrialResult(msgspec.Struct, frozen=True, kw_only=True):
     trial: int
     seed: int
     success: bool
+    # Journals that do not have it are of trials that could not fail.
+    failed: bool = False
     steps: int
     reward: float
     sensing_decisions: int
@@ -167,3 +185,10 @@ class TrialResult(msgspec.Struct, frozen=True, kw_only=True):
     digest: str
     sensing_ms: tuple[float, ...]
     decisions: Decisions | None = None
+
+    @property
+    def outcome(self) -> Outcome:
+        """How the trial ended: success and failure are the environment's word."""
+        if self.success:
+            return "succeeded"
+        return "failed" if self.failed else "truncated"

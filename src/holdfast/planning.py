@@ -90,11 +90,15 @@ class ObservationInfo(NamedTuple):
     explained : bool
         False if no particle explains the observation: the belief is valid but not to be trusted.
     resampled : bool
+    mahalanobis_distance : float or None
+        How far, in standard deviations, the observation is from what the nearest particle expects;
+        None for a general likelihood.
     """
 
     effective_sample_size: float
     explained: bool
     resampled: bool
+    mahalanobis_distance: float | None = None
 
 
 class TaskInfo(NamedTuple):
@@ -251,7 +255,9 @@ def observe(
     if resampled:
         belief = resample(belief, stream(state.seed, state.trial, state.step, Purpose.RESAMPLING))
     after = state._replace(sensed=True, belief=belief)
-    return after, ObservationInfo(found.effective_sample_size, found.explained, resampled)
+    return after, ObservationInfo(
+        found.effective_sample_size, found.explained, resampled, found.mahalanobis_distance
+    )
 
 
 def choose_task_action(

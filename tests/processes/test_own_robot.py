@@ -25,6 +25,7 @@ import pytest
 from tests.ports import free_port
 
 from holdfast.configuration import Configuration, load
+from holdfast.outcome import Done
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.problems.problem import FloatArray
 from holdfast.runtime.environment import Environment, EnvironmentMaker, load_environment
@@ -239,7 +240,7 @@ class Meddling:
         self._controller.kill()
         self._controller.start()
 
-    def is_done(self) -> bool:
+    def is_done(self) -> Done:
         return self._environment.is_done()
 
 

@@ -198,6 +198,7 @@ class TestUnexplained:
         with np.errstate(over="ignore"):
             after, info = update(Direct(1e-3), belief, 0, [1e200])
         assert not info.explained
+        assert info.mahalanobis_distance == np.inf
         assert after is belief
 
     @pytest.mark.parametrize(("away", "explained"), [(7.99, True), (8.01, False)])
@@ -205,7 +206,9 @@ class TestUnexplained:
         self, away: float, explained: bool
     ) -> None:
         belief = Belief.uniform([[0.0], [-1.0], [-2.0]])
-        assert update(Direct(0.25), belief, 0, [0.5 * away])[1].explained is explained
+        info = update(Direct(0.25), belief, 0, [0.5 * away])[1]
+        assert info.explained is explained
+        assert info.mahalanobis_distance == pytest.approx(away)
 
     def test_a_general_likelihood_of_zero_everywhere(self) -> None:
         belief = some_belief()
@@ -213,6 +216,13 @@ class TestUnexplained:
         assert after is belief
         assert not info.explained
         assert info.effective_sample_size == effective_sample_size(belief)
+        assert info.mahalanobis_distance is None
+
+    def test_a_particle_of_weight_zero_is_not_the_nearest(self) -> None:
+        belief = Belief.weighted([[0.0], [10.0]], [1.0, 0.0])
+        info = update(Direct(1.0), belief, 0, [10.0])[1]
+        assert not info.explained
+        assert info.mahalanobis_distance == 10.0
 
     def test_only_particles_of_weight_zero_could_have_made_it(self) -> None:
         belief = Belief.weighted([[0.0], [10.0]], [1.0, 0.0])

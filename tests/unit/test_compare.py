@@ -11,6 +11,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -194,9 +195,16 @@ class TestDecisions:
         found = self.compare(tmp_path, result_of(1, reward=-2.0))
         assert found.identical
         assert found.notes == (
-            "the world answered otherwise: trial 1 has success True, reward -1.0 in the first run "
-            "and success True, reward -2.0 in the second",
+            "the world answered otherwise: trial 1 has outcome succeeded, reward -1.0 in the first "
+            "run and outcome succeeded, reward -2.0 in the second",
         )
+
+    def test_another_outcome_is_noted(self, tmp_path: Path) -> None:
+        failed = msgspec.structs.replace(result_of(1), success=False, failed=True)
+        found = self.compare(tmp_path, failed)
+        assert found.identical
+        (note,) = found.notes
+        assert note.endswith("and outcome failed, reward -1.0 in the second")
 
 
 class TestRuns:

@@ -168,6 +168,18 @@ class TestEvents:
         assert robot.calls[1][1] == 2
         assert robot.calls[2][1].tolist() == ACTION.tolist()
 
+    @pytest.mark.parametrize("failed", ["failed", np.str_("failed")])
+    def test_the_task_may_have_failed(self, failed: str, bench: Bench) -> None:
+        robot = Robot(is_done=failed)
+        performer = bench.open(robot)
+        performer.begin()
+        assert bench.event() == Begun("failed", None)
+        performer.perform(0, ACTION)
+        acted = bench.event()
+        assert acted == Acted(0, -1.0, "failed")
+        assert isinstance(acted, Acted)
+        assert type(acted.done) is str
+
     def test_the_count_is_asked_for_after_a_crash_alone(self, bench: Bench) -> None:
         robot = Robot(is_done=True)
         bench.open(robot, resumed=True).begin(4)
@@ -299,9 +311,11 @@ class TestFailures:
             ("perform", "1", "returned '1'; it must return a finite number, the reward, or None"),
             ("perform", [1.0], "returned [1.0]; it must return a finite number"),
             ("perform", True, "returned True; it must return a finite number"),
-            ("is_done", None, "returned None; it must return True or False"),
-            ("is_done", 1, "returned 1; it must return True or False"),
-            ("is_done", np.array([True]), "it must return True or False"),
+            ("is_done", None, 'returned None; it must return True, False or "failed"'),
+            ("is_done", 1, 'returned 1; it must return True, False or "failed"'),
+            ("is_done", "", """returned ''; it must return True, False or "failed\""""),
+            ("is_done", "done", """returned 'done'; it must return True, False or "failed\""""),
+            ("is_done", np.array([True]), 'it must return True, False or "failed"'),
             ("steps_performed", -1, "returned -1; it must return a whole number >= 0"),
             ("steps_performed", 3.0, "returned 3.0; it must return a whole number >= 0"),
             ("steps_performed", True, "returned True; it must return a whole number >= 0"),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import csv
 import json
+import shutil
 import sqlite3
 from dataclasses import replace
 from pathlib import Path
@@ -16,9 +17,11 @@ import scipy.stats
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 
+from holdfast.cli.terminal import _summary_rows
 from holdfast.configuration import Configuration, load
 from holdfast.files import OutputError, write_atomically
 from holdfast.outcome import Decisions, TrialResult
+from holdfast.planning import Planner
 from holdfast.recording.figure import _draw_workspace, trial_figure
 from holdfast.recording.journal import Journal
 from holdfast.recording.recorder import MAX_PARTICLES_KEPT, Recorder
@@ -37,9 +40,13 @@ from holdfast.recording.tables import (
 from holdfast.recording.timings import AnswerCounts
 from holdfast.runtime.trial import run_trial
 from holdfast.session.records import PausedRecord
+from holdfast.session.robot import replay
 from holdfast.settings import EnvironmentSettings
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
+
+BEFORE_OUTCOMES = Path(__file__).parent / "data" / "journal_before_outcomes.sqlite"
+"""Of a robot killed at step 21 of trial 2, when results said only whether a trial succeeded."""
 
 
 def result_of(
@@ -74,6 +81,10 @@ def configuration_of(
         f"simulator: {{num_trials: 3, max_steps: 30, seed: {seed}}}\n"
     )
     return load(path)
+
+
+def failed(result: TrialResult) -> TrialResult:
+    return msgspec.structs.replace(result, success=False, failed=True)
 
 
 def without_decisions(result: TrialResult) -> TrialResult:
@@ -119,11 +130,48 @@ class TestJournal:
         with Journal.open(path) as journal:
             assert journal.meta()["key"] == "value"
             assert journal.finished() == {0, 1, 2}
-            assert journal.tally() == (3, 2)
+            assert journal.tally() == (3, 2, 0)
             expected = sorted(map(without_decisions, results), key=lambda result: result.trial)
             assert list(journal.results()) == expected
             for result in results:
                 assert journal.decisions(result.trial) == result.decisions
+
+    def test_how_a_trial_ended_comes_back(self, tmp_path: Path) -> None:
+        path = tmp_path / "journal.sqlite"
+        with Journal.create(path, {}) as journal:
+            journal.add(result_of(0))
+            journal.add(failed(result_of(1)))
+            journal.add(result_of(2, success=False))
+        with Journal.open(path) as journal:
+            outcomes = [result.outcome for result in journal.results()]
+            assert outcomes == ["succeeded", "failed", "truncated"]
+            assert journal.tally() == (3, 1, 1)
+
+    def test_one_from_before_trials_could_fail(self, tmp_path: Path) -> None:
+        """It was made by that code: trials without success had run out of steps."""
+        path = tmp_path / "journal.sqlite"
+        shutil.copyfile(BEFORE_OUTCOMES, path)
+        with Journal.open(path) as journal:
+            results = list(journal.results(with_decisions=True))
+            assert [result.outcome for result in results] == ["truncated", "succeeded"]
+            assert [result.success for result in results] == [False, True]
+            assert journal.tally() == (2, 1, 0)
+            (tmp_path / "old.yaml").write_text(journal.meta()["configuration"])
+            configuration = load(tmp_path / "old.yaml")
+            for result in results:
+                again = run_trial(
+                    configuration.problem,
+                    configuration.planning,
+                    configuration.simulator,
+                    result.trial,
+                )
+                assert again.digest == result.digest
+                assert again.outcome == result.outcome
+            unfinished = journal.unfinished()
+            assert unfinished is not None
+            planner = Planner(configuration.problem, configuration.planning)
+            history = replay(planner, 2, unfinished.trial, unfinished.records)
+            assert (unfinished.trial, history.state.step) == (2, 21)
 
     def test_closing_leaves_one_file(self, tmp_path: Path) -> None:
         with Journal.create(tmp_path / "journal.sqlite", {}) as journal:
@@ -190,10 +238,14 @@ class TestTables:
             assert high == pytest.approx(expected.high, abs=1e-12)
 
     def test_csv_numbers_read_back_exactly(self) -> None:
-        results = [result_of(0, reward=-0.1 - 0.2), result_of(1, success=False, reward=1e-300)]
+        results = [
+            result_of(0, reward=-0.1 - 0.2),
+            result_of(1, success=False, reward=1e-300),
+            failed(result_of(2)),
+        ]
         rows = list(csv.DictReader("".join(csv_lines(results)).splitlines()))
         assert tuple(rows[0]) == CSV_COLUMNS
-        assert CSV_COLUMNS[:8] == (
+        assert CSV_COLUMNS == (
             "trial",
             "seed",
             "success",
@@ -202,12 +254,17 @@ class TestTables:
             "sensing_decisions",
             "mean_sensing_ms",
             "recoveries",
+            "unexplained_observations",
+            "digest",
+            "outcome",
         )
         for row, result in zip(rows, results, strict=True):
             assert float(row["reward"]) == result.reward
             assert float(row["mean_sensing_ms"]) == result.mean_sensing_ms
             assert int(row["success"]) == result.success
             assert row["digest"] == result.digest
+        assert [row["outcome"] for row in rows] == ["succeeded", "truncated", "failed"]
+        assert [row["success"] for row in rows] == ["1", "0", "0"]
 
     def test_summary(self) -> None:
         builder = SummaryBuilder()
@@ -224,6 +281,20 @@ class TestTables:
         assert summary.sensing_ms_p99 == pytest.approx(2.98)
         assert summary.unexplained_observations == 3
         assert json.loads(summary.to_json())["digest"] == summary.digest
+        assert summary.failures == 0
+        assert "failed" not in dict(_summary_rows(summary))
+
+    def test_failures_are_no_successes_and_told_if_there_are_any(self) -> None:
+        builder = SummaryBuilder()
+        builder.add(result_of(0, reward=-1.0))
+        builder.add(failed(result_of(1, reward=-8.0)))
+        builder.add(failed(result_of(2)))
+        builder.add(result_of(3, success=False))
+        summary = builder.build(problem="p", seed=5, version="1", trials=4, wall_time_s=2.0)
+        assert (summary.successes, summary.failures, summary.finished) == (1, 2, 4)
+        assert summary.success_rate == pytest.approx(0.25)
+        assert summary.mean_reward_of_successes == pytest.approx(-1.0)
+        assert dict(_summary_rows(summary))["failed"] == "2 of 4 trials"
 
     def test_who_decided_is_told_where_it_is_known(self) -> None:
         builder = SummaryBuilder()

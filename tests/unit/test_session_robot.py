@@ -5,7 +5,7 @@ from __future__ import annotations
 import heapq
 import itertools
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -26,6 +26,7 @@ from holdfast.planning import (
     observe,
 )
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
+from holdfast.recording.recorder import Recorder
 from holdfast.runtime.environment import SimulatedEnvironment
 from holdfast.runtime.trial import run_trial
 from holdfast.session.dispatcher import Dispatcher, ServiceRefusedError
@@ -157,8 +158,34 @@ class Sent(NamedTuple):
     request: Request
 
 
+class FailingWorld(SimulatedEnvironment):
+    """Whose task has failed once so many task actions were performed."""
+
+    fails_at = 6
+
+    def is_done(self) -> Any:
+        return "failed" if self.step >= self.fails_at else super().is_done()
+
+
+class Misleading(SimulatedEnvironment):
+    """What it shows in these sensing actions, counted from 0, no particle can explain."""
+
+    lies: frozenset[int] = frozenset()
+
+    def __init__(self, *arguments: Any) -> None:
+        super().__init__(*arguments)
+        self.sensed = 0
+
+    def perform_sensing(self, sensing_action: int) -> np.ndarray:
+        shown = super().perform_sensing(sensing_action)
+        self.sensed += 1
+        return shown + 100.0 if self.sensed - 1 in self.lies else shown
+
+
 class World:
     """A robot, its services, its environment and a clock."""
+
+    environment_class: type[SimulatedEnvironment] = SimulatedEnvironment
 
     def __init__(
         self,
@@ -242,7 +269,7 @@ class World:
 
     def begin(self, trial: int) -> None:
         history = replay(self.planner, self.simulator.seed, trial, self.journal)
-        self.environment = SimulatedEnvironment(PROBLEM, self.simulator.seed, trial)
+        self.environment = self.environment_class(PROBLEM, self.simulator.seed, trial)
         for action in history.actions:
             self.environment.perform(action)
         begun = Begun(self.environment.is_done(), self.environment.step)
@@ -1014,6 +1041,129 @@ def test_pause_writes_everything_down_and_a_new_robot_goes_on() -> None:
     assert history.state.step == 7
     begun = begin_after(tuple(world.journal), None, tail_is_certain=False)
     assert begun.stopped is None
+
+
+class TestFailedTask:
+    """An environment says that the task has failed: the trial ends, and not with success."""
+
+    def world(self) -> World:
+        world = World(simulator=SimulatorSettings(num_trials=1, max_steps=14, seed=11))
+        world.environment_class = FailingWorld
+        return world
+
+    def assert_failed(self, world: World) -> None:
+        (result,) = world.results
+        assert (result.outcome, result.success, result.failed) == ("failed", False, True)
+        assert result.steps == FailingWorld.fails_at
+        expected = run_trial(
+            PROBLEM, PLANNING, world.simulator, 0, FailingWorld(PROBLEM, world.simulator.seed, 0)
+        )
+        assert (result.digest, result.outcome) == (expected.digest, expected.outcome)
+
+    def test_ends_the_trial(self) -> None:
+        world = self.world()
+        world.start()
+        world.run()
+        self.assert_failed(world)
+
+    def test_out_of_steps_is_no_failure(self) -> None:
+        world = World(simulator=SimulatorSettings(num_trials=1, max_steps=14, seed=11))
+        world.start()
+        world.run()
+        assert world.results[0].outcome == "truncated"
+
+    def test_is_still_so_for_a_robot_that_was_killed_right_after(self) -> None:
+        killed = self.world()
+        killed.on_act = lambda step: setattr(killed, "ended", step == FailingWorld.fails_at - 1)
+        killed.start()
+        killed.run()
+        assert not killed.results
+        assert isinstance(killed.journal[-1], ActingRecord)
+        resumed = self.world()
+        resumed.carry_out(resumed.robot.start(0.0))
+        history = replay(resumed.planner, 11, 0, killed.journal)
+        begun = Begun(killed.environment.is_done(), killed.environment.step)
+        resumed.carry_out(resumed.robot.begin_trial(0, history, begun, 0.0, tail_is_certain=True))
+        self.assert_failed(resumed)
+
+    @pytest.mark.parametrize("environment_class", [FailingWorld, SimulatedEnvironment])
+    def test_is_kept_when_the_robot_is_asked_to_end_in_the_last_action(
+        self, environment_class: type[SimulatedEnvironment]
+    ) -> None:
+        """Nobody may be there to say it again."""
+        world = self.world()
+        world.environment_class = environment_class
+        last = (FailingWorld.fails_at if environment_class is FailingWorld else 14) - 1
+        world.on_act = lambda step: (
+            world.after(0.0001, lambda: world.robot.pause(world.now)) if step == last else None
+        )
+        world.start()
+        world.run()
+        (result,) = world.results
+        assert result.outcome == ("failed" if environment_class is FailingWorld else "truncated")
+        assert result.steps == last + 1
+
+
+class TestUnexplainedObservations:
+    def world(self, lies: set[int], num_sensing: int, records: tuple[Record, ...] = ()) -> World:
+        class Lying(Misleading):
+            pass
+
+        Lying.lies = frozenset(lies)
+        world = World(simulator=SimulatorSettings(num_trials=1, max_steps=4 * num_sensing, seed=11))
+        world.environment_class = Lying
+        world.start(records=records)
+        world.run()
+        return world
+
+    def test_each_is_told(self) -> None:
+        world = self.world({2, 4}, 6)
+        recorder = Recorder(trial=0)
+        alike = world.environment_class(PROBLEM, world.simulator.seed, 0)
+        run_trial(PROBLEM, PLANNING, world.simulator, 0, alike, recorder)
+        unexplained = [each for each in recorder.record.sensing if not each.explained]
+        told = world.reports("unexplained_observation")
+        assert [(fields["step"], fields["sensing_action"]) for fields in told] == [
+            (each.step, each.sensing_action) for each in unexplained
+        ]
+        assert {2 * 4, 4 * 4} <= {each.step for each in unexplained}
+        assert len(unexplained) == world.results[0].unexplained_observations < 5
+        for fields in told:
+            assert fields["trial"] == 0
+            assert isinstance(fields["deviations"], float)
+            assert fields["deviations"] > 8.0
+        assert not world.reports("filter_diverged")
+
+    def test_none_is_told_where_all_are_explained(self) -> None:
+        world = self.world(set(), 6)
+        assert world.results[0].unexplained_observations == 0
+        assert not world.reports("unexplained_observation")
+
+    def test_a_run_of_them_is_told_once_and_the_lines_are_bounded(self) -> None:
+        world = self.world(set(range(1, 40)), 40)
+        assert len(world.reports("unexplained_observation")) == 10
+        (diverged,) = world.reports("filter_diverged")
+        assert diverged["step"] == 4 * 5
+        assert world.results[0].unexplained_observations == 39
+        assert "counted only" in str(world.reports("unexplained_observation")[-1]["reason"])
+
+    def test_a_robot_that_was_restarted_counts_on(self) -> None:
+        first = World(simulator=SimulatorSettings(num_trials=1, max_steps=32, seed=11))
+
+        class Lying(Misleading):
+            lies = frozenset(range(20))
+
+        first.environment_class = Lying
+        first.on_act = lambda step: setattr(first, "ended", step == 10)
+        first.start()
+        first.run()
+        assert len(first.reports("unexplained_observation")) == 3
+        assert not first.reports("filter_diverged")
+        second = self.world(set(range(20)), 8, tuple(first.journal[:-1]))
+        (diverged,) = second.reports("filter_diverged")
+        assert diverged["step"] == 4 * 4
+        assert len(second.reports("unexplained_observation")) == 5
+        assert second.results[0].unexplained_observations == 8
 
 
 def test_rate_paces_the_steps_and_counts_missed_ticks() -> None:

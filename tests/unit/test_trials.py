@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import hashlib
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from holdfast.configuration import Configuration, load
-from holdfast.errors import InvalidValueError, ProblemError
+from holdfast.errors import EnvironmentFailedError, InvalidValueError, ProblemError
 from holdfast.outcome import Decisions, SensingDecision, TaskDecision, TrialResult
 from holdfast.problems.problem import FloatArray
 from holdfast.recording.recorder import Recorder
@@ -90,6 +91,27 @@ class TestOneTrial:
         first, second = one(configuration), one(configuration)
         assert first.decisions == second.decisions
         assert first.digest == second.digest
+
+    def test_an_environment_may_say_that_the_task_failed(self, tmp_path: Path) -> None:
+        configuration = configuration_of(tmp_path)
+        problem, simulator = configuration.problem, configuration.simulator
+
+        class Failing(SimulatedEnvironment):
+            says: Any = "failed"
+
+            def is_done(self) -> Any:
+                return self.says if self.step == 7 else super().is_done()
+
+        world = Failing(problem, simulator.seed, 0)
+        result = run_trial(problem, configuration.planning, simulator, 0, world)
+        assert (result.outcome, result.success, result.failed) == ("failed", False, True)
+        assert result.steps == 7
+        for wrong, says in (("crashed", "'crashed'"), (1, "1"), (None, "None")):
+            world = Failing(problem, simulator.seed, 0)
+            world.says = wrong
+            message = f'Failing: is_done returned {says}; it must return True, False or "failed"'
+            with pytest.raises(EnvironmentFailedError, match=f"^{message}$"):
+                run_trial(problem, configuration.planning, simulator, 0, world)
 
     def test_other_trials_and_seeds_decide_otherwise(self, tmp_path: Path) -> None:
         configuration = configuration_of(tmp_path)

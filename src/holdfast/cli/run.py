@@ -320,7 +320,7 @@ def _run(options: _Options) -> None:
             display.show(result)
 
         try:
-            display.start(earlier.finished, earlier.successes, directory_path)
+            display.start(earlier, directory_path)
             try:
                 if maker is not None:
                     missed_ticks = run_as_robot(

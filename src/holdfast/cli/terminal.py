@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
     from holdfast.configuration import Configuration
     from holdfast.outcome import TrialResult
+    from holdfast.recording.journal import Tally
     from holdfast.recording.tables import RunSummary
 
 __all__ = [
@@ -233,10 +234,12 @@ class RunDisplay:
         self._line = line
         self._finished = 0
         self._successes = 0
+        self._failures = 0
 
-    def start(self, finished: int, successes: int, directory: Path) -> None:
+    def start(self, earlier: Tally, directory: Path) -> None:
         """Begin, with what an earlier part of the run has finished."""
-        self._finished, self._successes = finished, successes
+        finished, self._successes, self._failures = earlier
+        self._finished = finished
         simulator = self._configuration.simulator
         title = (
             f"{self._configuration.problem_name}, {counted(simulator.num_trials, 'trial')}, "
@@ -250,6 +253,7 @@ class RunDisplay:
         """Count one more finished trial."""
         self._finished += 1
         self._successes += result.success
+        self._failures += result.failed
         self._line.show(self._finished, self._note())
 
     def stop(self) -> None:
@@ -258,7 +262,7 @@ class RunDisplay:
 
     def _note(self) -> str:
         share = f"{100.0 * self._successes / self._finished:.1f} %" if self._finished else "-"
-        return f"success {share}"
+        return f"success {share}" + (f", {self._failures:,} failed" if self._failures else "")
 
 
 def run_display(configuration: Configuration, *, quiet: bool) -> RunDisplay:
@@ -303,6 +307,8 @@ def _summary_rows(summary: RunSummary) -> list[tuple[str, str]]:
                 f"95 % interval {100 * low:.1f} to {100 * high:.1f} %)",
             )
         )
+    if summary.failures:
+        rows.append(("failed", f"{summary.failures:,} of {counted(summary.finished, 'trial')}"))
     if summary.mean_reward is not None:
         value = f"{summary.mean_reward:.4g}"
         if summary.mean_reward_of_successes is not None:

@@ -31,6 +31,7 @@ from matplotlib.ticker import MaxNLocator
 
 from holdfast.configuration import Configuration
 from holdfast.files import write_atomically
+from holdfast.outcome import Outcome
 from holdfast.problems.problem import FloatArray, Problem, Scene
 from holdfast.recording.recorder import SensingRecord, TrialRecord
 
@@ -46,6 +47,12 @@ _GOAL = "#1E8A4C"
 # Ordered so that neighbours differ in lightness, too.
 _ACTION_COLORS = ("#1D3C78", "#E8A317", "#B5342B", "#54B5A6", "#7D3C98", "#9AA05A")
 _ACTION_MARKERS = ("o", "s", "^", "D", "v", "P")
+
+_OUTCOMES: dict[Outcome, str] = {
+    "succeeded": "goal reached",
+    "failed": "failed",
+    "truncated": "goal not reached",
+}
 
 _NUM_BODIES = 9
 _NUM_CLOUDS = 4
@@ -138,7 +145,7 @@ def _title(configuration: Configuration, record: TrialRecord) -> str:
     text = f"{configuration.problem_name}, seed {configuration.simulator.seed}"
     result = record.result
     if result is not None:
-        outcome = "goal reached" if result.success else "goal not reached"
+        outcome = _OUTCOMES[result.outcome]
         text += (
             f", trial {result.trial}: {outcome} in {result.steps:,} steps, "
             f"{result.sensing_decisions:,} sensing actions, reward {result.reward:.4g}"

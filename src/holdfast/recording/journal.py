@@ -78,10 +78,11 @@ _open_here: weakref.WeakValueDictionary[tuple[int, int], Journal] = weakref.Weak
 
 
 class Tally(NamedTuple):
-    """How many trials are finished, and how many of them successfully."""
+    """How many trials are finished, and how many of them succeeded and failed."""
 
     finished: int
     successes: int
+    failures: int
 
 
 class UnfinishedTrial(NamedTuple):
@@ -608,11 +609,12 @@ class Journal:
 
     def tally(self) -> Tally:
         """Count the trials that are finished."""
-        finished = successes = 0
+        finished = successes = failures = 0
         for result in self.results():
             finished += 1
             successes += result.success
-        return Tally(finished, successes)
+            failures += result.failed
+        return Tally(finished, successes, failures)
 
     def results(self, *, with_decisions: bool = False) -> Iterator[TrialResult]:
         """Yield the results in the order of their trials.

@@ -36,6 +36,7 @@ CSV_COLUMNS = (
     "recoveries",
     "unexplained_observations",
     "digest",
+    "outcome",
 )
 """Columns of ``trials.csv``."""
 
@@ -59,6 +60,8 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
         Trials that are finished; all other figures are about these.
     successes : int
         Trials that reached the goal.
+    failures : int
+        Trials that ended in failure, as an environment says; the rest ran out of steps.
     success_rate : float or None
         Successes over finished trials.
     success_rate_interval_95 : tuple of float, or None
@@ -72,7 +75,7 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
     sensing_decisions : int
         Sensing actions chosen in all trials.
     unexplained_observations : int
-        Observations that no particle explained.
+        Observations that no particle explained: they lay outside the validation gate of all.
     recoveries : int
         Times that the local service took over, in all processes of the run.
     sensing_decisions_by_service, task_answers_by_service : dict of str to int, or None
@@ -96,6 +99,7 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
     trials: int
     finished: int
     successes: int
+    failures: int
     success_rate: float | None
     success_rate_interval_95: tuple[float, float] | None
     mean_reward: float | None
@@ -166,6 +170,7 @@ class SummaryBuilder:
     def __init__(self) -> None:
         self._finished = 0
         self._successes = 0
+        self._failures = 0
         self._reward = 0.0
         self._reward_of_successes = 0.0
         self._steps = 0
@@ -182,6 +187,7 @@ class SummaryBuilder:
         if result.success:
             self._successes += 1
             self._reward_of_successes += result.reward
+        self._failures += result.failed
         self._steps += result.steps
         self._sensing_decisions += result.sensing_decisions
         self._unexplained += result.unexplained_observations
@@ -224,6 +230,7 @@ class SummaryBuilder:
             trials=trials,
             finished=count,
             successes=self._successes,
+            failures=self._failures,
             success_rate=self._successes / count if count else None,
             success_rate_interval_95=wilson_interval(self._successes, count) if count else None,
             mean_reward=self._reward / count if count else None,

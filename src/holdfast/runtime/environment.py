@@ -22,6 +22,7 @@ import numpy.typing as npt
 
 from holdfast import contract
 from holdfast.errors import ConfigurationError, EnvironmentFailedError, InvalidValueError
+from holdfast.outcome import Done
 from holdfast.problems.problem import Problem
 from holdfast.randomness import Purpose, stream
 from holdfast.user_code import account_of_user_error, find_class
@@ -30,10 +31,12 @@ if TYPE_CHECKING:
     from holdfast.configuration import Configuration
 
 __all__ = [
+    "DONE_VALUES",
     "CountingEnvironment",
     "Environment",
     "EnvironmentMaker",
     "SimulatedEnvironment",
+    "as_done",
     "load_environment",
 ]
 
@@ -41,6 +44,9 @@ FloatArray = npt.NDArray[np.float64]
 
 GROUP = "holdfast.environments"
 """Entry points by which packages register their environments."""
+
+DONE_VALUES = 'True, False or "failed"'
+"""What ``is_done`` may return, for messages."""
 
 _REQUIRED = ("perform_sensing", "perform", "is_done")
 
@@ -59,8 +65,15 @@ class Environment(Protocol):
         """Perform a task action and return its reward, or None where there is none."""
         ...
 
-    def is_done(self) -> bool:
-        """Tell whether the task is done."""
+    def is_done(self) -> Done:
+        """Tell whether the task is done.
+
+        Returns
+        -------
+        bool or "failed"
+            True if it has succeeded, False if it goes on. ``"failed"`` ends the trial as well, but
+            in failure: the robot has crashed, say, or broken what it was to handle.
+        """
         ...
 
 
@@ -164,6 +177,13 @@ class SimulatedEnvironment:
     def steps_performed(self) -> int:
         """Return the number of task actions performed, those of :meth:`after` included."""
         return self.step
+
+
+def as_done(value: object) -> Done | None:
+    """Return what ``is_done`` of an environment has returned; None if it must not return that."""
+    if isinstance(value, bool | np.bool_):
+        return bool(value)
+    return "failed" if isinstance(value, str) and value == "failed" else None
 
 
 class EnvironmentMaker:

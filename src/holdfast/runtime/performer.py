@@ -26,9 +26,10 @@ import numpy.typing as npt
 
 from holdfast import contract
 from holdfast.errors import EnvironmentFailedError, HoldfastError, InvalidValueError
+from holdfast.outcome import Done
 from holdfast.problems.problem import Problem
 from holdfast.randomness import Purpose, stream
-from holdfast.runtime.environment import Environment, EnvironmentMaker
+from holdfast.runtime.environment import DONE_VALUES, Environment, EnvironmentMaker, as_done
 from holdfast.session.events import Acted, Begun, EnvironmentEvent, EnvironmentFailed, Sensed
 from holdfast.user_code import account_of_user_error
 
@@ -154,7 +155,7 @@ class _CheckedEnvironment:
                 self._method = "steps_performed"
                 count = self._count(ask())
             self._method = "is_done"
-            return Begun(self._truth(environment.is_done()), count)
+            return Begun(self._done(environment.is_done()), count)
         except self._caught as error:
             return self._failed(step, error)
 
@@ -176,7 +177,7 @@ class _CheckedEnvironment:
             begun = True
             reward = self._reward(environment.perform(action))
             self._method = "is_done"
-            return Acted(step, reward, self._truth(environment.is_done()))
+            return Acted(step, reward, self._done(environment.is_done()))
         except self._caught as error:
             return self._failed(step, error, performance_unknown=begun)
 
@@ -251,10 +252,11 @@ class _CheckedEnvironment:
             raise self._unusable(value, "a finite number, the reward, or None")
         return float(number)
 
-    def _truth(self, value: object) -> bool:
-        if not isinstance(value, bool | np.bool_):
-            raise self._unusable(value, "True or False")
-        return bool(value)
+    def _done(self, value: object) -> Done:
+        done = as_done(value)
+        if done is None:
+            raise self._unusable(value, DONE_VALUES)
+        return done
 
     def _count(self, value: object) -> int:
         number = _numbers(value)

@@ -364,8 +364,10 @@ class RobotProcess:
             "trial",
             trial=result.trial,
             success=result.success,
+            outcome=result.outcome,
             steps=result.steps,
             recoveries=result.recoveries,
+            unexplained_observations=result.unexplained_observations,
             digest=result.digest[:16],
         )
         self._begin_next()

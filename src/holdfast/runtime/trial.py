@@ -15,8 +15,8 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from holdfast.errors import ProblemError
-from holdfast.outcome import DecisionLog, TrialResult
+from holdfast.errors import EnvironmentFailedError, ProblemError
+from holdfast.outcome import DecisionLog, Done, TrialResult
 from holdfast.planning import (
     ObservationInfo,
     PlanningState,
@@ -31,7 +31,12 @@ from holdfast.planning import (
     observe,
 )
 from holdfast.problems.problem import FloatArray, Problem
-from holdfast.runtime.environment import Environment, SimulatedEnvironment
+from holdfast.runtime.environment import (
+    DONE_VALUES,
+    Environment,
+    SimulatedEnvironment,
+    as_done,
+)
 from holdfast.settings import PlanningSettings, SimulatorSettings
 
 __all__ = [
@@ -112,7 +117,7 @@ def run_trial(
     environment: Environment | None = None,
     observer: TrialObserver = NULL_OBSERVER,
 ) -> TrialResult:
-    """Run one trial to the goal or to ``max_steps``.
+    """Run one trial until it is done, has failed, or has had ``max_steps``.
 
     Parameters
     ----------
@@ -138,7 +143,8 @@ def run_trial(
     ------
     HoldfastError
         If holdfast refuses what the problem or the environment returned; :class:`ProblemError` for
-        a reward that is not finite.
+        a reward that is not finite, :class:`EnvironmentFailedError` for anything else than what
+        ``is_done`` may return.
     """
     seed = simulator.seed
     if environment is None:
@@ -151,8 +157,8 @@ def run_trial(
     total_reward = 0.0
     unexplained = 0
     steps = 0
-    success = environment.is_done()
-    while not success and steps < simulator.max_steps:
+    done = _ask_done(environment)
+    while not done and steps < simulator.max_steps:
         if needs_sensing(planning, state):
             started = perf_counter()
             sensing_action, sensing_info = choose_sensing_action(problem, planning, state)
@@ -180,14 +186,15 @@ def run_trial(
         observer.acted(TaskStep(environment, state, task_info, executed, reward))
         state = advance(problem, planning, state, executed)
         steps += 1
-        success = environment.is_done()
+        done = _ask_done(environment)
     log.ended(steps, digest(state))
 
     decisions = log.decisions()
     result = TrialResult(
         trial=trial,
         seed=seed,
-        success=success,
+        success=done is True,
+        failed=done == "failed",
         steps=steps,
         reward=total_reward,
         sensing_decisions=len(sensing_ms),
@@ -200,3 +207,14 @@ def run_trial(
     )
     observer.trial_ended(state, result)
     return result
+
+
+def _ask_done(environment: Environment) -> Done:
+    value = environment.is_done()
+    done = as_done(value)
+    if done is None:
+        raise EnvironmentFailedError(
+            f"{type(environment).__name__}: is_done returned {value!r:.80}; it must return "
+            f"{DONE_VALUES}"
+        )
+    return done

@@ -12,6 +12,8 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from holdfast.outcome import Done
+
 __all__ = [
     "Acted",
     "Appeared",
@@ -71,14 +73,14 @@ class Begun(NamedTuple):
 
     Attributes
     ----------
-    done : bool
-        Whether the task is done already.
+    done : bool or "failed"
+        Whether the task is done already, or has failed.
     steps_performed : int or None
         Task actions performed in this trial so far, as the environment itself has counted; None if
         it was not asked or does not count.
     """
 
-    done: bool
+    done: Done
     steps_performed: int | None
 
 
@@ -104,13 +106,13 @@ class Acted(NamedTuple):
     step : int
     reward : float or None
         Finite; None where the environment gives none.
-    done : bool
-        Whether the task is done.
+    done : bool or "failed"
+        Whether the task is done, or has failed.
     """
 
     step: int
     reward: float | None
-    done: bool
+    done: Done
 
 
 class EnvironmentFailed(NamedTuple):

@@ -20,9 +20,10 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
+from holdfast.belief import UNEXPLAINED_DEVIATIONS_SQUARED
 from holdfast.errors import HoldfastError, InvalidValueError
-from holdfast.outcome import DecisionLog, TrialResult
-from holdfast.planning import Planner, PlanningState
+from holdfast.outcome import DecisionLog, Done, TrialResult
+from holdfast.planning import ObservationInfo, Planner, PlanningState
 from holdfast.session.dispatcher import Dispatcher
 from holdfast.session.effects import (
     Act,
@@ -75,6 +76,13 @@ _OF_THE_BODY = (Sensed, Acted, EnvironmentFailed)
 _TICKS_INTERVAL_S = 1.0
 """Missed ticks are reported at most this often; all of them are counted."""
 
+_DIVERGENCE_RUN = 5
+"""So many unexplained observations in a row are no outliers: the filter has diverged. (A sensor in
+which one of a hundred is an outlier shows five in a row once in 10^10 observations.)"""
+
+_MOST_TOLD = 10
+"""Of each kind of event about unexplained observations, for each trial; all of them are counted."""
+
 
 class HeldError(HoldfastError):
     """The robot holds still: its environment failed. The run can be resumed."""
@@ -106,6 +114,10 @@ class History:
         Whether the process before ended in order.
     num_unexplained : int
         Observations that no particle explained.
+    unexplained_in_a_row : int
+        The last so many observations.
+    num_divergences : int
+        Times that these have become so many that the filter is said to have diverged.
     sensing_ms : list of float
         How long each sensing action that was performed had been computed.
     recoveries : int
@@ -122,6 +134,8 @@ class History:
         self.pending: FloatArray | None = None
         self.paused = False
         self.num_unexplained = 0
+        self.unexplained_in_a_row = 0
+        self.num_divergences = 0
         self.sensing_ms: list[float] = []
         self.recoveries = 0
 
@@ -136,6 +150,8 @@ class History:
         self.observations = (*self.observations, kept)[-MAX_OBSERVATIONS:]
         self.num_observations += 1
         self.num_unexplained += not explained
+        self.unexplained_in_a_row = 0 if explained else self.unexplained_in_a_row + 1
+        self.num_divergences += self.unexplained_in_a_row == _DIVERGENCE_RUN
         self.sensing_ms.append(record.sensing_ms)
         self.log.sensed(record.step, record.sensing_action, record.digest)
         self.state = after
@@ -251,7 +267,7 @@ class Robot:
         self._effects = dispatcher.effects
         self._history: History | None = None
         self._trial = 0
-        self._done = False
+        self._done: Done = False
         self._in_environment = False
         self._sensing_action = 0
         self._computed_ms = 0.0
@@ -296,8 +312,8 @@ class Robot:
         history : History
             From :func:`replay`; of no records for a new trial.
         begun : Begun
-            What the environment says: whether the task is done and, if it can tell, how many task
-            actions it has performed in this trial.
+            What the environment says: whether the task is done or has failed and, if it can tell,
+            how many task actions it has performed in this trial.
         now : float
         tail_is_certain : bool
             Whether the records are surely all that were ever written: no power was cut since.
@@ -405,7 +421,11 @@ class Robot:
         self._dispatcher.was_deaf(seconds)
 
     def pause(self, now: float) -> list[Effect]:
-        """End in order: after what is being performed, write everything down and stand still."""
+        """End in order: after what is being performed, write everything down and stand still.
+
+        If that was the end of a trial, :class:`EndTrial` comes instead of :class:`Paused`, and no
+        other trial must be begun.
+        """
         self._pausing = True
         self._go_on(now)
         return self._take()
@@ -443,8 +463,44 @@ class Robot:
         )
         history.observed(record, after, explained=info.explained)
         self._write(record)
+        if not info.explained:
+            self._tell_unexplained(state.step, info)
         if not self._pausing:
             self._ask(reached, now)
+
+    def _tell_unexplained(self, step: int, info: ObservationInfo) -> None:
+        """Say that the last observation was unexplained, and if it is one too many in a row."""
+        history = self._history
+        assert history is not None
+        gate = f"{UNEXPLAINED_DEVIATIONS_SQUARED**0.5:g} standard deviations"
+        if history.num_unexplained <= _MOST_TOLD:
+            distance = info.mahalanobis_distance
+            fields: dict[str, object] = {} if distance is None else {"deviations": distance}
+            more = history.num_unexplained == _MOST_TOLD
+            self._report(
+                "unexplained_observation",
+                trial=self._trial,
+                step=step,
+                sensing_action=self._sensing_action,
+                **fields,
+                reason=(
+                    "no particle can have made it"
+                    if distance is None
+                    else f"outside the validation gate of every particle ({gate})"
+                )
+                + ("; further ones of this trial are counted only" if more else ""),
+            )
+        if (
+            history.unexplained_in_a_row == _DIVERGENCE_RUN
+            and history.num_divergences <= _MOST_TOLD
+        ):
+            self._report(
+                "filter_diverged",
+                trial=self._trial,
+                step=step,
+                reason=f"the last {_DIVERGENCE_RUN} observations were unexplained: the belief has "
+                "lost the state, or the problem's model is wrong; the robot goes on",
+            )
 
     def _acted(self, event: Acted) -> None:
         history = self._history
@@ -480,15 +536,16 @@ class Robot:
             if self._pausing and history is None:
                 self._effects.append(Paused())
             return
+        state = history.state
+        if self._done or state.step >= self._simulator.max_steps:
+            # Before a pause: that the task is done, and how it ended, is in no other record.
+            self._end_trial(now)
+            return
         if self._pausing:
             self._write(PausedRecord())
             self._history = None
             self._dispatcher.drop()
             self._effects.append(Paused())
-            return
-        state = history.state
-        if self._done or state.step >= self._simulator.max_steps:
-            self._end_trial(now)
             return
         if self._planner.needs_sensing(state):
             self._next_sensing(state, now)
@@ -597,7 +654,8 @@ class Robot:
         result = TrialResult(
             trial=self._trial,
             seed=self._simulator.seed,
-            success=self._done,
+            success=self._done is True,
+            failed=self._done == "failed",
             steps=state.step,
             reward=history.total_reward,
             sensing_decisions=history.num_observations,
