@@ -233,6 +233,7 @@ def run_robot(
             notebook,
             on_result,
             notebook.add_timing,
+            lambda _: None,
             rate_hz,
             links.offload,
         )

@@ -36,6 +36,7 @@ from holdfast.sensing import SensingInfo
 from holdfast.settings import MAX_PARTICLES, PlanningSettings, check_settings
 
 __all__ = [
+    "Decision",
     "ObservationInfo",
     "Planner",
     "PlanningState",
@@ -51,6 +52,7 @@ __all__ = [
     "initial_state",
     "needs_sensing",
     "observe",
+    "plan_until_sensing",
 ]
 
 FloatArray = npt.NDArray[np.float64]
@@ -118,6 +120,24 @@ class TaskInfo(NamedTuple):
     estimate: FloatArray
     commanded: FloatArray
     stage: int
+
+
+class Decision(NamedTuple):
+    """All that can be decided in a state before something is sensed again.
+
+    Attributes
+    ----------
+    actions : tuple of arrays of shape (action_size,)
+        Task actions up to the next sensing step; none if the state has to sense first.
+    sensing_action : int or None
+        Of that sensing step; None if it is too far away.
+    ahead : PlanningState
+        The state in which it was chosen.
+    """
+
+    actions: tuple[FloatArray, ...]
+    sensing_action: int | None
+    ahead: PlanningState
 
 
 def initial_state(
@@ -322,6 +342,39 @@ def advance(
     )
 
 
+def plan_until_sensing(
+    problem: Problem, settings: PlanningSettings, state: PlanningState, max_actions: int
+) -> tuple[list[FloatArray], PlanningState]:
+    """Choose the task actions up to the next sensing step: no observation comes between them.
+
+    Parameters
+    ----------
+    problem : Problem
+    settings : PlanningSettings
+    state : PlanningState
+    max_actions : int
+        Stop after so many.
+
+    Returns
+    -------
+    actions : list of arrays of shape (action_size,)
+        Executed actions; empty if the state has to sense first.
+    ahead : PlanningState
+        The state that they lead to.
+
+    Raises
+    ------
+    ProblemError
+        If a function of the problem breaks its contract.
+    """
+    actions: list[FloatArray] = []
+    while len(actions) < max_actions and not needs_sensing(settings, state):
+        action, _ = choose_task_action(problem, settings, state)
+        state = advance(problem, settings, state, action)
+        actions.append(action)
+    return actions, state
+
+
 class Planner:
     """The functions that change a state, for one problem and its settings.
 
@@ -355,6 +408,15 @@ class Planner:
     def advance(self, state: PlanningState, task_action: FloatArray) -> PlanningState:
         """Predict the belief and go to the next step; see :func:`advance`."""
         return advance(self.problem, self.settings, state, task_action)
+
+    def decide(self, state: PlanningState, max_actions: int) -> Decision:
+        """Decide all that can be decided before something is sensed again."""
+        actions, ahead = plan_until_sensing(self.problem, self.settings, state, max_actions)
+        if not needs_sensing(self.settings, ahead):
+            return Decision(tuple(actions), None, ahead)
+        return Decision(
+            tuple(actions), choose_sensing_action(self.problem, self.settings, ahead)[0], ahead
+        )
 
     def digest(self, state: PlanningState) -> bytes:
         """Return 32 bytes that are equal for equal states only; see :func:`digest`."""

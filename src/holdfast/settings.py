@@ -177,6 +177,10 @@ class OffloadSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
         all.
     decision_timeout_ms : float
         A decision that takes longer than this is given up even if its service shows progress.
+    verify_share : float
+        Share of the services' answers that this robot computes again with its own planner while it
+        moves, from 0 to 1. Whoever answered otherwise is not asked again in the run. (Answers that
+        differ from each other, or are outside the problem's own limits, are always settled so.)
     tls : str or None
         Directory with this robot's credentials, as ``holdfast keys`` makes it. In a file it may be
         relative to that file.
@@ -189,6 +193,7 @@ class OffloadSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
     decision_deadline_ms: Milliseconds | None = None
     max_hedged_share: Annotated[float, msgspec.Meta(ge=0.0, le=1.0)] = 0.1
     decision_timeout_ms: Milliseconds = 60_000.0
+    verify_share: Annotated[float, msgspec.Meta(ge=0.0, le=1.0)] = 0.05
     tls: Text | None = None
 
 

@@ -18,7 +18,13 @@ from typing import Any
 
 from holdfast.errors import ConfigurationError
 
-__all__ = ["account_of_user_error", "find_class", "is_users_file", "registered_names"]
+__all__ = [
+    "account_of_user_error",
+    "describe_problem_error",
+    "find_class",
+    "is_users_file",
+    "registered_names",
+]
 
 _HOLDFAST = Path(__file__).resolve().parent
 _LIBRARIES = tuple(
@@ -86,6 +92,18 @@ def account_of_user_error(error: BaseException, name: str) -> str | None:
     text = error.msg if isinstance(error, SyntaxError) else str(error)
     kind = type(error).__name__
     return f"{name} raised {kind}{': ' if text else ''}{text}\n{where}"
+
+
+def describe_problem_error(name: str, error: BaseException) -> str:
+    """Put what a problem raised into words, wherever it came from.
+
+    Parameters
+    ----------
+    name : str
+        Of the problem.
+    error : BaseException
+    """
+    return account_of_user_error(error, name) or f"{type(error).__name__}: {error}"
 
 
 def registered_names(group: str) -> list[str]:

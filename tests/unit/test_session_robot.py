@@ -33,6 +33,7 @@ from holdfast.session.dispatcher import Dispatcher, ServiceRefusedError
 from holdfast.session.effects import (
     Abandon,
     Act,
+    Decide,
     Effect,
     EndTrial,
     Journal,
@@ -43,11 +44,13 @@ from holdfast.session.effects import (
     Sense,
     Stop,
     Timing,
+    Verified,
 )
 from holdfast.session.events import (
     Acted,
     Appeared,
     Begun,
+    Decided,
     Ended,
     EnvironmentFailed,
     Replied,
@@ -196,9 +199,12 @@ class World:
         rate_hz: float | None = None,
         planning: PlanningSettings = PLANNING,
         simulator: SimulatorSettings = SIMULATOR,
+        verify_share: float = 0.05,
     ) -> None:
         self.now = 0.0
-        self.offload = OffloadSettings(services=services, decision_deadline_ms=deadline_ms)
+        self.offload = OffloadSettings(
+            services=services, decision_deadline_ms=deadline_ms, verify_share=verify_share
+        )
         self.services = {name: SmallService() for name in (*services, LOCAL)}
         self.services[LOCAL].up = False
         self.launchable = True
@@ -214,7 +220,13 @@ class World:
             OPENING,
             PROBLEM.action_size,
             len(PROBLEM.sensing_actions),
+            lambda actions: self.limited(actions),
+            b"secret",
         )
+        self.limited = PROBLEM.execute
+        self.own_s = 0.005
+        self.own = self.decide
+        self.verified: list[Verified] = []
         self.planner, self.simulator = Planner(PROBLEM, planning), simulator
         self.robot = Robot(self.planner, simulator, dispatcher, rate_hz)
         self.environment = SimulatedEnvironment(PROBLEM, simulator.seed, 0)
@@ -313,6 +325,11 @@ class World:
                 self.act(effect)
             elif isinstance(effect, Launch):
                 self.launch(effect)
+            elif isinstance(effect, Decide):
+                decided = self.own(effect)
+                self.after(self.own_s, lambda it=decided: self.robot.handle(it, self.now))  # type: ignore[misc]
+            elif isinstance(effect, Verified):
+                self.verified.append(effect)
             elif isinstance(effect, EndTrial):
                 self.results.append(effect.result)
                 self.journal = []
@@ -324,6 +341,10 @@ class World:
                 self.stopped = effect
             elif isinstance(effect, Paused):
                 self.ended = True
+
+    def decide(self, effect: Decide) -> Decided:
+        actions, sensing_action, ahead = self.planner.decide(effect.state, MAX_TASK_ACTIONS)
+        return Decided(effect.number, actions, sensing_action, digest(ahead), self.own_s)
 
     def later(self, event: Sensed | Acted) -> Callable[[], list[Effect]]:
         return lambda: self.robot.handle(event, self.now)

@@ -1,7 +1,8 @@
 """The command line: options in, a run, and what a person at a terminal wants to see of it.
 
 Nothing below this package prints or exits. Here an error that holdfast raises on purpose, or that a
-problem's own code raises, becomes one message and exit code 2; Ctrl-C, SIGTERM and a terminal that
+problem's own code raises, becomes one message and exit code 2, or 3 if services answered otherwise
+than the robot's own planner; Ctrl-C, SIGTERM and a terminal that
 is closed end a run in order, with 128 and the signal's number; so does, with SIGPIPE's, a reader of
 the standard output that has ended; and anything else is a defect and keeps its traceback.
 
@@ -59,10 +60,10 @@ def _main() -> None:
         finally:
             sys.stdout.flush()
     except HoldfastError as error:
-        from holdfast.cli.endings import EXIT_ERROR, tell_error
+        from holdfast.cli.endings import EXIT_ERROR, RunError, tell_error
 
         tell_error(error, arguments)
-        sys.exit(EXIT_ERROR)
+        sys.exit(error.exit_code if isinstance(error, RunError) else EXIT_ERROR)
     except KeyboardInterrupt as interruption:
         from holdfast.cli.endings import EXIT_SIGNAL, signal_of
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from holdfast.cli.endings import EXIT_DIFFERENT, ResumableError, ended_by_signals, signal_of
+from holdfast.cli.endings import EXIT_DIFFERENT, RunError, ended_by_signals, signal_of
 from holdfast.errors import HoldfastError, InvalidValueError
 
 if TYPE_CHECKING:
@@ -244,7 +244,7 @@ def _run(
         )
         raise
     except HoldfastError as error:
-        raise ResumableError(error, again) from error
+        raise RunError(error, again) from error
     note = _draw(directory, summary, series.outcomes)
     show.conclude(summary, directory, note)
     return summary.identical == summary.finished

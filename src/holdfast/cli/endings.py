@@ -14,8 +14,9 @@ __all__ = [
     "EXIT_DIFFERENT",
     "EXIT_ERROR",
     "EXIT_SIGNAL",
+    "EXIT_WRONG_ANSWER",
     "EndedBySignal",
-    "ResumableError",
+    "RunError",
     "ended_by_signals",
     "signal_of",
     "tell_error",
@@ -27,29 +28,38 @@ EXIT_DIFFERENT = 1
 EXIT_ERROR = 2
 """Something that holdfast refuses, or that cannot be done."""
 
+EXIT_WRONG_ANSWER = 3
+"""A service answered otherwise than the robot's own planner; events.jsonl says which and when."""
+
 EXIT_SIGNAL = 128
 """Added to the number of the signal that ended a run, as shells do it."""
 
 
-class ResumableError(HoldfastError):
-    """What ended a run that can go on.
+class RunError(HoldfastError):
+    """What ended a run.
 
     Parameters
     ----------
     error : HoldfastError
-    command : str
-        The command that goes on.
+    command : str or None
+        The command that goes on; None if none would.
+    exit_code : int
 
     Attributes
     ----------
-    reason, command : str
+    reason : str
+    command : str or None
         Both of them; the message has them together.
+    exit_code : int
     """
 
-    def __init__(self, error: HoldfastError, command: str) -> None:
-        super().__init__(f"{error}\nGo on with: {command}")
+    def __init__(
+        self, error: HoldfastError, command: str | None, exit_code: int = EXIT_ERROR
+    ) -> None:
+        super().__init__(f"{error}\nGo on with: {command}" if command else str(error))
         self.reason = str(error)
         self.command = command
+        self.exit_code = exit_code
 
 
 def tell_error(error: HoldfastError, arguments: Sequence[str]) -> None:
@@ -66,13 +76,13 @@ def tell_error(error: HoldfastError, arguments: Sequence[str]) -> None:
         return
     from holdfast.runtime.logs import tell_event
 
-    text = error.reason if isinstance(error, ResumableError) else str(error)
+    text = error.reason if isinstance(error, RunError) else str(error)
     # The rest, such as lines of the user's code, apart: a value of an event has its bound.
     reason, _, details = text.partition("\n")
     fields = {"reason": reason}
     if details:
         fields["details"] = details
-    if isinstance(error, ResumableError):
+    if isinstance(error, RunError) and error.command:
         fields["resume_command"] = error.command
     component = {"serve": "service", "chaos": "chaos"}.get(arguments[0], "robot")
     tell_event(component, "error", **fields)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from holdfast.cli.endings import ResumableError, ended_by_signals, signal_of
+from holdfast.cli.endings import RunError, ended_by_signals, signal_of
 from holdfast.errors import HoldfastError, InvalidValueError
 
 if TYPE_CHECKING:
@@ -145,7 +145,7 @@ def _run(
             sys.stderr.write(f"\n{how}; {kept}.\nGo on with: {again}\n")
         raise
     except HoldfastError as error:
-        raise ResumableError(error, again) from error
+        raise RunError(error, again) from error
 
 
 def _compute(workload: Workload, directory: Path, executor: Executor) -> None:

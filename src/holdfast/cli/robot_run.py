@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from holdfast.recording.run_directory import RunDirectory
     from holdfast.runtime.environment import EnvironmentMaker
     from holdfast.runtime.logs import EventSink, LogFormat
+    from holdfast.session.effects import Verified
 
 __all__ = ["is_robot_run", "run_as_robot"]
 
@@ -67,8 +68,8 @@ def run_as_robot(
     HoldfastError
         If the robot holds still and cannot go on.
     """
-    from holdfast.recording.run_directory import EVENTS_NAME, TIMINGS_NAME
-    from holdfast.recording.timings import TimingTable
+    from holdfast.recording.run_directory import EVENTS_NAME, TIMINGS_NAME, VERIFICATION_NAME
+    from holdfast.recording.timings import TimingTable, VerificationTable
     from holdfast.runtime.links import make_links
     from holdfast.runtime.logs import EventLog, TeeEventLog
     from holdfast.runtime.robot_process import RobotProcess
@@ -86,6 +87,11 @@ def run_as_robot(
         stack.callback(links.close)
         timings = TimingTable(directory.path / TIMINGS_NAME)
         stack.callback(timings.close)
+        on_verified: Callable[[Verified], None] = _ignore
+        if configuration.offload.services:
+            verification = VerificationTable(directory.path / VERIFICATION_NAME)
+            stack.callback(verification.close)
+            on_verified = verification.add
         robot = RobotProcess(
             configuration,
             links.services,
@@ -96,9 +102,14 @@ def run_as_robot(
             events,
             on_result,
             timings.add,
+            on_verified,
             rate_hz,
             links.offload,
         )
         launcher = None if links.launcher is None else links.launcher(robot.deliver)
         robot.run(directory.journal.finished(), launcher)
         return robot.missed_ticks
+
+
+def _ignore(verified: Verified) -> None:
+    """Do nothing: a robot that asks no service has nothing to verify."""

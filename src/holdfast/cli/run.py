@@ -14,7 +14,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from holdfast.cli.endings import ResumableError, ended_by_signals, signal_of
+from holdfast.cli.endings import (
+    EXIT_ERROR,
+    EXIT_WRONG_ANSWER,
+    RunError,
+    ended_by_signals,
+    signal_of,
+)
 from holdfast.cli.overrides import Override, combined, parse_assignment
 from holdfast.cli.terminal import duration, print_files, print_summary, run_display
 from holdfast.errors import HoldfastError, InvalidValueError
@@ -313,6 +319,7 @@ def _run(options: _Options) -> None:
         display = run_display(configuration, quiet=quiet or options.log == "json")
         recorder = Recorder(trial=0)
         missed_ticks = 0
+        summary: RunSummary | None = None
         started = perf_counter()
 
         def on_result(result: TrialResult) -> None:
@@ -346,7 +353,7 @@ def _run(options: _Options) -> None:
                     display.stop()
                 # Tables of what is finished; if the disk is the trouble, the first error says so.
                 with contextlib.suppress(HoldfastError):
-                    directory.write_tables(perf_counter() - started)
+                    summary = directory.write_tables(perf_counter() - started)
                 raise
             display.stop()
             summary = directory.write_tables(perf_counter() - started)
@@ -373,16 +380,28 @@ def _run(options: _Options) -> None:
         except HoldfastError as error:
             from holdfast.session.robot import UnknownPerformanceError
 
-            if directory.journal.unfinished_trial() is None or isinstance(
+            cannot_go_on = directory.journal.unfinished_trial() is None or isinstance(
                 error, UnknownPerformanceError
-            ):
-                raise
-            command = options.resume_command(directory_path)
-            raise ResumableError(error, command) from error
+            )
+            resume = None if cannot_go_on else options.resume_command(directory_path)
+            raise RunError(error, resume, _exit_code(summary) or EXIT_ERROR) from error
         if not quiet:
             print_files(directory_path)
         if note is not None:
             notes.note(note)
+        if _exit_code(summary):
+            notes.note(
+                "services answered otherwise than the robot's own planner; events.jsonl and "
+                "verification.csv say where"
+            )
+            raise SystemExit(_exit_code(summary))
+
+
+def _exit_code(summary: RunSummary | None) -> int:
+    """Return the exit code of a run that came to its end."""
+    if summary is not None and (summary.wrong_answers or summary.not_deterministic):
+        return EXIT_WRONG_ANSWER
+    return 0
 
 
 def _idle_services(configuration: Configuration, summary: RunSummary) -> list[str]:

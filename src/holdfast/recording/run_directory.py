@@ -23,7 +23,7 @@ from holdfast.outcome import TrialResult
 from holdfast.recording.fingerprint import difference, fingerprint
 from holdfast.recording.journal import Journal, Survives
 from holdfast.recording.tables import RunSummary, SummaryBuilder, csv_lines
-from holdfast.recording.timings import count_answers
+from holdfast.recording.timings import count_answers, count_verified
 
 __all__ = [
     "CONFIGURATION_NAME",
@@ -33,6 +33,7 @@ __all__ = [
     "SUMMARY_NAME",
     "TIMINGS_NAME",
     "TRIALS_NAME",
+    "VERIFICATION_NAME",
     "RunDirectory",
     "claim_default_directory",
     "configuration_difference",
@@ -46,6 +47,7 @@ FIGURE_NAME = "trial.png"
 JOURNAL_NAME = "journal.sqlite"
 SUMMARY_NAME = "summary.json"
 TIMINGS_NAME = "timings.csv"
+VERIFICATION_NAME = "verification.csv"
 TRIALS_NAME = "trials.csv"
 
 # Which service decides, and how soon it is given up, changes no decision.
@@ -105,8 +107,9 @@ class RunDirectory:
         try:
             if journal is not None:
                 journal.restart(meta)
-                for name in (TRIALS_NAME, SUMMARY_NAME, FIGURE_NAME, EVENTS_NAME, TIMINGS_NAME):
-                    (path / name).unlink(missing_ok=True)
+                for name in output_names():
+                    if name not in (CONFIGURATION_NAME, JOURNAL_NAME):
+                        (path / name).unlink(missing_ok=True)
             else:
                 _require_writable(path)
                 journal = Journal.create(path / JOURNAL_NAME, meta, survives=survives)
@@ -186,6 +189,7 @@ class RunDirectory:
             trials=self.configuration.simulator.num_trials,
             wall_time_s=total_s,
             answers=count_answers(self.path / TIMINGS_NAME, self.journal.finished()),
+            verified=count_verified(self.path / VERIFICATION_NAME),
         )
         write_atomically(self.path / SUMMARY_NAME, summary.to_json())
         return summary
@@ -207,13 +211,14 @@ class RunDirectory:
 
 
 def output_names() -> tuple[str, ...]:
-    """Return the names of the files that a run leaves in its directory, the last two not always.
+    """Return the names of the files that a run leaves in its directory, the last three not always.
 
     Returns
     -------
     tuple of str
-        ``events.jsonl`` (changes of status) and ``timings.csv`` (a row for each decision) are there
-        only if services decided.
+        ``events.jsonl`` (changes of status), ``timings.csv`` (a row for each decision) and
+        ``verification.csv`` (a row for each answer that was computed again) are there only if
+        services decided.
     """
     return (
         TRIALS_NAME,
@@ -223,6 +228,7 @@ def output_names() -> tuple[str, ...]:
         JOURNAL_NAME,
         EVENTS_NAME,
         TIMINGS_NAME,
+        VERIFICATION_NAME,
     )
 
 

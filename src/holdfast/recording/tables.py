@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 
 from holdfast.outcome import TrialResult
-from holdfast.recording.timings import AnswerCounts
+from holdfast.recording.timings import AnswerCounts, VerificationCounts
 
 __all__ = [
     "CSV_COLUMNS",
@@ -83,6 +83,13 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
         those up to the next sensing step); None where ``timings.csv`` is not kept.
     longest_wait_ms : float or None
         The longest time that the robot stood still for a decision.
+    verified_answers : int or None
+        Answers of services that the robot's own planner computed again; None where no service
+        decided.
+    wrong_answers : dict of str to int, or None
+        By service: those that were not what the robot's own planner decides.
+    not_deterministic : int or None
+        Those of which nothing can be said: the robot's own planner came to two decisions.
     sensing_ms_median, sensing_ms_p99 : float or None
         Wall time of choosing a sensing action. Each decision counts once, as it was carried out,
         also those of earlier processes of a run that was resumed.
@@ -111,6 +118,9 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
     sensing_decisions_by_service: dict[str, int] | None
     task_answers_by_service: dict[str, int] | None
     longest_wait_ms: float | None
+    verified_answers: int | None
+    wrong_answers: dict[str, int] | None
+    not_deterministic: int | None
     sensing_ms_median: float | None
     sensing_ms_p99: float | None
     wall_time_s: float
@@ -204,6 +214,7 @@ class SummaryBuilder:
         trials: int,
         wall_time_s: float,
         answers: AnswerCounts | None = None,
+        verified: VerificationCounts | None = None,
     ) -> RunSummary:
         """Return the summary of what was added.
 
@@ -217,6 +228,8 @@ class SummaryBuilder:
         wall_time_s : float
         answers : AnswerCounts or None
             Who decided, where that is known.
+        verified : VerificationCounts or None
+            What was computed again, where services decided.
         """
         count = self._finished
         median = p99 = None
@@ -244,6 +257,9 @@ class SummaryBuilder:
             sensing_decisions_by_service=None if answers is None else answers.sensing,
             task_answers_by_service=None if answers is None else answers.task,
             longest_wait_ms=None if answers is None else answers.longest_wait_ms,
+            verified_answers=None if verified is None else verified.verified,
+            wrong_answers=None if verified is None else verified.wrong,
+            not_deterministic=None if verified is None else verified.not_deterministic,
             sensing_ms_median=median,
             sensing_ms_p99=p99,
             wall_time_s=round(wall_time_s, 3),

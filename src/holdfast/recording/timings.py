@@ -1,6 +1,6 @@
-"""How long each decision of a run took, and who made it: a row for each, as it is made.
+"""How long each decision of a run took, who made it, and whether it was right: rows as they come.
 
-These times are for people and figures; nothing is decided by them. So a row is handed to the
+These tables are for people and figures; nothing is decided by them. So a row is handed to the
 operating system at once but not forced to the disk, and what a crash cuts off is cut off here too
 when the run goes on. (The times in the tables of the trials come from the journal.)
 """
@@ -10,14 +10,23 @@ from __future__ import annotations
 import csv
 import time
 from collections import Counter
-from collections.abc import Callable, Container
+from collections.abc import Callable, Container, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 from holdfast.files import OutputError
-from holdfast.session.effects import Timing
+from holdfast.session.effects import Timing, Verified
 
-__all__ = ["TIMING_COLUMNS", "AnswerCounts", "TimingTable", "count_answers"]
+__all__ = [
+    "TIMING_COLUMNS",
+    "VERIFICATION_COLUMNS",
+    "AnswerCounts",
+    "TimingTable",
+    "VerificationCounts",
+    "VerificationTable",
+    "count_answers",
+    "count_verified",
+]
 
 TIMING_COLUMNS = (
     "trial",
@@ -32,15 +41,17 @@ TIMING_COLUMNS = (
 )
 
 
-class TimingTable:
-    """The file ``timings.csv`` of a run, open for more rows.
+VERIFICATION_COLUMNS = ("trial", "step", "service", "kind", "verdict", "time")
 
-    The last column says when the decision was carried out, as ``events.jsonl`` writes times.
+
+class _Table:
+    """A file of rows, open for more; its last column says when, as ``events.jsonl`` writes times.
 
     Parameters
     ----------
     path : Path
         Appended to if it is there.
+    columns : sequence of str
     clock : callable
         Returns nanoseconds since the epoch.
 
@@ -50,7 +61,7 @@ class TimingTable:
         If it cannot be written.
     """
 
-    def __init__(self, path: Path, *, clock: Callable[[], int] = time.time_ns) -> None:
+    def __init__(self, path: Path, columns: Sequence[str], clock: Callable[[], int]) -> None:
         self._path = path
         self._clock = clock
         try:
@@ -58,9 +69,42 @@ class TimingTable:
                 _cut_off_unfinished_line(path)
             self._file = path.open("a", buffering=1, encoding="utf-8", newline="")
             if self._file.tell() == 0:
-                self._file.write(",".join(TIMING_COLUMNS) + "\n")
+                self._file.write(",".join(columns) + "\n")
         except OSError as error:
-            raise OutputError(f"{path}: cannot be written: {error.strerror}") from error
+            raise self._unwritable(error) from error
+
+    def _write(self, *values: object) -> None:
+        seconds, rest_ns = divmod(self._clock(), 1_000_000_000)
+        moment = time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime(seconds))
+        try:
+            self._file.write(f"{','.join(map(str, values))},{moment}.{rest_ns // 1000:06d}Z\n")
+        except OSError as error:
+            raise self._unwritable(error) from error
+
+    def _unwritable(self, error: OSError) -> OutputError:
+        return OutputError(f"{self._path}: cannot be written: {error.strerror}")
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+
+class TimingTable(_Table):
+    """The file ``timings.csv`` of a run: a row for each answer that was used.
+
+    Parameters
+    ----------
+    path : Path
+    clock : callable
+
+    Raises
+    ------
+    OutputError
+        If it cannot be written.
+    """
+
+    def __init__(self, path: Path, *, clock: Callable[[], int] = time.time_ns) -> None:
+        super().__init__(path, TIMING_COLUMNS, clock)
 
     def add(self, timing: Timing) -> None:
         """Add a row.
@@ -70,23 +114,93 @@ class TimingTable:
         OutputError
             If it cannot be written.
         """
-        service = timing.service.replace('"', '""')
-        if any(character in service for character in ',"\n'):
-            service = f'"{service}"'
-        seconds, rest_ns = divmod(self._clock(), 1_000_000_000)
-        moment = time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime(seconds))
-        try:
-            self._file.write(
-                f"{timing.trial},{timing.step},{timing.kind},{service},{timing.status},"
-                f"{timing.waited_ms:.3f},{timing.round_trip_ms:.3f},{timing.computed_ms:.3f},"
-                f"{moment}.{rest_ns // 1000:06d}Z\n"
-            )
-        except OSError as error:
-            raise OutputError(f"{self._path}: cannot be written: {error.strerror}") from error
+        self._write(
+            timing.trial,
+            timing.step,
+            timing.kind,
+            _quoted(timing.service),
+            timing.status,
+            f"{timing.waited_ms:.3f}",
+            f"{timing.round_trip_ms:.3f}",
+            f"{timing.computed_ms:.3f}",
+        )
 
-    def close(self) -> None:
-        """Close the file."""
-        self._file.close()
+
+class VerificationTable(_Table):
+    """The file ``verification.csv`` of a run: a row for each answer that was computed again.
+
+    Parameters
+    ----------
+    path : Path
+    clock : callable
+
+    Raises
+    ------
+    OutputError
+        If it cannot be written.
+    """
+
+    def __init__(self, path: Path, *, clock: Callable[[], int] = time.time_ns) -> None:
+        super().__init__(path, VERIFICATION_COLUMNS, clock)
+
+    def add(self, verified: Verified) -> None:
+        """Add a row.
+
+        Raises
+        ------
+        OutputError
+            If it cannot be written.
+        """
+        self._write(
+            verified.trial,
+            verified.step,
+            _quoted(verified.service),
+            verified.kind,
+            verified.verdict,
+        )
+
+
+class VerificationCounts(NamedTuple):
+    """How many answers of a run's services were computed again.
+
+    Attributes
+    ----------
+    verified : int
+    wrong : dict of str to int
+        By service: those that are not what the robot's own planner decides.
+    not_deterministic : int
+        Those of which nothing can be said, because the robot's own planner came to two decisions.
+    """
+
+    verified: int
+    wrong: dict[str, int]
+    not_deterministic: int
+
+
+def count_verified(path: Path) -> VerificationCounts | None:
+    """Count the rows of a run's ``verification.csv``.
+
+    Parameters
+    ----------
+    path : Path
+
+    Returns
+    -------
+    VerificationCounts or None
+        None if there is no such table. A row that is damaged does not count.
+    """
+    verified = not_deterministic = 0
+    wrong: Counter[str] = Counter()
+    try:
+        for row in _rows(path, len(VERIFICATION_COLUMNS)):
+            service, verdict = row[2], row[4]
+            verified += verdict in ("same", "different")
+            not_deterministic += verdict == "not_deterministic"
+            if verdict == "different":
+                wrong[service] += 1
+    except (OSError, csv.Error):
+        return None
+    return VerificationCounts(verified, dict(wrong.most_common()), not_deterministic)
 
 
 class AnswerCounts(NamedTuple):
@@ -133,24 +247,36 @@ def count_answers(path: Path, trials: Container[int]) -> AnswerCounts | None:
         decided.clear()
 
     try:
-        with path.open(encoding="utf-8", errors="replace", newline="") as file:
-            for row in csv.reader(line.replace("\0", "") for line in file):
-                try:
-                    trial, step, kind, service, _, waited_ms = row[:6]
-                    number, key, wait_ms = int(trial), (int(step), kind), float(waited_ms)
-                except ValueError:
-                    continue  # the head, or a row that a power cut has spoilt
-                if number not in trials:
-                    continue
-                if number != current:
-                    settle()
-                    current = number
-                decided[key] = service
-                longest_ms = wait_ms if longest_ms is None else max(longest_ms, wait_ms)
+        for row in _rows(path, 6):
+            try:
+                trial, step, kind, service, _, waited_ms = row[:6]
+                number, key, wait_ms = int(trial), (int(step), kind), float(waited_ms)
+            except ValueError:
+                continue  # the head, or a row that a power cut has spoilt
+            if number not in trials:
+                continue
+            if number != current:
+                settle()
+                current = number
+            decided[key] = service
+            longest_ms = wait_ms if longest_ms is None else max(longest_ms, wait_ms)
     except (OSError, csv.Error):
         return None
     settle()
     return AnswerCounts(dict(sensing.most_common()), dict(task.most_common()), longest_ms)
+
+
+def _rows(path: Path, least: int) -> Iterator[list[str]]:
+    """Yield the rows of a table, as far as they have enough columns."""
+    with path.open(encoding="utf-8", errors="replace", newline="") as file:
+        for row in csv.reader(line.replace("\0", "") for line in file):
+            if len(row) >= least:
+                yield row
+
+
+def _quoted(service: str) -> str:
+    quoted = service.replace('"', '""')
+    return f'"{quoted}"' if any(character in quoted for character in ',"\n') else quoted
 
 
 def _cut_off_unfinished_line(path: Path) -> None:

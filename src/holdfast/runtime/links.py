@@ -6,6 +6,7 @@ launched, finds the robot. With none named the planner is in the robot's own pro
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -18,7 +19,7 @@ from holdfast.runtime.own_planner import OWN_PLANNER, OwnPlanner
 from holdfast.runtime.recovery_launcher import RecoveryExited, RecoveryLauncher
 from holdfast.runtime.transport.contract import RobotTransport
 from holdfast.settings import OffloadSettings
-from holdfast.user_code import account_of_user_error
+from holdfast.user_code import describe_problem_error
 
 __all__ = ["RECOVERY_SERVICE", "Links", "make_links"]
 
@@ -77,12 +78,14 @@ def make_links(configuration: Configuration, log_path: Path | None, events: Even
     if not offload.services:
         # It cannot be lost, so it may be silent for as long as it computes.
         patient = msgspec.structs.replace(
-            offload, detection_timeout_ms=_FOR_EVER_MS, decision_timeout_ms=_FOR_EVER_MS
+            offload,
+            detection_timeout_ms=_FOR_EVER_MS,
+            decision_timeout_ms=_FOR_EVER_MS,
+            verify_share=0.0,
         )
-        name = configuration.problem_name
         planner = OwnPlanner(
             Configuration.from_plain(configuration.plain()).problem,
-            lambda error: account_of_user_error(error, name) or f"{type(error).__name__}: {error}",
+            functools.partial(describe_problem_error, configuration.problem_name),
         )
         return Links(planner, (OWN_PLANNER,), None, None, patient, _nothing)
     return _zenoh_links(configuration, log_path, events)

@@ -14,6 +14,7 @@ from time import monotonic
 from typing import NamedTuple
 
 from holdfast.problems.problem import Problem
+from holdfast.protocol.verification import OWN_PLANNER
 from holdfast.session.events import Appeared, Ended, Replied, TransportEvent, Vanished
 from holdfast.session.messages import Opening
 from holdfast.session.service import Service
@@ -21,9 +22,6 @@ from holdfast.session.service_effects import Answer, Effect, End, Run
 from holdfast.session.service_limits import ServiceLimits
 
 __all__ = ["OWN_PLANNER", "OwnPlanner"]
-
-OWN_PLANNER = "in_process"
-"""The name of the service."""
 
 # A robot is never too large for itself.
 _NO_LIMITS = ServiceLimits(max_particles=2**62, max_work=2**62, max_state_bytes=2**62)

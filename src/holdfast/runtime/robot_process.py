@@ -9,6 +9,8 @@ the queue, so a robot that moves slowly still hears at once that a service has d
 from __future__ import annotations
 
 import contextlib
+import functools
+import os
 import signal
 import sys
 import threading
@@ -18,10 +20,12 @@ from queue import Empty, SimpleQueue
 from time import monotonic
 from typing import NamedTuple, Protocol, TypeAlias
 
+from holdfast import contract
 from holdfast.configuration import Configuration
 from holdfast.errors import HoldfastError, TrialError
 from holdfast.outcome import TrialResult
 from holdfast.planning import Planner
+from holdfast.robot.own_decisions import OwnDecisions
 from holdfast.runtime.diagnosis import MissingServices
 from holdfast.runtime.environment import EnvironmentMaker
 from holdfast.runtime.logs import EventSink
@@ -32,6 +36,7 @@ from holdfast.session.dispatcher import Dispatcher
 from holdfast.session.effects import (
     Abandon,
     Act,
+    Decide,
     Effect,
     EndTrial,
     Journal,
@@ -42,13 +47,20 @@ from holdfast.session.effects import (
     Sense,
     Stop,
     Timing,
+    Verified,
 )
-from holdfast.session.events import Begun, EnvironmentEvent, EnvironmentFailed, TransportEvent
+from holdfast.session.events import (
+    Begun,
+    Decided,
+    EnvironmentEvent,
+    EnvironmentFailed,
+    TransportEvent,
+)
 from holdfast.session.messages import Opening
 from holdfast.session.records import Record
 from holdfast.session.robot import HeldError, History, Robot, replay
 from holdfast.settings import OffloadSettings
-from holdfast.user_code import account_of_user_error
+from holdfast.user_code import account_of_user_error, describe_problem_error
 
 __all__ = ["Launcher", "RobotProcess", "StepJournal"]
 
@@ -116,7 +128,7 @@ class _Interrupted(NamedTuple):
     number: int
 
 
-_Happening: TypeAlias = TransportEvent | EnvironmentEvent | RecoveryExited | _Interrupted
+_Happening: TypeAlias = TransportEvent | EnvironmentEvent | Decided | RecoveryExited | _Interrupted
 
 
 class RobotProcess:
@@ -139,6 +151,8 @@ class RobotProcess:
         Gets the result of each trial, and keeps it.
     on_timing : callable
         Gets the times of each decision.
+    on_verified : callable
+        Gets what each answer that was computed again came to.
     rate_hz : float or None
         Task actions a second; None acts as soon as possible.
     offload : OffloadSettings or None
@@ -156,6 +170,7 @@ class RobotProcess:
         events: EventSink,
         on_result: Callable[[TrialResult], None],
         on_timing: Callable[[Timing], None],
+        on_verified: Callable[[Verified], None],
         rate_hz: float | None = None,
         offload: OffloadSettings | None = None,
     ) -> None:
@@ -170,6 +185,7 @@ class RobotProcess:
         )
         self._on_result = on_result
         self._on_timing = on_timing
+        self._on_verified = on_verified
         self._queue: SimpleQueue[tuple[float, _Happening]] = SimpleQueue()
         self._now = monotonic()
         self._launcher: Launcher | None = None
@@ -178,7 +194,7 @@ class RobotProcess:
         self._starting: tuple[int, History, bool] | None = None
         self._finished: set[int] = set()
         self._numbers = iter(range(configuration.simulator.num_trials))
-        self._paused = False
+        self._all_performed = False
         self._ended = False
         self._interrupted: int | None = None
         problem = configuration.problem
@@ -199,6 +215,15 @@ class RobotProcess:
             ),
             problem.action_size,
             len(problem.sensing_actions),
+            functools.partial(contract.executed_action, problem),
+            os.urandom(32),
+        )
+        self._own = OwnDecisions(
+            lambda: Planner(
+                Configuration.from_plain(configuration.plain()).problem, configuration.planning
+            ),
+            functools.partial(describe_problem_error, configuration.problem_name),
+            self.deliver,
         )
         self._planner = Planner(problem, configuration.planning)
         self._robot = Robot(self._planner, simulator, dispatcher, rate_hz)
@@ -208,7 +233,7 @@ class RobotProcess:
         """Ticks of the rate that passed while the robot was not ready."""
         return self._robot.missed_ticks
 
-    def deliver(self, event: TransportEvent | EnvironmentEvent | RecoveryExited) -> None:
+    def deliver(self, event: TransportEvent | EnvironmentEvent | Decided | RecoveryExited) -> None:
         """Take an event from any thread."""
         self._queue.put((monotonic(), event))
 
@@ -256,6 +281,7 @@ class RobotProcess:
             if self._performer is not None:
                 self._performer.close()
             self._transport.close()
+            self._own.close()
             if launcher is not None:
                 launcher.close()
         if self._interrupted is not None:
@@ -318,6 +344,8 @@ class RobotProcess:
             )
         elif not isinstance(event, Begun):
             self._carry_out(robot.handle(event, now))
+            if self._all_performed and isinstance(event, Decided):
+                self._ended = not robot.num_unverified
 
     def _carry_out(self, effects: list[Effect]) -> None:
         for effect in effects:
@@ -333,6 +361,10 @@ class RobotProcess:
                 self._performer.sense(effect.step, effect.sensing_action)
             elif isinstance(effect, Timing):
                 self._on_timing(effect)
+            elif isinstance(effect, Decide):
+                self._own.ask(effect)
+            elif isinstance(effect, Verified):
+                self._on_verified(effect)
             elif isinstance(effect, Abandon):
                 self._transport.abandon(effect.call)
             elif isinstance(effect, Report):
@@ -384,7 +416,16 @@ class RobotProcess:
         else:
             following = next((n for n in self._numbers if n not in self._finished), None)
             if following is None:
-                self._ended = True
+                # What is being computed again is still worth knowing.
+                left_out = self._robot.num_unverifiable
+                if left_out:
+                    self._events.event(
+                        "note",
+                        reason=f"{left_out} answers that were to be computed again "
+                        "(offload.verify_share) were not: this robot is too slow for so many",
+                    )
+                self._all_performed = True
+                self._ended = not self._robot.num_unverified
                 return
             trial, records, tail_is_certain = following, (), True
         self._replayed = trial

@@ -23,12 +23,16 @@ when the local one is started in :mod:`~holdfast.session.launches`.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import numpy.typing as npt
 
 from holdfast.errors import HoldfastError
+from holdfast.protocol.verification import OwnDecisionError, Verification
 from holdfast.session.calls import Call, Calls
 from holdfast.session.effects import Effect, Launch, Report, Stop
-from holdfast.session.events import Appeared, Ended, Replied, TransportEvent
+from holdfast.session.events import Appeared, Decided, Ended, Replied, TransportEvent
 from holdfast.session.hedging import Hedging
 from holdfast.session.known_services import KnownService, KnownServices
 from holdfast.session.launches import Launches
@@ -40,6 +44,8 @@ from holdfast.session.status import Cause, Status, next_status
 from holdfast.settings import OffloadSettings, RecoverySettings
 
 __all__ = ["Dispatcher", "ServiceRefusedError"]
+
+FloatArray = npt.NDArray[np.float64]
 
 
 class ServiceRefusedError(HoldfastError):
@@ -65,6 +71,10 @@ class Dispatcher:
     opening : Opening
     action_size, num_sensing_actions : int
         Of the problem, to check the answers.
+    limited : callable
+        What the problem's ``execute`` makes of actions, shape ``(count, action_size)`` in and out.
+    secret : bytes
+        Known to this robot alone: with it, it is drawn which answers are computed again.
 
     Attributes
     ----------
@@ -90,6 +100,8 @@ class Dispatcher:
         opening: Opening,
         action_size: int,
         num_sensing_actions: int,
+        limited: Callable[[FloatArray], FloatArray],
+        secret: bytes,
     ) -> None:
         timeout_s = 1e-3 * offload.detection_timeout_ms
         wanted = recovery_settings.launch != "never"
@@ -100,7 +112,12 @@ class Dispatcher:
         self.effects: list[Effect] = []
         self._services = KnownServices(services, recovery if wanted else None, timeout_s)
         self._calls = Calls(session, epoch, opening, self.effects)
-        self._replies = Replies(self._calls, action_size, num_sensing_actions, self.effects)
+        self._verification = Verification(
+            offload.verify_share, secret, recovery, limited, self.effects
+        )
+        self._replies = Replies(
+            self._calls, action_size, num_sensing_actions, self._verification, self.effects
+        )
         self._launches = Launches(recovery_settings)
         self._hedging = Hedging(offload)
         self._standstill = Standstill(timeout_s, self.effects)
@@ -182,6 +199,42 @@ class Dispatcher:
             self._vanished(self._services.get(event.service), event.boot, now)
         self._work(now)
 
+    def decided(self, event: Decided, performed: int, now: float) -> None:
+        """Take what the robot's own planner answers.
+
+        Parameters
+        ----------
+        event : Decided
+        performed : int
+            Task actions of the question at hand that are performed, or ordered.
+        now : float
+        """
+        try:
+            usable = self._verification.decided(event, self.question, performed)
+        except OwnDecisionError as error:
+            self._stop(error)
+            return
+        if not usable:
+            # What was done cannot be undone; from where it led, a new question is asked.
+            self.drop()
+        self._drop_wrong_services()
+        self._work(now)
+
+    def doubt(self) -> None:
+        """Let the robot's own planner answer the question: what came of it was of no use."""
+        if self.question is not None:
+            self._verification.check(self.question)
+
+    @property
+    def num_unverified(self) -> int:
+        """Questions that the robot's own planner still has to answer."""
+        return len(self._verification)
+
+    @property
+    def num_unverifiable(self) -> int:
+        """Questions that it should have answered, but too many waited."""
+        return self._verification.left_out
+
     def recovery_exited(self, launch: int, reason: str, now: float) -> None:
         """Take note that a process of the local service has ended, or could not be started.
 
@@ -223,7 +276,7 @@ class Dispatcher:
         if self._calls:
             due += [service.detector.deadline() for service in services]
             due.append(self._calls.first_sent_at() + self._limit_s)
-        if question is not None and not question.complete:
+        if question is not None and question.is_open:
             if not self._is_being_asked(question, self._worked_at):
                 due += [
                     self._ask_again_at(service, question)
@@ -267,7 +320,11 @@ class Dispatcher:
             return
         self._report("service_appeared", service=service.name)
         question = self.question
-        if self.status is Status.LOCAL_RECOVERY and question is not None:
+        if (
+            self.status is Status.LOCAL_RECOVERY
+            and question is not None
+            and service.refused is None
+        ):
             # It need not wait for the next turn: with an answer to this one it holds the state.
             self._send(service, question, now, also=True)
 
@@ -289,6 +346,7 @@ class Dispatcher:
         except StaleEpochError as error:
             self._stop(error)
             return
+        self._drop_wrong_services()
         if question is self.question:
             if news.at_work:
                 self._standstill.let_go(now)
@@ -312,6 +370,30 @@ class Dispatcher:
             service.detector.suspect("a call ended without the answer")
             self._report_suspected(service)
 
+    def _drop_wrong_services(self) -> None:
+        """Ask those no more who answered otherwise than the robot's own planner."""
+        for wrong in self._verification.take_wrong():
+            service = self._services.get(wrong.service)
+            if service is None:
+                continue
+            service.distrust(
+                f"answered otherwise than the robot's own planner in step {wrong.step}"
+            )
+            for call in self._calls.to(service):
+                self._calls.abandon(call)
+            self._report(
+                "wrong_answer",
+                service=service.name,
+                step=wrong.step,
+                kind=wrong.kind,
+                reason="not what the robot's own planner decides in the same state; it is not "
+                "asked again in this run",
+            )
+            question = self.question
+            if question is not None and any(g.service == wrong.service for g in question.given):
+                # What it said last was perhaps not looked at yet.
+                self._verification.dispute(question)
+
     # -- deciding whom to ask --------------------------------------------------------------------
 
     def _work(self, now: float) -> None:
@@ -328,7 +410,7 @@ class Dispatcher:
         if question is None:
             self._note_lost_cloud(now)
             return
-        if question.complete:
+        if not question.is_open:
             self._standstill.let_go(now)
             self._note_lost_cloud(now)
             return

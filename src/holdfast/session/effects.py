@@ -14,11 +14,13 @@ import numpy.typing as npt
 
 from holdfast.errors import HoldfastError
 from holdfast.outcome import TrialResult
+from holdfast.planning import PlanningState
 from holdfast.session.records import Record
 
 __all__ = [
     "Abandon",
     "Act",
+    "Decide",
     "Effect",
     "EndTrial",
     "Journal",
@@ -29,6 +31,7 @@ __all__ = [
     "Sense",
     "Stop",
     "Timing",
+    "Verified",
 ]
 
 FloatArray = npt.NDArray[np.float64]
@@ -67,6 +70,45 @@ class Act(NamedTuple):
 
     step: int
     action: FloatArray
+
+
+class Decide(NamedTuple):
+    """Let the robot's own planner answer a question, while the robot goes on.
+
+    Attributes
+    ----------
+    number : int
+        Names it in the :class:`~holdfast.session.events.Decided` that follows.
+    state : PlanningState
+        Of the question.
+    urgent : bool
+        Whether the robot waits for it: then it comes before those that are not.
+    """
+
+    number: int
+    state: PlanningState
+    urgent: bool
+
+
+class Verified(NamedTuple):
+    """A part of an answer was compared with what the robot's own planner answers; for the record.
+
+    Attributes
+    ----------
+    trial, step : int
+        Of the question.
+    service : str
+        Whose answer it was.
+    kind : {"task", "sensing"}
+    verdict : {"same", "different", "not_deterministic", "failed"}
+        The last two: the robot's own planner does not agree with itself, or has failed.
+    """
+
+    trial: int
+    step: int
+    service: str
+    kind: str
+    verdict: str
 
 
 class Launch(NamedTuple):
@@ -142,5 +184,17 @@ class Stop(NamedTuple):
 
 
 Effect: TypeAlias = (
-    Journal | Send | Abandon | Sense | Act | Launch | Report | Timing | EndTrial | Paused | Stop
+    Journal
+    | Send
+    | Abandon
+    | Sense
+    | Act
+    | Decide
+    | Launch
+    | Report
+    | Timing
+    | Verified
+    | EndTrial
+    | Paused
+    | Stop
 )

@@ -18,6 +18,7 @@ __all__ = [
     "Acted",
     "Appeared",
     "Begun",
+    "Decided",
     "Ended",
     "EnvironmentEvent",
     "EnvironmentFailed",
@@ -139,3 +140,30 @@ class EnvironmentFailed(NamedTuple):
 
 
 EnvironmentEvent: TypeAlias = Begun | Sensed | Acted | EnvironmentFailed
+
+
+class Decided(NamedTuple):
+    """The robot's own planner has answered a question, or failed at it.
+
+    Attributes
+    ----------
+    number : int
+        Of its :class:`~holdfast.session.effects.Decide`.
+    actions : tuple of array
+        Task actions up to the next sensing step.
+    sensing_action : int or None
+        Of that sensing step; None if it is too far away.
+    ahead_digest : bytes
+        Of the state in which it was chosen.
+    computed_s : float
+        How long the planner computed.
+    failure : str or None
+        For a person: why there is no answer; None if there is.
+    """
+
+    number: int
+    actions: tuple[FloatArray, ...] = ()
+    sensing_action: int | None = None
+    ahead_digest: bytes = b""
+    computed_s: float = 0.0
+    failure: str | None = None

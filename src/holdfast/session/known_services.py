@@ -42,6 +42,8 @@ _MAX_DRIFTS = 2
 _LOCAL_PATIENCE = 4.0
 """The local service may be silent this much longer: to replace it costs more than to wait."""
 
+_WRONG_ANSWER = "wrong_answer"
+
 _FINAL_REFUSALS = frozenset({"unknown_problem", "version", "too_large"})
 _REFUSED_BY_ALL = frozenset({"invalid", "failed"})
 """Refusals that say something of the question itself: any other service would say the same."""
@@ -96,6 +98,8 @@ class KnownService:
         What it refused last with, since such a part.
     refused, refused_code : str or None, str
         Why it is asked no more.
+    distrusted : str or None
+        Why it is asked no more, whichever process takes its place.
     retry_at : float
         It is not asked before.
     backoff_s : float
@@ -110,6 +114,7 @@ class KnownService:
         "backoff_s",
         "complaint",
         "detector",
+        "distrusted",
         "drifts",
         "last_boot",
         "late_after_s",
@@ -137,6 +142,7 @@ class KnownService:
         self.late_at = -math.inf
         self.late_soonest_s = math.inf
         self.late_times = 0
+        self.distrusted: str | None = None
         self.forget()
 
     def forget(self) -> None:
@@ -146,8 +152,8 @@ class KnownService:
         self.drifts = 0
         self.task_refusals = self.sensing_refusals = 0
         self.complaint: str | None = None
-        self.refused: str | None = None
-        self.refused_code = ""
+        self.refused = self.distrusted
+        self.refused_code = "" if self.refused is None else _WRONG_ANSWER
         self.retry_at = 0.0
         self.backoff_s = _FIRST_RETRY_S
         self.num_busy = 0
@@ -261,6 +267,11 @@ class KnownService:
             self.refused = text
             self.refused_code = code
         return final
+
+    def distrust(self, text: str) -> None:
+        """Take note that it was wrong: it is asked no more in this run."""
+        self.distrusted = self.refused = text
+        self.refused_code = _WRONG_ANSWER
 
     # -- what it needs ---------------------------------------------------------------------------
 

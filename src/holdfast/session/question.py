@@ -3,7 +3,8 @@
 The question is a state: what is to be done from there on until the robot has sensed again? The
 answer has up to two parts, the task actions on the way and the sensing action at its end, and each
 may come from another service, or from several. The first that comes counts; a later one can only
-say the same, or show that somebody errs.
+say the same, or show that somebody errs. Then the robot's own planner answers
+(:mod:`holdfast.protocol.verification`), and nothing is done before it has.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from holdfast.planning import PlanningState, encode_checkpoint, needs_sensing
+from holdfast.session.events import Decided
 from holdfast.session.messages import (
     DIGEST_SIZE,
     MAX_TASK_ACTIONS,
@@ -25,7 +27,7 @@ from holdfast.session.messages import (
 )
 from holdfast.settings import PlanningSettings
 
-__all__ = ["Provenance", "Question"]
+__all__ = ["Given", "Provenance", "Question"]
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -36,6 +38,55 @@ class Provenance(NamedTuple):
     service: str
     round_trip_s: float
     computed_s: float
+
+
+_MAX_GIVEN = 64
+"""Bound on the parts of answers that are kept to be compared; services that differ are few."""
+
+
+class Given:
+    """A part of an answer, as a service gave it; equal parts of one service are kept once.
+
+    Attributes
+    ----------
+    service : str
+    tasks : list of array or None
+    sensing : SensingAnswer or None
+        One of the two.
+    outside_limits : bool
+        Whether the tasks are not what the problem's ``execute`` lets through.
+    judged : bool
+        Whether it was compared with the robot's own answer.
+    """
+
+    __slots__ = ("judged", "outside_limits", "sensing", "service", "tasks")
+
+    def __init__(
+        self, service: str, tasks: list[FloatArray] | None, sensing: SensingAnswer | None
+    ) -> None:
+        self.service = service
+        self.tasks = tasks
+        self.sensing = sensing
+        self.outside_limits = False
+        self.judged = False
+
+    @property
+    def kind(self) -> str:
+        """Which part it is."""
+        return "task" if self.sensing is None else "sensing"
+
+    def says_the_same(self, other: Given) -> bool:
+        """Tell whether two parts of the same kind agree."""
+        if self.sensing is not None and other.sensing is not None:
+            return (self.sensing.sensing_action, self.sensing.digest) == (
+                other.sensing.sensing_action,
+                other.sensing.digest,
+            )
+        return (
+            self.tasks is not None
+            and other.tasks is not None
+            and all(map(np.array_equal, self.tasks, other.tasks))
+        )
 
 
 class Question:
@@ -61,14 +112,29 @@ class Question:
     tasks : list of array or None
     sensing : SensingAnswer or None
     task_source, sensing_source : Provenance or None
+    given : list of Given
+        What services answered, to be compared.
+    checked : bool
+        Whether the robot's own planner answers it as well.
+    disputed : bool
+        Whether nothing may be done before it has.
+    own : Decided or None
+        What it answered.
+    own_is_certain : bool or None
+        Whether it came to the same when it was asked twice; None if it was not.
     """
 
     __slots__ = (
         "_checkpoint",
+        "checked",
         "digest",
+        "disputed",
+        "given",
         "needed_at",
         "num_observations",
         "observations",
+        "own",
+        "own_is_certain",
         "sensing",
         "sensing_source",
         "sensing_step",
@@ -99,6 +165,11 @@ class Question:
         self.sensing: SensingAnswer | None = None
         self.task_source: Provenance | None = None
         self.sensing_source: Provenance | None = None
+        self.given: list[Given] = []
+        self.checked = False
+        self.disputed = False
+        self.own: Decided | None = None
+        self.own_is_certain: bool | None = None
         self._checkpoint: bytes | None = None
         if needs_sensing(settings, state):
             self.task_count = 0
@@ -123,15 +194,20 @@ class Question:
             self._checkpoint = encode_checkpoint(self.state)
         return self._checkpoint
 
-    def take_tasks(self, reply: TaskAnswer, action_size: int, source: Provenance) -> bool:
-        """Keep the task actions if none have come; tell whether they are the ones that are kept.
+    @property
+    def is_open(self) -> bool:
+        """Whether services are to be asked: something is missing, and it is not in dispute."""
+        return not self.disputed and not self.complete
+
+    def read_tasks(self, reply: TaskAnswer, action_size: int, service: str) -> Given:
+        """Return the task actions of a reply.
 
         Parameters
         ----------
         reply : TaskAnswer
         action_size : int
             Of the problem.
-        source : Provenance
+        service : str
 
         Raises
         ------
@@ -143,24 +219,17 @@ class Question:
                 "malformed", f"{reply.count} task actions where {self.task_count} were asked"
             )
         numbers = numbers_from(reply.actions, reply.count * action_size)
-        actions = list(numbers.reshape(reply.count, action_size))
-        if self.tasks is None:
-            self.tasks = actions
-            self.task_source = source
-            return True
-        return all(map(np.array_equal, self.tasks, actions))
+        return Given(service, list(numbers.reshape(reply.count, action_size)), None)
 
-    def take_sensing(
-        self, reply: SensingAnswer, num_sensing_actions: int, source: Provenance
-    ) -> bool:
-        """Keep the sensing action if none has come; tell whether it is the one that is kept.
+    def read_sensing(self, reply: SensingAnswer, num_sensing_actions: int, service: str) -> Given:
+        """Return the sensing action of a reply.
 
         Parameters
         ----------
         reply : SensingAnswer
         num_sensing_actions : int
             Of the problem.
-        source : Provenance
+        service : str
 
         Raises
         ------
@@ -176,8 +245,28 @@ class Question:
             raise MessageError("malformed", "a sensing action for another state than was asked")
         if reply.sensing_action >= num_sensing_actions:
             raise MessageError("malformed", f"there is no sensing action {reply.sensing_action}")
-        if self.sensing is None:
-            self.sensing = reply
+        return Given(service, None, reply)
+
+    def take(self, given: Given, source: Provenance) -> bool:
+        """Keep a part of the answer if it is the first; tell whether it agrees with what was given.
+
+        A part outside the limits is only kept to be compared.
+
+        Parameters
+        ----------
+        given : Given
+        source : Provenance
+        """
+        others = [each for each in self.given if each.kind == given.kind]
+        known = any(each.service == given.service and each.says_the_same(given) for each in others)
+        if not known and len(self.given) < _MAX_GIVEN:
+            self.given.append(given)
+        if given.outside_limits:
+            return False
+        if given.tasks is not None and self.tasks is None:
+            self.tasks = given.tasks
+            self.task_source = source
+        elif given.sensing is not None and self.sensing is None:
+            self.sensing = given.sensing
             self.sensing_source = source
-            return True
-        return self.sensing.sensing_action == reply.sensing_action
+        return all(given.says_the_same(each) for each in others)

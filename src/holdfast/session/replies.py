@@ -13,7 +13,10 @@ from __future__ import annotations
 
 import enum
 
+import numpy as np
+
 from holdfast.errors import HoldfastError
+from holdfast.protocol.verification import Verification
 from holdfast.session.calls import Call, Calls
 from holdfast.session.effects import Effect, Report
 from holdfast.session.known_services import KnownService
@@ -75,14 +78,22 @@ class Replies:
     calls : Calls
     action_size, num_sensing_actions : int
         Of the problem, to check the answers.
+    verification : Verification
+        Is told of every answer.
     effects : list of Effect
         What is to be given up and told is added to it.
     """
 
     def __init__(
-        self, calls: Calls, action_size: int, num_sensing_actions: int, effects: list[Effect]
+        self,
+        calls: Calls,
+        action_size: int,
+        num_sensing_actions: int,
+        verification: Verification,
+        effects: list[Effect],
     ) -> None:
         self._calls = calls
+        self._verification = verification
         self._action_size = action_size
         self._num_sensing_actions = num_sensing_actions
         self._effects = effects
@@ -147,21 +158,29 @@ class Replies:
     # -- answers ---------------------------------------------------------------------------------
 
     def _take_answer(self, call: Call, reply: TaskAnswer | SensingAnswer, now: float) -> None:
-        question = call.question
-        source = Provenance(call.service.name, now - call.sent_at, 1e-6 * reply.computed_us)
+        question, name = call.question, call.service.name
         if isinstance(reply, TaskAnswer):
-            kind, agrees = "task", question.take_tasks(reply, self._action_size, source)
+            given = question.read_tasks(reply, self._action_size, name)
+            assert given.tasks is not None
+            outside = self._verification.outside_limits(np.array(given.tasks))
+            given.outside_limits = outside is not None
         else:
-            most = self._num_sensing_actions
-            kind, agrees = "sensing", question.take_sensing(reply, most, source)
+            given = question.read_sensing(reply, self._num_sensing_actions, name)
+            outside = None
+        source = Provenance(name, now - call.sent_at, 1e-6 * reply.computed_us)
+        agrees = question.take(given, source)
         if not agrees:
-            self._report(
-                "disagreement",
-                service=call.service.name,
-                step=question.state.step,
-                kind=kind,
-                reason="two services decided differently; the first answer stands",
-            )
+            if not question.disputed and question.own is None:
+                why = outside or "two answers to one question differ"
+                self._report(
+                    "disagreement",
+                    service=name,
+                    step=question.state.step,
+                    kind=given.kind,
+                    reason=f"{why}; the robot's own planner decides",
+                )
+            self._verification.dispute(question)
+        self._verification.answered(question, name)
 
     def _was_answered(self, call: Call, reply: TaskAnswer | SensingAnswer, now: float) -> News:
         service, question = call.service, call.question

@@ -39,6 +39,7 @@ from holdfast.session.effects import (
 from holdfast.session.events import (
     Acted,
     Begun,
+    Decided,
     EnvironmentEvent,
     EnvironmentFailed,
     Sensed,
@@ -287,6 +288,16 @@ class Robot:
         return self._dispatcher.status
 
     @property
+    def num_unverified(self) -> int:
+        """Answers that the robot's own planner still has to compute again."""
+        return self._dispatcher.num_unverified
+
+    @property
+    def num_unverifiable(self) -> int:
+        """Answers that it should have computed again, but too many waited."""
+        return self._dispatcher.num_unverifiable
+
+    @property
     def trial(self) -> int | None:
         """The trial that is running, None between two."""
         return None if self._history is None else self._trial
@@ -377,9 +388,13 @@ class Robot:
 
     # -- what happens ----------------------------------------------------------------------------
 
-    def handle(self, event: TransportEvent | EnvironmentEvent, now: float) -> list[Effect]:
-        """Take note of what a transport or the environment delivered."""
-        if isinstance(event, _OF_THE_BODY):
+    def handle(
+        self, event: TransportEvent | EnvironmentEvent | Decided, now: float
+    ) -> list[Effect]:
+        """Take note of what a transport, the environment or the robot's own planner delivered."""
+        if isinstance(event, Decided):
+            self._dispatcher.decided(event, self._num_ordered(), now)
+        elif isinstance(event, _OF_THE_BODY):
             # Between trials, or after a stop, whatever comes late is of no use.
             if self._history is not None and self._in_environment and not self._stopped:
                 self._in_environment = False
@@ -400,6 +415,13 @@ class Robot:
             self._dispatcher.handle(event, now)
         self._go_on(now)
         return self._take()
+
+    def _num_ordered(self) -> int:
+        """Return how many task actions of the question's answer are performed, or ordered."""
+        question, history = self._dispatcher.question, self._history
+        if question is None or history is None:
+            return 0
+        return history.state.step - question.state.step + (history.pending is not None)
 
     def recovery_exited(self, launch: int, reason: str, now: float) -> list[Effect]:
         """Take note that a process of the local service has ended, or could not be started."""
@@ -559,7 +581,7 @@ class Robot:
             question = self._dispatcher.question
             assert question is not None
         answer = question.sensing
-        if answer is None:
+        if answer is None or question.disputed:
             self._dispatcher.need(now)
             return
         if (
@@ -568,6 +590,7 @@ class Robot:
         ):
             # Chosen for another state than this: the service's belief has drifted from ours.
             self._report("prefetch_unused", trial=self._trial, step=state.step)
+            self._dispatcher.doubt()
             self._ask(self._planner.digest(state), now)
             self._dispatcher.need(now)
             return
@@ -588,7 +611,7 @@ class Robot:
             question = self._dispatcher.question
             assert question is not None
             offset = 0
-        if question.tasks is None:
+        if question.tasks is None or question.disputed:
             self._dispatcher.need(now)
             return
         if offset == 0 and question.task_source is not None:

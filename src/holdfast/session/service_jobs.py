@@ -32,6 +32,7 @@ from holdfast.planning import (
     initial_state,
     needs_sensing,
     observe,
+    plan_until_sensing,
 )
 from holdfast.problems.problem import Problem
 from holdfast.session.messages import (
@@ -220,18 +221,13 @@ class Job:
         if needs_sensing(planning, state):
             index, _ = choose_sensing_action(problem, planning, state)
             return Outcome(problem=problem, state=state, restored=restored, sensing_action=index)
-        actions: list[bytes] = []
-        ahead = state
-        while len(actions) < MAX_TASK_ACTIONS and not needs_sensing(planning, ahead):
-            action, _ = choose_task_action(problem, planning, ahead)
-            ahead = advance(problem, planning, ahead, action)
-            actions.append(numbers_to(action))
+        actions, ahead = plan_until_sensing(problem, planning, state, MAX_TASK_ACTIONS)
         return Outcome(
             problem=problem,
             state=state,
             restored=restored,
             num_actions=len(actions),
-            actions=b"".join(actions),
+            actions=numbers_to(actions),
             ahead=ahead,
             ahead_digest=digest(ahead)[:DIGEST_SIZE],
         )

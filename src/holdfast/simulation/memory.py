@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from holdfast.planning import ObservationInfo, Planner, PlanningState, digest
+from holdfast.planning import Decision, ObservationInfo, Planner, PlanningState, digest
 from holdfast.session.service_jobs import Job, Outcome
 from holdfast.simulation.surroundings import Violation
 
@@ -92,6 +92,7 @@ class RememberingPlanner(Planner):
             tuple[int, int, bytes], tuple[PlanningState, PlanningState, ObservationInfo]
         ] = {}
         self._advanced: dict[tuple[int, bytes], tuple[PlanningState, PlanningState]] = {}
+        self._decided: dict[int, tuple[PlanningState, Decision]] = {}
         self._taken_over = 0
 
     def initial_state(self, seed: int, trial: int) -> PlanningState:
@@ -128,6 +129,15 @@ class RememberingPlanner(Planner):
             return after
         if self._is_checked():
             self._compare(known[1], self._planner.advance(state, task_action))
+        return known[1]
+
+    def decide(self, state: PlanningState, max_actions: int) -> Decision:
+        """Decide all that can be decided before something is sensed again."""
+        known = self._decided.get(id(state))
+        if known is None:
+            if len(self._decided) >= _MOST:
+                self._decided.clear()
+            known = self._decided[id(state)] = state, self._planner.decide(state, max_actions)
         return known[1]
 
     def digest(self, state: PlanningState) -> bytes:

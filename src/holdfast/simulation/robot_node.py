@@ -7,6 +7,7 @@ has done are not.
 
 from __future__ import annotations
 
+import functools
 from collections import deque
 from collections.abc import Callable, Iterable
 from typing import Any, Protocol
@@ -14,12 +15,14 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
+from holdfast import contract
 from holdfast.errors import HoldfastError
 from holdfast.planning import Planner
 from holdfast.session.dispatcher import Dispatcher
 from holdfast.session.effects import (
     Abandon,
     Act,
+    Decide,
     Effect,
     EndTrial,
     Journal,
@@ -30,16 +33,18 @@ from holdfast.session.effects import (
     Sense,
     Stop,
     Timing,
+    Verified,
 )
 from holdfast.session.events import (
     Acted,
     Begun,
+    Decided,
     EnvironmentEvent,
     Replied,
     Sensed,
     TransportEvent,
 )
-from holdfast.session.messages import Opening
+from holdfast.session.messages import MAX_TASK_ACTIONS, Opening
 from holdfast.session.robot import Robot, UnknownPerformanceError, replay
 from holdfast.settings import (
     OffloadSettings,
@@ -63,8 +68,16 @@ _PERFORMS_AFTER_S = 0.0002
 """From the order until the body moves: the process may die in between."""
 
 _BEGINS_AFTER_S = 0.001
+_DECIDES_AFTER_S = 0.003
+"""What the robot's own planner takes for a question."""
+
+_SECRET = b"which answers are computed again"
 _DEAF_S = 0.005
 """As the real process: a loop that did not listen for longer blames nobody for that time."""
+
+
+_WITHOUT_CONSEQUENCES = (Report, Timing, Decide, Verified)
+"""Effects before which the process need not die: nothing outside it changes by them."""
 
 
 class Task:
@@ -196,6 +209,8 @@ class RobotNode:
             Abandon: self._abandon,
             Report: self._report,
             Timing: self._decided,
+            Decide: self._decide,
+            Verified: self._verified,
             Launch: self._launch,
             EndTrial: self._end_trial,
             Paused: self._paused,
@@ -232,6 +247,8 @@ class RobotNode:
             task.opening,
             task.planner.problem.action_size,
             len(task.planner.problem.sensing_actions),
+            functools.partial(contract.executed_action, task.planner.problem),
+            _SECRET,
         )
         self._robot = Robot(task.planner, task.simulator, dispatcher, self._run.rate_hz)
         self._network.robot_started(self.process)
@@ -325,7 +342,7 @@ class RobotNode:
         if self._robot is not None and not self._deaf:
             self._set_alarm()
 
-    def _heard(self, event: TransportEvent | EnvironmentEvent) -> None:
+    def _heard(self, event: TransportEvent | EnvironmentEvent | Decided) -> None:
         assert self._robot is not None
         if isinstance(event, Replied):
             self._statuses.heard(self._asked[event.call], event.payload)
@@ -371,7 +388,7 @@ class RobotNode:
         while todo and not self._deaf:
             effect = todo[0]
             kind = type(effect)
-            if kind is not Timing and kind is not Report:
+            if kind not in _WITHOUT_CONSEQUENCES:
                 self._host.boundary(kind)
                 if not todo:
                     return  # killed
@@ -417,6 +434,16 @@ class RobotNode:
 
     def _decided(self, effect: Timing) -> None:
         self._host.decided(effect.service, effect.status, 1e-3 * effect.waited_ms)
+
+    def _decide(self, effect: Decide) -> None:
+        actions, sensing_action, ahead = self._task.planner.decide(effect.state, MAX_TASK_ACTIONS)
+        digest = self._task.planner.digest(ahead)
+        event = Decided(effect.number, actions, sensing_action, digest, _DECIDES_AFTER_S)
+        self._agenda.after(_DECIDES_AFTER_S, self._happens, self.process, self._heard, event)
+
+    def _verified(self, effect: Verified) -> None:
+        if effect.verdict != "same":
+            raise Violation(f"{effect.service} is said to have answered wrongly: {effect}")
 
     def _launch(self, effect: Launch) -> None:
         self._host.launch(effect.number)

@@ -1,0 +1,1 @@
+"""The protocol between robots and services, as state machines without input and output."""

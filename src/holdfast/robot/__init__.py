@@ -1,0 +1,1 @@
+"""The robot's shell: what its state machine asks for is done here, with threads and clocks."""

@@ -1,0 +1,273 @@
+"""A service that lies, or errs, is found out by the robot, which does what its own planner says."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import msgspec
+import numpy as np
+import pytest
+from tests.unit.test_session_robot import LOCAL, PROBLEM, World
+
+from holdfast.problems.peg_in_hole_2d import PegInHole2D
+from holdfast.protocol.verification import MAX_OPEN_CHECKS, OwnDecisionError, Verification
+from holdfast.session.dispatcher import ServiceRefusedError
+from holdfast.session.effects import Act, Decide, Effect, Stop
+from holdfast.session.events import Decided
+from holdfast.session.messages import (
+    Reply,
+    SensingAnswer,
+    TaskAnswer,
+    numbers_from,
+    numbers_to,
+)
+from holdfast.session.question import Question
+
+
+def lie(world: World, name: str, change: Callable[[Reply], Reply], after: int = 0) -> None:
+    """Let a service change its answers from one of its requests on."""
+    service = world.services[name]
+    honest = service.answer
+    asked = 0
+
+    def answer(payload: bytes) -> list[Reply]:
+        nonlocal asked
+        asked += 1
+        replies = honest(payload)
+        return replies if asked <= after else [change(reply) for reply in replies]
+
+    service.answer = answer  # type: ignore[method-assign]
+
+
+def other_actions(factor: float) -> Callable[[Reply], Reply]:
+    """Return a lie about task actions: each is so much of what it should be."""
+
+    def change(reply: Reply) -> Reply:
+        if not isinstance(reply, TaskAnswer):
+            return reply
+        numbers = factor * numbers_from(reply.actions, len(reply.actions) // 8)
+        return msgspec.structs.replace(reply, actions=numbers_to(numbers))
+
+    return change
+
+
+def other_sensing(reply: Reply) -> Reply:
+    if not isinstance(reply, SensingAnswer):
+        return reply
+    following = (reply.sensing_action + 1) % len(PROBLEM.sensing_actions)
+    return msgspec.structs.replace(reply, sensing_action=following)
+
+
+def wrong(world: World) -> list[tuple[object, object]]:
+    return [(each["service"], each["kind"]) for each in world.reports("wrong_answer")]
+
+
+def test_an_action_outside_the_limits_is_never_performed() -> None:
+    world = World(verify_share=0.0)
+    lie(world, "cloud", other_actions(77.7), after=2)
+    world.start()
+    world.run()
+    world.assert_same_as_without_faults()
+    assert wrong(world) == [("cloud", "task")]
+    reason = str(world.reports("disagreement")[0]["reason"])
+    assert "outside the limits of the problem's execute" in reason
+    assert world.statuses() == ["local_recovery"]
+    assert [(each.kind, each.verdict) for each in world.verified] == [
+        ("task", "different"),
+        ("sensing", "same"),
+    ]
+
+
+def test_where_two_answers_differ_the_robot_decides() -> None:
+    # The first is so slow once that the second is asked as well; that one lies, and is the sooner.
+    world = World(services=("first", "second"), verify_share=0.0)
+    first = world.services["first"]
+    lie(world, "second", other_actions(0.5))
+    honest = first.answer
+
+    def answer(payload: bytes) -> list[Reply]:
+        first.latency_s = 0.2535 if len(first.requests) == 1 else 0.001
+        return honest(payload)
+
+    first.answer = answer  # type: ignore[method-assign]
+    world.start()
+    world.run()
+    assert world.stopped is None
+    assert [each["kind"] for each in world.reports("disagreement")] == ["task"]
+    assert wrong(world) == [("second", "task")]
+    verdicts = [(each.service, each.kind, each.verdict) for each in world.verified]
+    assert ("first", "task", "same") in verdicts
+    assert ("second", "task", "different") in verdicts
+    found_at = next(at for at, e in world.trace if is_report(e, "wrong_answer"))
+    assert {sent.service for sent in world.sent if sent.at > found_at} == {"first"}
+
+
+@pytest.mark.parametrize(
+    ("change", "kind"), [(other_actions(0.5), "task"), (other_sensing, "sensing")]
+)
+def test_a_share_of_the_answers_is_computed_again(
+    change: Callable[[Reply], Reply], kind: str
+) -> None:
+    world = World(verify_share=1.0)
+    lie(world, "cloud", change, after=3)
+    world.start()
+    world.run()
+    assert world.stopped is None
+    assert len(world.results) == 2
+    assert wrong(world)[0] == ("cloud", kind)
+    assert len(wrong(world)) <= 2  # both parts of one answer at most
+    # Nobody is asked again who was wrong; the trial that began afterwards is as it should be.
+    found_at = next(at for at, e in world.trace if is_report(e, "wrong_answer"))
+    assert all(sent.service == LOCAL for sent in world.sent if sent.at > found_at)
+    assert {each.verdict for each in world.verified} == {"same", "different"}
+
+
+def is_report(effect: Effect, name: str) -> bool:
+    return getattr(effect, "name", None) == name
+
+
+def test_honest_answers_are_all_the_same_and_cost_no_time() -> None:
+    plain, verified = World(verify_share=0.0), World(verify_share=1.0)
+    for world in (plain, verified):
+        world.start()
+        world.run()
+        world.assert_same_as_without_faults()
+    assert {each.verdict for each in verified.verified} == {"same"}
+    # A question for each observation, each with both parts; the last ones of a trial may not come.
+    asked = len(verified.sent)
+    assert 2 * asked - 4 <= len(verified.verified) <= 2 * asked
+    assert plain.now == verified.now
+    assert not plain.verified
+
+
+def test_the_share_is_kept_and_no_service_can_tell_which() -> None:
+    drawn: dict[bytes, list[bool]] = {}
+    for secret in (b"one", b"other"):
+        effects: list[Effect] = []
+        verification = Verification(0.25, secret, None, PROBLEM.execute, effects)
+        drawn[secret] = []
+        for number in range(2000):
+            question = question_of(number)
+            before = len(effects)
+            verification.answered(question, "cloud")
+            drawn[secret].append(len(effects) > before)
+            for effect in effects[before:]:
+                assert isinstance(effect, Decide)
+                verification.decided(Decided(effect.number), None, 0)
+    # Binomial: four standard deviations of 2,000 draws at 1/4 are 78 (false alarms: 6e-5 each).
+    assert all(abs(sum(each) - 500) <= 78 for each in drawn.values())
+    both = sum(a and b for a, b in zip(drawn[b"one"], drawn[b"other"], strict=True))
+    assert abs(both - 125) <= 44
+
+
+def question_of(number: int) -> Question:
+    world = World()
+    state = world.planner.initial_state(number, 0)
+    return Question(world.planner.settings, state, number.to_bytes(16, "big"), (), 0)
+
+
+def test_what_a_robot_cannot_keep_up_with_is_left_out_and_counted() -> None:
+    effects: list[Effect] = []
+    verification = Verification(1.0, b"secret", None, PROBLEM.execute, effects)
+    for number in range(MAX_OPEN_CHECKS + 7):
+        verification.answered(question_of(number), "cloud")
+    assert len(effects) == len(verification) == MAX_OPEN_CHECKS
+    assert verification.left_out == 7
+
+
+def test_a_wrong_answer_that_was_obeyed_is_found_and_the_robot_goes_on_from_where_it_is() -> None:
+    world = World(verify_share=1.0)
+    world.own_s = 0.025  # two actions are performed meanwhile
+    lie(world, "cloud", other_actions(0.5), after=1)
+    world.start()
+    world.run()
+    assert world.stopped is None
+    assert wrong(world)[0] == ("cloud", "task")
+    found_at = next(at for at, e in world.trace if is_report(e, "wrong_answer"))
+    first = next(index for index, (at, e) in enumerate(world.trace) if at >= found_at)
+    after = [e for _, e in world.trace[first:] if isinstance(e, Act)]
+    limits = PegInHole2D().execute
+    assert after
+    assert all(np.array_equal(e.action, limits(e.action)) for e in after)
+    # Every task action since is the robot's own, in the state in which it is.
+    steps = [e.step for _, e in world.trace if isinstance(e, Act)]
+    assert steps == sorted(steps) or len(world.results) == 2
+
+
+def test_a_problem_that_is_not_deterministic_is_blamed_itself() -> None:
+    world = World(verify_share=1.0)
+    calls = 0
+    honest = world.own
+
+    def own(effect: Decide) -> Decided:
+        nonlocal calls
+        calls += 1
+        decided = honest(effect)
+        return decided._replace(actions=tuple(a * (1.0 - 1e-3 * calls) for a in decided.actions))
+
+    world.own = own
+    world.start()
+    world.run()
+    assert world.stopped is None
+    assert world.reports("not_deterministic")
+    assert not wrong(world)
+    assert "not_deterministic" in {each.verdict for each in world.verified}
+
+
+def test_limits_that_change_what_they_let_through_tell_nothing() -> None:
+    world = World(verify_share=0.0)
+    world.limited = lambda actions: 0.5 * actions
+    world.start()
+    world.run()
+    world.assert_same_as_without_faults()
+    # It was looked at once; the service was right.
+    assert [each.verdict for each in world.verified if each.kind == "task"] == ["same"]
+    assert len(world.reports("disagreement")) == 1
+    assert not wrong(world)
+
+
+def test_the_robot_holds_still_if_its_own_planner_cannot_settle_it() -> None:
+    world = World(verify_share=0.0)
+    lie(world, "cloud", other_actions(77.7), after=1)
+    world.own = lambda effect: Decided(effect.number, failure="ValueError: no such state")
+    world.start()
+    world.run()
+    assert isinstance(world.stopped, Stop)
+    assert isinstance(world.stopped.error, OwnDecisionError)
+    assert "no such state" in str(world.stopped.error)
+    assert all(
+        np.array_equal(e.action, PROBLEM.execute(e.action))
+        for _, e in world.trace
+        if isinstance(e, Act)
+    )
+
+
+def test_a_failed_verification_is_told_and_stops_nobody() -> None:
+    world = World(verify_share=1.0)
+    world.own = lambda effect: Decided(effect.number, failure="MemoryError")
+    world.start()
+    world.run()
+    world.assert_same_as_without_faults()
+    assert world.reports("verification_failed")
+    assert {each.verdict for each in world.verified} <= {"failed"}
+
+
+def test_a_service_that_was_wrong_is_not_asked_again_when_it_is_started_anew() -> None:
+    world = World(verify_share=0.0)
+    lie(world, "cloud", other_actions(77.7), after=1)
+    world.on_act = lambda step: world.bring_up("cloud") if step == 6 else None
+    world.start()
+    world.run()
+    world.assert_same_as_without_faults()
+    found_at = next(at for at, e in world.trace if is_report(e, "wrong_answer"))
+    assert all(sent.service == LOCAL for sent in world.sent if sent.at > found_at)
+
+
+def test_without_a_local_service_the_robot_stops_when_all_have_lied() -> None:
+    world = World(verify_share=0.0, launch="never")
+    lie(world, "cloud", other_actions(77.7), after=1)
+    world.start()
+    world.run()
+    assert isinstance(world.stopped, Stop)
+    assert isinstance(world.stopped.error, ServiceRefusedError)
+    assert "the robot's own planner" in str(world.stopped.error)
