@@ -1,0 +1,40 @@
+"""The peg, but a process with ``HOLDFAST_TEST_LIE`` in its environment decides otherwise.
+
+The code is the same everywhere, as with a faulty machine, or an operator who means harm: nothing
+but the decisions tells such a service from an honest one.
+
+- ``far``: task actions beyond what a peg can be moved at once;
+- ``half``: task actions half as long;
+- ``sensing``: other sensing actions, and the right task actions.
+"""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+import numpy.typing as npt
+
+from holdfast.problems.peg_in_hole_2d import PegInHole2D
+
+FloatArray = npt.NDArray[np.float64]
+
+VARIABLE = "HOLDFAST_TEST_LIE"
+
+
+class LyingPeg(PegInHole2D):
+    """The peg in the plane, in honest processes."""
+
+    name = "lying_peg"
+
+    def policy(self, states: FloatArray, stage: int | npt.NDArray[np.int64]) -> FloatArray:
+        actions = super().policy(states, stage)
+        # What is sensed is chosen by the actions of all particles; what is done, by one state's.
+        many = states.ndim > 1 and len(states) > 1
+        if os.environ.get(VARIABLE) == "sensing" and many:
+            return actions * np.array([0.0, 0.0, 1.0])  # as if the angle alone mattered
+        return actions
+
+    def execute(self, actions: FloatArray) -> FloatArray:
+        factor = {"far": 77.7, "half": 0.5}.get(os.environ.get(VARIABLE, ""), 1.0)
+        return factor * super().execute(actions)

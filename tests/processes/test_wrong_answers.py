@@ -1,0 +1,119 @@
+"""A service that lies, or errs: real processes, in which only the decisions tell it apart."""
+
+from __future__ import annotations
+
+import csv
+import json
+from typing import Any
+
+import pytest
+from tests.processes.faults import (
+    HERE,
+    LOCAL_RECOVERY,
+    PATIENT,
+    RECOVERY,
+    References,
+    Robot,
+    Service,
+    Site,
+    Story,
+    assert_identical,
+    document_of,
+)
+from tests.processes.lying_problem import VARIABLE
+
+EXIT_WRONG_ANSWER = 3
+
+DOCUMENT = {
+    **document_of("peg_in_hole_2d", max_steps=40),
+    "problem": "lying_problem:LyingPeg",
+    "problem_directory": str(HERE),
+}
+SERVES = ("--problem", "lying_problem:LyingPeg", "--problem-directory", str(HERE))
+
+
+def liar(site: Site, what: str) -> Service:
+    service = site.service(*SERVES)
+    service.variables[VARIABLE] = what
+    return service.start()
+
+
+def summary_of(robot: Robot) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads((robot.out / "summary.json").read_text())
+    return found
+
+
+def verdicts_of(robot: Robot) -> list[tuple[str, str, str]]:
+    with (robot.out / "verification.csv").open(newline="") as file:
+        return [(row["service"], row["kind"], row["verdict"]) for row in csv.DictReader(file)]
+
+
+def test_an_action_beyond_the_limits_is_not_performed(site: Site, references: References) -> None:
+    cloud = liar(site, "far")
+    story = Story(site, references, DOCUMENT, offload={"verify_share": 0.0})
+    robot = site.run(story.file, services=[cloud])
+    assert robot.wait() == EXIT_WRONG_ANSWER, robot.account()
+    story.world.check()
+    # Nothing of it was performed: it is the run of an honest planner.
+    assert_identical(robot.out, story.reference)
+    story.world.assert_each_once(story.reference)
+    found = robot.matching("wrong_answer")
+    assert found[0]["kind"] == "task"
+    assert {event["service"] for event in found} == {cloud.endpoint}
+    assert [to for _, to in robot.statuses()] == [LOCAL_RECOVERY]
+    summary = summary_of(robot)
+    assert summary["wrong_answers"] == {cloud.endpoint: len(found)}
+    assert set(summary["sensing_decisions_by_service"]) <= {cloud.endpoint, RECOVERY, "in_process"}
+    assert (cloud.endpoint, "task", "different") in verdicts_of(robot)
+
+
+@pytest.mark.parametrize(("what", "kind"), [("half", "task"), ("sensing", "sensing")])
+def test_a_lie_within_the_limits_is_found_among_the_answers_computed_again(
+    what: str, kind: str, site: Site
+) -> None:
+    cloud = liar(site, what)
+    world, file = site.world(DOCUMENT, offload={**PATIENT, "verify_share": 1.0})
+    robot = site.run(file, services=[cloud])
+    assert robot.wait() == EXIT_WRONG_ANSWER, robot.account()
+    world.check()
+    assert {event["service"] for event in robot.matching("wrong_answer")} == {cloud.endpoint}
+    assert (cloud.endpoint, kind, "different") in verdicts_of(robot)
+    assert summary_of(robot)["wrong_answers"][cloud.endpoint] >= 1
+    assert LOCAL_RECOVERY in [to for _, to in robot.statuses()]
+    told = " ".join(event["reason"] for event in robot.matching("note"))
+    assert "verification.csv" in told
+
+
+def test_a_liar_without_anybody_else_ends_the_run_which_can_go_on(
+    site: Site, references: References
+) -> None:
+    cloud = liar(site, "far")
+    story = Story(site, references, DOCUMENT, recovery={"launch": "never"})
+    robot = site.run(story.file, services=[cloud])
+    assert robot.wait() == EXIT_WRONG_ANSWER, robot.account()
+    (told,) = robot.matching("error")
+    assert told["reason"].startswith(f"no service will decide: {cloud.endpoint}: wrong_answer")
+    assert "--resume" in told["resume_command"]
+    # With an honest service it comes to the decisions of a run without faults; that somebody has
+    # lied is not forgotten.
+    honest = site.service(*SERVES).start()
+    robot = site.run(story.file, services=[honest], resume=True)
+    assert robot.wait() == EXIT_WRONG_ANSWER, robot.account()
+    story.world.check()
+    assert_identical(robot.out, story.reference)
+    story.world.assert_each_once(story.reference)
+    assert set(summary_of(robot)["wrong_answers"]) == {cloud.endpoint}
+
+
+def test_honest_services_are_verified_and_decide_the_same(
+    site: Site, references: References
+) -> None:
+    cloud = site.service(*SERVES).start()
+    story = Story(site, references, DOCUMENT, offload={"verify_share": 1.0})
+    robot = story.run(cloud)
+    summary = summary_of(robot)
+    assert summary["wrong_answers"] == {}
+    assert summary["not_deterministic"] == 0
+    # Every part of every answer but those that came after the last one was compared.
+    assert summary["verified_answers"] >= summary["sensing_decisions"] - 1 > 0
+    assert {verdict for _, _, verdict in verdicts_of(robot)} == {"same"}
