@@ -1,9 +1,9 @@
 """A robot whose services send it anything at all: it decides what it would have decided.
 
-What a service computes cannot be told from what it makes up, except where the answer names the
-state that it is for. So a service that answers well-formed and wrong is believed in the task
-actions (`Refused` is how it says that it cannot); everything else that is not the answer must have
-no effect but on time.
+A service that answers well-formed, within the problem's limits and wrong is found out by computing
+again (`tests/unit/test_verification.py`), perhaps after the robot has obeyed it. Everything else
+that is not the answer must have no effect but on time; `Refused` is how a service says that it
+cannot.
 """
 
 from __future__ import annotations
@@ -40,13 +40,15 @@ ONE_TRIAL = SimulatorSettings(num_trials=1, max_steps=14, seed=11)
 class HostileWorld(World):
     """Beside each honest reply come others; nobody but the honest service is ever believed."""
 
-    def __init__(self, seed: int, share: float) -> None:
+    def __init__(self, seed: int, share: float, *kinds: str) -> None:
         chance = random.Random(seed)
         services = ("first", "second")[: chance.randint(1, 2)]
-        launch = chance.choice(("on_failure", "never"))
+        # Whoever sends too much of what is no answer is asked no more.
+        launch = "on_failure" if "beyond" in kinds else chance.choice(("on_failure", "never"))
         super().__init__(services=services, launch=launch, simulator=ONE_TRIAL)
         self.chance = chance
         self.share = share
+        self.kinds = ("spoilt", "nonsense", "late", "shapeless", "mild", *kinds)
         self.specimens = [corpus.content_of(reply) for reply in corpus.replies()]
         self.mutator = Mutator(chance, self.specimens)
         self.seen: list[bytes] = []
@@ -87,7 +89,11 @@ class HostileWorld(World):
 
     def payload(self, call: int) -> bytes:
         """Return anything but a good answer to that call, and but a word that ends the run."""
-        match self.chance.choice(("spoilt", "nonsense", "late", "shapeless", "mild")):
+        match self.chance.choice(self.kinds):
+            case "beyond":
+                count = self.chance.randint(1, 4)
+                far = [self.chance.choice((-1.0, 1.0)) * self.chance.uniform(0.2, 9.0)]
+                return encode(TaskAnswer(call % 2**32, count, numbers_to(far * 3 * count), 1))
             case "late" if self.seen:
                 return self.other_number(self.chance.choice(self.seen), call)
             case "nonsense":
@@ -147,6 +153,18 @@ def test_whatever_comes_the_decisions_are_the_same(examples: int) -> None:
         world.assert_same_as_without_faults()
         calls = world.robot._dispatcher._calls._open
         assert len(calls) <= 4 * len(world.services)
+
+    always(examples, check, st.integers(0, 2**48))
+
+
+@examples(quick=15, slow=800)
+def test_no_action_beyond_the_limits_is_performed(examples: int) -> None:
+    def check(seed: int) -> None:
+        world = HostileWorld(seed, 0.7, "beyond")
+        world.start()
+        world.run(until_s=600.0)
+        assert world.stopped is None, world.stopped
+        world.assert_same_as_without_faults()
 
     always(examples, check, st.integers(0, 2**48))
 
