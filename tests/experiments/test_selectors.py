@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator
 
@@ -10,11 +11,16 @@ from tests.experiments.made_up import noise, results_of
 
 from holdfast.experiments import parameters, selectors
 from holdfast.experiments.cases import CASES
-from holdfast.experiments.study import Report, Scale
+from holdfast.experiments.study import Report, Scale, Study
 from holdfast.experiments.tables import number_of
 from holdfast.experiments.tasks import Task
+from holdfast.experiments.trial_batches import run_trials_of
+from holdfast.problems.problem import Problem
+from holdfast.runtime import trial as trial_runner
+from holdfast.runtime.environment import SimulatedEnvironment
 
 SCALE = Scale(seed=5)
+PEG_IN_HOLE = "peg_in_hole_2d"
 PEG_IN_SPACE = "peg_in_hole_3d"
 
 
@@ -246,6 +252,45 @@ def test_what_a_parameter_does(monkeypatch: pytest.MonkeyPatch) -> None:
     assert report.findings[-1].startswith("no difference in steps beyond noise")
     assert "horizon (neighbours)" not in report.findings[-1]
     assert "M (neighbours) (least p" in report.findings[-1]
+
+
+@pytest.mark.parametrize("study", [selectors.Selectors(), parameters.Parameters()])
+def test_whatever_is_compared_meets_the_same_worlds(study: Study) -> None:
+    """Trials are compared pair by pair: of one problem they differ in how it is planned alone."""
+    runs: dict[str, set[tuple[str, str]]] = {}
+    for task in study.tasks(SCALE):
+        assert task.parameters["seed"] == SCALE.seed
+        posed = {name: value for name, value in task.parameters.items() if name != "planning"}
+        problem = str((posed["problem"], posed["model"]))
+        runs.setdefault(problem, set()).add((str(task.parameters["planning"]), str(posed)))
+    assert len(runs) > 1
+    for found in runs.values():
+        ways, batches = ({run[part] for run in found} for part in (0, 1))
+        assert len(ways) > 1
+        # Every way has every batch: the same seed, numbers of trials and length.
+        assert found == set(itertools.product(ways, batches))
+
+
+def test_the_trials_of_every_way_begin_in_the_same_states(monkeypatch: pytest.MonkeyPatch) -> None:
+    began: list[bytes] = []
+
+    class Noted(SimulatedEnvironment):
+        def __init__(self, problem: Problem, seed: int, trial: int) -> None:
+            super().__init__(problem, seed, trial)
+            began.append(self.state.tobytes())
+
+    monkeypatch.setattr(trial_runner, "SimulatedEnvironment", Noted)
+    worlds = {}
+    for task in selectors.Selectors().tasks(SCALE):
+        if task.parameters["problem"] != PEG_IN_HOLE or task.parameters["first_trial"] != 0:
+            continue
+        began.clear()
+        run_trials_of(**{**task.parameters, "num_trials": 3, "max_steps": 1})
+        worlds[str(task.parameters)] = tuple(began)
+    # Two cases are this problem.
+    assert len(worlds) == 2 * len(selectors.WAYS) * len(selectors.INTERVALS)
+    assert len(set(worlds.values())) == 1
+    assert len(set(began)) == 3
 
 
 def test_each_variant_differs_in_one_thing() -> None:

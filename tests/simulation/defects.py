@@ -489,6 +489,18 @@ _defect(
     Edit(Dispatcher, "_try_at", "not service.detector.present", "not service.detector.trusted"),
 )
 _defect(
+    "given_up_cloud_never_tried",
+    "A cloud that was given up is asked no more, neither with the turns that follow nor when it "
+    "appears again: the local service decides well enough.",
+    Edit(Dispatcher, "_try_others", "if at is not None and at <= now:", "if False:"),
+    Edit(
+        Dispatcher,
+        "_appeared",
+        "if self.status is Status.LOCAL_RECOVERY and question is not None:",
+        "if False:",
+    ),
+)
+_defect(
     "old_process_taken_for_new",
     "The news that a service's process is gone is believed of the process that took its place.",
     Edit(FailureDetector, "vanished", "if boot != self.boot:", "if self.boot is None:"),

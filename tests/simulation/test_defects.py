@@ -47,6 +47,12 @@ FOUND_AT_ONCE = [
         "run forgets_after_s=0.03 services_clock_offset_s=205448.849812",
         "no time passes",
     ),
+    # Every decision is right, so the checker of the failback alone sees it.
+    (
+        "given_up_cloud_never_tried",
+        "run act_s=0.1\ncrash service=cloud-1 at=0.15 down_s=0.3",
+        "local decides (local_recovery), and not cloud-1",
+    ),
 ]
 
 

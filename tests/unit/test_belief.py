@@ -210,6 +210,14 @@ class TestUnexplained:
         assert info.explained is explained
         assert info.mahalanobis_distance == pytest.approx(away)
 
+    @pytest.mark.parametrize(("weight", "explained"), [(0.0, False), (1e-9, True)])
+    def test_a_particle_without_weight_explains_nothing(
+        self, weight: float, explained: bool
+    ) -> None:
+        """What is seen is where a particle is, but the belief holds that to be impossible."""
+        belief = Belief.weighted([[0.0], [10.0]], [1.0, weight])
+        assert update(Direct(0.01), belief, 0, [10.0])[1].explained is explained
+
     def test_a_general_likelihood_of_zero_everywhere(self) -> None:
         belief = some_belief()
         after, info = update(General(), belief, 0, [1e6])
@@ -296,6 +304,18 @@ class TestResample:
         after = resample(belief, STREAM)
         assert after.states.tobytes() == belief.states.tobytes()
         assert not np.shares_memory(after.states, belief.states)
+
+    @pytest.mark.parametrize("substream", range(5))
+    def test_the_comb_begins_at_the_number_drawn(self, substream: int) -> None:
+        """Tooth j is at (j + u) / N of the weights, u being what the stream gives.
+
+        Any other number of [0, 1) would be as good for a filter, but decide otherwise.
+        """
+        belief = some_belief(40)
+        draws = STREAM.substream(substream)
+        teeth = (np.arange(40) + draws.uniform()) / 40
+        found = np.searchsorted(np.cumsum(belief.weights), teeth, side="right")
+        np.testing.assert_array_equal(resample(belief, draws).states, belief.states[found])
 
     def test_over_all_offsets_it_is_unbiased(self) -> None:
         """E[copies of n] = N w_n over the offset, for each of twelve particles.

@@ -241,6 +241,7 @@ class World:
         self.ended = False
         self.acted: list[tuple[int, np.ndarray]] = []
         self.on_act: Callable[[int], None] = lambda _: None
+        self.on_the_way: Callable[[int, bytes], bytes] = lambda _, payload: payload
 
     # -- faults ----------------------------------------------------------------------------------
 
@@ -387,7 +388,8 @@ class World:
         name = self.calls.get(call)
         if name is None or not self.services[name].up:
             return []
-        return self.robot.handle(Replied(call, encode(reply)), self.now)
+        payload = self.on_the_way(call, encode(reply))
+        return self.robot.handle(Replied(call, payload), self.now)
 
     def end(self, call: int) -> list[Effect]:
         if self.calls.pop(call, None) is None:
@@ -504,6 +506,83 @@ def test_kill_again_after_failback() -> None:
     assert sum(result.recoveries for result in world.results) == 3
 
 
+def test_a_cloud_that_appears_again_is_asked_what_the_local_service_was_asked() -> None:
+    """Not only with the next turn: while the robot moves, the cloud comes to hold its state."""
+    world = World()
+
+    def fault(performed: int) -> None:
+        if performed == 4 and not world.results:
+            world.kill("cloud")
+            # The robot has been answered for the steps that follow, and is in the midst of them.
+            world.bring_up("cloud", 0.392)
+
+    world.on_act = fault
+    world.start()
+    world.run()
+    world.assert_same_as_without_faults()
+    appeared_at = [
+        at for at, e in world.trace if isinstance(e, Report) and e.name == "service_appeared"
+    ]
+    assert len(appeared_at) == 2
+    asked = [sent for sent in world.sent if sent.at >= appeared_at[1]]
+    assert (asked[0].service, asked[0].at) == ("cloud", appeared_at[1])
+    last = [sent.request for sent in world.sent if sent.at < appeared_at[1]][-1]
+    assert asked[0].request.digest == last.digest
+    assert world.statuses() == ["local_recovery", "keep_alive"]
+
+
+def test_a_given_up_service_sees_the_next_question_also_while_another_decides() -> None:
+    """Only an answer of its own brings it back, so it must be asked although nobody needs it."""
+    world = World(services=("first", "second"))
+    first = world.services["first"]
+
+    def fault(performed: int) -> None:
+        # It is asked one question that it never answers; then it is as before.
+        first.stopped = not world.results and performed == 3
+
+    world.on_act = fault
+    world.start()
+    world.run()
+    world.assert_same_as_without_faults()
+    suspected_at = next(
+        at for at, e in world.trace if isinstance(e, Report) and e.name == "service_suspected"
+    )
+    after = [sent for sent in world.sent if sent.at >= suspected_at]
+    tries = [sent.at for sent in after if sent.service == "first"]
+    assert len(tries) > 2
+    # One try at a time, since it may be far away; with its answer it decides alone.
+    assert tries[1] >= tries[0] + 1e-3 * world.offload.detection_timeout_ms
+    assert {sent.service for sent in after if sent.at < tries[1]} == {"first", "second"}
+    assert {sent.service for sent in after if sent.at > tries[1]} == {"first"}
+    assert world.statuses() == []
+
+
+def test_a_preferred_service_that_is_back_is_asked_while_the_other_takes_its_time() -> None:
+    """The robot stands still for the second, which says that it is at work; the first could do."""
+    world = World(services=("first", "second"))
+    second = world.services["second"]
+
+    def takes_for_ever(request: Request) -> list[Reply]:
+        return [Progress(request.number, False)] * 4000
+
+    second.rule = takes_for_ever
+    second.latency_s = 0.01
+
+    def fault(performed: int) -> None:
+        if performed == 3 and not world.results:
+            world.kill("first")
+            world.bring_up("first", 0.05)
+
+    world.on_act = fault
+    world.start()
+    world.run()
+    world.assert_same_as_without_faults()
+    assert {sent.service for sent in world.sent} == {"first", "second"}
+    # Two timeouts at most: until the decision is late, and the next look.
+    assert world.longest_wait_ms() <= 2 * world.offload.detection_timeout_ms
+    assert world.statuses() == []
+
+
 def test_cloud_and_recovery_killed_together() -> None:
     world = World()
 
@@ -595,6 +674,35 @@ def test_a_lost_reply_is_asked_for_again() -> None:
     world.run()
     world.assert_same_as_without_faults()
     assert dropped == 3
+
+
+@pytest.mark.parametrize("damaged", [1, 2, 5])
+def test_a_damaged_reply_is_asked_for_again_and_nobody_is_blamed(damaged: int) -> None:
+    """The line has flipped a bit: the service is as good as before, and is asked again at once."""
+    world = World()
+    spoilt: list[tuple[float, int]] = []
+
+    def flip_a_bit(call: int, payload: bytes) -> bytes:
+        if len(spoilt) == 0 and len(world.sent) == damaged:
+            spoilt.append((world.now, call))
+            return payload[:-9] + bytes([payload[-9] ^ 16]) + payload[-8:]
+        return payload
+
+    world.on_the_way = flip_a_bit
+    world.start()
+    world.run()
+    world.assert_same_as_without_faults()
+    ((at, call),) = spoilt
+    (told,) = world.reports("malformed_reply")
+    assert told["service"] == "cloud"
+    # What else comes in that call is not to be believed, nor is its end news of the service.
+    assert (at, Abandon(call)) in world.trace
+    asked, again = world.sent[damaged - 1 : damaged + 1]
+    assert again.service == "cloud"
+    assert (again.request.digest, again.request.step) == (asked.request.digest, asked.request.step)
+    assert at < again.at <= at + 0.021
+    assert world.reports("service_suspected") == []
+    assert world.statuses() == []
 
 
 def test_swallowed_requests_are_sent_again_after_the_timeout() -> None:
