@@ -78,8 +78,11 @@ class Forgetful(Lander):
         if self.trial == 1 and self.steps_performed() == 6:
             before = signal.getsignal(signal.SIGTERM)
             os.kill(os.getpid(), signal.SIGTERM)
-            while signal.getsignal(signal.SIGTERM) is before:
-                time.sleep(0.001)
+            # Until it was heard; only what happens next may wake the one that hears it.
+            for _ in range(200):
+                if signal.getsignal(signal.SIGTERM) is not before:
+                    break
+                time.sleep(0.005)
         self.landed = self.steps_performed() == 6
         return reward
 
