@@ -1251,7 +1251,7 @@ class TestUnexplainedObservations:
         alike = world.environment_class(PROBLEM, world.simulator.seed, 0)
         run_trial(PROBLEM, PLANNING, world.simulator, 0, alike, recorder)
         unexplained = [each for each in recorder.record.sensing if not each.explained]
-        told = world.reports("unexplained_observation")
+        told = world.reports("unexplained")
         assert [(fields["step"], fields["sensing_action"]) for fields in told] == [
             (each.step, each.sensing_action) for each in unexplained
         ]
@@ -1266,15 +1266,15 @@ class TestUnexplainedObservations:
     def test_none_is_told_where_all_are_explained(self) -> None:
         world = self.world(set(), 6)
         assert world.results[0].unexplained_observations == 0
-        assert not world.reports("unexplained_observation")
+        assert not world.reports("unexplained")
 
     def test_a_run_of_them_is_told_once_and_the_lines_are_bounded(self) -> None:
         world = self.world(set(range(1, 40)), 40)
-        assert len(world.reports("unexplained_observation")) == 10
+        assert len(world.reports("unexplained")) == 10
         (diverged,) = world.reports("filter_diverged")
         assert diverged["step"] == 4 * 5
         assert world.results[0].unexplained_observations == 39
-        assert "counted only" in str(world.reports("unexplained_observation")[-1]["reason"])
+        assert "counted only" in str(world.reports("unexplained")[-1]["reason"])
 
     def test_a_robot_that_was_restarted_counts_on(self) -> None:
         first = World(simulator=SimulatorSettings(num_trials=1, max_steps=32, seed=11))
@@ -1286,12 +1286,12 @@ class TestUnexplainedObservations:
         first.on_act = lambda step: setattr(first, "ended", step == 10)
         first.start()
         first.run()
-        assert len(first.reports("unexplained_observation")) == 3
+        assert len(first.reports("unexplained")) == 3
         assert not first.reports("filter_diverged")
         second = self.world(set(range(20)), 8, tuple(first.journal[:-1]))
         (diverged,) = second.reports("filter_diverged")
         assert diverged["step"] == 4 * 4
-        assert len(second.reports("unexplained_observation")) == 5
+        assert len(second.reports("unexplained")) == 5
         assert second.results[0].unexplained_observations == 8
 
 

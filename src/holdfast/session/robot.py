@@ -500,7 +500,7 @@ class Robot:
             fields: dict[str, object] = {} if distance is None else {"deviations": distance}
             more = history.num_unexplained == _MOST_TOLD
             self._report(
-                "unexplained_observation",
+                "unexplained",
                 trial=self._trial,
                 step=step,
                 sensing_action=self._sensing_action,

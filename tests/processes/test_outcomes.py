@@ -1,0 +1,229 @@
+"""How trials end with a robot of one's own: in success, in failure, or out of steps.
+
+The commands are real, and so are the signals: the world's class sends them to its own process,
+right after the step that ends a trial.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+import signal
+import subprocess
+from pathlib import Path
+from typing import Any
+
+from tests.processes.faults import COMMAND, PATIENCE_S, events_of
+
+from holdfast import __version__
+from holdfast.recording.journal import Journal
+
+BEFORE_OUTCOMES = Path(__file__).parents[1] / "unit" / "data" / "journal_before_outcomes.sqlite"
+"""Of a robot killed at step 21 of trial 2, when results said only whether a trial succeeded."""
+
+AS_BEFORE = "c8620a9f2dab01e3b944d3e864944901548b38b9229c531cbe512fff9a22123f"
+"""The digest of that trial."""
+
+# What was moved is in a file, which outlives the process, as a real robot does.
+LANDER = """
+import os
+import signal
+import time
+from pathlib import Path
+
+import numpy as np
+
+
+class Lander:
+    ending = {0: True, 1: "failed"}  # of trial 2: it goes on
+
+    def __init__(self, trial, resumed):
+        self.trial, self.moves = trial, Path(f"moves-{trial}")
+        if not resumed:
+            self.moves.write_text("")
+
+    def perform_sensing(self, sensing_action):
+        return np.array([SHOWN])
+
+    def perform(self, task_action):
+        with self.moves.open("a") as file:
+            file.write(".")
+        return -1.0
+
+    def is_done(self):
+        return self.ending.get(self.trial, False) if self.steps_performed() >= 6 else False
+
+    def steps_performed(self):
+        return len(self.moves.read_text())
+
+
+class Crashing(Lander):
+    # The robot's process is killed once, right after the step that ended the trial.
+    def is_done(self):
+        done = super().is_done()
+        killed = Path(f"killed-{self.trial}")
+        if done and not killed.exists():
+            killed.touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+        return done
+
+
+class Forgetful(Lander):
+    # Is asked to end during the last step, and does not know of it any more later on.
+    landed = False
+
+    def perform(self, task_action):
+        reward = super().perform(task_action)
+        if self.trial == 1 and self.steps_performed() == 6:
+            before = signal.getsignal(signal.SIGTERM)
+            os.kill(os.getpid(), signal.SIGTERM)
+            # Until it was heard; only what happens next may wake the one that hears it.
+            for _ in range(200):
+                if signal.getsignal(signal.SIGTERM) is not before:
+                    break
+                time.sleep(0.005)
+        self.landed = self.steps_performed() == 6
+        return reward
+
+    def is_done(self):
+        return self.ending.get(self.trial, False) if self.landed else False
+
+
+class Wrong(Lander):
+    ending = {0: True, 1: "crashed"}
+"""
+
+CONFIGURATION = """
+problem: peg_in_hole_2d
+particle_filter: {num_particles: 20}
+active_sensing: {num_observation_samples: 2, num_cores: 1}
+simulator: {num_trials: 3, max_steps: 9, sensing_intervals: 0, seed: 3}
+"""
+
+
+class Command:
+    """``holdfast run`` in a directory of its own."""
+
+    def __init__(self, directory: Path, name: str, shown: float = 4.0) -> None:
+        self.directory = directory
+        self.out = directory / "run"
+        (directory / "lander.py").write_text(LANDER.replace("SHOWN", str(shown)))
+        (directory / "lander.yaml").write_text(CONFIGURATION)
+        self._arguments = ("run", "lander.yaml", "-e", f"lander:{name}", "--out", "run")
+
+    def run(self, *arguments: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            [*COMMAND, *self._arguments, *arguments],
+            cwd=self.directory,
+            capture_output=True,
+            text=True,
+            timeout=PATIENCE_S,
+            check=False,
+        )
+
+    def rows(self) -> list[dict[str, str]]:
+        with (self.out / "trials.csv").open() as file:
+            return list(csv.DictReader(file))
+
+    def summary(self) -> dict[str, Any]:
+        read: dict[str, Any] = json.loads((self.out / "summary.json").read_text())
+        return read
+
+    def assert_ended(self, ended: subprocess.CompletedProcess[str]) -> None:
+        """Make sure that all three trials ended as they should."""
+        assert ended.returncode == 0, ended.stderr
+        rows = self.rows()
+        assert [row["outcome"] for row in rows] == ["succeeded", "failed", "truncated"]
+        assert [row["success"] for row in rows] == ["1", "0", "0"]
+        assert [row["steps"] for row in rows] == ["6", "6", "9"]
+        summary = self.summary()
+        assert (summary["successes"], summary["failures"], summary["finished"]) == (1, 1, 3)
+        assert "failed        1 of 3 trials" in ended.stdout
+        told = [event for event in events_of(self.out) if event["event"] == "trial"]
+        assert [event["outcome"] for event in told] == ["succeeded", "failed", "truncated"]
+        assert len((self.directory / "moves-1").read_text()) == 6
+
+
+def test_a_failed_task_is_no_success(tmp_path: Path) -> None:
+    command = Command(tmp_path, "Lander")
+    command.assert_ended(command.run())
+
+
+def test_nobody_speaks_of_failures_where_there_are_none(tmp_path: Path) -> None:
+    command = Command(tmp_path, "Lander")
+    ended = command.run("--trials", "1")
+    assert ended.returncode == 0, ended.stderr
+    assert "failed" not in ended.stdout
+    assert command.summary()["failures"] == 0
+
+
+def test_killed_right_after_the_step_that_ended_the_trial(tmp_path: Path) -> None:
+    command = Command(tmp_path, "Crashing")
+    ended = command.run()
+    for _ in range(2):
+        assert ended.returncode == -signal.SIGKILL
+        ended = command.run("--resume")
+    command.assert_ended(ended)
+
+
+def test_asked_to_end_in_the_step_that_ended_the_trial(tmp_path: Path) -> None:
+    command = Command(tmp_path, "Forgetful")
+    ended = command.run()
+    assert ended.returncode == 128 + signal.SIGTERM, ended.stderr
+    assert [row["outcome"] for row in command.rows()] == ["succeeded", "failed"]
+    command.assert_ended(command.run("--resume"))
+
+
+def test_anything_else_is_an_error_that_names_it(tmp_path: Path) -> None:
+    ended = Command(tmp_path, "Wrong").run()
+    assert ended.returncode == 2
+    assert (
+        "lander:Wrong: is_done returned 'crashed'; it must return True, False or \"failed\""
+        in " ".join(ended.stderr.split())
+    )
+
+
+def test_a_filter_that_has_lost_the_robot_is_told(tmp_path: Path) -> None:
+    command = Command(tmp_path, "Lander", shown=1000.0)
+    ended = command.run()
+    assert ended.returncode == 0, ended.stderr
+    rows = command.rows()
+    for trial, row in enumerate(rows):
+        assert row["unexplained_observations"] == row["sensing_decisions"] == row["steps"]
+        told = [event for event in events_of(command.out) if event.get("trial") == trial]
+        each = [event for event in told if event["event"] == "unexplained"]
+        assert [event["step"] for event in each] == list(range(int(row["steps"])))
+        assert all(event["deviations"] > 8.0 for event in each)
+        (diverged,) = [event for event in told if event["event"] == "filter_diverged"]
+        assert diverged["step"] == 4
+    assert command.summary()["unexplained_observations"] == 21
+    assert "unexplained" in ended.stdout
+    assert "21 of 21 observations" in ended.stdout
+    assert ended.stderr.count("filter diverged") == 3
+
+
+def test_a_run_from_before_trials_could_fail_goes_on(tmp_path: Path) -> None:
+    """Its journal was made by that code; the digest is what that code came to, undisturbed."""
+    out = tmp_path / "run"
+    out.mkdir()
+    shutil.copyfile(BEFORE_OUTCOMES, out / "journal.sqlite")
+    with Journal.open(out / "journal.sqlite") as journal:
+        (tmp_path / "old.yaml").write_text(journal.meta()["configuration"])
+        # Another version's runs are not gone on with; this is about another form of results alone.
+        journal.set_meta("holdfast_version", __version__)
+    ended = subprocess.run(
+        [*COMMAND, "run", "old.yaml", "--rate", "1000", "--out", "run", "--resume"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+        check=False,
+    )
+    assert ended.returncode == 0, ended.stderr
+    with (out / "trials.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["outcome"] for row in rows] == ["truncated", "succeeded", "truncated"]
+    assert [row["success"] for row in rows] == ["0", "1", "0"]
+    assert rows[2]["digest"] == AS_BEFORE
+    assert [event["step"] for event in events_of(out) if event["event"] == "resumed_trial"] == [21]
