@@ -277,9 +277,9 @@ class TestProcesses:
         for _ in range(2):
             unfinished = unfinished_of(path)
             assert unfinished is not None
-            assert len(unfinished.records) < len(all_records(6))
+            kept = len(unfinished.records)
+            assert kept < len(all_records(6))
             assert not unfinished.is_complete
-        kept = len(unfinished.records)
         # Somebody knew enough to go on from there.
         with Journal.open(path) as journal:
             journal.append(TRIAL, records_of(7))
@@ -497,7 +497,7 @@ class TestDamage:
             assert numbers == kept
             assert numbers == sorted(numbers)
             # What began the trial is in the journal itself.
-            assert set(numbers) == {2, 5, 8, 11, 14, 17}
+            assert set(numbers) == {2, 5, 8, 11, 14}
 
     @pytest.mark.parametrize("name", ["journal.sqlite", "journal.sqlite-wal"])
     def test_a_flipped_bit_anywhere(self, killed: Path, memory_path: Path, name: str) -> None:

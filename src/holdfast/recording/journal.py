@@ -158,7 +158,7 @@ class Journal:
         self._encode = msgspec.msgpack.Encoder().encode
         self._steps: _Steps | None = None
         self._count: _Count | None = None
-        self._in_place: list[tuple[str, tuple[int, int]]] = []
+        self._in_place: list[tuple[Path, tuple[int, int]]] = []
         self._version_read: tuple[int, ...] | None = None
         self._close = contextlib.ExitStack()
         self._close.callback(connection.close)
@@ -327,7 +327,7 @@ class Journal:
         # Absolute, for the user's code may change the current directory.
         path = self.path.absolute()
         for place in (path, _log_path(path)):
-            self._in_place.append((str(place), _identity(place)))
+            self._in_place.append((place, _identity(place)))
 
     def _require_in_place(self) -> None:
         """Find out whether what is written is still to be found under its name.
@@ -337,16 +337,12 @@ class Journal:
         """
         for number, (place, identity) in enumerate(self._in_place):
             try:
-                status = os.stat(place)
+                if _identity(place) == identity:
+                    continue
             except (FileNotFoundError, NotADirectoryError):
                 pass
             except OSError as error:
-                raise OutputError(
-                    f"{place}: cannot be reached any more: {error.strerror}"
-                ) from None
-            else:
-                if (status.st_dev, status.st_ino) == identity:
-                    continue
+                raise OutputError(f"{place}: is out of reach now: {error.strerror}") from None
             if number == 0:
                 raise LostJournalError(
                     f"{place}: the journal is gone: it was removed, renamed or replaced while this "
@@ -413,8 +409,8 @@ class Journal:
         try:
             yield
         except sqlite3.DatabaseError as error:
-            # The plain error is one in our SQL: then the tables are not those that we have made. One
-            # without a name is of Python's module, which could not decode a text.
+            # The plain error is one in our SQL: then the tables are not those that we have made.
+            # One without a name is of Python's module, which could not decode a text.
             name = getattr(error, "sqlite_errorname", None)
             undecoded = name is None and isinstance(error, sqlite3.OperationalError)
             if (
