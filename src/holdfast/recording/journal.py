@@ -14,7 +14,7 @@ A log that is removed or cut, or left behind when the journal is copied, would t
 with it, and SQLite would not notice. So whatever begins a trial is moved on into the main file at
 once, which then says that there is a log; and how many records were kept is written beside it, into
 ``journal.sqlite-count``. A journal with fewer records than that is known to lack some. That costs
-half a microsecond a step; a mode without a log, as safe in a power cut, would cost the disk's time.
+a few microseconds a step; a mode without a log, as safe in a power cut, would wait for the disk.
 The two files beside the journal go when it is closed.
 """
 
@@ -812,28 +812,30 @@ class _Count:
     def __init__(self, path: Path, *, synchronous: bool) -> None:
         self._path = path
         self._synchronous = synchronous
-        with self._errors():
-            self._descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
-
-    @contextlib.contextmanager
-    def _errors(self) -> Iterator[None]:
         try:
-            yield
+            self._descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
         except OSError as error:
-            raise OutputError(f"{self._path}: cannot be written: {error.strerror}") from error
+            raise self._cannot_be_written(error) from error
+
+    def _cannot_be_written(self, error: OSError) -> OutputError:
+        return OutputError(f"{self._path}: cannot be written: {error.strerror}")
 
     def begin(self, trial: int, number: int) -> None:
         """Count the records of another trial, or those that a process before has left."""
         self.write(trial, number)
         if self._synchronous:
-            with self._errors():
+            try:
                 os.fsync(self._descriptor)
                 _synchronize_directory(self._path.parent)
+            except OSError as error:
+                raise self._cannot_be_written(error) from error
 
     def write(self, trial: int, number: int) -> None:
         """Note how many there are; this outlives the process."""
-        with self._errors():
+        try:
             os.pwrite(self._descriptor, _NUMBERS.pack(trial, number), 0)
+        except OSError as error:
+            raise self._cannot_be_written(error) from error
 
     def close(self) -> None:
         """Close the file and leave it where it is."""
