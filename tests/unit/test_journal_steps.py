@@ -292,6 +292,18 @@ class TestProcesses:
         assert len(unfinished.records) == kept + len(records_of(7))
         assert unfinished.is_complete
 
+    def test_a_journal_that_cannot_note_its_end_keeps_its_count(self, path: Path) -> None:
+        with Journal.create(path, {}) as journal:
+            journal.append(TRIAL, records_of(0))
+
+            def refuse(operation: int, *_: object) -> int:
+                return sqlite3.SQLITE_DENY if operation == sqlite3.SQLITE_INSERT else 0
+
+            journal._connection.set_authorizer(refuse)
+        unfinished = unfinished_of(path)
+        assert unfinished is not None
+        assert unfinished.is_complete
+
     def test_a_finished_trial_leaves_no_count(self, killed: Path, tmp_path: Path) -> None:
         path = copy_of(killed, tmp_path)
         with Journal.open(path) as journal:

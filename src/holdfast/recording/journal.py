@@ -308,14 +308,16 @@ class Journal:
         """Move the log into the main file: a plain file can be read by anything."""
         # It does no harm if this fails: the next one to open the journal does it.
         with contextlib.suppress(sqlite3.Error, OutputError):
-            counted = self._count is not None
-            if counted:
-                # Only who has written the count may say that it is needed no more: if records were
-                # lost before, whoever comes next must find that out as well.
-                with contextlib.suppress(OutputError), self._transaction():
-                    self._note({"steps_counted": "0"})
+            needless = False
+            # Only who has written the count may say that it is needed no more: if records were
+            # lost before, whoever comes next must find that out as well.
+            if self._count is not None:
+                with contextlib.suppress(OutputError):
+                    with self._transaction():
+                        self._note({"steps_counted": "0"})
+                    needless = True
             self._connection.execute("PRAGMA journal_mode = DELETE")
-            if counted or self.unfinished_trial() is None:
+            if needless or self.unfinished_trial() is None:
                 _count_path(self.path).unlink(missing_ok=True)
 
     def _move_log(self) -> None:
