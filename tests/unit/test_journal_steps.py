@@ -124,7 +124,7 @@ def killed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def copy_of(journal: Path, directory: Path) -> Path:
-    for name in ("journal.sqlite", "journal.sqlite-wal"):
+    for name in ("journal.sqlite", "journal.sqlite-wal", "journal.sqlite-count"):
         if journal.with_name(name).exists():
             shutil.copyfile(journal.with_name(name), directory / name)
     return directory / "journal.sqlite"
@@ -208,9 +208,8 @@ class TestSteps:
             "from holdfast.files import OutputError\n"
             "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
             "journal.append(TRIAL, records_of(0))\n"
-            "log = os.stat(sys.argv[2] + '-wal').st_size\n"
             "hard = resource.getrlimit(resource.RLIMIT_FSIZE)[1]\n"
-            "resource.setrlimit(resource.RLIMIT_FSIZE, (log + 100, hard))\n"
+            "resource.setrlimit(resource.RLIMIT_FSIZE, (100, hard))\n"
             "try:\n"
             "    journal.append(TRIAL, records_of(1))\n"
             "except OutputError as error:\n"
@@ -248,11 +247,68 @@ class TestProcesses:
         assert unfinished.trial == TRIAL
         assert unfinished.records == all_records(6)
         assert unfinished.same_boot
+        assert unfinished.is_complete
         with Journal.open(path) as journal:
             assert journal.finished() == {0, 1, 2}
             assert journal.raise_epoch() == 2
             journal.add(result_of(TRIAL))
             assert journal.unfinished() is None
+
+    @pytest.mark.parametrize("content", [None, b"", b"\0" * 15, struct.pack("<qq", TRIAL + 1, 1)])
+    def test_without_its_count_nobody_knows_what_is_missing(
+        self, content: bytes | None, killed: Path, tmp_path: Path
+    ) -> None:
+        path = copy_of(killed, tmp_path)
+        count = tmp_path / "journal.sqlite-count"
+        count.unlink()
+        if content is not None:
+            count.write_bytes(content)
+        unfinished = unfinished_of(path)
+        assert unfinished is not None
+        assert unfinished.records == all_records(6)
+        assert not unfinished.is_complete
+
+    def test_what_is_missing_is_missing_for_whoever_comes_next(
+        self, killed: Path, tmp_path: Path
+    ) -> None:
+        path = copy_of(killed, tmp_path)
+        log = tmp_path / "journal.sqlite-wal"
+        os.truncate(log, log.stat().st_size // 2)
+        for _ in range(2):
+            unfinished = unfinished_of(path)
+            assert unfinished is not None
+            kept = len(unfinished.records)
+            assert kept < len(all_records(6))
+            assert not unfinished.is_complete
+        # Somebody knew enough to go on from there.
+        with Journal.open(path) as journal:
+            journal.append(TRIAL, records_of(7))
+            unfinished = journal.unfinished()
+            assert unfinished is not None
+            assert unfinished.is_complete
+        assert [entry.name for entry in tmp_path.iterdir()] == [path.name]
+        unfinished = unfinished_of(path)
+        assert unfinished is not None
+        assert len(unfinished.records) == kept + len(records_of(7))
+        assert unfinished.is_complete
+
+    def test_a_journal_that_cannot_note_its_end_keeps_its_count(self, path: Path) -> None:
+        with Journal.create(path, {}) as journal:
+            journal.append(TRIAL, records_of(0))
+
+            def refuse(operation: int, *_: object) -> int:
+                return sqlite3.SQLITE_DENY if operation == sqlite3.SQLITE_INSERT else 0
+
+            journal._connection.set_authorizer(refuse)
+        unfinished = unfinished_of(path)
+        assert unfinished is not None
+        assert unfinished.is_complete
+
+    def test_a_finished_trial_leaves_no_count(self, killed: Path, tmp_path: Path) -> None:
+        path = copy_of(killed, tmp_path)
+        with Journal.open(path) as journal:
+            journal.add(result_of(TRIAL))
+        assert [entry.name for entry in tmp_path.iterdir()] == [path.name]
 
     def test_reading_changes_nothing(self, killed: Path, tmp_path: Path) -> None:
         path = copy_of(killed, tmp_path)
@@ -261,6 +317,7 @@ class TestProcesses:
             unfinished = journal.unfinished()
             assert unfinished is not None
             assert unfinished.records == all_records(6)
+            assert unfinished.is_complete
             assert [result.trial for result in journal.results(with_decisions=True)] == [0, 1, 2]
             assert content(tmp_path) == before
             with pytest.raises(OutputError, match="readonly"):
@@ -293,9 +350,9 @@ class TestProcesses:
             for use in (Journal.open, Journal.read):
                 with pytest.raises(OutputError, match="another process is using this run"):
                     use(path)
-            # A log in memory: no file beside it that several processes share.
+            # The log's index is in memory: no file beside it that several processes share.
             names = {entry.name for entry in path.parent.iterdir()}
-            assert names == {"journal.sqlite", "journal.sqlite-wal"}
+            assert names == {"journal.sqlite", "journal.sqlite-wal", "journal.sqlite-count"}
         unfinished = unfinished_of(path)
         assert unfinished is not None
         assert unfinished.records == all_records(2)
@@ -393,7 +450,7 @@ class TestDamage:
     """Whatever is cut off or flipped: what comes back is what was written, from the first on."""
 
     @staticmethod
-    def outcome(path: Path, *, read: bool) -> list[Record] | str:
+    def outcome(path: Path, *, read: bool) -> UnfinishedTrial | str:
         try:
             with Journal.read(path) if read else Journal.open(path) as journal:
                 unfinished = journal.unfinished()
@@ -402,10 +459,9 @@ class TestDamage:
                 assert journal.meta()["configuration"] == "x" * 100
         except OutputError as error:
             return str(error)
-        if unfinished is None:
-            return []
+        assert unfinished is not None
         assert unfinished.trial == TRIAL
-        return unfinished.records
+        return unfinished
 
     def check(self, path: Path, *, read: bool, where: str) -> int | None:
         """Return how many records came back; None if it was refused."""
@@ -415,8 +471,10 @@ class TestDamage:
             assert "--out" in found, f"{where}: {found}"
             return None
         expected = all_records(6)
-        assert found == expected[: len(found)], where
-        return len(found)
+        assert found.records == expected[: len(found.records)], where
+        # Whatever is missing, it is known that something is.
+        assert found.is_complete == (len(found.records) == len(expected)), where
+        return len(found.records)
 
     @staticmethod
     def check_goes_on(path: Path, kept: int) -> None:
@@ -450,7 +508,8 @@ class TestDamage:
             numbers = [number for number in kept if number is not None]
             assert numbers == kept
             assert numbers == sorted(numbers)
-            assert {0, 2, 5, 8, 11, 14} <= set(numbers)
+            # What began the trial is in the journal itself.
+            assert set(numbers) == {2, 5, 8, 11, 14}
 
     @pytest.mark.parametrize("name", ["journal.sqlite", "journal.sqlite-wal"])
     def test_a_flipped_bit_anywhere(self, killed: Path, memory_path: Path, name: str) -> None:

@@ -378,10 +378,12 @@ def _run(options: _Options) -> None:
             )
             raise
         except HoldfastError as error:
+            from holdfast.recording.journal import LostJournalError
             from holdfast.session.robot import UnknownPerformanceError
 
-            cannot_go_on = directory.journal.unfinished_trial() is None or isinstance(
-                error, UnknownPerformanceError
+            cannot_go_on = (
+                isinstance(error, UnknownPerformanceError | LostJournalError)
+                or directory.journal.unfinished_trial() is None
             )
             resume = None if cannot_go_on else options.resume_command(directory_path)
             raise RunError(error, resume, _exit_code(summary) or EXIT_ERROR) from error

@@ -8,8 +8,14 @@ finished. Tables and summary are made from the journal and can be made again at 
 SQLite writes ahead (WAL): a commit is one append to ``journal.sqlite-wal``, which takes some
 microseconds and outlives the death of the process. To outlive the death of the machine it has to be
 on the disk as well; that is done for what begins or finishes a trial, and on demand for every step.
-The writer has the file for itself, so the index of that log is kept in its memory and no third file
-is needed.
+The writer has the file for itself, so the index of that log is kept in its memory.
+
+A log that is removed or cut, or left behind when the journal is copied, would take the last steps
+with it, and SQLite would not notice. So whatever begins a trial is moved on into the main file at
+once, which then says that there is a log; and how many records were kept is written beside it, into
+``journal.sqlite-count``. A journal with fewer records than that is known to lack some. That costs
+a few microseconds a step; a mode without a log, as safe in a power cut, would wait for the disk.
+The two files beside the journal go when it is closed.
 """
 
 from __future__ import annotations
@@ -35,7 +41,15 @@ from holdfast.files import OutputError
 from holdfast.outcome import Decisions, TrialResult
 from holdfast.session.records import Record, RecordError, decode_record, encode_record
 
-__all__ = ["SCHEMA_VERSION", "Journal", "Survives", "Tally", "UnfinishedTrial"]
+__all__ = [
+    "SCHEMA_VERSION",
+    "Journal",
+    "LostJournalError",
+    "Survives",
+    "Tally",
+    "UnfinishedTrial",
+    "require_writable",
+]
 
 Survives: TypeAlias = Literal["process_crash", "power_cut"]
 """What a journalled step outlives; see :class:`holdfast.settings.RecoverySettings`."""
@@ -77,6 +91,10 @@ _NUMBERS = struct.Struct("<qq")
 _open_here: weakref.WeakValueDictionary[tuple[int, int], Journal] = weakref.WeakValueDictionary()
 
 
+class LostJournalError(OutputError):
+    """The journal was removed or replaced while it was open: nothing can go on with it."""
+
+
 class Tally(NamedTuple):
     """How many trials are finished, and how many of them succeeded and failed."""
 
@@ -98,17 +116,21 @@ class UnfinishedTrial(NamedTuple):
         that is not known.
     on_disk : bool
         Whether each of them was on the disk before it was acted on (``survives="power_cut"``).
+    all_counted : bool
+        Whether they are as many as were counted when they were written; False if that is not known,
+        too. If so, no log was removed or cut.
     """
 
     trial: int
     records: list[Record]
     same_boot: bool
     on_disk: bool
+    all_counted: bool
 
     @property
     def is_complete(self) -> bool:
         """Whether no record can have been lost: what happened after the last one is not known."""
-        return self.same_boot or self.on_disk
+        return self.all_counted and (self.same_boot or self.on_disk)
 
 
 class Journal:
@@ -135,6 +157,8 @@ class Journal:
         self._connection = connection
         self._encode = msgspec.msgpack.Encoder().encode
         self._steps: _Steps | None = None
+        self._count: _Count | None = None
+        self._in_place: list[tuple[Path, tuple[int, int]]] = []
         self._version_read: tuple[int, ...] | None = None
         self._close = contextlib.ExitStack()
         self._close.callback(connection.close)
@@ -219,12 +243,12 @@ class Journal:
             if check:
                 journal.check()
             journal._write_ahead()
+            identity = _identity(path)
+            journal._note_places()
         except BaseException:
             journal.close()
             raise
-        # An empty log would stay behind otherwise, and a plain file can be read by anything.
-        journal._close.callback(journal._merge_log)
-        identity = _identity(path)
+        journal._close.callback(journal._leave_one_file)
         _open_here[identity] = journal
         journal._close.callback(_open_here.pop, identity, None)
         return journal
@@ -277,11 +301,59 @@ class Journal:
                 raise OutputError(f"{self.path}: SQLite cannot write ahead here (mode {mode})")
             self._connection.execute(f"PRAGMA wal_autocheckpoint = {_MAX_LOG_PAGES}")
             self._set_synchronous(self.survives)
+            # The log is made by the first use of the database in that mode.
+            self._connection.execute("SELECT 1 FROM meta LIMIT 1").fetchone()
 
-    def _merge_log(self) -> None:
+    def _leave_one_file(self) -> None:
+        """Move the log into the main file: a plain file can be read by anything."""
         # It does no harm if this fails: the next one to open the journal does it.
-        with contextlib.suppress(sqlite3.Error):
+        with contextlib.suppress(sqlite3.Error, OutputError):
+            needless = False
+            # Only who has written the count may say that it is needed no more: if records were
+            # lost before, whoever comes next must find that out as well.
+            if self._count is not None:
+                with contextlib.suppress(OutputError):
+                    with self._transaction():
+                        self._note({"steps_counted": "0"})
+                    needless = True
             self._connection.execute("PRAGMA journal_mode = DELETE")
+            if needless or self.unfinished_trial() is None:
+                _count_path(self.path).unlink(missing_ok=True)
+
+    def _move_log(self) -> None:
+        """Move what is in the log into the main file, and let both outlive a power cut."""
+        with self._errors():
+            self._connection.execute("PRAGMA wal_checkpoint(PASSIVE)")
+
+    def _note_places(self) -> None:
+        # Absolute, for the user's code may change the current directory.
+        path = self.path.absolute()
+        for place in (path, _log_path(path)):
+            self._in_place.append((place, _identity(place)))
+
+    def _require_in_place(self) -> None:
+        """Find out whether what is written is still to be found under its name.
+
+        A file can be removed while it is open. Then SQLite goes on to write to it, and all is gone
+        as soon as it is closed. While it is open, no other file can get its number.
+        """
+        for number, (place, identity) in enumerate(self._in_place):
+            try:
+                if _identity(place) == identity:
+                    continue
+            except (FileNotFoundError, NotADirectoryError):
+                pass
+            except OSError as error:
+                raise OutputError(f"{place}: is out of reach now: {error.strerror}") from None
+            if number == 0:
+                raise LostJournalError(
+                    f"{place}: the journal is gone: it was removed, renamed or replaced while this "
+                    "run was writing to it; nothing is performed that is not written down"
+                )
+            raise OutputError(
+                f"{place}: the journal's log is gone: it was removed or replaced while this run "
+                "was writing to it; nothing is performed that is not written down"
+            )
 
     def check(self) -> None:
         """Find out whether the file is whole.
@@ -340,10 +412,17 @@ class Journal:
             yield
         except sqlite3.DatabaseError as error:
             # The plain error is one in our SQL: then the tables are not those that we have made.
-            if getattr(error, "sqlite_errorname", "") == "SQLITE_ERROR" or _is_named(
-                error, "SQLITE_CORRUPT", "SQLITE_NOTADB"
+            # One without a name is of Python's module, which could not decode a text.
+            name = getattr(error, "sqlite_errorname", None)
+            undecoded = name is None and isinstance(error, sqlite3.OperationalError)
+            if (
+                undecoded
+                or name == "SQLITE_ERROR"
+                or _is_named(error, "SQLITE_CORRUPT", "SQLITE_NOTADB")
             ):
                 raise self._damaged(str(error)) from error
+            # SQLite says of some of the files that are gone that it cannot write to them.
+            self._require_in_place()
             raise OutputError(f"{self.path}: {error}") from error
         except sqlite3.Error as error:
             raise OutputError(f"{self.path}: {error}") from error
@@ -357,7 +436,13 @@ class Journal:
 
     @contextlib.contextmanager
     def _transaction(self, *, on_disk: bool = True) -> Iterator[None]:
-        """Do all of what is inside or nothing; with ``on_disk``, a power cut does not undo it."""
+        """Do all of what is inside or nothing; with ``on_disk``, a power cut does not undo it.
+
+        Raises
+        ------
+        LostJournalError
+            If it was done to a file that nobody can find any more.
+        """
         connection = self._connection
         raised = on_disk and self.survives != "power_cut"
         with self._errors():
@@ -374,6 +459,7 @@ class Journal:
             finally:
                 if raised:
                     self._set_synchronous(self.survives)
+        self._require_in_place()
 
     # -----------------------------------------------------------------------------------------
     # The run
@@ -433,13 +519,14 @@ class Journal:
         """Count one more process of the run, and return how many these are now, from 1.
 
         When this returns, the new count is on the disk: no two processes get the same, even if the
-        power is cut between them.
+        power is cut between them, or the log removed.
         """
         text = self.meta().get("epoch", "0")
         if not text.isdecimal() or not 0 <= int(text) < _MAX_EPOCH:
             raise self._damaged(f"its epoch is {text!r}, not from 0 to {_MAX_EPOCH - 1}")
         epoch = int(text) + 1
         self.set_meta("epoch", str(epoch))
+        self._move_log()
         return epoch
 
     # -----------------------------------------------------------------------------------------
@@ -447,11 +534,11 @@ class Journal:
     # -----------------------------------------------------------------------------------------
 
     def append(self, trial: int, records: Sequence[Record]) -> None:
-        """Keep records of a trial that is not finished: all of them, or none if this raises.
+        """Keep records of a trial that is not finished; act on none of them if this raises.
 
         When this returns they outlive the death of the process; with ``survives="power_cut"`` they
         are on the disk. The first records of a trial, and the first after each opening, always
-        are: so a trial that was begun is known to be, whatever happens.
+        are, and in the main file: so a trial that was begun is known to be, whatever happens.
 
         Parameters
         ----------
@@ -461,7 +548,9 @@ class Journal:
         Raises
         ------
         OutputError
-            If they cannot be written.
+            If they cannot be written. All of them are kept then, or none.
+        LostJournalError
+            If the file was removed.
         InvalidValueError
             If the trial is finished already, or another one is unfinished.
         """
@@ -479,16 +568,33 @@ class Journal:
             sequence += 1
         # Until it is known that they are kept, nothing is known of what is in the file.
         self._steps = None
+        count = self._count_from(trial, steps.next_sequence) if first else self._count
+        assert count is not None
         with self._transaction(on_disk=first):
             if first:
                 self._note(
                     {
                         "steps_boot": _boot_id() or "",
                         "steps_on_disk": str(int(self.survives == "power_cut")),
+                        "steps_counted": "1",
                     }
                 )
             self._connection.executemany("INSERT INTO steps VALUES (?, ?, ?, ?)", rows)
+        if first:
+            self._move_log()
+        # Afterwards: a count that is too small does no harm.
+        count.write(trial, sequence)
         self._steps = _Steps(trial, sequence)
+
+    def _count_from(self, trial: int, number: int) -> _Count:
+        """Begin to count: what is in the journal now was found to be enough to go on from."""
+        if self._count is None:
+            self._count = _Count(
+                _count_path(self.path.absolute()), synchronous=self.survives == "power_cut"
+            )
+            self._close.callback(self._count.close)
+        self._count.begin(trial, number)
+        return self._count
 
     def _begin(self, trial: int) -> _Steps:
         with self._errors():
@@ -548,11 +654,16 @@ class Journal:
             return None
         meta = self.meta()
         boot = _boot_id()
+        all_counted = True
+        if meta.get("steps_counted") == "1":
+            counted = _read_count(_count_path(self.path))
+            all_counted = counted is not None and counted[0] == trial and counted[1] <= len(records)
         return UnfinishedTrial(
             trial=trial,
             records=records,
             same_boot=boot is not None and meta.get("steps_boot") == boot,
             on_disk=meta.get("steps_on_disk") == "1",
+            all_counted=all_counted,
         )
 
     # -----------------------------------------------------------------------------------------
@@ -591,8 +702,8 @@ class Journal:
         if dropped.rowcount:
             # Now, while the robot has nothing to do, and not in the middle of its next trial. The
             # trial is kept already, so trouble here is told by whatever is written next.
-            with contextlib.suppress(sqlite3.Error):
-                self._connection.execute("PRAGMA wal_checkpoint(PASSIVE)")
+            with contextlib.suppress(OutputError):
+                self._move_log()
 
     def is_empty(self) -> bool:
         """Tell whether nothing has been done yet: no trial is finished, and none is begun."""
@@ -662,11 +773,84 @@ class Journal:
             return _DECISIONS_DECODER.decode(row[0])
 
 
+def require_writable(path: Path) -> None:
+    """Make sure that a journal's file can be written; SQLite's own errors do not say why not.
+
+    Raises
+    ------
+    OutputError
+        If it cannot be.
+    """
+    try:
+        # One that is open here can be, and closing it a second time would drop its lock.
+        if _identity(path) not in _open_here:
+            os.close(os.open(path, os.O_WRONLY | os.O_CLOEXEC))
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written: {error.strerror}") from error
+
+
 class _Steps(NamedTuple):
     """The unfinished trial, and the number of its next record."""
 
     trial: int
     next_sequence: int
+
+
+class _Count:
+    """How many records of the unfinished trial were kept, in a file beside the journal.
+
+    Parameters
+    ----------
+    path : Path
+    synchronous : bool
+        Whether it is on the disk when :meth:`begin` returns.
+
+    Raises
+    ------
+    OutputError
+        If it cannot be written; so do the methods.
+    """
+
+    def __init__(self, path: Path, *, synchronous: bool) -> None:
+        self._path = path
+        self._synchronous = synchronous
+        try:
+            self._descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+        except OSError as error:
+            raise self._cannot_be_written(error) from error
+
+    def _cannot_be_written(self, error: OSError) -> OutputError:
+        return OutputError(f"{self._path}: cannot be written: {error.strerror}")
+
+    def begin(self, trial: int, number: int) -> None:
+        """Count the records of another trial, or those that a process before has left."""
+        self.write(trial, number)
+        if self._synchronous:
+            try:
+                os.fsync(self._descriptor)
+                _synchronize_directory(self._path.parent)
+            except OSError as error:
+                raise self._cannot_be_written(error) from error
+
+    def write(self, trial: int, number: int) -> None:
+        """Note how many there are; this outlives the process."""
+        try:
+            os.pwrite(self._descriptor, _NUMBERS.pack(trial, number), 0)
+        except OSError as error:
+            raise self._cannot_be_written(error) from error
+
+    def close(self) -> None:
+        """Close the file and leave it where it is."""
+        os.close(self._descriptor)
+
+
+def _read_count(path: Path) -> tuple[int, int] | None:
+    """Return the trial, and how many of its records were kept; None if nobody knows."""
+    try:
+        trial, number = _NUMBERS.unpack(path.read_bytes())
+    except (OSError, struct.error):
+        return None
+    return trial, number
 
 
 def _first_rows(meta: dict[str, str]) -> dict[str, str]:
@@ -733,9 +917,17 @@ def _version_of_file(path: Path) -> tuple[int, ...]:
     return status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns
 
 
+def _log_path(path: Path) -> Path:
+    return path.with_name(f"{path.name}-wal")
+
+
+def _count_path(path: Path) -> Path:
+    return path.with_name(f"{path.name}-count")
+
+
 def _logs_of(path: Path) -> list[Path]:
     """Return the files beside a database that hold a part of its content."""
-    logs = (path.with_name(path.name + suffix) for suffix in ("-wal", "-journal"))
+    logs = (_log_path(path), path.with_name(f"{path.name}-journal"))
     return [log for log in logs if log.is_file() and log.stat().st_size]
 
 

@@ -21,7 +21,7 @@ from holdfast.configuration import Configuration
 from holdfast.files import OutputError, write_atomically
 from holdfast.outcome import TrialResult
 from holdfast.recording.fingerprint import difference, fingerprint
-from holdfast.recording.journal import Journal, Survives
+from holdfast.recording.journal import Journal, Survives, require_writable
 from holdfast.recording.tables import RunSummary, SummaryBuilder, csv_lines
 from holdfast.recording.timings import count_answers, count_verified
 
@@ -111,7 +111,7 @@ class RunDirectory:
                     if name not in (CONFIGURATION_NAME, JOURNAL_NAME):
                         (path / name).unlink(missing_ok=True)
             else:
-                _require_writable(path)
+                _require_writable_directory(path)
                 journal = Journal.create(path / JOURNAL_NAME, meta, survives=survives)
             # After the journal, which only one run can have: so both are the same run's.
             write_atomically(path / CONFIGURATION_NAME, text)
@@ -132,12 +132,23 @@ class RunDirectory:
         ------
         OutputError
             If it holds no run, one of other code or with another configuration, one with a trial
-            that the configuration does not ask for, one that is damaged, or one that is in use.
+            that the configuration does not ask for, one that is damaged, or one that is in use; or
+            if it cannot be written.
         """
         if not path.is_dir():
             raise OutputError(f"{path}: there is no such directory, so no run to resume")
         if not (path / JOURNAL_NAME).is_file():
             raise OutputError(f"{path}: holds no {JOURNAL_NAME}, so no run to resume")
+        try:
+            _require_writable_directory(path)
+            require_writable(path / JOURNAL_NAME)
+        except OutputError as error:
+            # Whether something is the matter with the journal as well, its reader says.
+            Journal.read(path / JOURNAL_NAME).close()
+            raise OutputError(
+                f"{error}; its journal is whole: go on when it can be written, or with a copy of "
+                "the directory (--out)"
+            ) from error
         journal = Journal.open(
             path / JOURNAL_NAME, survives=configuration.recovery.journal_survives
         )
@@ -313,7 +324,7 @@ def _unused_journal(path: Path, survives: Survives) -> Journal | None:
     return None
 
 
-def _require_writable(path: Path) -> None:
+def _require_writable_directory(path: Path) -> None:
     """Find out by an ordinary file: SQLite's own errors do not say why."""
     try:
         with tempfile.TemporaryFile(dir=path):

@@ -327,7 +327,8 @@ class Robot:
             how many task actions it has performed in this trial.
         now : float
         tail_is_certain : bool
-            Whether the records are surely all that were ever written: no power was cut since.
+            Whether the records are surely all that were ever written: no power was cut since, and
+            none of the journal's files.
         """
         self._trial = trial
         self._history = history
@@ -365,7 +366,8 @@ class Robot:
             what = (
                 "the journal ends with a task action and does not say whether it was performed"
                 if history.pending is not None
-                else "the machine was restarted, so the journal may lack its last records"
+                else "the journal may lack its last records (the machine was restarted, or a file "
+                "of the journal removed or cut)"
             )
             raise UnknownPerformanceError(
                 f"{where}: {what}, and the environment has no method steps_performed that could "

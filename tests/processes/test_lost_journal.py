@@ -1,0 +1,294 @@
+"""The files of a run are taken away, cannot be written or have no room: the robot holds still.
+
+It says what is the matter with which file, and whatever it does then, it performs nothing twice.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import signal
+import sqlite3
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from tests.processes.faults import (
+    COMMAND,
+    References,
+    Robot,
+    Site,
+    Story,
+    assert_identical,
+    document_of,
+    sensing_steps,
+    wait_until,
+)
+
+from holdfast.recording.journal import Journal
+
+PEG = "peg_in_hole_2d"
+SHORT = document_of(PEG, max_steps=40)
+KILLED = sensing_steps(SHORT)[1]
+"""Killed while it senses there, the robot leaves a journal without an action of unknown fate."""
+
+_IN_NAMESPACE = ("unshare", "--user", "--map-root-user", "--mount")
+
+
+def why_no_mounts() -> str | None:
+    """Return why no file system can be mounted in a namespace of its own; None if it can be."""
+    if shutil.which("unshare") is None:
+        return "unshare is not installed (Debian's package: util-linux)"
+    done = subprocess.run(
+        [*_IN_NAMESPACE, "mount", "-t", "tmpfs", "tmpfs", "/mnt"],
+        capture_output=True,
+        text=True,
+        timeout=30,
+        check=False,
+    )
+    return None if done.returncode == 0 else f"no mount in a namespace: {done.stderr.strip()}"
+
+
+WHY_NOT = why_no_mounts()
+needs_mounts = pytest.mark.skipif(WHY_NOT is not None, reason=str(WHY_NOT))
+
+
+def in_namespace(script: str, directory: Path) -> list[str]:
+    """Return the robot's command with a script before it that mounts something at a directory."""
+    return [*_IN_NAMESPACE, "sh", "-c", script, str(directory), *COMMAND]
+
+
+READ_ONLY = 'mount --bind "$0" "$0" && mount -o remount,bind,ro "$0" && exec "$@"'
+
+# What is in it is gone with the namespace, so it is brought out.
+SMALL = """
+mount -t tmpfs -o size=160k tmpfs "$0" || exit 99
+"$@"
+code=$?
+cp -a "$0" "$0-kept"
+exit $code
+"""
+
+
+def content(directory: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in directory.iterdir() if path.is_file()}
+
+
+def journal_of(robot: Robot) -> Path:
+    return robot.out / "journal.sqlite"
+
+
+def remove_journal(out: Path) -> None:
+    (out / "journal.sqlite").unlink()
+
+
+def remove_log(out: Path) -> None:
+    (out / "journal.sqlite-wal").unlink()
+
+
+def rename(out: Path) -> None:
+    out.rename(out.with_name("renamed"))
+
+
+def replace(out: Path) -> None:
+    shutil.copyfile(out / "journal.sqlite", out / "copy")
+    (out / "copy").rename(out / "journal.sqlite")
+
+
+class TestTakenAwayInMidRun:
+    @pytest.mark.parametrize("take", [remove_journal, shutil.rmtree, replace])
+    def test_the_robot_holds_still(
+        self, take: Callable[[Path], None], site: Site, references: References
+    ) -> None:
+        story = Story(site, references, SHORT)
+        story.at("perform", 12, lambda: take(story.running.out))
+        robot = site.run(story.file)
+        assert robot.wait() == 2, robot.account()
+        assert f"{journal_of(robot)}: the journal is gone" in robot.output
+        assert "Traceback" not in robot.output
+        # Nothing can go on with what is not there.
+        assert "--resume" not in robot.output
+        # What the robot was about to do when it was taken away was done, and nothing after it.
+        assert story.world.step == 13
+
+    def test_a_renamed_directory_goes_on_under_its_name(
+        self, site: Site, references: References
+    ) -> None:
+        story = Story(site, references, SHORT)
+        story.at("perform", 12, lambda: rename(story.running.out))
+        robot = site.run(story.file)
+        assert robot.wait() == 2, robot.account()
+        assert f"{journal_of(robot)}: the journal is gone" in robot.output
+        assert story.world.step == 13
+        story.finish(site.run(story.file, out="renamed", resume=True))
+
+    def test_what_was_in_a_removed_log_is_kept(self, site: Site, references: References) -> None:
+        """The process has it open still, and moves it into the journal when it ends."""
+        story = Story(site, references, SHORT)
+        story.at("perform", 12, lambda: remove_log(story.running.out))
+        robot = site.run(story.file)
+        assert robot.wait() == 2, robot.account()
+        assert f"{journal_of(robot)}-wal: the journal's log is gone" in robot.output
+        assert story.world.step == 13
+        story.finish(site.run(story.file, resume=True))
+
+    @pytest.mark.parametrize("take", [remove_journal, shutil.rmtree])
+    def test_a_batch_ends(self, take: Callable[[Path], None], site: Site) -> None:
+        """Its own problem takes the files away, in its last trial."""
+        (site.directory / "thief.py").write_text(THIEF)
+        out = site.directory / "out"
+        file = site.configure(
+            {**document_of(PEG, max_steps=6, trials=3), "problem": "thief:Thief"},
+        )
+        variables = {"THIEF_TAKES": str(out if take is shutil.rmtree else out / "journal.sqlite")}
+        batch = site.process(
+            *COMMAND, "run", str(file), "--out", str(out), "--jobs", "1", variables=variables
+        )
+        assert batch.wait() == 2, batch.account()
+        assert f"{out / 'journal.sqlite'}: the journal is gone" in batch.output
+        assert "Traceback" not in batch.output
+
+
+THIEF = """
+import os, shutil
+from pathlib import Path
+from holdfast.problems.peg_in_hole_2d import PegInHole2D
+
+class Thief(PegInHole2D):
+    moves = 0
+
+    def is_goal(self, state):
+        Thief.moves += 1
+        path = Path(os.environ["THIEF_TAKES"])
+        if Thief.moves == 15:
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
+        return super().is_goal(state)
+"""
+
+
+class TestLogTakenAwayAfterAKill:
+    @pytest.mark.parametrize("world", ["PlainWorldClient", "WorldClient"])
+    @pytest.mark.parametrize(
+        "lost",
+        [
+            ("journal.sqlite-wal",),
+            ("journal.sqlite-wal", "journal.sqlite-count"),
+        ],
+        ids="+".join,
+    )
+    def test_nothing_is_performed_twice(
+        self, world: str, lost: tuple[str, ...], site: Site, references: References
+    ) -> None:
+        document = SHORT
+        story = Story(site, references, document, environment={"object": f"world_client:{world}"})
+        story.at("sense", KILLED, site.kill_robot)
+        robot = site.run(story.file)
+        assert robot.wait() == -signal.SIGKILL
+        assert story.world.step == KILLED
+        for name in lost:
+            (robot.out / name).unlink()
+        for _ in range(2):  # a refusal changes nothing: the next one is refused as well
+            again = site.run(story.file, resume=True)
+            assert again.wait() == 2, again.account()
+            assert story.world.step == KILLED
+            assert not story.world.wrongs
+            if world == "WorldClient":
+                assert (
+                    f"the environment says that {KILLED} task actions were performed"
+                    in again.output
+                )
+            else:
+                assert "the journal may lack its last records" in again.output
+            assert "--resume" not in again.output
+
+    def test_a_simulated_world_is_made_again(self, site: Site, references: References) -> None:
+        """It dies with the robot, so what is lost is decided again, as it was."""
+        robot = site.run(site.configure(SHORT), "--rate", "100")
+        timings = robot.out / "timings.csv"
+        wait_until(
+            lambda: timings.exists() and len(timings.read_text().splitlines()) > 4, "decisions"
+        )
+        robot.kill()
+        remove_log(robot.out)
+        robot = site.run(site.configure(SHORT), "--rate", "10000", resume=True)
+        robot.finish()
+        assert robot.matching("resumed_trial", trial=0)
+        assert_identical(robot.out, references(SHORT))
+
+    def test_whoever_reads_a_killed_journal_with_sqlite_takes_nothing(
+        self, site: Site, references: References
+    ) -> None:
+        """Closing merges the log and removes it: all records are there, so the robot goes on."""
+        story = Story(
+            site, references, SHORT, environment={"object": "world_client:PlainWorldClient"}
+        )
+        story.at("sense", KILLED, site.kill_robot)
+        robot = site.run(story.file)
+        assert robot.wait() == -signal.SIGKILL
+        with contextlib.closing(sqlite3.connect(journal_of(robot))) as connection:
+            connection.execute("SELECT COUNT(*) FROM steps").fetchone()
+        assert not (robot.out / "journal.sqlite-wal").exists()
+        story.finish(site.run(story.file, resume=True))
+
+    def test_the_epoch_is_never_given_out_again(self, site: Site, references: References) -> None:
+        story = Story(site, references, SHORT)
+        story.at("sense", KILLED, site.kill_robot)
+        robot = site.run(story.file)
+        assert robot.wait() == -signal.SIGKILL
+        with Journal.read(journal_of(robot)) as journal:
+            epoch = journal.meta()["epoch"]
+        remove_log(robot.out)
+        with Journal.read(journal_of(robot)) as journal:
+            assert journal.meta()["epoch"] == epoch
+
+
+class TestCannotBeWritten:
+    @needs_mounts
+    @pytest.mark.parametrize("killed", [True, False], ids=["killed", "ended"])
+    def test_a_read_only_file_system(
+        self, killed: bool, site: Site, references: References
+    ) -> None:
+        story = Story(site, references, SHORT)
+        end = site.kill_robot if killed else lambda: story.running.signal(signal.SIGTERM)
+        story.at("sense", KILLED, end)
+        robot = site.run(story.file)
+        assert robot.wait() in (-signal.SIGKILL, 128 + signal.SIGTERM)
+        before = content(robot.out)
+        command = in_namespace(READ_ONLY, robot.out)
+        again = site.run(story.file, resume=True, command=command)
+        assert again.wait() == 2, again.account()
+        assert f"{robot.out}: cannot be written: Read-only file system" in again.output
+        assert "its journal is whole" in again.output
+        assert "not a usable journal" not in again.output
+        assert content(robot.out) == before
+        story.finish(site.run(story.file, resume=True))
+
+    @needs_mounts
+    def test_a_read_only_journal(self, site: Site, references: References) -> None:
+        """The directory may be written, the file alone may not."""
+        story = Story(site, references, SHORT)
+        story.at("sense", KILLED, site.kill_robot)
+        robot = site.run(story.file)
+        assert robot.wait() == -signal.SIGKILL
+        before = content(robot.out)
+        again = site.run(
+            story.file, resume=True, command=in_namespace(READ_ONLY, journal_of(robot))
+        )
+        assert again.wait() == 2, again.account()
+        assert f"{journal_of(robot)}: cannot be written: Read-only file system" in again.output
+        assert "its journal is whole" in again.output
+        assert content(robot.out) == before
+        story.finish(site.run(story.file, resume=True))
+
+    @needs_mounts
+    def test_a_disk_that_fills_up(self, site: Site, references: References) -> None:
+        story = Story(site, references, SHORT)
+        out = site.directory / "out"
+        out.mkdir()
+        robot = site.run(story.file, command=in_namespace(SMALL, out))
+        assert robot.wait() == 2, robot.account()
+        assert f"{journal_of(robot)}: database or disk is full" in robot.output
+        assert "--resume" in robot.output
+        assert 0 < story.world.step < 40
+        story.finish(site.run(story.file, out="out-kept", resume=True))
