@@ -533,9 +533,9 @@ def _draw_figure(
 
     try:
         note = _draw_trial(configuration, directory, recorder, trial_figure)
-    except HoldfastError:
+    except (HoldfastError, KeyboardInterrupt):
         raise
-    except Exception as error:
+    except BaseException as error:
         from holdfast.user_code import account_of_user_error
 
         account = account_of_user_error(error, configuration.problem_name)
