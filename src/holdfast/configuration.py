@@ -29,6 +29,7 @@ from typing import Any, TypeVar
 import msgspec
 import msgspec.inspect
 
+from holdfast.contract import GAUSSIAN_OBSERVATIONS, has_general_observations
 from holdfast.errors import ConfigurationError, HoldfastError, UnknownProblemError
 from holdfast.problems import registry
 from holdfast.problems.problem import Problem, ProblemBase
@@ -42,7 +43,7 @@ from holdfast.settings import (
     SelectorSettings,
     SimulatorSettings,
 )
-from holdfast.user_code import account_of_user_error
+from holdfast.user_code import account_of_user_error, in_words
 from holdfast.yaml_document import MAX_BYTES, Document, KeyPath, dotted, read, write
 
 __all__ = ["Configuration", "build_problem", "load"]
@@ -467,12 +468,6 @@ def _find_problem(source: _Source, name: str | None) -> tuple[str, type, Path | 
         if given or source.problem is None:
             raise
         raise UnknownProblemError(f"{source.place(('problem',))}: {error}") from error
-    except Exception as error:
-        # Its module was found, but does not come through its own import.
-        account = account_of_user_error(error, name)
-        if account is None:
-            raise
-        raise ConfigurationError(f"{source.place(('problem',))}: {account}") from error
     return name, problem_class, directory
 
 
@@ -707,12 +702,14 @@ def _build_problem(
             )
         else:
             problem = build(arguments["model"], arguments["state_space_planner"])
-    except Exception as error:
+        missing = [member for member in _needed_members(problem) if not hasattr(problem, member)]
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:
         complaint = _cannot_be_built(source, name, resolved, error)
         if complaint is None:
             raise
         raise complaint from error
-    missing = [member for member in _members(Problem) if not hasattr(problem, member)]
     if missing:
         raise ConfigurationError(
             f"{source.path}: {name} is no problem: it lacks {', '.join(missing)}"
@@ -725,7 +722,10 @@ def _keyword_arguments(source: _Source, problem_class: type) -> dict[str, Any]:
     build = getattr(problem_class, "from_settings", None)
     if getattr(build, "__func__", None) not in (None, ProblemBase.from_settings.__func__):  # type: ignore[attr-defined]
         return {}
-    parameters = inspect.signature(problem_class).parameters.values()
+    try:
+        parameters = inspect.signature(problem_class).parameters.values()
+    except (TypeError, ValueError):
+        return {}  # compiled code does not always tell; then its constructor complains
     named = {
         parameter.name: parameter.default
         for parameter in parameters
@@ -781,14 +781,15 @@ def _in_the_form_of(default: Any, value: Any) -> Any:
 
 
 def _cannot_be_built(
-    source: _Source, name: str, sections: Mapping[str, Mapping[str, Any]], error: Exception
+    source: _Source, name: str, sections: Mapping[str, Mapping[str, Any]], error: BaseException
 ) -> ConfigurationError | None:
     """Return the problem's own complaint, with the line of the first of its keys named there.
 
     A complaint about no key is a defect of the problem and comes with its frames; None means that
-    the defect is ours.
+    the problem is ours, and so is the defect.
     """
-    text = str(error) or type(error).__name__
+    text = str(error) if isinstance(error, HoldfastError | ValueError) else in_words(error)
+    text = text or type(error).__name__
     mentioned = [
         (at.start(), (section, key))
         for section, keys in sections.items()
@@ -801,17 +802,20 @@ def _cannot_be_built(
     account = account_of_user_error(cause, name)
     if account is not None and not (refused and mentioned and cause is error):
         return ConfigurationError(f"{source.path}: {account}")
-    if not refused and not isinstance(error, TypeError):
+    if name in registry.BUILT_IN and not refused and not isinstance(error, TypeError):
         return None
     if mentioned:
         return ConfigurationError(f"{source.place(min(mentioned)[1])}: {text}")
     return ConfigurationError(f"{source.path}: {name} cannot be built: {text}")
 
 
-def _members(protocol: type) -> list[str]:
-    """Return the names of a protocol's public attributes and methods."""
-    names = [*protocol.__annotations__, *vars(protocol)]
-    return [name for name in names if not name.startswith("_")]
+def _needed_members(problem: Any) -> list[str]:
+    """Return the names of the attributes and methods that a problem has to have."""
+    names = [name for name in (*Problem.__annotations__, *vars(Problem)) if name[0] != "_"]
+    if has_general_observations(problem):
+        # Its own likelihood is in their place.
+        return [name for name in names if name not in GAUSSIAN_OBSERVATIONS]
+    return names
 
 
 def _fields(schema: type[msgspec.Struct]) -> list[str]:

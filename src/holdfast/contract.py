@@ -54,6 +54,9 @@ PARAMETERS: Mapping[str, tuple[str, ...]] = {
 }
 """What a problem's functions are called with, by position."""
 
+GAUSSIAN_OBSERVATIONS = ("observation_mean", "observation_variance")
+"""What a problem with a likelihood of its own need not have."""
+
 
 def check_problem(problem: Any) -> None:
     """Check what can be checked without calling anything.

@@ -3,6 +3,10 @@
 A problem or an environment is a person's own code that holdfast calls. When it fails, the frames
 that matter are that person's; those of holdfast and of the libraries between them only hide these.
 When no frame is the person's, the defect is ours and nothing may be hidden.
+
+Such code may raise anything: a script that is imported calls ``sys.exit(0)``, which is no
+``Exception`` and would end a run as if all were done. So whoever calls it catches everything but
+KeyboardInterrupt, which is Ctrl-C, and passes on what has no account here.
 """
 
 from __future__ import annotations
@@ -22,6 +26,7 @@ __all__ = [
     "account_of_user_error",
     "describe_problem_error",
     "find_class",
+    "in_words",
     "is_users_file",
     "registered_names",
 ]
@@ -32,6 +37,11 @@ _LIBRARIES = tuple(
     for name in ("stdlib", "platstdlib", "purelib", "platlib")
     if (path := sysconfig.get_path(name))
 )
+_MAX_TEXT = 1000
+_MAX_LINES = 10
+_MAX_FRAMES = 5
+"""Bounds on what an account has of a message, and of the frames at either end."""
+
 _PACKAGE_FOLDERS = frozenset({"site-packages", "dist-packages"})
 
 
@@ -72,26 +82,65 @@ def account_of_user_error(error: BaseException, name: str) -> str | None:
     Returns
     -------
     str or None
-        One line with the type and the message, then file, line and source of each frame of the
-        user's; None if the user's code had no part in it.
+        The type and the message, then file, line and source of each frame of the user's, all of
+        bounded length; None if the user's code had no part in it, or only called what ends a
+        command in order (``print``, once nobody reads the standard output).
     """
-    ours = False
+    ours = inner = False
     frames = []
     for frame in traceback.extract_tb(error.__traceback__):
+        inner = _place(frame.filename).is_relative_to(_HOLDFAST)
         # Whatever calls holdfast (a script, a notebook) comes first and is not at fault.
-        ours = ours or _place(frame.filename).is_relative_to(_HOLDFAST)
+        ours = ours or inner
         if ours and is_users_file(frame.filename):
             frames.append(frame)
+    if inner and isinstance(error, SystemExit):
+        return None
     if isinstance(error, SyntaxError) and error.filename and is_users_file(error.filename):
         # A file that cannot be parsed has no frame; the error itself says where.
-        where = f'  File "{error.filename}", line {error.lineno}\n    {(error.text or "").strip()}'
+        source = (error.text or "").strip()
+        where = f'  File "{error.filename}", line {error.lineno}\n    {source:.{_MAX_TEXT}}'
     elif frames:
-        where = "".join(traceback.format_list(frames)).rstrip()
+        where = _frames_listed(frames)
     else:
         return None
-    text = error.msg if isinstance(error, SyntaxError) else str(error)
+    return f"{name} raised {in_words(error)}\n{where}"
+
+
+def in_words(error: BaseException) -> str:
+    """Return an error's type and message, cut to a length that a person reads.
+
+    Parameters
+    ----------
+    error : BaseException
+    """
     kind = type(error).__name__
-    return f"{name} raised {kind}{': ' if text else ''}{text}\n{where}"
+    try:
+        text = str(error.msg if isinstance(error, SyntaxError) else error)
+    except KeyboardInterrupt:
+        raise
+    except BaseException:  # noqa: BLE001 - whoever raised the error may have written it
+        return f"{kind}, which cannot be put into words"
+    lines = text.splitlines()
+    if len(lines) > _MAX_LINES:
+        text = "\n".join([*lines[:_MAX_LINES], f"... ({len(lines)} lines in all)"])
+    if len(text) > _MAX_TEXT:
+        text = f"{text[:_MAX_TEXT]}... ({len(text)} characters in all)"
+    return f"{kind}: {text}" if text else kind
+
+
+def _frames_listed(frames: list[traceback.FrameSummary]) -> str:
+    # A recursion has a thousand of them; how it began and where it ended is told by a few.
+    if len(frames) > 2 * _MAX_FRAMES:
+        left_out = len(frames) - 2 * _MAX_FRAMES
+        listed = [
+            *traceback.format_list(frames[:_MAX_FRAMES]),
+            f"  ... {left_out} more\n",
+            *traceback.format_list(frames[-_MAX_FRAMES:]),
+        ]
+    else:
+        listed = traceback.format_list(frames)
+    return "".join(listed).rstrip()
 
 
 def describe_problem_error(name: str, error: BaseException) -> str:
@@ -103,7 +152,7 @@ def describe_problem_error(name: str, error: BaseException) -> str:
         Of the problem.
     error : BaseException
     """
-    return account_of_user_error(error, name) or f"{type(error).__name__}: {error}"
+    return account_of_user_error(error, name) or in_words(error)
 
 
 def registered_names(group: str) -> list[str]:
@@ -152,7 +201,8 @@ def find_class(
     Raises
     ------
     error_type
-        If the name is not registered, or the module or its class cannot be imported.
+        If the name is not registered, or the module or its class cannot be imported, whatever its
+        import raises.
     """
     if ":" in name:
         return _imported_class(name, what, search_directory, error_type)
@@ -166,6 +216,10 @@ def find_class(
                 f"{what}: {name} is registered as {entry_point.value}, which cannot be imported: "
                 f"{error}"
             ) from error
+        except KeyboardInterrupt:
+            raise
+        except BaseException as error:
+            raise _not_imported(name, what, entry_point.value, error, error_type) from error
         return _as_class(name, what, loaded, error_type)
     known = registered_names(group)
     likely = _classes_beside(name, search_directory) or difflib.get_close_matches(name, known, n=3)
@@ -224,6 +278,10 @@ def _imported_class(
         raise error_type(
             f"{what}: {name}: the module {module_name} cannot be imported{where}: {error}"
         ) from error
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:
+        raise _not_imported(name, what, module_name, error, error_type) from error
     if not hasattr(module, class_name):
         classes = [key for key, value in vars(module).items() if isinstance(value, type)]
         close = difflib.get_close_matches(class_name, classes, n=3)
@@ -232,6 +290,20 @@ def _imported_class(
             f"{what}: {name}: the module {module_name} has no {class_name}{suggestion}"
         )
     return _as_class(name, what, getattr(module, class_name), error_type)
+
+
+def _not_imported(
+    name: str,
+    what: str,
+    module_name: str,
+    error: BaseException,
+    error_type: type[ConfigurationError],
+) -> ConfigurationError:
+    """Return the error about a module that is there, but does not come through its own import."""
+    account = account_of_user_error(error, name)
+    if account is None:
+        account = f"{name}: the module {module_name} raised {in_words(error)}"
+    return error_type(f"{what}: {account}")
 
 
 def _as_class(

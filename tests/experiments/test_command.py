@@ -27,7 +27,7 @@ def test_list(capsys: pytest.CaptureFixture[str]) -> None:
     [
         ({"names": ["published"]}, "experiment 'published': .* did you mean published_2017"),
         ({"names": None}, "which experiment"),
-        ({"names": ["all"], "jobs": -1}, "--jobs -1: must be 0"),
+        ({"names": ["all"], "jobs": -1}, "--jobs -1: must be from 1 to "),
         ({"names": ["all"], "place": "slurm"}, "--executor slurm: must be local, ray "),
         ({"names": ["all"], "place": "ray://"}, "--executor ray://: must be local, ray "),
         ({"names": ["all"], "place": "ray", "jobs": 3}, "--jobs 3: has no effect with .* ray"),

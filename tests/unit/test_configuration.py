@@ -905,7 +905,7 @@ class TestProblems:
         with pytest.raises(ConfigurationError) as caught:
             load(path)
         message = str(caught.value)
-        assert "line 1: unparsable_lamps:Keywords raised SyntaxError" in message
+        assert "line 1: problem: unparsable_lamps:Keywords raised SyntaxError" in message
         assert 'unparsable_lamps.py", line 3\n    def f(:' in message
 
     def test_what_a_problem_itself_refuses(self, write: Write) -> None:

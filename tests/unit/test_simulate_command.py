@@ -105,7 +105,7 @@ def test_ctrl_c_says_how_to_go_on() -> None:
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (["--jobs", "-1"], "--jobs -1: must be from 0 (one for each core) to 1024"),
+        (["--jobs", "-1"], "--jobs is '-1'; allowed are whole numbers from 0 to 1024"),
         (["--schedule", str(STORY), "--seeds", "0:5"], "leave --seeds and --story out"),
     ],
 )

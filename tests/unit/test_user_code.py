@@ -1,12 +1,17 @@
-"""Whose code a frame of a traceback belongs to."""
+"""Code that is not ours: whose a frame of a traceback is, and what is said of what it raises."""
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from holdfast import planning
+from holdfast.cli import _main
+from holdfast.configuration import load
+from holdfast.runtime.trials import run_trials
 from holdfast.user_code import is_users_file
 
 
@@ -22,3 +27,210 @@ def test_theirs(name: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> N
     monkeypatch.chdir(tmp_path)
     assert is_users_file(name)
     assert is_users_file(str(tmp_path / name))
+
+
+EXITS = """
+import sys
+
+from holdfast.problems.peg_in_hole_2d import PegInHole2D
+
+
+class InThePolicy(PegInHole2D):
+    actions = 0
+
+    def execute(self, actions):
+        if actions.ndim == 1:
+            InThePolicy.actions += 1
+            if InThePolicy.actions > 45:  # in the second trial
+                sys.exit(0)
+        return super().execute(actions)
+
+
+class InTheWorld(PegInHole2D):
+    def move(self, states, actions, stream):
+        if states.ndim == 1:
+            sys.exit(0)
+        return super().move(states, actions, stream)
+
+
+class InTheConstructor(PegInHole2D):
+    def __init__(self, *settings):
+        sys.exit(0)
+
+
+class InTheFigure(PegInHole2D):
+    def scene(self):
+        sys.exit(0)
+
+
+class WithoutException(PegInHole2D):
+    def policy(self, states, stage):
+        raise GeneratorExit("enough")
+
+
+class Wordless(Exception):
+    def __str__(self):
+        sys.exit(0)
+
+
+class WithoutWords(PegInHole2D):
+    def policy(self, states, stage):
+        raise Wordless
+
+
+class WithManyWords(PegInHole2D):
+    def policy(self, states, stage):
+        raise ValueError("many\\n" * 100_000)
+
+
+class Recursive(PegInHole2D):
+    def policy(self, states, stage):
+        return self.turn(states, stage)
+
+    def turn(self, states, stage):
+        return self.policy(states, stage)
+
+
+class WithoutSetter(PegInHole2D):
+    resolution = property(lambda self: 1.0)
+
+
+class RobotThatExits:
+    def __init__(self):
+        sys.exit(0)
+
+
+class SensorThatExits:
+    def perform_sensing(self, sensing_action):
+        sys.exit(0)
+
+    def perform(self, task_action):
+        return None
+
+    def is_done(self):
+        return False
+"""
+
+PEG = """
+problem: peg_in_hole_2d
+particle_filter: {num_particles: 20}
+active_sensing: {num_observation_samples: 2, num_cores: 1}
+simulator: {num_trials: 2, max_steps: 30, seed: 3}
+"""
+
+
+class TestWhateverItRaises:
+    """A run ends with an error that names the code at fault, and never as if all were done."""
+
+    @pytest.fixture(autouse=True)
+    def workplace(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setattr(sys, "path", [*sys.path])
+        (tmp_path / "exits.py").write_text(EXITS)
+        (tmp_path / "exits_at_import.py").write_text("import sys\n\nsys.exit(0)\n")
+        (tmp_path / "peg.yaml").write_text(PEG)
+        yield
+        for name in ("exits", "exits_at_import"):
+            sys.modules.pop(name, None)
+
+    def ending(
+        self,
+        arguments: list[str],
+        capsys: pytest.CaptureFixture[str],
+        monkeypatch: pytest.MonkeyPatch,
+    ) -> str:
+        monkeypatch.setattr(sys, "argv", ["holdfast", *arguments])
+        with pytest.raises(SystemExit) as ended:
+            _main()
+        said = capsys.readouterr().err
+        assert ended.value.code == 2, said
+        assert "Traceback" not in said
+        error = said.partition("holdfast: error: ")[2]
+        assert 0 < error.count("\n") < 40
+        assert len(error) < 6000
+        return error
+
+    @pytest.mark.parametrize("mode", [[], ["--rate", "10000"]], ids=["batch", "robot"])
+    @pytest.mark.parametrize(
+        ("name", "what", "where"),
+        [
+            ("InThePolicy", "raised SystemExit: 0", "in execute"),
+            ("InTheWorld", "raised SystemExit: 0", "in move"),
+            ("InTheConstructor", "raised SystemExit: 0", "in __init__"),
+            ("InTheFigure", "raised SystemExit: 0", "in scene"),
+            ("WithoutException", "raised GeneratorExit: enough", "in policy"),
+            ("WithoutWords", "raised Wordless, which cannot be put into words", "in policy"),
+            ("WithManyWords", "raised ValueError: many\n", "in policy"),
+            ("Recursive", "raised RecursionError: maximum", "in policy"),
+            ("WithoutSetter", "cannot be built: AttributeError: property", ""),
+        ],
+    )
+    def test_a_problem(
+        self,
+        name: str,
+        what: str,
+        where: str,
+        mode: list[str],
+        capsys: pytest.CaptureFixture[str],
+        monkeypatch: pytest.MonkeyPatch,
+    ) -> None:
+        command = ["run", "peg.yaml", "--problem", f"exits:{name}", "--out", "out", *mode]
+        error = self.ending(command, capsys, monkeypatch)
+        assert what in error
+        assert where in error
+        if name == "InThePolicy" and not mode:
+            assert error.startswith("trial 1 (seed 3): ")
+
+    @pytest.mark.parametrize(
+        ("name", "where"), [("RobotThatExits", "in __init__"), ("SensorThatExits", "in perform_")]
+    )
+    def test_an_environment(
+        self,
+        name: str,
+        where: str,
+        capsys: pytest.CaptureFixture[str],
+        monkeypatch: pytest.MonkeyPatch,
+    ) -> None:
+        command = ["run", "peg.yaml", "--environment", f"exits:{name}", "--out", "out"]
+        error = self.ending(command, capsys, monkeypatch)
+        assert f"exits:{name}" in error
+        assert "raised SystemExit: 0" in error
+        assert where in error
+
+    @pytest.mark.parametrize(
+        "command",
+        [
+            ["run", "peg.yaml", "--problem", "exits_at_import:X"],
+            ["run", "peg.yaml", "--environment", "exits_at_import:X"],
+            ["serve", "--listen", "tcp/127.0.0.1:0", "--problem", "exits_at_import:X"],
+        ],
+        ids=lambda command: command[0] + command[-2],
+    )
+    def test_a_module(
+        self,
+        command: list[str],
+        capsys: pytest.CaptureFixture[str],
+        monkeypatch: pytest.MonkeyPatch,
+    ) -> None:
+        error = self.ending(command, capsys, monkeypatch)
+        assert "exits_at_import:X raised SystemExit: 0\n" in error
+        assert "line 3, in <module>" in error
+        assert not Path("runs").exists()
+
+    @pytest.mark.parametrize("name", ["collections:OrderedDict", "builtins:int", "enum:Enum"])
+    def test_a_class_that_is_no_problem(
+        self, name: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        error = self.ending(["run", "peg.yaml", "--problem", name], capsys, monkeypatch)
+        assert error.startswith(f"peg.yaml: {name} ")
+        assert error.count("\n") == 1
+
+    def test_ctrl_c_is_not_the_code_s(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        configuration = load("peg.yaml")
+
+        def policy(*_: object) -> None:
+            raise KeyboardInterrupt
+
+        monkeypatch.setattr(configuration.problem, "policy", policy)
+        with pytest.raises(KeyboardInterrupt):
+            run_trials(configuration, 1, (), lambda _: None)

@@ -15,13 +15,13 @@ from holdfast import __version__
 from holdfast.cli.chaos import chaos
 from holdfast.cli.compare import compare
 from holdfast.cli.demo import demo
+from holdfast.cli.endings import EXIT_ERROR
 from holdfast.cli.experiment import experiment
 from holdfast.cli.keys import keys
 from holdfast.cli.run import run
 from holdfast.cli.serve import serve
 from holdfast.cli.simulate import simulate
 from holdfast.errors import HoldfastError
-from holdfast.runtime.command_line import wants_json
 
 __all__ = ["app", "run_application"]
 
@@ -76,15 +76,18 @@ def run_application(arguments: list[str]) -> None:
     if first.endswith((".yaml", ".yml")):
         command = shlex.join(["holdfast", "run", *arguments])
         raise HoldfastError(f"{first} is no command; did you mean: {command}")
-    if not wants_json(arguments):
-        app(args=arguments, prog_name="holdfast")
     try:
         code = app(args=arguments, prog_name="holdfast", standalone_mode=False)
+    except typer.Abort as error:
+        raise KeyboardInterrupt from error
     except Exception as error:
-        # Typer has had more than one place for the class of what it has to say of an option.
+        # Typer has had more than one place for the classes of what it has to say of options.
         message = getattr(error, "format_message", None)
         if not callable(message):
             raise
+        if type(error).__name__ == "NoArgsIsHelpError":
+            typer.echo(message(), err=True)
+            sys.exit(EXIT_ERROR)
         raise HoldfastError(message()) from error
     sys.exit(code)
 

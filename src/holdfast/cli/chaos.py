@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from holdfast.cli.endings import EXIT_DIFFERENT, RunError, ended_by_signals, signal_of
+from holdfast.cli.options import MAX_SEED, MAX_TRIALS, location, whole_number
 from holdfast.errors import HoldfastError, InvalidValueError
 
 if TYPE_CHECKING:
@@ -31,6 +32,7 @@ __all__ = ["chaos"]
 _RUNS = Path("runs")
 _MAX_TRIALS = 100_000
 _DEFAULT_TRIALS = 20
+_MAX_JOBS = 64
 _TABLE_NAME = "table.txt"
 _WIDE = 142
 """Characters that the whole table needs; on a narrower terminal a part of it is left out."""
@@ -47,10 +49,22 @@ _DASH_EXPLAINED = (
 
 def chaos(
     trials: Annotated[
-        int, typer.Option("--trials", metavar="N", min=1, max=_MAX_TRIALS, help="Number of trials.")
+        int,
+        typer.Option(
+            "--trials",
+            metavar="N",
+            parser=whole_number("--trials", 1, _MAX_TRIALS),
+            help="Number of trials.",
+        ),
     ] = _DEFAULT_TRIALS,
     seed: Annotated[
-        int, typer.Option("--seed", metavar="S", min=0, help="Seed of all that happens.")
+        int,
+        typer.Option(
+            "--seed",
+            metavar="S",
+            parser=whole_number("--seed", 0, MAX_SEED),
+            help="Seed of all that happens.",
+        ),
     ] = 0,
     out: Annotated[
         Path | None,
@@ -58,6 +72,7 @@ def chaos(
             "--out",
             "-o",
             metavar="DIR",
+            parser=location("--out"),
             help="Directory for the results (default: runs/chaos, numbered if taken).",
             show_default=False,
         ),
@@ -81,13 +96,18 @@ def chaos(
             "--jobs",
             "-j",
             metavar="N",
-            min=1,
-            max=64,
+            parser=whole_number("--jobs", 1, _MAX_JOBS),
             help="Trials at the same time; each has four or five processes, so times get longer.",
         ),
     ] = 1,
     first: Annotated[
-        int, typer.Option("--first", metavar="T", min=0, help="Number of the first trial.")
+        int,
+        typer.Option(
+            "--first",
+            metavar="T",
+            parser=whole_number("--first", 0, MAX_TRIALS),
+            help="Number of the first trial.",
+        ),
     ] = 0,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with the series in DIR.")] = False,
     keep: Annotated[

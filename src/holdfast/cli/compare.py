@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from holdfast.cli.endings import EXIT_DIFFERENT
+from holdfast.cli.options import location
 
 __all__ = ["compare"]
 
@@ -17,12 +18,20 @@ def compare(
     first: Annotated[
         Path,
         typer.Argument(
-            metavar="RUN", show_default=False, help="Directory of a run, or its journal."
+            metavar="RUN",
+            parser=location("RUN"),
+            show_default=False,
+            help="Directory of a run, or its journal.",
         ),
     ],
     second: Annotated[
         Path,
-        typer.Argument(metavar="RUN", show_default=False, help="The other one, likewise."),
+        typer.Argument(
+            metavar="RUN",
+            parser=location("RUN"),
+            show_default=False,
+            help="The other one, likewise.",
+        ),
     ],
     json: Annotated[
         bool, typer.Option("--json", help="Print the finding as a JSON object.")

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from holdfast.cli.endings import EXIT_DIFFERENT, ended_by_signals, signal_of
+from holdfast.cli.options import MAX_SEED, location, whole_number
 from holdfast.errors import HoldfastError
 
 if TYPE_CHECKING:
@@ -37,12 +38,19 @@ def demo(
             "--out",
             "-o",
             metavar="DIR",
+            parser=location("--out"),
             help="Directory for both runs and the logs (default: runs/demo, numbered if taken).",
             show_default=False,
         ),
     ] = None,
     seed: Annotated[
-        int, typer.Option("--seed", metavar="S", min=0, help="Seed of all random draws.")
+        int,
+        typer.Option(
+            "--seed",
+            metavar="S",
+            parser=whole_number("--seed", 0, MAX_SEED),
+            help="Seed of all random draws.",
+        ),
     ] = 0,
     quick: Annotated[
         bool, typer.Option("--quick", help="A shorter run: about half the time.")

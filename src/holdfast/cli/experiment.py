@@ -12,7 +12,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from holdfast.cli.endings import RunError, ended_by_signals, signal_of
+from holdfast.cli.options import MAX_SEED, location, whole_number
 from holdfast.errors import HoldfastError, InvalidValueError
+from holdfast.runtime.command_line import MAX_JOBS
 
 if TYPE_CHECKING:
     from holdfast.experiments.executors import Executor
@@ -25,8 +27,6 @@ _DEFAULT_DIRECTORY = Path("runs") / "experiments"
 
 _MOST_FINDINGS = 20
 """Sentences of a study that are printed; all of them are kept."""
-
-_LARGEST_SEED = 2**63 - 1
 
 _NOTE = "all kept"
 """What is to be said of the trials that are finished."""
@@ -44,11 +44,23 @@ def experiment(
         ),
     ] = False,
     out: Annotated[
-        Path, typer.Option("--out", "-o", metavar="DIR", help="Directory for the results.")
+        Path,
+        typer.Option(
+            "--out",
+            "-o",
+            metavar="DIR",
+            parser=location("--out"),
+            help="Directory for the results.",
+        ),
     ] = _DEFAULT_DIRECTORY,
     seed: Annotated[
         int,
-        typer.Option("--seed", metavar="S", min=0, max=_LARGEST_SEED, help="Seed of all trials."),
+        typer.Option(
+            "--seed",
+            metavar="S",
+            parser=whole_number("--seed", 0, MAX_SEED),
+            help="Seed of all trials.",
+        ),
     ] = 2017,
     jobs: Annotated[
         int,
@@ -56,6 +68,7 @@ def experiment(
             "--jobs",
             "-j",
             metavar="N",
+            parser=whole_number("--jobs", 0, MAX_JOBS),
             help="Processes; 0: one for each core. Changes time only.",
         ),
     ] = 0,
@@ -110,8 +123,6 @@ def _executor_of(place: str, jobs: int) -> Executor:
     from holdfast.experiments.ray_executor import RayExecutor
     from holdfast.runtime.trials import available_cores
 
-    if jobs < 0:
-        raise InvalidValueError(f"--jobs {jobs}: must be 0 (one for each core) or more")
     if place == "local":
         return LocalExecutor(jobs or available_cores())
     executor = RayExecutor.of(place)

@@ -8,17 +8,26 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from holdfast.cli.options import location, whole_number
+
 if TYPE_CHECKING:
     from holdfast.runtime.credentials import KeyRing
 
 __all__ = ["keys"]
+
+# Those of holdfast.runtime.credentials, which need not be imported for a --help.
+_DEFAULT_DAYS = 365
+_MAX_DAYS = 3650
 
 
 def keys(
     directory: Annotated[
         Path,
         typer.Argument(
-            metavar="DIR", show_default=False, help="Where they go; made if it is not there."
+            metavar="DIR",
+            parser=location("DIR"),
+            show_default=False,
+            help="Where they go; made if it is not there.",
         ),
     ],
     robot: Annotated[
@@ -36,8 +45,14 @@ def keys(
             help="Where robots reach the services, besides this machine; may be repeated.",
         ),
     ] = None,
-    # The default of holdfast.runtime.credentials, which need not be imported for a --help.
-    days: Annotated[int, typer.Option(metavar="N", help="How long they are valid.")] = 365,
+    days: Annotated[
+        int,
+        typer.Option(
+            metavar="N",
+            parser=whole_number("--days", 1, _MAX_DAYS),
+            help="How long they are valid.",
+        ),
+    ] = _DEFAULT_DAYS,
     renew: Annotated[
         bool,
         typer.Option("--renew", help="New certificates for keys that are there already."),

@@ -21,6 +21,7 @@ from holdfast.cli.endings import (
     ended_by_signals,
     signal_of,
 )
+from holdfast.cli.options import MAX_SEED, MAX_TRIALS, location, number, whole_number
 from holdfast.cli.overrides import Override, combined, parse_assignment
 from holdfast.cli.terminal import duration, print_files, print_summary, run_display
 from holdfast.errors import HoldfastError, InvalidValueError
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
 __all__ = ["run"]
 
 _RUNS = Path("runs")
+_MIN_RATE_HZ = 0.001
 _MAX_RATE_HZ = 10_000.0
 _OF_SERVICES = ("recovery.launch", "offload.tls")
 """Keys without effect where no service is named."""
@@ -48,19 +50,28 @@ def run(
     configuration_path: Annotated[
         Path,
         typer.Argument(
-            metavar="CONFIG", show_default=False, help="Configuration file (YAML) of the run."
+            metavar="CONFIG",
+            parser=location("CONFIG"),
+            show_default=False,
+            help="Configuration file (YAML) of the run.",
         ),
     ],
     trials: Annotated[
         int | None,
         typer.Option(
-            "--trials", metavar="N", min=1, help="Number of trials, instead of the file's."
+            "--trials",
+            metavar="N",
+            parser=whole_number("--trials", 1, MAX_TRIALS),
+            help="Number of trials, instead of the file's.",
         ),
     ] = None,
     seed: Annotated[
         int | None,
         typer.Option(
-            "--seed", metavar="S", min=0, help="Seed of all random draws, instead of the file's."
+            "--seed",
+            metavar="S",
+            parser=whole_number("--seed", 0, MAX_SEED),
+            help="Seed of all random draws, instead of the file's.",
         ),
     ] = None,
     problem: Annotated[
@@ -86,8 +97,7 @@ def run(
             "--jobs",
             "-j",
             metavar="N",
-            min=1,
-            max=MAX_JOBS,
+            parser=whole_number("--jobs", 1, MAX_JOBS),
             help=(
                 "Largest number of processes (default: one for each core). It changes time only, "
                 "never a result."
@@ -101,6 +111,7 @@ def run(
             "--out",
             "-o",
             metavar="DIR",
+            parser=location("--out"),
             help="Directory for the results (default: runs/CONFIG-seedS, numbered if taken).",
             show_default=False,
         ),
@@ -150,6 +161,7 @@ def run(
         typer.Option(
             "--tls",
             metavar="DIR",
+            parser=location("--tls"),
             help="This robot's credentials, as holdfast keys makes them.",
             show_default=False,
         ),
@@ -169,6 +181,7 @@ def run(
         typer.Option(
             "--rate",
             metavar="HZ",
+            parser=number("--rate", _MIN_RATE_HZ, _MAX_RATE_HZ, "Hz"),
             help="Task actions a second (default: as fast as it goes).",
             show_default=False,
         ),
@@ -192,10 +205,6 @@ def run(
     Ctrl-C or a crash loses no trial and no step: the same command with
     --resume goes on.
     """
-    if rate is not None and not 0.0 < rate <= _MAX_RATE_HZ:
-        raise InvalidValueError(
-            f"--rate is {rate:g}; allowed are more than 0 and at most {_MAX_RATE_HZ:g} (Hz)"
-        )
     if log not in ("text", "json"):
         raise InvalidValueError(f"--log is {log!r}; allowed are text and json")
     options = _Options(
@@ -526,9 +535,9 @@ def _draw_figure(
 
     try:
         note = _draw_trial(configuration, directory, recorder, trial_figure)
-    except HoldfastError:
+    except (HoldfastError, KeyboardInterrupt):
         raise
-    except Exception as error:
+    except BaseException as error:
         from holdfast.user_code import account_of_user_error
 
         account = account_of_user_error(error, configuration.problem_name)

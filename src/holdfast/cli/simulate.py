@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from holdfast.cli.endings import EXIT_DIFFERENT, ended_by_signals
+from holdfast.cli.options import location, whole_number
 from holdfast.errors import HoldfastError
 from holdfast.runtime.command_line import MAX_JOBS
 
@@ -40,6 +41,7 @@ def simulate(
         Path | None,
         typer.Option(
             metavar="FILE",
+            parser=location("--schedule"),
             show_default=False,
             help="Run the schedule in a file instead and tell its story; without --seeds, --story.",
         ),
@@ -51,7 +53,11 @@ def simulate(
     jobs: Annotated[
         int,
         typer.Option(
-            "--jobs", "-j", metavar="N", help="Processes; 0: one for each core. Changes time only."
+            "--jobs",
+            "-j",
+            metavar="N",
+            parser=whole_number("--jobs", 0, MAX_JOBS),
+            help="Processes; 0: one for each core. Changes time only.",
         ),
     ] = 0,
     shrink: Annotated[
@@ -68,8 +74,6 @@ def simulate(
     Ends at the first seed under which it does not, and prints its schedule, a smaller one, and the
     command that runs it again. Exit code 0: there was none. 1: there was one.
     """
-    if not 0 <= jobs <= MAX_JOBS:
-        raise HoldfastError(f"--jobs {jobs}: must be from 0 (one for each core) to {MAX_JOBS}")
     if schedule is not None:
         if seeds is not None or story:
             raise HoldfastError(
@@ -78,7 +82,9 @@ def simulate(
         with ended_by_signals():
             _run_file(schedule, shrink=shrink)
         return
-    wanted = _seeds_of(seeds or ("0:1" if story else "0:1000"))
+    if seeds is None:
+        seeds = "0:1" if story else "0:1000"
+    wanted = _seeds_of(seeds)
     if story:
         for seed in wanted:
             _tell_seed(seed)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 
 __all__ = ["MAX_JOBS", "wants_json"]
@@ -19,7 +20,7 @@ def wants_json(arguments: Sequence[str]) -> bool:
         With ``--log json`` or ``--log=json`` among them.
     """
     chosen = "text"
-    for option, value in zip(arguments, [*arguments[1:], ""], strict=True):
+    for option, value in itertools.pairwise([*arguments, ""]):
         if option == "--log":
             chosen = value
         elif option.startswith("--log="):

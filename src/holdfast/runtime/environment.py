@@ -25,7 +25,7 @@ from holdfast.errors import ConfigurationError, EnvironmentFailedError, InvalidV
 from holdfast.outcome import Done
 from holdfast.problems.problem import Problem
 from holdfast.randomness import Purpose, stream
-from holdfast.user_code import account_of_user_error, find_class
+from holdfast.user_code import find_class
 
 if TYPE_CHECKING:
     from holdfast.configuration import Configuration
@@ -332,12 +332,6 @@ def load_environment(configuration: Configuration) -> EnvironmentMaker:
         )
     except ConfigurationError as error:
         raise ConfigurationError(f"{configuration.path}: {error}") from error
-    except (Exception, SystemExit) as error:
-        # Its module was found, but does not come through its own import; a script may even exit.
-        account = account_of_user_error(error, name)
-        if account is None:
-            raise
-        raise ConfigurationError(f"{configuration.path}: environment.object: {account}") from error
     try:
         return EnvironmentMaker(name, problem, seed, settings.timeout_ms, found, settings.arguments)
     except ConfigurationError as error:

@@ -14,7 +14,6 @@ method returned it.
 
 from __future__ import annotations
 
-import contextlib
 import threading
 from collections.abc import Callable, Sequence
 from queue import SimpleQueue
@@ -122,8 +121,8 @@ class _CheckedEnvironment:
     name : str
         Of the environment.
     resumed : bool
-    caught : type
-        What of the exceptions becomes an event.
+    passed_on : tuple of type
+        Which exceptions do not become an event.
     """
 
     def __init__(
@@ -133,13 +132,13 @@ class _CheckedEnvironment:
         name: str,
         *,
         resumed: bool,
-        caught: type[BaseException],
+        passed_on: tuple[type[BaseException], ...] = (),
     ) -> None:
         self._make = make
         self._problem = problem
         self._name = name
         self._resumed = resumed
-        self._caught = caught
+        self._passed_on = passed_on
         self._sizes: dict[int, int | None] = {}
         # What is being called. Read by another thread when it takes too long.
         self._method = name
@@ -156,7 +155,9 @@ class _CheckedEnvironment:
                 count = self._count(ask())
             self._method = "is_done"
             return Begun(self._done(environment.is_done()), count)
-        except self._caught as error:
+        except self._passed_on:
+            raise
+        except BaseException as error:  # noqa: BLE001 - a SystemExit would end a thread unheard
             return self._failed(step, error)
 
     def sense(self, step: int, sensing_action: int) -> EnvironmentEvent:
@@ -164,7 +165,9 @@ class _CheckedEnvironment:
         try:
             shown = self._begun().perform_sensing(sensing_action)
             return Sensed(step, self._observation(sensing_action, shown))
-        except self._caught as error:
+        except self._passed_on:
+            raise
+        except BaseException as error:  # noqa: BLE001 - a SystemExit would end a thread unheard
             return self._failed(step, error)
 
     def perform(self, step: int, task_action: FloatArray) -> EnvironmentEvent:
@@ -178,15 +181,21 @@ class _CheckedEnvironment:
             reward = self._reward(environment.perform(action))
             self._method = "is_done"
             return Acted(step, reward, self._done(environment.is_done()))
-        except self._caught as error:
+        except self._passed_on:
+            raise
+        except BaseException as error:  # noqa: BLE001 - a SystemExit would end a thread unheard
             return self._failed(step, error, performance_unknown=begun)
 
     def close(self) -> None:
         close = getattr(self.environment, "close", None)
         if callable(close):
             # The trial is over: whatever its end brings changes nothing of it.
-            with contextlib.suppress(self._caught):
+            try:
                 close()
+            except self._passed_on:
+                raise
+            except BaseException:  # noqa: BLE001
+                return
 
     def stalled(
         self, step: int, timeout_ms: float, *, performance_unknown: bool
@@ -307,7 +316,9 @@ class InlinePerformer:
         *,
         resumed: bool = False,
     ) -> None:
-        self._checked = _CheckedEnvironment(make, problem, name, resumed=resumed, caught=Exception)
+        self._checked = _CheckedEnvironment(
+            make, problem, name, resumed=resumed, passed_on=(KeyboardInterrupt,)
+        )
         self._deliver = deliver
         self._failed: EnvironmentFailed | None = None
         self._closed = False
@@ -403,12 +414,10 @@ class ThreadedPerformer:
         if not timeout_ms > 0.0:
             raise InvalidValueError(f"environment.timeout_ms {timeout_ms}: must be above 0")
         self._checked = _CheckedEnvironment(
-            # BaseException, for a SystemExit would end the thread without a word.
             make,
             problem,
             name,
             resumed=resumed,
-            caught=BaseException,
         )
         self._deliver = deliver
         self._name = name

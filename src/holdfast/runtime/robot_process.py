@@ -268,7 +268,9 @@ class RobotProcess:
         except HoldfastError:
             self._salvage()
             raise
-        except Exception as error:
+        except KeyboardInterrupt:
+            raise
+        except BaseException as error:
             self._salvage()
             account = account_of_user_error(error, self._configuration.problem_name)
             if account is None:

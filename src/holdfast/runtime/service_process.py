@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
 from holdfast.errors import InvalidValueError, TransportError
-from holdfast.runtime.command_line import wants_json
 
 if TYPE_CHECKING:
     from holdfast.runtime.endpoints import Endpoint, TlsFiles
@@ -55,9 +54,7 @@ def main(arguments: Sequence[str]) -> int:
     HoldfastError
         If an option cannot be used; the message says which and why.
     """
-    parser = _parser()
-    parser.arguments = arguments
-    options = parser.parse_args(arguments)
+    options = _parser().parse_args(arguments)
     # Nothing is thrown away while modules are loaded, so there is nothing to look for.
     gc.disable()
     # NumPy's BLAS would start threads that nothing here has work for.
@@ -66,14 +63,10 @@ def main(arguments: Sequence[str]) -> int:
 
 
 class _Parser(argparse.ArgumentParser):
-    """Raises what another one would write as text, if the text is to be an event."""
-
-    arguments: Sequence[str] = ()
+    """Raises what another one would write as text, with its usage."""
 
     def error(self, message: str) -> NoReturn:
-        if wants_json(self.arguments):
-            raise InvalidValueError(message)
-        super().error(message)
+        raise InvalidValueError(message.removeprefix("argument "))
 
 
 def _parser() -> _Parser:
@@ -102,6 +95,7 @@ def _parser() -> _Parser:
     add("--name", default=DEFAULT_NAME, help=f"name of the service (default: {DEFAULT_NAME})")
     add(
         "--tls",
+        type=_directory,
         metavar="DIR",
         help="directory with this service's credentials, as 'holdfast keys' makes it; robots must "
         "have theirs of the same authority",
@@ -154,7 +148,7 @@ def _parser() -> _Parser:
     )
     add(
         "--problem-directory",
-        type=Path,
+        type=_directory,
         metavar="DIR",
         help="where the modules of --problem are looked for first (default: the current directory)",
     )
@@ -187,6 +181,12 @@ def _number(least: float, most: float) -> type[float]:
     return number  # type: ignore[return-value]
 
 
+def _directory(text: str) -> Path:
+    if not text:
+        raise argparse.ArgumentTypeError("'' is no path (. is the current directory)")
+    return Path(text)
+
+
 def _port(text: str) -> int:
     return _whole_number(0, 65535)(text)
 
@@ -201,7 +201,7 @@ def _serve(options: argparse.Namespace) -> int:
     if options.tls is not None:
         from holdfast.runtime.credentials import load_credentials
 
-        tls = load_credentials(Path(options.tls), "service", warn=lambda text: _warn(options, text))
+        tls = load_credentials(options.tls, "service", warn=lambda text: _warn(options, text))
     listen, connect = options.listen, options.connect
     if not listen and not connect:
         listen = [f"{'tcp' if tls is None else 'tls'}/{_DEFAULT_PLACE}"]

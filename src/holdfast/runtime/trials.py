@@ -203,7 +203,9 @@ def _run_one(
         raise
     except HoldfastError as error:
         raise TrialError(f"{where}: {error}") from error
-    except Exception as error:
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:
         account = account_of_user_error(error, configuration.problem_name)
         if account is not None:
             raise TrialError(f"{where}: {account}") from error

@@ -1,0 +1,164 @@
+"""What cannot be an option's value is refused with one line, whichever command and option it is."""
+
+from __future__ import annotations
+
+import inspect
+import sys
+from pathlib import Path
+
+import pytest
+import typer
+
+from holdfast.cli import _main
+from holdfast.cli.application import app
+from holdfast.cli.keys import keys
+from holdfast.runtime import credentials
+
+NUMBERS = [
+    ["run", "peg.yaml", "--trials"],
+    ["run", "peg.yaml", "--seed"],
+    ["run", "peg.yaml", "--jobs"],
+    ["run", "peg.yaml", "-j"],
+    ["run", "peg.yaml", "--rate"],
+    ["demo", "--seed"],
+    ["chaos", "--trials"],
+    ["chaos", "--seed"],
+    ["chaos", "--jobs"],
+    ["chaos", "--first"],
+    ["experiment", "all", "--seed"],
+    ["experiment", "all", "--jobs"],
+    ["simulate", "--jobs"],
+    ["simulate", "--seeds"],
+    ["keys", "mine", "--days"],
+    ["serve", "--workers"],
+    ["serve", "--lease-ms"],
+    ["serve", "--max-sessions"],
+    ["serve", "--metrics"],
+]
+PATHS = [
+    ["run"],
+    ["run", "peg.yaml", "--out"],
+    ["run", "peg.yaml", "--tls"],
+    ["demo", "--out"],
+    ["chaos", "--out"],
+    ["experiment", "all", "--out"],
+    ["simulate", "--schedule"],
+    ["compare"],
+    ["compare", "one"],
+    ["keys"],
+    ["serve", "--tls"],
+    ["serve", "--problem-directory"],
+]
+
+
+@pytest.fixture(autouse=True)
+def workplace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "peg.yaml").write_text("problem: peg_in_hole_2d\n")
+
+
+def last_words(
+    arguments: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> str:
+    """Run a command that is to be refused, and return the one line that it says."""
+    monkeypatch.setattr(sys, "argv", ["holdfast", *arguments])
+    with pytest.raises(SystemExit) as ended:
+        _main()
+    assert ended.value.code == 2
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert said.err.startswith("holdfast: error: ")
+    assert said.err.count("\n") == 1, said.err
+    assert sorted(path.name for path in Path().iterdir()) == ["peg.yaml"]
+    return said.err
+
+
+@pytest.mark.parametrize("value", ["ten", "", "-1", "nan", "1e400", "9" * 30])
+@pytest.mark.parametrize("words", NUMBERS, ids=" ".join)
+def test_a_number(
+    words: list[str],
+    value: str,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    option = {"-j": "--jobs"}.get(words[-1], words[-1])
+    line = last_words([*words, value], capsys, monkeypatch)
+    assert option in line
+    assert value in line
+
+
+@pytest.mark.parametrize("value", ["1e-300", "0", "0.0009", "10001", "inf"])
+def test_a_rate(
+    value: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    line = last_words(["run", "peg.yaml", "--rate", value], capsys, monkeypatch)
+    assert line == (
+        f"holdfast: error: --rate is '{value}'; allowed are numbers from 0.001 to 10000 (Hz)\n"
+    )
+
+
+@pytest.mark.parametrize("words", PATHS, ids=" ".join)
+def test_an_empty_path_is_not_the_current_directory(
+    words: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    more = ["two"] if words[0] == "compare" and len(words) == 1 else []
+    line = last_words([*words, "", *more], capsys, monkeypatch)
+    assert "''" in line
+    assert "(. is the current directory)" in line
+
+
+@pytest.mark.parametrize(
+    ("arguments", "reason"),
+    [
+        (["nonsense"], "No such command 'nonsense'"),
+        (["run", "peg.yaml", "--nonsense"], "--nonsense"),
+        (["run", "peg.yaml", "again"], "again"),
+        (["run", "peg.yaml", "--trials"], "--trials"),
+        (["compare", "one"], "RUN"),
+        (["serve", "--nonsense"], "--nonsense"),
+        (["serve", "--log", "xml"], "--log"),
+        (["run", "peg.yaml", "--log", "xml"], "--log"),
+    ],
+)
+def test_other_misuse(
+    arguments: list[str],
+    reason: str,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    assert reason in last_words(arguments, capsys, monkeypatch)
+
+
+@pytest.mark.parametrize("arguments", [[], ["run"], ["compare"], ["keys"], ["experiment"]])
+def test_without_arguments_there_is_help(
+    arguments: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["holdfast", *arguments])
+    with pytest.raises(SystemExit) as ended:
+        _main()
+    said = capsys.readouterr()
+    assert ended.value.code in (0, 2)
+    assert (said.out + said.err).startswith("Usage: holdfast")
+
+
+def test_every_number_and_path_of_the_commands_is_in_these_tables() -> None:
+    """So that a new option gets a line above."""
+    listed = {(words[0], words[-1]) for words in [*NUMBERS, *PATHS] if words[-1].startswith("--")}
+    for command in app.registered_commands:
+        assert command.callback is not None
+        name = command.callback.__name__
+        for parameter in inspect.signature(command.callback, eval_str=True).parameters.values():
+            for info in getattr(parameter.annotation, "__metadata__", ()):
+                if isinstance(info, typer.models.ArgumentInfo):
+                    continue
+                kind = parameter.annotation.__origin__
+                if {int, float, Path} & {kind, *getattr(kind, "__args__", ())}:
+                    names = [info.default, *info.param_decls, f"--{parameter.name}"]
+                    assert any((name, option) in listed for option in names), (name, names)
+                    assert info.parser is not None
+
+
+def test_limits_that_are_stated_twice_agree() -> None:
+    here = keys.__globals__
+    assert here["_DEFAULT_DAYS"] == credentials.DEFAULT_DAYS
+    assert here["_MAX_DAYS"] == credentials.AUTHORITY_DAYS
