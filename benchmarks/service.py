@@ -29,10 +29,11 @@ from benchmarks.processes import (
 )
 from benchmarks.report import Bar, Result, Table, milliseconds, paragraph
 from benchmarks.robots import Notebook, configuration_for, run_robot
-from benchmarks.turns import Asker, Caller, decided_in_process, opening_of, recorded_turns
+from benchmarks.turns import Asker, Caller, decided_in_process, recorded_turns
 from holdfast.outcome import TrialResult
 from holdfast.planning import choose_sensing_action, digest, encode_checkpoint, initial_state
 from holdfast.recording.journal import Journal
+from holdfast.runtime.robot_process import opening_of
 from holdfast.runtime.trial import run_trial
 from holdfast.session.messages import DIGEST_SIZE, numbers_to
 from holdfast.session.records import ActingRecord, PerformedRecord

@@ -13,7 +13,6 @@ from time import perf_counter
 from typing import NamedTuple, Self
 
 from benchmarks.beliefs import MAX_STEPS, SEED
-from holdfast.configuration import Configuration
 from holdfast.planning import (
     PlanningState,
     advance,
@@ -46,7 +45,7 @@ from holdfast.session.messages import (
 )
 from holdfast.settings import PlanningSettings
 
-__all__ = ["Asked", "Asker", "Caller", "Turn", "decided_in_process", "opening_of", "recorded_turns"]
+__all__ = ["Asked", "Asker", "Caller", "Turn", "decided_in_process", "recorded_turns"]
 
 _PATIENCE_S = 30.0
 _SWITCH_INTERVAL_S = 0.0005
@@ -162,17 +161,6 @@ def decided_in_process(problem: Problem, settings: PlanningSettings, turn: Turn)
         state, _ = observe(problem, settings, turn.before, last.sensing_action, observation)
     ahead, _ = _rolled(problem, settings, state)
     return choose_sensing_action(problem, settings, ahead)[0]
-
-
-def opening_of(configuration: Configuration) -> Opening:
-    """Return what a service is told of a robot's run."""
-    return Opening(
-        configuration.problem_name,
-        dict(configuration.model),
-        dict(configuration.state_space_planner),
-        configuration.planning,
-        configuration.simulator.seed,
-    )
 
 
 class Asked(NamedTuple):

@@ -11,6 +11,7 @@ NB_MODULE(_kernel, module) {
     // A problem that is alive when the interpreter ends, as in any script, is no leak.
     nanobind::set_leak_warnings(false);
     module.def("simd", [] { return holdfast::vector_kernels().name; });
+    module.def("sources", [] { return HOLDFAST_SOURCES; });
     holdfast::bind_numerics(module);
     holdfast::bind_entropy(module);
     holdfast::bind_geometry(module);

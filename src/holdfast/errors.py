@@ -13,6 +13,7 @@ __all__ = [
     "EnvironmentFailedError",
     "HoldfastError",
     "InvalidValueError",
+    "OtherCodeError",
     "ProblemError",
     "TransportError",
     "TrialError",
@@ -34,6 +35,13 @@ class ConfigurationError(HoldfastError):
 
 class UnknownProblemError(ConfigurationError):
     """No problem of that name is registered, nor can it be imported."""
+
+
+class OtherCodeError(HoldfastError):
+    """The robot's holdfast or problem is other code than the service's, which may decide otherwise.
+
+    The message names the problem and the digests of both.
+    """
 
 
 class ProblemError(HoldfastError):

@@ -47,6 +47,7 @@ from holdfast.session.records import (
     RecoveredRecord,
 )
 from holdfast.settings import ActiveSensingSettings, ParticleFilterSettings, PlanningSettings
+from holdfast.source_digest import core_version, problem_digest
 
 __all__ = [
     "PLANNING",
@@ -76,6 +77,8 @@ PLANNING = PlanningSettings(
     sensing_interval=2,
 )
 
+_NO_CODE_OF_ITS_OWN = problem_digest(registry.problem_class(PROBLEM))
+
 _EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
@@ -91,9 +94,14 @@ class Turn(NamedTuple):
     observed: tuple[Observed, ...]
 
 
-def opening_of(name: str = PROBLEM, seed: int = SEED) -> Opening:
-    """Return what a robot says of its run."""
-    return Opening(name, {}, {}, PLANNING, seed)
+def opening_of(
+    name: str = PROBLEM,
+    seed: int = SEED,
+    model: dict[str, object] | None = None,
+    planning: PlanningSettings = PLANNING,
+) -> Opening:
+    """Return what a robot with a problem of holdfast's, or one that is nowhere, says of its run."""
+    return Opening(name, model or {}, {}, planning, seed, core_version(), _NO_CODE_OF_ITS_OWN)
 
 
 def problem_of(opening: Opening) -> Problem:

@@ -30,7 +30,6 @@ from holdfast.session.messages import (
     MAX_OBSERVATIONS,
     MessageError,
     Observed,
-    Opening,
     Refused,
     Request,
     decode_reply,
@@ -177,7 +176,7 @@ class HostileMessages:
         if name.startswith("multitier"):
             holes = [{"center": [4.0, 6.0 - 0.01 * number], "depth": 0.01} for number in range(900)]
             model = {"holes": holes}
-        opening = Opening(name, model, {}, planning, chance.randrange(2**63))
+        opening = corpus.opening_of(name, chance.randrange(2**63), model, planning)
         return encode(msgspec.structs.replace(request, opening=opening, checkpoint=None))
 
     def _costly(self) -> bytes:
@@ -186,7 +185,7 @@ class HostileMessages:
             particle_filter=ParticleFilterSettings(num_particles=30_000),
             active_sensing=ActiveSensingSettings(num_observation_samples=10, num_cores=0),
         )
-        opening = Opening(corpus.PROBLEM, {}, {}, planning, self._chance.randrange(2**63))
+        opening = corpus.opening_of(seed=self._chance.randrange(2**63), planning=planning)
         request = self._request(self._chance.randbytes(16))
         changes = {"opening": opening, "checkpoint": None, "observations": ()}
         return encode(msgspec.structs.replace(request, **changes))

@@ -808,3 +808,14 @@ def sensing_steps(document: Mapping[str, Any]) -> list[int]:
     """Return the steps at which the robot senses."""
     simulator = document["simulator"]
     return list(range(0, simulator["max_steps"], simulator["sensing_intervals"] + 1))
+
+
+def services_in_order(robot: Robot) -> list[str]:
+    """Return who decided, one after the other."""
+    rows = (robot.out / "timings.csv").read_text().splitlines()[1:]
+    services = [row.split(",")[3] for row in rows]
+    return [
+        service
+        for index, service in enumerate(services)
+        if services[index - 1 : index] != [service]
+    ]

@@ -30,13 +30,13 @@ from tests.processes.faults import (
     RECOVERY,
     RESTORED,
     References,
-    Robot,
     Service,
     Site,
     Story,
     document_of,
     events_of,
     sensing_steps,
+    services_in_order,
     wait_for_end,
 )
 
@@ -553,14 +553,3 @@ class TestReplicas:
         robot = story.run(first, second)
         assert robot.statuses() == []
         assert second.endpoint in services_in_order(robot)
-
-
-def services_in_order(robot: Robot) -> list[str]:
-    """Return who decided, one after the other."""
-    rows = (robot.out / "timings.csv").read_text().splitlines()[1:]
-    services = [row.split(",")[3] for row in rows]
-    return [
-        service
-        for index, service in enumerate(services)
-        if services[index - 1 : index] != [service]
-    ]

@@ -29,12 +29,12 @@ from tests.questions import request_of
 from holdfast.configuration import Configuration, load
 from holdfast.planning import initial_state
 from holdfast.runtime.endpoints import ServiceAddress
+from holdfast.runtime.robot_process import opening_of
 from holdfast.runtime.transport.calls import DEFAULT_MAX_MESSAGE_BYTES
 from holdfast.runtime.transport.zenoh_transport import ZenohRobotTransport
 from holdfast.session.events import Appeared, Ended, Replied, TransportEvent
 from holdfast.session.messages import (
     PROTOCOL_VERSION,
-    Opening,
     Progress,
     Refused,
     Reply,
@@ -104,14 +104,7 @@ def first_request(configuration: Configuration, **changes: Any) -> Request:
     state = initial_state(
         configuration.problem, configuration.planning, configuration.simulator.seed, 0
     )
-    opening = Opening(
-        configuration.problem_name,
-        dict(configuration.model),
-        dict(configuration.state_space_planner),
-        configuration.planning,
-        configuration.simulator.seed,
-    )
-    request = request_of(state, bytes(range(16)), 1, opening=opening)
+    request = request_of(state, bytes(range(16)), 1, opening=opening_of(configuration))
     return msgspec.structs.replace(request, **changes)
 
 

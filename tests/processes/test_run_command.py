@@ -16,8 +16,8 @@ from pathlib import Path
 import pytest
 from tests.ports import free_port
 
-from holdfast import __version__
 from holdfast.recording.machine import machines
+from holdfast.source_digest import core_version
 
 COMMAND = [sys.executable, "-c", "from holdfast.cli import main; main()"]
 
@@ -291,7 +291,7 @@ class TestOutput:
     def test_version(self, workplace: Path) -> None:
         done = holdfast(workplace, "--version")
         assert done.returncode == 0
-        assert done.stdout == f"holdfast {__version__} ({machines()} state machines)\n"
+        assert done.stdout == f"holdfast {core_version()} ({machines()} state machines)\n"
 
 
 class TestInterruption:

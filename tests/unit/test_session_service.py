@@ -20,7 +20,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.questions import request_of
 
-from holdfast.errors import ConfigurationError, ProblemError, UnknownProblemError
+from holdfast.errors import ConfigurationError, OtherCodeError, ProblemError, UnknownProblemError
 from holdfast.planning import (
     PlanningState,
     advance,
@@ -797,6 +797,22 @@ class TestRefusals:
         assert "this and that" in reply.text
         assert bench.service.statistics.sessions == 0
         assert bench.service.statistics.refusals == {"unknown_problem": 1}
+
+    def test_a_problem_is_not_lent_to_a_robot_with_other_code(self) -> None:
+        def make(opening: Opening) -> Problem:
+            if (opening.core_version, opening.problem_digest) != ("1", "2"):
+                raise OtherCodeError("deploy the same version")
+            return make_problem(opening)
+
+        bench = Bench(make)
+        opening = msgspec.structs.replace(Robot().opening, core_version="1", problem_digest="2")
+        robot = Robot(key=1)
+        robot.opening = opening
+        assert content(bench.ask(robot.request())) == robot.right_answer()
+        for key, changes in ((2, {"core_version": "0"}), (3, {"problem_digest": "0"})):
+            other = Robot(key=key)
+            other.opening = msgspec.structs.replace(opening, **changes)
+            assert refused(bench.ask(other.request())).code == "other_code"
 
     def test_model_that_does_not_fit(self) -> None:
         def make(opening: Opening) -> Problem:

@@ -11,7 +11,6 @@ from typing import Annotated
 
 import typer
 
-from holdfast import __version__
 from holdfast.cli.chaos import chaos
 from holdfast.cli.compare import compare
 from holdfast.cli.demo import demo
@@ -95,8 +94,9 @@ def run_application(arguments: list[str]) -> None:
 def _print_version(wanted: bool) -> None:
     if wanted:
         from holdfast.recording.machine import machines
+        from holdfast.source_digest import core_version
 
-        typer.echo(f"holdfast {__version__} ({machines()} state machines)")
+        typer.echo(f"holdfast {core_version()} ({machines()} state machines)")
         raise typer.Exit
 
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import sys
-from collections.abc import Callable
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
     from holdfast.configuration import Configuration
@@ -15,9 +15,39 @@ if TYPE_CHECKING:
     from holdfast.runtime.logs import EventSink, LogFormat
     from holdfast.session.effects import Verified
 
-__all__ = ["is_robot_run", "run_as_robot"]
+__all__ = ["RobotRun", "is_robot_run", "run_as_robot"]
 
 RECOVERY_LOG_NAME = "recovery.log"
+
+
+class RobotRun(NamedTuple):
+    """What there is to say of a run besides its results.
+
+    Attributes
+    ----------
+    missed_ticks : int
+        Of the rate.
+    refusals : dict of str
+        Why a service was asked no more, by its name.
+    """
+
+    missed_ticks: int = 0
+    refusals: Mapping[str, str] = {}
+
+
+class _Refusals:
+    """An event sink that remembers which services refused for good."""
+
+    def __init__(self) -> None:
+        self.reasons: dict[str, str] = {}
+
+    def event(self, name: str, /, **fields: object) -> None:
+        """Take an event."""
+        if name == "refused" and fields["final"]:
+            self.reasons[str(fields["service"])] = f"{fields['code']}: {fields['reason']}"
+
+    def close(self) -> None:
+        """Take no more."""
 
 
 def is_robot_run(configuration: Configuration, rate_hz: float | None) -> bool:
@@ -45,8 +75,8 @@ def run_as_robot(
     rate_hz: float | None,
     log_format: LogFormat,
     quiet: bool,
-) -> int:
-    """Run the missing trials one after another, and return the number of missed ticks.
+) -> RobotRun:
+    """Run the missing trials one after another.
 
     Parameters
     ----------
@@ -76,8 +106,10 @@ def run_as_robot(
 
     with contextlib.ExitStack() as stack:
         # What is only for people on a terminal is kept in the file all the same.
+        refusals = _Refusals()
         sinks: list[EventSink] = [
-            EventLog(directory.path / EVENTS_NAME, format="json", component="robot")
+            EventLog(directory.path / EVENTS_NAME, format="json", component="robot"),
+            refusals,
         ]
         if not quiet:
             sinks.append(EventLog(sys.stderr, format=log_format, component="robot"))
@@ -108,7 +140,7 @@ def run_as_robot(
         )
         launcher = None if links.launcher is None else links.launcher(robot.deliver)
         robot.run(directory.journal.finished(), launcher)
-        return robot.missed_ticks
+        return RobotRun(robot.missed_ticks, refusals.reasons)
 
 
 def _ignore(verified: Verified) -> None:

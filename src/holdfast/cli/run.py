@@ -6,7 +6,7 @@ import contextlib
 import shlex
 import signal
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
@@ -299,7 +299,7 @@ class _Options:
 
 
 def _run(options: _Options) -> None:
-    from holdfast.cli.robot_run import is_robot_run, run_as_robot
+    from holdfast.cli.robot_run import RobotRun, is_robot_run, run_as_robot
     from holdfast.recording.recorder import Recorder
     from holdfast.recording.run_directory import (
         FIGURE_NAME,
@@ -327,7 +327,7 @@ def _run(options: _Options) -> None:
         notes = _Notes(options)
         display = run_display(configuration, quiet=quiet or options.log == "json")
         recorder = Recorder(trial=0)
-        missed_ticks = 0
+        robot = RobotRun()
         summary: RunSummary | None = None
         started = perf_counter()
 
@@ -339,7 +339,7 @@ def _run(options: _Options) -> None:
             display.start(earlier, directory_path)
             try:
                 if maker is not None:
-                    missed_ticks = run_as_robot(
+                    robot = run_as_robot(
                         configuration,
                         directory,
                         maker,
@@ -368,9 +368,11 @@ def _run(options: _Options) -> None:
             summary = directory.write_tables(perf_counter() - started)
             if not quiet:
                 print_summary(summary)
-            if missed_ticks:
-                notes.note(f"{missed_ticks} ticks of --rate were missed")
-            for text in _idle_services(configuration, summary):
+            if robot.missed_ticks:
+                notes.note(f"{robot.missed_ticks} ticks of --rate were missed")
+            for service, reason in robot.refusals.items():
+                notes.note(f"{service} was asked no more: {reason}")
+            for text in _idle_services(configuration, summary, robot.refusals):
                 notes.note(text)
             with notes.while_it_lasts(f"drawing {FIGURE_NAME} ..."):
                 note = _draw_figure(configuration, directory, recorder)
@@ -415,8 +417,10 @@ def _exit_code(summary: RunSummary | None) -> int:
     return 0
 
 
-def _idle_services(configuration: Configuration, summary: RunSummary) -> list[str]:
-    """Say which of the services named have decided nothing: perhaps one was mistyped."""
+def _idle_services(
+    configuration: Configuration, summary: RunSummary, refusals: Collection[str]
+) -> list[str]:
+    """Say which of the services named decided nothing without a refusal: perhaps mistyped."""
     sensing = summary.sensing_decisions_by_service
     task = summary.task_answers_by_service
     if sensing is None or task is None or not summary.finished:
@@ -424,7 +428,7 @@ def _idle_services(configuration: Configuration, summary: RunSummary) -> list[st
     return [
         f"{service} decided nothing; events.jsonl says why"
         for service in configuration.offload.services
-        if service not in sensing and service not in task
+        if service not in sensing and service not in task and service not in refusals
     ]
 
 

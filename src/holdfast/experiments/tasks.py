@@ -8,7 +8,6 @@ and the code.
 
 from __future__ import annotations
 
-import ast
 import functools
 import hashlib
 import importlib
@@ -24,6 +23,7 @@ from holdfast import _kernel
 from holdfast.errors import HoldfastError
 from holdfast.experiments.tables import Table
 from holdfast.recording.machine import describe
+from holdfast.source_digest import follow_imports
 
 __all__ = ["Task", "TaskError", "code_of", "run_task", "task_key"]
 
@@ -168,29 +168,15 @@ def _sources_behind(module: str, package: Path) -> set[Path]:
 
     What a string names as ``module:attribute``, as registries do, counts as imported.
     """
-    found: set[Path] = set()
-    waiting = [module]
-    while waiting:
-        name = waiting.pop()
-        # A module's own package is imported with it.
-        parent, _, _ = name.rpartition(".")
-        if parent:
-            waiting.append(parent)
-        place = package.joinpath(*name.split(".")[1:])
+
+    def locate(name: str) -> Path | None:
+        top, *rest = name.split(".")
+        place = package.joinpath(*rest)
         path = place / "__init__.py" if place.is_dir() else place.with_suffix(".py")
-        if path in found or not path.is_file() or name == __name__:
-            continue  # seen; or a name inside a module; or this one, which knows all functions
-        found.add(path)
-        for node in ast.walk(ast.parse(path.read_bytes())):
-            names: list[str] = []
-            if isinstance(node, ast.Constant) and isinstance(node.value, str):
-                names = [node.value.partition(":")[0]] if _PLACE.fullmatch(node.value) else []
-            elif isinstance(node, ast.Import):
-                names = [alias.name for alias in node.names]
-            elif isinstance(node, ast.ImportFrom) and node.module:
-                names = [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
-            waiting += [name for name in names if name.split(".")[0] == package.name]
-    return found
+        # This module knows all functions.
+        return path if top == package.name and path.is_file() and name != __name__ else None
+
+    return set(follow_imports([module], locate, places=True).values())
 
 
 def _places_in(plain: object) -> list[str]:

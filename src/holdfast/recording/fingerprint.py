@@ -1,24 +1,22 @@
 """Which code made a run: a trial can only stand beside others that the same code decided.
 
-The version of holdfast tells its own code. A problem of somebody else's has no version that we
-could trust while it is being written, so the source of its class, and of the classes that it is
-derived from, is hashed.
+The version of holdfast and the digest of what decides in it tell its own code, the digests of its
+sources that of a problem (:mod:`holdfast.source_digest`).
 """
 
 from __future__ import annotations
 
-import hashlib
 import json
-import sys
 from collections.abc import Mapping
-from pathlib import Path
 
 from holdfast import __version__
 from holdfast.configuration import Configuration
+from holdfast.source_digest import core_version, problem_sources
 
 __all__ = ["difference", "fingerprint"]
 
 _VERSION = "holdfast_version"
+_CORE = "holdfast_core"
 _SOURCES = "problem_sources"
 
 
@@ -33,19 +31,14 @@ def fingerprint(configuration: Configuration) -> dict[str, str]:
     Returns
     -------
     dict of str
-        holdfast's version, and the hash of each source file of a problem that is not holdfast's,
-        as JSON.
+        holdfast's version, without and with the digest of its core, and the digests of a problem's
+        sources, as JSON.
     """
-    hashes: dict[str, str] = {}
-    for derived in type(configuration.problem).__mro__:
-        module = derived.__module__
-        package = module.partition(".")[0]
-        if package == "holdfast" or package in sys.stdlib_module_names:
-            continue
-        file = getattr(sys.modules.get(module), "__file__", None)
-        if file is not None and module not in hashes:
-            hashes[module] = hashlib.blake2b(Path(file).read_bytes(), digest_size=32).hexdigest()
-    return {_VERSION: __version__, _SOURCES: json.dumps(hashes, sort_keys=True)}
+    return {
+        _VERSION: __version__,
+        _CORE: core_version(),
+        _SOURCES: json.dumps(problem_sources(type(configuration.problem)), sort_keys=True),
+    }
 
 
 def difference(there: Mapping[str, str], here: Mapping[str, str]) -> str | None:
@@ -61,9 +54,14 @@ def difference(there: Mapping[str, str], here: Mapping[str, str]) -> str | None:
             f"it was made by holdfast {there.get(_VERSION, 'of an unknown version')}, "
             f"this is {here[_VERSION]}"
         )
+    core = there.get(_CORE)
+    if core is not None and core != here[_CORE]:
+        return f"it was made by holdfast {core}, this is {here[_CORE]}: other code"
     old: dict[str, str] = json.loads(there.get(_SOURCES, "{}"))
     new: dict[str, str] = json.loads(here[_SOURCES])
-    changed = sorted(name for name in old.keys() | new.keys() if old.get(name) != new.get(name))
+    # Journals that say nothing of the core name fewer modules.
+    names = old.keys() & new.keys() if core is None else old.keys() | new.keys()
+    changed = sorted(name for name in names if old.get(name) != new.get(name))
     if not changed:
         return None
     return f"the problem's source has changed since (module {', '.join(changed)})"

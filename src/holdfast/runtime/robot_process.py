@@ -25,6 +25,7 @@ from holdfast.configuration import Configuration
 from holdfast.errors import HoldfastError, TrialError
 from holdfast.outcome import TrialResult
 from holdfast.planning import Planner
+from holdfast.problems.registry import problem_class
 from holdfast.robot.own_decisions import OwnDecisions
 from holdfast.runtime.diagnosis import MissingServices
 from holdfast.runtime.environment import EnvironmentMaker
@@ -60,9 +61,10 @@ from holdfast.session.messages import Opening
 from holdfast.session.records import Record
 from holdfast.session.robot import HeldError, History, Robot, replay
 from holdfast.settings import OffloadSettings
+from holdfast.source_digest import core_version, problem_digest
 from holdfast.user_code import account_of_user_error, describe_problem_error
 
-__all__ = ["Launcher", "RobotProcess", "StepJournal"]
+__all__ = ["Launcher", "RobotProcess", "StepJournal", "opening_of"]
 
 _LONGEST_SLEEP_S = 3600.0  # the platform's clocks have limits of their own
 
@@ -129,6 +131,20 @@ class _Interrupted(NamedTuple):
 
 
 _Happening: TypeAlias = TransportEvent | EnvironmentEvent | Decided | RecoveryExited | _Interrupted
+
+
+def opening_of(configuration: Configuration) -> Opening:
+    """Return what services are told of a configuration's run, and of the code of this process."""
+    name = configuration.problem_name
+    return Opening(
+        name,
+        dict(configuration.model),
+        dict(configuration.state_space_planner),
+        configuration.planning,
+        configuration.simulator.seed,
+        core_version(),
+        problem_digest(problem_class(name, configuration.problem_directory)),
+    )
 
 
 class RobotProcess:
@@ -206,13 +222,7 @@ class RobotProcess:
             configuration.recovery,
             journal.session(),
             journal.raise_epoch(),
-            Opening(
-                configuration.problem_name,
-                dict(configuration.model),
-                dict(configuration.state_space_planner),
-                configuration.planning,
-                simulator.seed,
-            ),
+            opening_of(configuration),
             problem.action_size,
             len(problem.sensing_actions),
             functools.partial(contract.executed_action, problem),

@@ -37,7 +37,7 @@ from typing import Any, Literal, TypeAlias
 
 import msgspec
 
-from holdfast.errors import HoldfastError, UnknownProblemError
+from holdfast.errors import HoldfastError, OtherCodeError, UnknownProblemError
 from holdfast.problems import registry
 from holdfast.problems.problem import Problem
 from holdfast.runtime.logs import EventSink, NullEventLog
@@ -48,6 +48,7 @@ from holdfast.session.service import Service
 from holdfast.session.service_effects import Answer, Computed, Effect, End, Noted, Run
 from holdfast.session.service_jobs import Job
 from holdfast.session.service_limits import ServiceStatistics
+from holdfast.source_digest import core_version, problem_digest
 
 __all__ = ["KnownProblems", "ServiceBrokenError", "ServiceShell"]
 
@@ -112,6 +113,9 @@ class KnownProblems:
         self._classes = {
             name: registry.problem_class(name, search_directory=directory) for name in names
         }
+        # Now, for what is on the disk can be replaced while it runs as it was loaded.
+        self._core_version = core_version()
+        self._digests = {each: problem_digest(each) for each in self._classes.values()}
         self._names: frozenset[str] | None = None
         # msgspec (0.22) finds out about a struct's fields when the first one is made, and crashes
         # if a second thread makes one meanwhile.
@@ -124,6 +128,8 @@ class KnownProblems:
         ------
         UnknownProblemError
             If this service does not know it.
+        OtherCodeError
+            If the robot's holdfast or problem is other code than this service's.
         ConfigurationError
             If its settings do not fit.
         """
@@ -133,6 +139,7 @@ class KnownProblems:
     def _build(self, opening: Opening) -> Problem:
         name = opening.problem
         found = self._classes.get(name) or self._registered(name)
+        self._require_same_code(opening, found)
         if name in registry.BUILT_IN:
             # Their own check is enough to know that all is well; what is not, the configuration
             # can explain, but takes long to import.
@@ -142,6 +149,23 @@ class KnownProblems:
         from holdfast.configuration import build_problem
 
         return build_problem(name, found, opening.model, opening.state_space_planner)
+
+    def _require_same_code(self, opening: Opening, found: type[Any]) -> None:
+        if found not in self._digests:
+            self._digests[found] = problem_digest(found)
+        differences = [
+            f"{what} is {here} on this service, {there or 'not told'} on the robot"
+            for what, here, there in (
+                ("holdfast", self._core_version, opening.core_version),
+                ("the digest of the problem's code", self._digests[found], opening.problem_digest),
+            )
+            if here != there
+        ]
+        if differences:
+            raise OtherCodeError(
+                f"problem {opening.problem}: {' and '.join(differences)}; they may decide "
+                "differently, so deploy the same version on both, then start the service again"
+            )
 
     def _registered(self, name: str) -> type[Any]:
         if name in registry.BUILT_IN:

@@ -44,7 +44,7 @@ _LOCAL_PATIENCE = 4.0
 
 _WRONG_ANSWER = "wrong_answer"
 
-_FINAL_REFUSALS = frozenset({"unknown_problem", "version", "too_large"})
+_FINAL_REFUSALS = frozenset({"unknown_problem", "other_code", "version", "too_large"})
 _REFUSED_BY_ALL = frozenset({"invalid", "failed"})
 """Refusals that say something of the question itself: any other service would say the same."""
 

@@ -59,7 +59,7 @@ __all__ = [
 
 FloatArray = npt.NDArray[np.float64]
 
-PROTOCOL_VERSION = 2
+PROTOCOL_VERSION = 3
 """Raised whenever a message changes its form or its meaning; its checksum is the same in all."""
 
 CHECKSUM_SIZE = 4
@@ -130,6 +130,9 @@ class Observed(msgspec.Struct, array_like=True, frozen=True, forbid_unknown_fiel
 class Opening(msgspec.Struct, array_like=True, frozen=True):
     """What a service must know of a robot's run to plan for it: names and plain data, never code.
 
+    The settings are complete, with all defaults filled in. Code is only named, by its digest, so
+    that a service with other code refuses instead of deciding otherwise.
+
     Attributes
     ----------
     problem : str
@@ -138,6 +141,10 @@ class Opening(msgspec.Struct, array_like=True, frozen=True):
         The problem's two sections of the configuration.
     planning : PlanningSettings
     seed : int
+    core_version : str
+        Of the robot's holdfast (:func:`holdfast.source_digest.core_version`).
+    problem_digest : str
+        Of the code of the problem beyond that (:func:`holdfast.source_digest.problem_digest`).
     """
 
     problem: Name
@@ -145,6 +152,8 @@ class Opening(msgspec.Struct, array_like=True, frozen=True):
     state_space_planner: dict[str, object]
     planning: PlanningSettings
     seed: Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
+    core_version: Annotated[str, msgspec.Meta(max_length=200)] = ""
+    problem_digest: Annotated[str, msgspec.Meta(max_length=200)] = ""
 
 
 class Request(msgspec.Struct, array_like=True, frozen=True):
@@ -312,7 +321,8 @@ class Refused(msgspec.Struct, array_like=True, frozen=True, tag=6):
         Of the request; 0 if that could not be read.
     code : str
         ``damaged`` (on its way: it may be sent again), ``malformed``, ``too_large``, ``version``,
-        ``stale_epoch``, ``unknown_problem``, ``invalid`` (settings or state out of bounds),
+        ``stale_epoch``, ``unknown_problem``, ``other_code`` (the service's holdfast or problem
+        is not the robot's), ``invalid`` (settings or state out of bounds),
         ``out_of_memory`` (it may be asked again) or ``failed`` (the problem's own functions failed
         in this state).
     text : str

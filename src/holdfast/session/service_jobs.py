@@ -19,6 +19,7 @@ from holdfast.errors import (
     ConfigurationError,
     HoldfastError,
     InvalidValueError,
+    OtherCodeError,
     UnknownProblemError,
 )
 from holdfast.planning import (
@@ -324,6 +325,8 @@ def _account(error: BaseException, describe: Callable[[BaseException], str]) -> 
 def _code_of(error: HoldfastError) -> str:
     if isinstance(error, UnknownProblemError):
         return "unknown_problem"
+    if isinstance(error, OtherCodeError):
+        return "other_code"
     if isinstance(error, InvalidValueError | CheckpointError | ConfigurationError):
         return "invalid"
     # ProblemError, and whatever a problem raises of ours for reasons of its own.

@@ -233,7 +233,9 @@ class Session:
         # Packed, it is one object instead of thousands, all of which the collector would look at
         # again and again while nobody else has the interpreter.
         self.opening = pack_opening(opening)
-        self.problem_key = _key_of((opening.problem, opening.model, opening.state_space_planner))
+        # Of a problem's code, too: whoever names other code has to be refused.
+        named = (opening.problem, opening.core_version, opening.problem_digest)
+        self.problem_key = _key_of((named, opening.model, opening.state_space_planner))
         self.built = False
         # The number of threads changes no result, so the service may choose it.
         most = min(opening.planning.active_sensing.num_cores, max_threads)

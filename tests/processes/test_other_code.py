@@ -1,0 +1,96 @@
+"""A service whose copy of the problem, or whose holdfast, is not the robot's."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+from tests.processes.faults import (
+    LOST,
+    PATIENT,
+    RECOVERY,
+    Service,
+    Site,
+    assert_identical,
+    services_in_order,
+)
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "light_dark_room.py"
+NAME = "light_dark_room:LightDarkRoom"
+DOCUMENT = {
+    "problem": NAME,
+    "particle_filter": {"num_particles": 60},
+    "simulator": {"num_trials": 1, "max_steps": 60, "seed": 3, "sensing_intervals": 3},
+}
+CONSTANT, OLDER_CONSTANT = "0.0001 + 0.02 * (x * x", "0.0001 + 0.03 * (x * x"
+
+
+def older_copy(site: Site) -> Service:
+    """Return a service that is given the example as it was before one constant was changed."""
+    older = site.directory / "older"
+    older.mkdir()
+    text = EXAMPLE.read_text()
+    assert text.count(CONSTANT) == 1
+    (older / EXAMPLE.name).write_text(text.replace(CONSTANT, OLDER_CONSTANT))
+    return site.service("--problem", NAME, "--problem-directory", str(older))
+
+
+def current_copy(site: Site) -> Service:
+    newer = site.directory / "newer"
+    newer.mkdir()
+    shutil.copy(EXAMPLE, newer)
+    return site.service("--problem", NAME, "--problem-directory", str(newer))
+
+
+def digests_in(reason: str) -> tuple[str, str]:
+    """Return the digests of the service and of the robot that a refusal names."""
+    assert reason.startswith(f"problem {NAME}: the digest of the problem's code is ")
+    words = reason.replace(",", "").replace(";", "").split()
+    here, there = words[words.index("service") - 3], words[words.index("robot") - 3]
+    assert len(here) == len(there) == 16
+    return here, there
+
+
+class TestOlderCopyOfTheProblem:
+    def test_it_is_refused_and_the_local_service_decides(self, site: Site) -> None:
+        shutil.copy(EXAMPLE, site.directory)
+        file = site.configure(DOCUMENT, offload=PATIENT)
+        alone = site.holdfast("run", file, "--out", site.directory / "alone", "--jobs", "1", "-q")
+        assert alone.process.returncode == 0, alone.account()
+        cloud = older_copy(site).start()
+        robot = site.run(file, services=[cloud])
+        robot.finish()
+        assert_identical(robot.out, site.directory / "alone")
+        assert robot.statuses() == [LOST]
+        assert set(services_in_order(robot)) == {RECOVERY}
+        (refused,) = robot.matching("refused")
+        assert refused["service"] == cloud.endpoint
+        assert refused["code"] == "other_code"
+        assert refused["final"] is True
+        here, there = digests_in(refused["reason"])
+        assert here != there
+        assert "deploy the same version" in refused["reason"]
+        said = f"{cloud.endpoint} was asked no more: other_code: {refused['reason']}"
+        assert robot.matching("note", reason=said)
+
+    def test_another_service_with_the_same_code_decides(self, site: Site) -> None:
+        shutil.copy(EXAMPLE, site.directory)
+        file = site.configure(DOCUMENT, offload=PATIENT)
+        older, current = older_copy(site).start(), current_copy(site).start()
+        robot = site.run(file, services=[older, current])
+        robot.finish()
+        assert robot.statuses() == []
+        assert services_in_order(robot) == [current.endpoint]
+        (refused,) = robot.matching("refused")
+        assert (refused["service"], refused["code"]) == (older.endpoint, "other_code")
+
+    def test_alone_it_ends_the_run_and_says_what_to_do(self, site: Site) -> None:
+        shutil.copy(EXAMPLE, site.directory)
+        file = site.configure(DOCUMENT, offload=PATIENT, recovery={"launch": "never"})
+        cloud = older_copy(site).start()
+        robot = site.run(file, services=[cloud])
+        assert robot.wait() == 2
+        assert f"no service will decide: {cloud.endpoint}: other_code: problem {NAME}" in (
+            robot.output
+        )
+        assert "deploy the same version on both" in robot.output

@@ -1,0 +1,225 @@
+"""Digests of code: what changes them, and what does not."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import holdfast
+from holdfast import _kernel
+from holdfast.problems import registry
+from holdfast.recording.fingerprint import difference
+from holdfast.source_digest import core_version, follow_imports, problem_digest, problem_sources
+
+ROOT = Path(__file__).parents[2]
+PACKAGE = Path(holdfast.__file__).parent
+
+SOURCES = {
+    "arm_problem.py": """
+import math, arm_tables
+from arm_parts.joints import Joint
+from holdfast.problems.capsule_robot import CapsuleRobot
+from arm_base import Base
+class Arm(Base, CapsuleRobot):
+    def late(self):
+        import arm_late
+""",
+    "arm_base.py": "import numpy as np\nclass Base: pass\n",
+    "arm_tables.py": "import arm_tables_more\n",
+    "arm_tables_more.py": "import arm_problem\n",
+    "arm_late.py": "",
+    "arm_stranger.py": "",
+    "arm_parts/__init__.py": "",
+    "arm_parts/joints.py": "from . import limits\nfrom .links import Link\nclass Joint: pass\n",
+    "arm_parts/limits.py": "",
+    "arm_parts/links.py": "from .steel import SIZE\nclass Link: pass\n",
+    "arm_parts/steel/__init__.py": "from .. import units\nSIZE = 1\n",
+    "arm_parts/units.py": "",
+    "arm_parts/unused.py": "",
+}
+OF_THE_ARM = {
+    "arm_problem",
+    "arm_base",
+    "arm_tables",
+    "arm_tables_more",
+    "arm_late",
+    "arm_parts",
+    "arm_parts.joints",
+    "arm_parts.limits",
+    "arm_parts.links",
+    "arm_parts.steel",
+    "arm_parts.units",
+}
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    monkeypatch.setattr(sys, "path", sys.path.copy())
+    for name, text in SOURCES.items():
+        path = tmp_path / "arm" / name
+        path.parent.mkdir(exist_ok=True, parents=True)
+        path.write_text(text)
+    yield tmp_path / "arm"
+    for name in [each for each in sys.modules if each.partition(".")[0].startswith("arm_")]:
+        del sys.modules[name]
+    importlib.invalidate_caches()
+
+
+def arm_of(folder: Path) -> type:
+    return registry.problem_class("arm_problem:Arm", folder)
+
+
+class TestProblem:
+    def test_all_that_lies_beside_and_is_imported(self, folder: Path) -> None:
+        sources = problem_sources(arm_of(folder))
+        assert set(sources) == OF_THE_ARM
+        for name, digest in sources.items():
+            place = folder.joinpath(*name.split("."))
+            path = place / "__init__.py" if place.is_dir() else place.with_suffix(".py")
+            assert digest == hashlib.blake2b(path.read_bytes(), digest_size=32).hexdigest()
+
+    @pytest.mark.parametrize("name", SOURCES)
+    def test_a_changed_module(self, name: str, folder: Path) -> None:
+        arm = arm_of(folder)
+        before = problem_digest(arm)
+        with (folder / name).open("a") as file:
+            file.write("X = 1\n")
+        module = name.removesuffix(".py").replace("/", ".").removesuffix(".__init__")
+        assert (problem_digest(arm) != before) == (module in OF_THE_ARM)
+
+    def test_the_place_does_not_count(self, folder: Path, tmp_path: Path) -> None:
+        shutil.copytree(folder, tmp_path / "elsewhere")
+        program = (
+            "import sys; from pathlib import Path\n"
+            "from holdfast.problems import registry\n"
+            "from holdfast.source_digest import problem_digest\n"
+            "print(problem_digest(registry.problem_class('arm_problem:Arm', Path(sys.argv[1]))))"
+        )
+        found = {
+            subprocess.run(
+                [sys.executable, *flags, "-c", program, str(place)],
+                check=True,
+                capture_output=True,
+                text=True,
+            ).stdout
+            for place in (folder, tmp_path / "elsewhere")
+            for flags in ((), ("-O",), ("-B",))
+        }
+        assert found == {problem_digest(arm_of(folder)) + "\n"}
+
+    def test_an_installed_problem_has_no_neighbours(self, folder: Path) -> None:
+        libraries = folder.parent / "site-packages"
+        folder.rename(libraries)
+        sources = problem_sources(registry.problem_class("arm_problem:Arm", libraries))
+        assert set(sources) == {"arm_problem", "arm_base"}  # a class that it is derived from
+
+    def test_problems_of_holdfast_are_part_of_the_core(self) -> None:
+        for name in registry.BUILT_IN:
+            assert problem_sources(registry.problem_class(name)) == {}
+
+    def test_problems_of_the_studies_are_not(self) -> None:
+        name = "holdfast.experiments.busy_room:BusyRoom"
+        assert "holdfast.experiments.busy_room" in problem_sources(registry.problem_class(name))
+
+    def test_source_that_is_no_python_any_more(self, folder: Path) -> None:
+        arm = arm_of(folder)
+        (folder / "arm_tables.py").write_text("import (")
+        assert set(problem_sources(arm)) == OF_THE_ARM - {"arm_tables_more"}
+
+
+class TestCore:
+    def test_version_and_digest(self) -> None:
+        version, _, digest = core_version().partition("+")
+        assert version == holdfast.__version__
+        assert len(bytes.fromhex(digest)) == 8
+
+    def test_all_that_decides_is_part_of_it(self) -> None:
+        """What planning and the problems import, directly or not, stands where it is hashed."""
+
+        def locate(name: str) -> Path | None:
+            place = PACKAGE.parent.joinpath(*name.split("."))
+            path = place / "__init__.py" if place.is_dir() else place.with_suffix(".py")
+            return path if name.startswith("holdfast") and path.is_file() else None
+
+        problems = [place.partition(":")[0] for place in registry.BUILT_IN.values()]
+        deciding = ["holdfast.planning", *problems]
+        found = follow_imports(deciding, locate)
+        assert len(found) > 15
+        folders = {path.parent for path in found.values()}
+        assert folders == {PACKAGE, PACKAGE / "problems"}
+
+    @pytest.mark.parametrize("changed", ["sensing.py", "problems/peg_in_hole_2d.py", None])
+    def test_a_changed_source(self, changed: str | None, tmp_path: Path) -> None:
+        """An installation is copied, and asked for its version as a process of its own."""
+        shutil.copytree(
+            PACKAGE, tmp_path / "holdfast", ignore=shutil.ignore_patterns("__pycache__")
+        )
+        kernel = Path(_kernel.__file__ or "")
+        shutil.copy(kernel, tmp_path / "holdfast" / kernel.name)
+        if changed is not None:
+            with (tmp_path / "holdfast" / changed).open("a") as file:
+                file.write("# changed\n")
+        program = (
+            "import sys; sys.meta_path = [each for each in sys.meta_path "
+            "if 'ScikitBuild' not in type(each).__name__]\n"
+            f"sys.path.insert(0, {str(tmp_path)!r})\n"
+            "import holdfast, holdfast.source_digest as source_digest\n"
+            "print(holdfast.__file__); print(source_digest.core_version())"
+        )
+        done = subprocess.run(
+            [sys.executable, "-c", program], check=True, capture_output=True, text=True
+        )
+        file_name, version = done.stdout.split()
+        assert file_name == str(tmp_path / "holdfast" / "__init__.py")
+        assert (version == core_version()) == (changed is None)
+
+    @pytest.mark.skipif(not (ROOT / "cpp").is_dir(), reason="the kernel's sources are not here")
+    def test_the_kernel_is_told_by_its_sources(self) -> None:
+        sources = sorted(
+            path.relative_to(ROOT).as_posix()
+            for suffix in ("cpp", "hpp")
+            for path in (ROOT / "cpp").rglob(f"*.{suffix}")
+        )
+        lines = "".join(
+            f"{name} {hashlib.sha256((ROOT / name).read_bytes()).hexdigest()}\n"
+            for name in (*sources, "CMakeLists.txt")
+        )
+        assert _kernel.sources() == hashlib.sha256(lines.encode()).hexdigest(), "build it again"
+
+
+HERE = {
+    "holdfast_version": "1.0",
+    "holdfast_core": "1.0+a",
+    "problem_sources": json.dumps({"arm": "1", "arm_tables": "2"}),
+}
+
+
+class TestDifference:
+    def test_none(self) -> None:
+        assert difference(HERE, HERE) is None
+
+    def test_core(self) -> None:
+        there = {**HERE, "holdfast_core": "1.0+b"}
+        assert difference(there, HERE) == "it was made by holdfast 1.0+b, this is 1.0+a: other code"
+
+    @pytest.mark.parametrize(
+        ("there", "changed"),
+        [({"arm": "1"}, "arm_tables"), ({"arm": "0", "arm_tables": "2"}, "arm")],
+    )
+    def test_sources(self, there: dict[str, str], changed: str) -> None:
+        differs = difference({**HERE, "problem_sources": json.dumps(there)}, HERE)
+        assert differs == f"the problem's source has changed since (module {changed})"
+
+    def test_a_journal_of_before_the_core_was_told(self) -> None:
+        there = {"holdfast_version": "1.0", "problem_sources": json.dumps({"arm": "1"})}
+        assert difference(there, HERE) is None
+        there["problem_sources"] = json.dumps({"arm": "0"})
+        assert difference(there, HERE) is not None
