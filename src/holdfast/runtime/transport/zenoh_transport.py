@@ -74,7 +74,13 @@ from holdfast.runtime.transport.calls import (
 from holdfast.runtime.transport.contract import IncomingCall
 from holdfast.session.events import TransportEvent
 
-__all__ = ["KEY_VERSION", "ZenohRobotTransport", "ZenohServiceTransport", "connection_error"]
+__all__ = [
+    "KEY_VERSION",
+    "MAX_ROBOTS",
+    "ZenohRobotTransport",
+    "ZenohServiceTransport",
+    "connection_error",
+]
 
 KEY_VERSION = 1
 """Of the keys. The messages have a version of their own, which can be told to the other end."""
@@ -135,7 +141,7 @@ _FREE_PORT_ATTEMPTS = 8
 _MAX_BOOTS = 64
 """Incarnations of one service that a robot takes note of at the same time."""
 
-_MAX_ROBOTS = 4096
+MAX_ROBOTS = 4096
 """Links that a service accepts at the same time."""
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
@@ -1032,7 +1038,7 @@ def _settings(
             "unicast": {
                 "open_timeout": open_timeout_ms,
                 "accept_timeout": open_timeout_ms,
-                "max_sessions": _MAX_ROBOTS,
+                "max_sessions": MAX_ROBOTS,
             },
             "shared_memory": {"enabled": False},
             "link": link,
