@@ -229,6 +229,7 @@ class Service:
         self._site = site
         self.endpoint = endpoint
         self.options = tuple(options)
+        self.command: tuple[str, ...] = (sys.executable, "-m", "holdfast")
         self.variables: dict[str, str] = {}
         self.current: Process | None = None
 
@@ -240,8 +241,8 @@ class Service:
     def start(self) -> Service:
         """Start it; when this returns, robots can connect."""
         self.current = self._site.process(
-            sys.executable,
-            *("-m", "holdfast", "serve", "--listen", self.endpoint, "--log", "json"),
+            *self.command,
+            *("serve", "--listen", self.endpoint, "--log", "json"),
             *self.options,
             variables=self.variables,
         )

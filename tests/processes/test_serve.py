@@ -8,6 +8,7 @@ import os
 import platform
 import signal
 import socket
+import struct
 import subprocess
 import sys
 import time
@@ -102,6 +103,26 @@ def served(*arguments: str, **options: Any) -> Iterator[Served]:
         for stream in (service.process.stdin, service.process.stdout, service.process.stderr):
             if stream is not None:
                 stream.close()
+
+
+def listening_sockets(pid: int) -> set[tuple[str, int]]:
+    """Return the addresses and ports at which a process listens, as the system knows them."""
+    own = set()
+    for descriptor in Path(f"/proc/{pid}/fd").iterdir():
+        with contextlib.suppress(OSError):
+            own.add(str(descriptor.readlink()))
+    found = set()
+    for table in ("tcp", "tcp6"):
+        for line in Path(f"/proc/{pid}/net/{table}").read_text().splitlines()[1:]:
+            _, local, _, state, *_, inode = line.split()[:10]
+            if state == "0A" and f"socket:[{inode}]" in own:
+                address, _, port = local.partition(":")
+                # Each word of an address is in the machine's own order.
+                words = struct.unpack(f">{len(address) // 8}I", bytes.fromhex(address))
+                packed = struct.pack(f"={len(words)}I", *words)
+                family = socket.AF_INET if table == "tcp" else socket.AF_INET6
+                found.add((socket.inet_ntop(family, packed), int(port, 16)))
+    return found
 
 
 class End:
@@ -496,6 +517,15 @@ class TestTelling:
         assert 'holdfast_decisions_total{kind="sensing"} 3.0' in lines
         assert 'holdfast_refusals_total{code="malformed"} 1.0' in lines
         assert "holdfast_sessions 1.0" in lines
+
+    @pytest.mark.skipif(not Path("/proc/net/tcp").exists(), reason="the system's own table")
+    def test_what_is_not_said_to_be_reachable_listens_for_this_machine_alone(self) -> None:
+        """The sockets themselves are looked at, those of the metrics as well."""
+        pytest.importorskip("prometheus_client")
+        with served(*ANYWHERE, "--log", "json", "--metrics", "0") as service:
+            ready = json.loads(service.ready_line)
+            ports = {int(ready["listen"][0].rpartition(":")[2]), ready["metrics_port"]}
+            assert listening_sockets(service.process.pid) == {("127.0.0.1", p) for p in ports}
 
     def test_metrics_port_that_is_taken(self) -> None:
         pytest.importorskip("prometheus_client")

@@ -43,11 +43,13 @@ def _main() -> None:
         replace_closed_streams,
     )
     from holdfast.errors import HoldfastError
+    from holdfast.runtime.descriptors import allow_descriptors
 
     replace_closed_streams()
     forgive_unwritable_errors()
     arguments = sys.argv[1:]
     try:
+        allow_descriptors()
         if arguments[:1] == ["serve"]:
             from holdfast.runtime.service_process import main as serve
 

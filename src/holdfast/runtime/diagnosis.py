@@ -10,6 +10,7 @@ and nothing is decided by what it finds.
 from __future__ import annotations
 
 import contextlib
+import re
 import socket
 import threading
 from collections.abc import Mapping, Sequence
@@ -39,6 +40,8 @@ _OTHER_AUTHORITY = frozenset({7, 18, 19, 20, 21})
 _OTHER_NAME = frozenset({62, 64})
 """OpenSSL's numbers of what is wrong with a certificate."""
 
+_BY_ANOTHER_AUTHORITY = "the certificate is signed by another authority"
+
 
 def why_unreachable(endpoint: str, tls_files: TlsFiles | None, timeout_s: float) -> str | None:
     """Say why a service cannot be reached; never raises.
@@ -46,7 +49,7 @@ def why_unreachable(endpoint: str, tls_files: TlsFiles | None, timeout_s: float)
     Parameters
     ----------
     endpoint : str
-        In Zenoh's form. Over QUIC only the name and the robot's own credentials are looked at.
+        In Zenoh's form.
     tls_files : TlsFiles or None
         The robot's credentials.
     timeout_s : float
@@ -75,7 +78,7 @@ def why_unreachable(endpoint: str, tls_files: TlsFiles | None, timeout_s: float)
             if wrong is not None:
                 return wrong
         if place.protocol == "quic":
-            return None
+            return _connect_quic(place, tls_files, timeout_s)
         with socket.create_connection((place.host, place.port), timeout_s) as plain:
             if not place.is_encrypted:
                 return None
@@ -169,8 +172,6 @@ class MissingServices:
 def _unexplained(service: str) -> str:
     """Say what is known of a service that is missed although nothing wrong was found."""
     protocol = service.partition("/")[0]
-    if protocol == "quic":
-        return "its name and this robot's credentials are right, but it does not answer"
     or_tls = ", or speaks TLS (tls/...)" if protocol == "tcp" else ""
     return (
         "accepts connections, but does not answer as a holdfast service: it is none, is just "
@@ -183,6 +184,29 @@ def _connect_local(place: Endpoint, timeout_s: float) -> str | None:
         plain.settimeout(timeout_s)
         plain.connect(place.host)
     return None
+
+
+def _connect_quic(place: Endpoint, files: TlsFiles | None, timeout_s: float) -> str | None:
+    """Let Zenoh connect: nothing else here speaks QUIC. Its error has the words of its library."""
+    from holdfast.runtime.transport.zenoh_transport import connection_error
+
+    error = connection_error(place, files, timeout_s)
+    if error is None:
+        return None
+    # As with TLS, that comes after the robot's part of the handshake; not always with the reason.
+    if "by peer" in error or "connection lost" in error:
+        return "refuses this robot's certificate (is it of the same authority?)"
+    if "UnknownIssuer" in error:
+        return _BY_ANOTHER_AUTHORITY
+    if "not valid for name" in error:
+        names = re.findall(r"(?:DnsName|IpAddress)\(\"?([^)\"]*)\"?\)", error)
+        return _names_another(place, names)
+    found = re.search(r"invalid peer certificate: (.*?)(?: at /|$)", error)
+    if found is not None:
+        return f"the certificate is refused: {found[1]}"
+    if "deadline" in error or "timed out" in error:
+        return "nothing answers over QUIC"
+    return f"cannot be connected to: {error.partition(' at /')[0]}"
 
 
 def _own_credentials(files: TlsFiles) -> str | None:
@@ -219,10 +243,9 @@ def _shake_hands(
                 secure.recv(1)
     except ssl.SSLCertVerificationError as error:
         if error.verify_code in _OTHER_AUTHORITY:
-            return "the certificate is signed by another authority"
+            return _BY_ANOTHER_AUTHORITY
         if error.verify_code in _OTHER_NAME:
-            names = _names_of_certificate(context, place, timeout_s)
-            return f"the certificate does not name {place.host}{names}"
+            return _names_another(place, _names_of_certificate(context, place, timeout_s))
         return f"the certificate is refused: {error.verify_message}"
     except ssl.SSLError as error:
         alert = (error.reason or "").partition("_ALERT_")[2]
@@ -237,7 +260,7 @@ def _shake_hands(
     return None
 
 
-def _names_of_certificate(context: ssl.SSLContext, place: Endpoint, timeout_s: float) -> str:
+def _names_of_certificate(context: ssl.SSLContext, place: Endpoint, timeout_s: float) -> list[str]:
     """Connect once more, without looking at the name, to see which ones there are."""
     context.check_hostname = False
     with (
@@ -247,10 +270,15 @@ def _names_of_certificate(context: ssl.SSLContext, place: Endpoint, timeout_s: f
     ):
         shown = secure.getpeercert() or {}
         alternatives = shown.get("subjectAltName", ())
-        names = [str(entry[1]) for entry in alternatives if isinstance(entry, tuple)]
-        if names:
-            return f" (it names {', '.join(names[:8])}{', ...' if len(names) > 8 else ''})"
-    return ""
+        return [str(entry[1]) for entry in alternatives if isinstance(entry, tuple)]
+    return []
+
+
+def _names_another(place: Endpoint, names: Sequence[str]) -> str:
+    text = f"the certificate does not name {place.host}"
+    if not names:
+        return text
+    return f"{text} (it names {', '.join(names[:8])}{', ...' if len(names) > 8 else ''})"
 
 
 def _first_lower(text: str) -> str:

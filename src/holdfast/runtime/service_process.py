@@ -208,8 +208,10 @@ def _serve(options: argparse.Namespace) -> int:
     for text in (*listen, *connect):
         _check_safe(parse_endpoint(text), tls, insecure=options.insecure)
 
-    from holdfast.runtime.transport.zenoh_transport import ZenohServiceTransport
+    from holdfast.runtime.descriptors import NEEDED, allow_descriptors
+    from holdfast.runtime.transport.zenoh_transport import MAX_ROBOTS, ZenohServiceTransport
 
+    allow_descriptors(NEEDED + MAX_ROBOTS)
     boot = os.urandom(8).hex()
     transport = ZenohServiceTransport(
         options.name,

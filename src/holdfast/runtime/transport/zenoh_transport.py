@@ -74,7 +74,13 @@ from holdfast.runtime.transport.calls import (
 from holdfast.runtime.transport.contract import IncomingCall
 from holdfast.session.events import TransportEvent
 
-__all__ = ["KEY_VERSION", "ZenohRobotTransport", "ZenohServiceTransport"]
+__all__ = [
+    "KEY_VERSION",
+    "MAX_ROBOTS",
+    "ZenohRobotTransport",
+    "ZenohServiceTransport",
+    "connection_error",
+]
 
 KEY_VERSION = 1
 """Of the keys. The messages have a version of their own, which can be told to the other end."""
@@ -135,7 +141,7 @@ _FREE_PORT_ATTEMPTS = 8
 _MAX_BOOTS = 64
 """Incarnations of one service that a robot takes note of at the same time."""
 
-_MAX_ROBOTS = 4096
+MAX_ROBOTS = 4096
 """Links that a service accepts at the same time."""
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
@@ -893,9 +899,9 @@ def _opened(
             each if each.port or each.is_local_socket else each.with_port(free_port(each))
             for each in listen
         ]
-        configuration = _configuration(places, connect, access, lease_ms, max_received_bytes, tls)
+        settings = _settings(places, connect, access, lease_ms, max_received_bytes, tls)
         try:
-            return zenoh.open(configuration), places
+            return zenoh.open(zenoh.Config.from_json5(json.dumps(settings))), places
         except zenoh.ZError as error:
             # Somebody else may have taken the free port since.
             if any_port and "os error 98" in str(error) and attempt < _FREE_PORT_ATTEMPTS - 1:
@@ -913,6 +919,44 @@ def _reason(error: zenoh.ZError) -> str:
         return "another process listens there"
     found = re.search(r"([^:\[\]]+) \(os error \d+\)", text)
     return found[1].strip() if found else re.sub(r" at /\S+", "", text)
+
+
+def connection_error(endpoint: Endpoint, tls: TlsFiles | None, timeout_s: float) -> str | None:
+    """Connect once as a robot does, and hang up; return Zenoh's own words if that fails.
+
+    Parameters
+    ----------
+    endpoint : Endpoint
+    tls : TlsFiles or None
+        The robot's credentials.
+    timeout_s : float
+
+    Returns
+    -------
+    str or None
+        None if the link could be opened.
+    """
+    settings = _settings(
+        [],
+        [endpoint],
+        _access(coming=_FROM_SERVICE, going=_FROM_ROBOT),
+        1e3 * timeout_s,
+        _HEADER_BYTES,
+        tls,
+        open_timeout_ms=max(1, round(1e3 * timeout_s)),
+    )
+    # One attempt, whose error is told.
+    settings["connect"] = {
+        "endpoints": [str(endpoint)],
+        "exit_on_failure": True,
+        "timeout_ms": 0,
+    }
+    try:
+        session = zenoh.open(zenoh.Config.from_json5(json.dumps(settings)))
+    except zenoh.ZError as error:
+        return str(error)
+    _closed_aside(session)
+    return None
 
 
 def _access(*, coming: Sequence[str], going: Sequence[str]) -> dict[str, object]:
@@ -941,14 +985,15 @@ def _access(*, coming: Sequence[str], going: Sequence[str]) -> dict[str, object]
     }
 
 
-def _configuration(
+def _settings(
     listen: list[Endpoint],
     connect: list[Endpoint],
     access: dict[str, object],
     lease_ms: float,
     max_received_bytes: int,
     tls: TlsFiles | None,
-) -> zenoh.Config:
+    open_timeout_ms: int = _OPEN_TIMEOUT_MS,
+) -> dict[str, object]:
     link: dict[str, object] = {
         "protocols": sorted({endpoint.protocol for endpoint in [*listen, *connect]}),
         "tx": {
@@ -978,7 +1023,7 @@ def _configuration(
         "period_max_ms": _RETRY_MAX_MS,
         "period_increase_factor": 2,
     }
-    settings = {
+    return {
         "mode": "peer",
         "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
         "listen": {"endpoints": [str(endpoint) for endpoint in listen], "exit_on_failure": True},
@@ -991,12 +1036,11 @@ def _configuration(
         "access_control": access,
         "transport": {
             "unicast": {
-                "open_timeout": _OPEN_TIMEOUT_MS,
-                "accept_timeout": _OPEN_TIMEOUT_MS,
-                "max_sessions": _MAX_ROBOTS,
+                "open_timeout": open_timeout_ms,
+                "accept_timeout": open_timeout_ms,
+                "max_sessions": MAX_ROBOTS,
             },
             "shared_memory": {"enabled": False},
             "link": link,
         },
     }
-    return zenoh.Config.from_json5(json.dumps(settings))

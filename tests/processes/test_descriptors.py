@@ -1,0 +1,70 @@
+"""Commands that may have few files and sockets open: they work, or say so before they begin."""
+
+from __future__ import annotations
+
+import resource
+
+import pytest
+from tests.ports import free_port
+from tests.processes.faults import (
+    COMMAND,
+    LOCAL_RECOVERY,
+    LOST,
+    References,
+    Site,
+    Story,
+    document_of,
+)
+
+from holdfast.runtime.descriptors import NEEDED
+from holdfast.runtime.transport.zenoh_transport import MAX_ROBOTS
+
+PEG = "peg_in_hole_2d"
+
+
+def limited(limits: str, *command: str) -> tuple[str, ...]:
+    """Return a command under limits as the shell's ``ulimit`` takes them."""
+    return ("sh", "-c", f'ulimit {limits} && exec "$@"', "sh", *command)
+
+
+@pytest.mark.parametrize("number", [8, 9, 10, 12, NEEDED - 1])
+@pytest.mark.parametrize("command", ["run", "serve"])
+def test_too_few_are_refused_in_one_line(site: Site, command: str, number: int) -> None:
+    port = free_port()
+    arguments = ["serve", "--listen", f"tcp/127.0.0.1:{port}"]
+    if command == "run":
+        file = site.configure(document_of(PEG))
+        arguments = ["run", str(file), "--out", "out", "--service", f"tcp/127.0.0.1:{port}"]
+    ended = site.process(*limited(f"-n {number}", *COMMAND, *arguments))
+    assert ended.wait() == 2, ended.account()
+    (line,) = ended.output.splitlines()
+    assert line.startswith(f"holdfast: error: this process may have {number} files")
+    assert "RLIMIT_NOFILE" in line
+    assert f"ulimit -n {NEEDED}" in line
+    assert not (site.directory / "out").exists()
+
+
+def test_as_many_as_are_needed_are_enough(site: Site, references: References) -> None:
+    """For a robot whose service dies and that launches its own, and for both services."""
+    cloud = site.service()
+    cloud.command = limited(f"-n {NEEDED}", *cloud.command)
+    cloud.start()
+    story = Story(site, references, document_of(PEG))
+    story.at("perform", 30, cloud.kill, story.status(LOCAL_RECOVERY))
+    robot = site.run(story.file, services=[cloud], command=limited(f"-n {NEEDED}", *COMMAND))
+    story.finish(robot)
+    assert robot.statuses() == [LOST]
+    assert cloud.process.matching("session_opened")
+
+
+def test_a_service_takes_what_it_is_allowed(site: Site, references: References) -> None:
+    """Each robot is a socket: a soft limit is raised as far as the hard one allows."""
+    hard = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
+    cloud = site.service()
+    cloud.command = limited("-S -n 12", *cloud.command)
+    cloud.start()
+    wanted = NEEDED + MAX_ROBOTS
+    soft = wanted if hard == resource.RLIM_INFINITY else min(wanted, hard)
+    assert resource.prlimit(cloud.process.pid, resource.RLIMIT_NOFILE) == (soft, hard)
+    robot = Story(site, references, document_of(PEG)).run(cloud)
+    assert robot.statuses() == []
