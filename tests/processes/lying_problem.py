@@ -32,9 +32,9 @@ class LyingPeg(PegInHole2D):
         # What is sensed is chosen by the actions of all particles; what is done, by one state's.
         many = states.ndim > 1 and len(states) > 1
         if os.environ.get(VARIABLE) == "sensing" and many:
-            return actions * np.array([0.0, 0.0, 1.0])  # as if the angle alone mattered
+            return np.asarray(actions * np.array([0.0, 0.0, 1.0]))  # as if the angle alone mattered
         return actions
 
     def execute(self, actions: FloatArray) -> FloatArray:
         factor = {"far": 77.7, "half": 0.5}.get(os.environ.get(VARIABLE, ""), 1.0)
-        return factor * super().execute(actions)
+        return np.asarray(factor * super().execute(actions))

@@ -21,10 +21,10 @@ from holdfast.cli.terminal import _summary_rows
 from holdfast.configuration import Configuration, load
 from holdfast.files import OutputError, write_atomically
 from holdfast.outcome import Decisions, TrialResult
-from holdfast.planning import Planner
+from holdfast.planning import Planner, digest
 from holdfast.recording.figure import _draw_workspace, trial_figure
 from holdfast.recording.journal import Journal
-from holdfast.recording.recorder import MAX_PARTICLES_KEPT, Recorder
+from holdfast.recording.recorder import MAX_PARTICLES_KEPT, RecordedEnvironment, Recorder
 from holdfast.recording.run_directory import (
     RunDirectory,
     claim_default_directory,
@@ -38,8 +38,15 @@ from holdfast.recording.tables import (
     wilson_interval,
 )
 from holdfast.recording.timings import AnswerCounts
-from holdfast.runtime.trial import run_trial
-from holdfast.session.records import PausedRecord
+from holdfast.runtime.trial import NullObserver, SensingStep, TaskStep, run_trial
+from holdfast.session.records import (
+    ActingRecord,
+    ObservedRecord,
+    PausedRecord,
+    PerformedRecord,
+    Record,
+    RecordError,
+)
 from holdfast.session.robot import replay
 from holdfast.settings import EnvironmentSettings
 
@@ -70,7 +77,12 @@ def result_of(
 
 
 def configuration_of(
-    tmp_path: Path, *, seed: int = 5, tolerance: float = 0.1, num_particles: int = 30
+    tmp_path: Path,
+    *,
+    seed: int = 5,
+    tolerance: float = 0.1,
+    num_particles: int = 30,
+    max_steps: int = 30,
 ) -> Configuration:
     path = tmp_path / "peg.yaml"
     path.write_text(
@@ -78,7 +90,7 @@ def configuration_of(
         f"model: {{hole_tolerance: {tolerance}}}\n"
         f"particle_filter: {{num_particles: {num_particles}}}\n"
         "active_sensing: {num_observation_samples: 2, num_cores: 1}\n"
-        f"simulator: {{num_trials: 3, max_steps: 30, seed: {seed}}}\n"
+        f"simulator: {{num_trials: 3, max_steps: {max_steps}, seed: {seed}}}\n"
     )
     return load(path)
 
@@ -295,6 +307,19 @@ class TestTables:
         assert summary.success_rate == pytest.approx(0.25)
         assert summary.mean_reward_of_successes == pytest.approx(-1.0)
         assert dict(_summary_rows(summary))["failed"] == "2 of 4 trials"
+
+    def test_the_mean_of_rewards_that_are_not_there_is_none(self) -> None:
+        """A trial without a reward has not earned 0."""
+        without = msgspec.structs.replace(result_of(1, success=False), reward=None)
+        builder = SummaryBuilder()
+        builder.add(result_of(0, reward=-1.0))
+        builder.add(without)
+        summary = builder.build(problem="p", seed=5, version="1", trials=2, wall_time_s=2.0)
+        assert summary.mean_reward is None
+        assert summary.mean_reward_of_successes == -1.0
+        assert "mean reward" not in dict(_summary_rows(summary))
+        (row,) = csv.DictReader(csv_lines([without]))
+        assert row["reward"] == ""
 
     def test_who_decided_is_told_where_it_is_known(self) -> None:
         builder = SummaryBuilder()
@@ -578,6 +603,91 @@ class TestRecorder:
         configuration = configuration_of(tmp_path, num_particles=2 * MAX_PARTICLES_KEPT + 1)
         before = self.record(configuration).record.sensing[0].before
         assert MAX_PARTICLES_KEPT // 2 < len(before) <= MAX_PARTICLES_KEPT
+
+
+class _Journalling(NullObserver):
+    """Writes down what a robot writes down."""
+
+    def __init__(self) -> None:
+        self.records: list[Record] = []
+
+    def sensed(self, step: SensingStep) -> None:
+        data = np.asarray(step.observation, dtype="<f8").tobytes()
+        record = ObservedRecord(step.before.step, step.sensing_action, data, digest(step.after), 0)
+        self.records.append(record)
+
+    def acted(self, step: TaskStep) -> None:
+        data = np.asarray(step.executed, dtype="<f8").tobytes()
+        self.records.append(ActingRecord(step.state.step, data))
+        self.records.append(PerformedRecord(step.state.step, step.reward))
+
+
+class TestRecordedEnvironment:
+    """What was observed, given to the same planner, leads to the same beliefs."""
+
+    @staticmethod
+    def again(
+        configuration: Configuration, records: list[Record], result: TrialResult
+    ) -> tuple[Recorder, TrialResult]:
+        recorder = Recorder(result.trial)
+        found = run_trial(
+            configuration.problem,
+            configuration.planning,
+            configuration.simulator,
+            result.trial,
+            RecordedEnvironment(records, result),
+            recorder,
+        )
+        return recorder, found
+
+    @staticmethod
+    def first(configuration: Configuration) -> tuple[list[Record], TrialResult]:
+        journalling = _Journalling()
+        result = run_trial(
+            configuration.problem,
+            configuration.planning,
+            configuration.simulator,
+            1,
+            observer=journalling,
+        )
+        return journalling.records, result
+
+    @pytest.mark.parametrize("max_steps", [20, 500])
+    def test_the_beliefs_are_those_of_the_trial(self, tmp_path: Path, max_steps: int) -> None:
+        configuration = configuration_of(tmp_path, max_steps=max_steps)
+        records, result = self.first(configuration)
+        assert result.success == (max_steps == 500)
+        # The last performance is not written down on its own: the result says all of it.
+        recorder, again = self.again(configuration, records[:-1], result)
+        assert again.digest == result.digest
+        assert (again.success, again.steps) == (result.success, result.steps)
+        expected = TestRecorder.record(configuration).record
+        record = recorder.record
+        assert np.array_equal(record.estimates, expected.estimates)
+        assert np.array_equal(record.standard_deviations, expected.standard_deviations)
+        for seen, known in zip(record.sensing, expected.sensing, strict=True):
+            assert np.array_equal(seen.after, known.after)
+        assert record.true_states == []
+        assert record.rewards[:-1] == expected.rewards[:-1]
+        trial_figure(configuration, record, tmp_path / "trial.png")
+        assert (tmp_path / "trial.png").read_bytes().startswith(b"\x89PNG\r\n")
+
+    def test_a_failure_is_one_again(self, tmp_path: Path) -> None:
+        configuration = configuration_of(tmp_path)
+        records, result = self.first(configuration)
+        failed = msgspec.structs.replace(result, success=False, failed=True, steps=4)
+        _, again = self.again(configuration, records, failed)
+        assert (again.failed, again.steps) == (True, 4)
+
+    def test_what_was_decided_otherwise_is_refused(self, tmp_path: Path) -> None:
+        configuration = configuration_of(tmp_path)
+        records, result = self.first(configuration)
+        observed = records[0]
+        assert isinstance(observed, ObservedRecord)
+        other = msgspec.structs.replace(observed, sensing_action=observed.sensing_action ^ 1)
+        for spoilt in ([other, *records[1:]], records[:20], records[1:]):
+            with pytest.raises(RecordError, match="trial 1 is decided otherwise at step"):
+                self.again(configuration, spoilt, result)
 
 
 class TestFigure:

@@ -66,7 +66,8 @@ from holdfast.user_code import account_of_user_error, describe_problem_error
 
 __all__ = ["Launcher", "RobotProcess", "StepJournal", "opening_of"]
 
-_LONGEST_SLEEP_S = 3600.0  # the platform's clocks have limits of their own
+_LONGEST_SLEEP_S = 1.0
+"""A signal that comes just before the loop sleeps does not wake it; this late it is heard."""
 
 _DEAF_S = 0.005
 """When the loop did not listen for longer than this, no service is blamed for that time."""
@@ -318,11 +319,10 @@ class RobotProcess:
         while not self._ended:
             wake_at = robot.next_wakeup()
             try:
-                if wake_at is None:
-                    came_at, event = self._queue.get()
-                else:
-                    timeout_s = min(max(0.0, wake_at - monotonic()), _LONGEST_SLEEP_S)
-                    came_at, event = self._queue.get(timeout=timeout_s)
+                timeout_s = _LONGEST_SLEEP_S
+                if wake_at is not None:
+                    timeout_s = min(max(0.0, wake_at - monotonic()), timeout_s)
+                came_at, event = self._queue.get(timeout=timeout_s)
             except Empty:
                 began = monotonic()
                 if wake_at is not None and began - wake_at > _DEAF_S:
