@@ -373,11 +373,11 @@ _defect(
     ),
     Edit(
         Question,
-        "take_sensing",
+        "read_sensing",
         "if self.task_count == 0 and reply.digest != self.digest:",
         "if False:",
     ),
-    Edit(Question, "take_sensing", "if reply.step != self.sensing_step:", "if False:"),
+    Edit(Question, "read_sensing", "if reply.step != self.sensing_step:", "if False:"),
     Edit(
         Robot,
         "_next_sensing",
@@ -496,8 +496,8 @@ _defect(
     Edit(
         Dispatcher,
         "_appeared",
-        "if self.status is Status.LOCAL_RECOVERY and question is not None:",
-        "if False:",
+        "self.status is Status.LOCAL_RECOVERY\nand question",
+        "False\nand question",
     ),
 )
 _defect(
