@@ -304,6 +304,17 @@ class TestProcesses:
         assert unfinished is not None
         assert unfinished.is_complete
 
+    def test_a_count_that_cannot_be_removed_is_no_trouble(self, path: Path) -> None:
+        """As where the directory may not be written any more."""
+        with Journal.create(path, {}) as journal:
+            journal.append(TRIAL, records_of(0))
+            count = path.with_name("journal.sqlite-count")
+            count.unlink()
+            count.mkdir()
+        unfinished = unfinished_of(path)
+        assert unfinished is not None
+        assert unfinished.is_complete
+
     def test_a_finished_trial_leaves_no_count(self, killed: Path, tmp_path: Path) -> None:
         path = copy_of(killed, tmp_path)
         with Journal.open(path) as journal:

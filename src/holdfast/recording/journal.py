@@ -243,12 +243,12 @@ class Journal:
             if check:
                 journal.check()
             journal._write_ahead()
-            identity = _identity(path)
             journal._note_places()
         except BaseException:
             journal.close()
             raise
         journal._close.callback(journal._leave_one_file)
+        identity = journal._in_place[0][1]
         _open_here[identity] = journal
         journal._close.callback(_open_here.pop, identity, None)
         return journal
@@ -307,7 +307,7 @@ class Journal:
     def _leave_one_file(self) -> None:
         """Move the log into the main file: a plain file can be read by anything."""
         # It does no harm if this fails: the next one to open the journal does it.
-        with contextlib.suppress(sqlite3.Error, OutputError):
+        with contextlib.suppress(sqlite3.Error, OSError, OutputError):
             needless = False
             # Only who has written the count may say that it is needed no more: if records were
             # lost before, whoever comes next must find that out as well.
@@ -328,8 +328,10 @@ class Journal:
     def _note_places(self) -> None:
         # Absolute, for the user's code may change the current directory.
         path = self.path.absolute()
-        for place in (path, _log_path(path)):
-            self._in_place.append((place, _identity(place)))
+        try:
+            self._in_place = [(place, _identity(place)) for place in (path, _log_path(path))]
+        except OSError as error:
+            raise OutputError(f"{error.filename}: cannot be read: {error.strerror}") from error
 
     def _require_in_place(self) -> None:
         """Find out whether what is written is still to be found under its name.
