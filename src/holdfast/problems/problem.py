@@ -202,8 +202,9 @@ class ProblemBase:
     """Defaults for the optional members of :class:`Problem`.
 
     A subclass sets ``name``, ``state_size``, ``action_size``, ``sensing_actions``, ``resolution``
-    and ``motion_variance`` and writes ``initial_states``, ``move``, ``observation_mean``,
-    ``observation_variance``, ``policy`` and ``is_goal``.
+    and ``motion_variance`` and writes ``initial_states``, ``move``, ``policy``, ``is_goal`` and
+    either ``observation_mean`` and ``observation_variance`` or ``log_likelihood`` and
+    ``sample_observation`` (:class:`GeneralObservationProblem`).
     """
 
     name: str = ""
