@@ -13,15 +13,17 @@ that are compiled and have no source here, and other packages that are installed
 
 from __future__ import annotations
 
-import ast
 import functools
 import hashlib
 import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from holdfast import __version__, _kernel
-from holdfast.user_code import is_users_file
+
+if TYPE_CHECKING:
+    import ast
 
 __all__ = ["core_version", "follow_imports", "problem_digest", "problem_sources"]
 
@@ -110,6 +112,9 @@ def _places_from(name: str, file: Path) -> Callable[[str], Path | None]:
 
 def _is_beside(path: Path) -> bool:
     """Tell whether a source is a user's: in a folder of libraries, others' lie beside it."""
+    # A service that starts has no need of it, and a robot may wait for that service.
+    from holdfast.user_code import is_users_file
+
     return is_users_file(str(path))
 
 
@@ -159,6 +164,8 @@ def follow_imports(
 
 def _imported_by(path: Path, name: str, *, places: bool) -> list[str]:
     """Return the names that a module imports, and what may be a module's among those."""
+    import ast
+
     try:
         nodes = ast.walk(ast.parse(path.read_bytes()))
     except (SyntaxError, ValueError):

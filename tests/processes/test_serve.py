@@ -27,6 +27,7 @@ from holdfast.runtime.endpoints import PrivateSocket, ServiceAddress, TlsFiles
 from holdfast.runtime.transport.zenoh_transport import ZenohRobotTransport
 from holdfast.session.events import Appeared, Ended, Replied, TransportEvent, Vanished
 from holdfast.session.messages import (
+    PROTOCOL_VERSION,
     NeedState,
     Progress,
     Refused,
@@ -58,6 +59,24 @@ class Busy(CapsuleRobot):
             pass
         return super().policy(states, stage)
 """
+
+
+def robot_of_busy(directory: Path) -> Robot:
+    """Write that problem's module, and return a robot that has it."""
+    (directory / "busy_problem.py").write_text(BUSY)
+    program = (
+        "from holdfast.problems.registry import problem_class\n"
+        "from holdfast.source_digest import problem_digest\n"
+        "print(problem_digest(problem_class('busy_problem:Busy')))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=directory, capture_output=True, text=True, check=True
+    )
+    robot = Robot()
+    robot.opening = msgspec.structs.replace(
+        robot.opening, problem="busy_problem:Busy", problem_digest=done.stdout.strip()
+    )
+    return robot
 
 
 class Served:
@@ -220,7 +239,9 @@ class TestServing:
         assert "Traceback" not in log
 
     def test_a_large_message_that_is_no_request_disturbs_nobody(self) -> None:
-        hostile = sealed(b"\xdd" + (10**7).to_bytes(4, "big") + b"\x02" + b"\x90" * 10**7)
+        hostile = sealed(
+            b"\xdd" + (10**7).to_bytes(4, "big") + bytes([PROTOCOL_VERSION]) + b"\x90" * 10**7
+        )
         with (
             served(*ANYWHERE) as service,
             robots_end(service.endpoint) as attacker,
@@ -253,9 +274,7 @@ class TestServing:
                 assert content(end.ask(encode(robot.restore()))) == robot.right_answer()
 
     def test_killed_while_it_computes(self, tmp_path: Path) -> None:
-        (tmp_path / "busy_problem.py").write_text(BUSY)
-        robot = Robot()
-        robot.opening = msgspec.structs.replace(robot.opening, problem="busy_problem:Busy")
+        robot = robot_of_busy(tmp_path)
         with (
             served(*ANYWHERE, "--problem", "busy_problem:Busy", directory=tmp_path) as service,
             robots_end(service.endpoint) as end,
@@ -274,9 +293,7 @@ class TestServing:
             assert {type(event) for event in ended} == {Vanished, Ended}
 
     def test_stops_in_order_while_it_computes(self, tmp_path: Path) -> None:
-        (tmp_path / "busy_problem.py").write_text(BUSY)
-        robot = Robot()
-        robot.opening = msgspec.structs.replace(robot.opening, problem="busy_problem:Busy")
+        robot = robot_of_busy(tmp_path)
         arguments = ["--problem", "busy_problem:Busy", "--problem-directory", str(tmp_path)]
         directory = tmp_path / "elsewhere"
         directory.mkdir()
@@ -287,6 +304,8 @@ class TestServing:
             end.appeared()
             end.send(encode(robot.request()))
             event = end.events.get(timeout=PATIENCE_S)  # a sign: it is in work
+            assert isinstance(event, Replied)
+            assert isinstance(decode_reply(event.payload), Progress)
             code, log = service.end()
             assert code == 0, log
             assert "Fatal" not in log

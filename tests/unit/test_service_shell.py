@@ -15,7 +15,7 @@ from typing import Any
 
 import msgspec
 import pytest
-from tests.unit.test_session_service import Robot, content, planning_of
+from tests.unit.test_session_service import CODE, Robot, content, planning_of
 
 from holdfast.errors import ConfigurationError, OtherCodeError, UnknownProblemError
 from holdfast.problems import registry
@@ -96,9 +96,6 @@ class Held(CapsuleRobot):
         assert self.let_go.wait(PATIENCE_S)
         return super().policy(states, stage)
 
-
-CODE = core_version(), problem_digest(object)
-"""Of a problem that is one of holdfast's."""
 
 HELD_OPENING = Opening("held", {}, {}, planning_of(), 5)
 

@@ -66,8 +66,13 @@ from holdfast.settings import (
     PlanningSettings,
     SelectorSettings,
 )
+from holdfast.source_digest import core_version, problem_digest
 
 PROBLEMS = ("peg_in_hole_2d", "multitier_peg_in_hole_2d", "capsule_robot", "peg_in_hole_3d")
+
+
+CODE = core_version(), problem_digest(object)
+"""Of a problem that is one of holdfast's."""
 
 
 def planning_of(interval: int = 3, particles: int = 20, **sensing: Any) -> PlanningSettings:
@@ -160,7 +165,8 @@ class Robot:
         key: int = 1,
         seed: int = 5,
     ) -> None:
-        self.opening = Opening(problem, {}, {}, planning or planning_of(), seed)
+        planning = planning or planning_of()
+        self.opening = Opening(problem, {}, {}, planning, seed, *CODE)
         self.problem = make_problem(self.opening)
         self.session = key.to_bytes(16, "big")
         self.epoch = 1

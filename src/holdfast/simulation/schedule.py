@@ -35,6 +35,7 @@ __all__ = [
     "KillRobot",
     "LaunchFault",
     "MessageFault",
+    "OutOfMemory",
     "PauseRobot",
     "RunSettings",
     "Schedule",
@@ -199,6 +200,18 @@ class Slow(_Item, frozen=True, kw_only=True, tag="slow", tag_field="item"):
     factor: Annotated[float, msgspec.Meta(ge=1.0, le=2000.0)]
 
 
+class OutOfMemory(_Item, frozen=True, kw_only=True, tag="out_of_memory", tag_field="item"):
+    """A service has no memory for one part of an answer, for a while.
+
+    It is told in stories and never drawn: for long enough it ends a run whose services have none.
+    """
+
+    service: Service
+    at: Seconds
+    for_s: Seconds
+    part: Literal["task", "sensing"] = "sensing"
+
+
 class Cut(_Item, frozen=True, kw_only=True, tag="cut", tag_field="item"):
     """Nothing gets through between the robot and a service, in one direction or both."""
 
@@ -325,6 +338,7 @@ Fault: TypeAlias = (
     Crash
     | Stop
     | Slow
+    | OutOfMemory
     | Cut
     | Crowd
     | MessageFault

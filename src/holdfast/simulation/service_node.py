@@ -9,7 +9,7 @@ from holdfast.problems.problem import Problem
 from holdfast.session.messages import Opening
 from holdfast.session.service import Service
 from holdfast.session.service_effects import Answer, Effect, End, Run
-from holdfast.session.service_jobs import Job
+from holdfast.session.service_jobs import Job, Outcome
 from holdfast.session.service_limits import ServiceLimits
 from holdfast.simulation.agenda import Agenda, Clock
 from holdfast.simulation.memory import RememberedJobs
@@ -44,6 +44,8 @@ class ServiceNode:
         Whether it runs, and whether it is stopped.
     slowness : float
         Factor of what it takes to compute.
+    lacks_memory_for : list of str
+        Parts of an answer for which it has no memory, each as often as there is a reason.
     """
 
     def __init__(
@@ -77,6 +79,7 @@ class ServiceNode:
         self.up = False
         self.stopped = False
         self.slowness = 1.0
+        self.lacks_memory_for: list[str] = []
 
     # -- its life --------------------------------------------------------------------------------
 
@@ -150,7 +153,11 @@ class ServiceNode:
             self._deferred.append((self._finish, (life, job)))
             return
         assert self.machine is not None
-        outcome = self._jobs.outcome(job)
+        if job.kind in self.lacks_memory_for:
+            text = f"out of memory for a {job.kind} part"
+            outcome = Outcome(failure=("out_of_memory", text), problem=self._problem)
+        else:
+            outcome = self._jobs.outcome(job)
         self._carry_out(self.machine.finished(job, outcome, self._clock.now()))
 
     def _tick(self, life: int, due: float) -> None:

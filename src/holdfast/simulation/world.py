@@ -36,6 +36,7 @@ from holdfast.simulation.schedule import (
     KillRobot,
     LaunchFault,
     MessageFault,
+    OutOfMemory,
     PauseRobot,
     Schedule,
     Slow,
@@ -65,6 +66,9 @@ _MAX_MESSAGES = 5_000
 
 _CROWD_IS_FELT_S = 1.0
 """So long after its end our robot may still wait, because it was told to come back later."""
+
+_IS_ASKED_AGAIN_S = 1.0
+"""So long after it has memory again a service may still be left alone."""
 
 _LAUNCH_TIMEOUT_S = 5.0
 _SIZES_EACH = 500
@@ -318,6 +322,8 @@ class _World:
                 self._agenda.at(fault.at, self._stop, fault)
             elif isinstance(fault, Slow):
                 self._agenda.at(fault.at, self._slow, fault)
+            elif isinstance(fault, OutOfMemory):
+                self._agenda.at(fault.at, self._exhaust, fault)
             elif isinstance(fault, Cut):
                 self._agenda.at(fault.at, self._cut, fault)
             elif isinstance(fault, Crowd):
@@ -428,6 +434,17 @@ class _World:
         slownesses = self._slownesses[service.name]
         slownesses.remove(factor)
         service.slowness = max(slownesses, default=1.0)
+
+    def _exhaust(self, fault: OutOfMemory) -> None:
+        service = self._services[fault.service]
+        self._happened(fault, fault.for_s + _IS_ASKED_AGAIN_S)
+        self.noted(fault.service, "has no memory for %s parts", fault.part)
+        service.lacks_memory_for.append(fault.part)
+        self._agenda.after(fault.for_s, self._relieve, service, fault.part)
+
+    def _relieve(self, service: ServiceNode, part: str) -> None:
+        service.lacks_memory_for.remove(part)
+        self.noted(service.name, "has memory for %s parts again", part)
 
     def _cut(self, fault: Cut) -> None:
         self._happened(fault, fault.for_s + self._run.lease_s)
