@@ -21,6 +21,7 @@ import pytest
 from holdfast.files import OutputError
 from holdfast.runtime.logs import (
     MAX_LINE_BYTES,
+    BoundedEventLog,
     EventLog,
     EventSink,
     LogFormat,
@@ -347,6 +348,67 @@ class TestTargets:
             output, _ = process.communicate("\n", timeout=60)
         assert output == "alive 1\n"
         assert process.returncode == 0
+
+
+class Told:
+    """Keeps what is handed on."""
+
+    def __init__(self) -> None:
+        self.events: list[tuple[str, dict[str, object]]] = []
+        self.closed = False
+
+    def event(self, name: str, /, **fields: object) -> None:
+        self.events.append((name, fields))
+
+    def close(self) -> None:
+        self.closed = True
+
+
+class TestRepeatedEvents:
+    def test_of_each_kind_and_service_one_a_second_after_a_burst(self) -> None:
+        now, told = [0.0], Told()
+        log = BoundedEventLog(told, lambda: now[0])
+        for number in range(1000):
+            log.event("refused", service="east", number=number)
+            log.event("refused", service="west", number=number)
+            log.event("status", service="east", number=number)
+            log.event("holding", number=number)
+        burst = [
+            fields["number"] for name, fields in told.events if fields.get("service") == "west"
+        ]
+        assert burst == list(range(20))
+        assert sum(name == "status" for name, _ in told.events) == 1000
+        assert sum(name == "holding" for name, _ in told.events) == 1000
+        told.events.clear()
+        # The last that was left out is told when its time has come, with the number of the others.
+        now[0] = 1.0
+        log.event("holding", number=1000)
+        assert told.events == [
+            ("refused", {"service": service, "number": 999, "similar_lines_omitted": 979})
+            for service in ("east", "west")
+        ] + [("holding", {"number": 1000})]
+        told.events.clear()
+        log.event("refused", service="east", number=1000)
+        log.event("refused", service="east", number=1001)
+        now[0] = 2.5
+        log.event("refused", service="east", number=1002)
+        log.event("refused", service="east", number=1003)
+        log.close()
+        assert told.events == [
+            ("refused", {"service": "east", "number": 1001, "similar_lines_omitted": 1}),
+            ("refused", {"service": "east", "number": 1003, "similar_lines_omitted": 1}),
+        ]
+        assert told.closed
+
+    def test_what_is_rare_is_told_at_once(self) -> None:
+        now, told = [0.0], Told()
+        log = BoundedEventLog(told, lambda: now[0])
+        for number in range(100):
+            log.event("refused", service="east", number=number)
+            now[0] += 1.0
+        assert told.events == [
+            ("refused", {"service": "east", "number": number}) for number in range(100)
+        ]
 
 
 class TestOthers:

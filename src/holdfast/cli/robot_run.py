@@ -101,7 +101,7 @@ def run_as_robot(
     from holdfast.recording.run_directory import EVENTS_NAME, TIMINGS_NAME, VERIFICATION_NAME
     from holdfast.recording.timings import TimingTable, VerificationTable
     from holdfast.runtime.links import make_links
-    from holdfast.runtime.logs import EventLog, TeeEventLog
+    from holdfast.runtime.logs import BoundedEventLog, EventLog, TeeEventLog
     from holdfast.runtime.robot_process import RobotProcess
 
     with contextlib.ExitStack() as stack:
@@ -113,7 +113,7 @@ def run_as_robot(
         ]
         if not quiet:
             sinks.append(EventLog(sys.stderr, format=log_format, component="robot"))
-        events = TeeEventLog(*sinks)
+        events = BoundedEventLog(TeeEventLog(*sinks))
         stack.callback(events.close)
         links = make_links(configuration, directory.path / RECOVERY_LOG_NAME, events)
         stack.callback(links.close)

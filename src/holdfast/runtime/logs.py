@@ -18,22 +18,23 @@ resumed_trial, performed_unseen, trial, missed_ticks, stopped, note, interrupted
 By a service: ready, session_opened, session_taken_over, restored, refused, busy, evicted, stopping.
 By ``holdfast chaos``: chaos_trial, left_out, note, interrupted. By a command that ends with an
 error: error. Fields with a place of their own in the text form: ``from`` and ``to`` (of a change),
-``service``, ``reason``, ``duration_ms``. Events that may come very often are written at most once
-in a while; the next such line then says how many were left out, as ``similar_lines_omitted``.
+``service``, ``reason``, ``duration_ms``. Events that may come very often are written about once a
+second; the next such line then says how many were left out, as ``similar_lines_omitted``.
 """
 
 from __future__ import annotations
 
+import math
 import os
 import stat
 import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Hashable, Iterable, Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import Literal, Protocol, Self, TextIO, TypeAlias
+from typing import Literal, NamedTuple, Protocol, Self, TextIO, TypeAlias
 
 import msgspec
 
@@ -41,7 +42,10 @@ from holdfast.files import OutputError
 
 __all__ = [
     "MAX_LINE_BYTES",
+    "BoundedEventLog",
+    "CountedEvent",
     "EventLog",
+    "EventRates",
     "EventSink",
     "LogFormat",
     "NullEventLog",
@@ -61,6 +65,12 @@ _MAX_WAITING_LINES = 10_000
 """Lines that wait for a terminal that is not being read; further ones are lost, and counted."""
 
 _FLUSH_S = 0.5
+
+_REPEATED_S = 1.0
+"""Repeated events of one kind are told this often."""
+
+_BURST = 20
+"""So many of one kind, about one service, are told at once: more than an honest service causes."""
 
 _ROBOT = "robot"
 _COMPONENT_WIDTH = 8
@@ -113,6 +123,146 @@ class TeeEventLog:
         """Close all of them."""
         for sink in self._sinks:
             sink.close()
+
+
+class CountedEvent(NamedTuple):
+    """An event, and how many of its kind were left out before it."""
+
+    name: str
+    fields: Mapping[str, object]
+    omitted: int
+
+    def told(self) -> dict[str, object]:
+        """Return its fields, and the number if there is one."""
+        more = {"similar_lines_omitted": self.omitted} if self.omitted else {}
+        return {**self.fields, **more}
+
+
+class _Rate:
+    """Of one kind of event."""
+
+    __slots__ = ("allowance", "last", "omitted", "updated_at")
+
+    def __init__(self, burst: int, now: float) -> None:
+        self.allowance = float(burst)
+        self.updated_at = now
+        self.omitted = 0
+        self.last: tuple[str, Mapping[str, object]] | None = None
+
+
+class EventRates:
+    """Lets events of one kind through about once a second, and counts those in between.
+
+    What another machine can bring about, it can bring about a thousand times a second.
+
+    Parameters
+    ----------
+    burst : int
+        So many of a kind may come at once.
+    """
+
+    def __init__(self, burst: int) -> None:
+        self._burst = burst
+        self._rates: dict[Hashable, _Rate] = {}
+
+    def admit(
+        self, kind: Hashable, name: str, fields: Mapping[str, object], now: float
+    ) -> int | None:
+        """Tell whether an event is to be told now.
+
+        Parameters
+        ----------
+        kind : hashable
+            Those of one kind are counted together.
+        name : str
+        fields : mapping
+        now : float
+            In seconds.
+
+        Returns
+        -------
+        int or None
+            How many were left out before this one; None if it is left out itself.
+        """
+        rate = self._rates.get(kind)
+        if rate is None:
+            rate = self._rates[kind] = _Rate(self._burst, now)
+        earned = (now - rate.updated_at) / _REPEATED_S
+        rate.allowance = min(float(self._burst), rate.allowance + earned)
+        rate.updated_at = now
+        if rate.allowance < 1.0:
+            rate.omitted += 1
+            rate.last = name, fields
+            return None
+        rate.allowance -= 1.0
+        omitted, rate.omitted, rate.last = rate.omitted, 0, None
+        return omitted
+
+    def next_due(self) -> float | None:
+        """Return when :meth:`due` will have something; None if nothing is left out."""
+        times = [self._due_at(rate) for rate in self._rates.values() if rate.last is not None]
+        return min(times, default=None)
+
+    def due(self, now: float) -> list[CountedEvent]:
+        """Return, of each kind of which some were left out, the last one, once its time has come.
+
+        Parameters
+        ----------
+        now : float
+            Infinite for all of them.
+        """
+        told = []
+        for rate in self._rates.values():
+            if rate.last is not None and self._due_at(rate) <= now:
+                told.append(CountedEvent(*rate.last, rate.omitted - 1))
+                rate.allowance, rate.updated_at = 0.0, now
+                rate.omitted, rate.last = 0, None
+        return told
+
+    @staticmethod
+    def _due_at(rate: _Rate) -> float:
+        return rate.updated_at + (1.0 - rate.allowance) * _REPEATED_S
+
+
+class BoundedEventLog:
+    """Hands on what concerns a service only so often: no service can fill a robot's log.
+
+    Changes of status are all handed on.
+
+    Parameters
+    ----------
+    sink : EventSink
+    clock : callable
+        Returns seconds.
+    """
+
+    def __init__(self, sink: EventSink, clock: Callable[[], float] = time.monotonic) -> None:
+        self._sink = sink
+        self._clock = clock
+        # Taken again by the same thread if a signal's handler reports an event.
+        self._lock = threading.RLock()
+        self._rates = EventRates(_BURST)
+
+    def event(self, name: str, /, **fields: object) -> None:
+        """Hand an event on, or count it."""
+        with self._lock:
+            now = self._clock()
+            self._tell(self._rates.due(now))
+            omitted: int | None = 0
+            if "service" in fields and name != "status":
+                omitted = self._rates.admit((name, fields["service"]), name, fields, now)
+            if omitted is not None:
+                self._tell([CountedEvent(name, fields, omitted)])
+
+    def close(self) -> None:
+        """Tell what was left out last, and close."""
+        with self._lock:
+            self._tell(self._rates.due(math.inf))
+            self._sink.close()
+
+    def _tell(self, events: Iterable[CountedEvent]) -> None:
+        for event in events:
+            self._sink.event(event.name, **event.told())
 
 
 class EventLog:

@@ -40,7 +40,7 @@ import msgspec
 from holdfast.errors import HoldfastError, OtherCodeError, UnknownProblemError
 from holdfast.problems import registry
 from holdfast.problems.problem import Problem
-from holdfast.runtime.logs import EventSink, NullEventLog
+from holdfast.runtime.logs import CountedEvent, EventRates, EventSink, NullEventLog
 from holdfast.runtime.senders import NOBODY, Senders
 from holdfast.runtime.transport.contract import IncomingCall, ServiceTransport
 from holdfast.session.messages import Busy, MessageError, Opening, Request, decode_request, encode
@@ -79,7 +79,6 @@ _TICK_S = 0.05
 _STAYS_AWAKE_S = 1.0
 """After a call the timekeeper goes on ticking for this long: to wake it costs the next call."""
 
-_LOGGED_AT_MOST_EVERY_S = 1.0
 _RARELY_LOGGED = frozenset(
     {"busy", "refused", "session_opened", "session_taken_over", "restored", "evicted"}
 )
@@ -284,7 +283,7 @@ class ServiceShell:
         self._numbers = itertools.count(1)
         self._unread = 0
         self._unread_logged = 0
-        self._logged: dict[str, tuple[float, int, Noted]] = {}
+        self._rates = EventRates(burst=1)
         self._heard_at = -_STAYS_AWAKE_S
         # Who leads holds the baton; it is passed on, by whomever, when the term ends. What is ready
         # to run belongs to the leader of the moment; both are changed under this lock.
@@ -587,14 +586,14 @@ class ServiceShell:
             due = self._service.next_wakeup()
             if now - self._heard_at < _STAYS_AWAKE_S:
                 due = now + _TICK_S if due is None else min(due, now + _TICK_S)
-            for logged_at, omitted, _ in self._logged.values():
-                tell_at = logged_at + _LOGGED_AT_MOST_EVERY_S
-                if omitted and tell_at > now:
-                    due = tell_at if due is None else min(due, tell_at)
+            omitted = self._rates.due(now)
+            tell_at = self._rates.next_due()
+            if tell_at is not None:
+                due = tell_at if due is None else min(due, tell_at)
             self._wakes_at = float("inf") if due is None else due
         self._senders.post(calls)
         self._take_note(notes)
-        self._log_omitted(now)
+        self._log_omitted(omitted)
         return None if due is None else max(0.0, due - monotonic())
 
     def _wake(self) -> None:
@@ -609,35 +608,24 @@ class ServiceShell:
             return
         now = monotonic()
         with self._lock:
-            logged_at, omitted, _ = self._logged.get(
-                note.event, (-_LOGGED_AT_MOST_EVERY_S, 0, note)
-            )
-            tell_at = logged_at + _LOGGED_AT_MOST_EVERY_S
-            omit = now < tell_at
-            self._logged[note.event] = (logged_at, omitted + 1, note) if omit else (now, 0, note)
-            late = omit and tell_at < self._wakes_at
+            omitted = self._rates.admit(note.event, note.event, note.fields, now)
+            tell_at = self._rates.next_due()
+            late = omitted is None and tell_at is not None and tell_at < self._wakes_at
             if late:
                 self._wakes_at = now
         if late:
             self._wake()
-        if not omit:
-            self._log_one(note, omitted)
+        if omitted is not None:
+            self._log_one(CountedEvent(note.event, note.fields, omitted))
 
-    def _log_omitted(self, now: float) -> None:
-        """Log the last of those that were left out, once its time has come, with their number."""
-        told = []
-        with self._lock:
-            for event, (logged_at, omitted, note) in self._logged.items():
-                if omitted and logged_at + _LOGGED_AT_MOST_EVERY_S <= now:
-                    self._logged[event] = (now, 0, note)
-                    told.append((note, omitted - 1))
-        for note, omitted in told:
-            self._log_one(note, omitted)
+    def _log_omitted(self, events: list[CountedEvent]) -> None:
+        """Log events that were left out and whose time has come, and who was turned away unread."""
+        for event in events:
+            self._log_one(event)
         unread = self._unread
         if unread != self._unread_logged:
             self._unread_logged = unread
             self._log(Noted("busy", {"turned_away_unread": unread}))
 
-    def _log_one(self, note: Noted, omitted: int) -> None:
-        more = {"similar_lines_omitted": omitted} if omitted else {}
-        self._events.event(note.event, **note.fields, **more)
+    def _log_one(self, event: CountedEvent) -> None:
+        self._events.event(event.name, **event.told())

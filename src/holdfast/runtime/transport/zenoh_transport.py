@@ -33,6 +33,8 @@ What holds here was measured, not read:
   ask it and to be answered is dropped, in both directions (``_access``). Its rules cannot be
   changed while a session is open, and a rule for some clients applies only to those that match all
   that it says of them; so these rules are the same for everybody.
+- Besides its own authority, a robot's end believes the public ones of the web: Zenoh adds them and
+  has no setting against it. They may certify the host name of a service, but no private address.
 - ``close`` can take ten seconds when a peer has vanished, so it runs aside and is not waited for. A
   process that ends without it can be aborted in a callback, so it is also called at exit.
 """
