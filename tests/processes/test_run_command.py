@@ -61,6 +61,24 @@ class MyRobot:
         return False
 """
 
+MY_WORLD = """
+from holdfast.runtime.environment import SimulatedEnvironment
+
+
+class MyWorld:
+    def __init__(self, problem, seed, trial):
+        self.world = SimulatedEnvironment(problem, seed, trial)
+
+    def perform_sensing(self, sensing_action):
+        return self.world.perform_sensing(sensing_action)
+
+    def perform(self, task_action):
+        self.world.perform(task_action)  # and no reward
+
+    def is_done(self):
+        return self.world.is_done()
+"""
+
 SLOW_CONFIGURATION = """
 problem: slow_problem:Slow
 particle_filter: {num_particles: 20}
@@ -263,6 +281,25 @@ class TestOutput:
         assert "pip install matplotlib" in done.stderr
         assert not (workplace / "out" / "trial.png").exists()
         assert (workplace / "out" / "summary.json").exists()
+
+    def test_a_world_of_ones_own_has_a_figure_of_the_belief(self, workplace: Path) -> None:
+        (workplace / "my_world.py").write_text(MY_WORLD)
+        arguments = ("run", "peg.yaml", "--environment", "my_world:MyWorld", "--out", "out")
+        done = holdfast(workplace, *arguments, "--trials", "1")
+        assert done.returncode == 0, done.stderr
+        assert "figure" not in done.stderr
+        figure = workplace / "out" / "trial.png"
+        assert figure.read_bytes().startswith(b"\x89PNG\r\n")
+        # Of an earlier part of the run there are no observations: the figure stays as it is.
+        before = figure.stat().st_mtime_ns
+        done = holdfast(workplace, *arguments, "--trials", "2", "--resume")
+        assert done.returncode == 0, done.stderr
+        assert "figure" not in done.stderr
+        assert figure.stat().st_mtime_ns == before
+        figure.unlink()
+        done = holdfast(workplace, *arguments, "--trials", "2", "--resume")
+        assert done.returncode == 0, done.stderr
+        assert "note: no figure, because trial 0 ended in an earlier part of the run" in done.stderr
 
     def test_a_run_can_be_extended(self, workplace: Path) -> None:
         arguments = ("run", "peg.yaml", "--jobs", "1", "--out")

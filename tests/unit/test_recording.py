@@ -21,10 +21,10 @@ from holdfast.cli.terminal import _summary_rows
 from holdfast.configuration import Configuration, load
 from holdfast.files import OutputError, write_atomically
 from holdfast.outcome import Decisions, TrialResult
-from holdfast.planning import Planner
+from holdfast.planning import Planner, digest
 from holdfast.recording.figure import _draw_workspace, trial_figure
 from holdfast.recording.journal import Journal
-from holdfast.recording.recorder import MAX_PARTICLES_KEPT, Recorder
+from holdfast.recording.recorder import MAX_PARTICLES_KEPT, RecordedEnvironment, Recorder
 from holdfast.recording.run_directory import (
     RunDirectory,
     claim_default_directory,
@@ -38,8 +38,15 @@ from holdfast.recording.tables import (
     wilson_interval,
 )
 from holdfast.recording.timings import AnswerCounts
-from holdfast.runtime.trial import run_trial
-from holdfast.session.records import PausedRecord
+from holdfast.runtime.trial import NullObserver, SensingStep, TaskStep, run_trial
+from holdfast.session.records import (
+    ActingRecord,
+    ObservedRecord,
+    PausedRecord,
+    PerformedRecord,
+    Record,
+    RecordError,
+)
 from holdfast.session.robot import replay
 from holdfast.settings import EnvironmentSettings
 
@@ -70,7 +77,12 @@ def result_of(
 
 
 def configuration_of(
-    tmp_path: Path, *, seed: int = 5, tolerance: float = 0.1, num_particles: int = 30
+    tmp_path: Path,
+    *,
+    seed: int = 5,
+    tolerance: float = 0.1,
+    num_particles: int = 30,
+    max_steps: int = 30,
 ) -> Configuration:
     path = tmp_path / "peg.yaml"
     path.write_text(
@@ -78,7 +90,7 @@ def configuration_of(
         f"model: {{hole_tolerance: {tolerance}}}\n"
         f"particle_filter: {{num_particles: {num_particles}}}\n"
         "active_sensing: {num_observation_samples: 2, num_cores: 1}\n"
-        f"simulator: {{num_trials: 3, max_steps: 30, seed: {seed}}}\n"
+        f"simulator: {{num_trials: 3, max_steps: {max_steps}, seed: {seed}}}\n"
     )
     return load(path)
 
@@ -578,6 +590,84 @@ class TestRecorder:
         configuration = configuration_of(tmp_path, num_particles=2 * MAX_PARTICLES_KEPT + 1)
         before = self.record(configuration).record.sensing[0].before
         assert MAX_PARTICLES_KEPT // 2 < len(before) <= MAX_PARTICLES_KEPT
+
+
+class _Journalling(NullObserver):
+    """Writes down what a robot writes down."""
+
+    def __init__(self) -> None:
+        self.records: list[Record] = []
+
+    def sensed(self, step: SensingStep) -> None:
+        data = np.asarray(step.observation, dtype="<f8").tobytes()
+        record = ObservedRecord(step.before.step, step.sensing_action, data, digest(step.after), 0)
+        self.records.append(record)
+
+    def acted(self, step: TaskStep) -> None:
+        data = np.asarray(step.executed, dtype="<f8").tobytes()
+        self.records.append(ActingRecord(step.state.step, data))
+        self.records.append(PerformedRecord(step.state.step, step.reward))
+
+
+class TestRecordedEnvironment:
+    """What was observed, given to the same planner, leads to the same beliefs."""
+
+    @staticmethod
+    def again(
+        configuration: Configuration, records: list[Record], result: TrialResult
+    ) -> tuple[Recorder, TrialResult]:
+        recorder = Recorder(result.trial)
+        found = run_trial(
+            configuration.problem,
+            configuration.planning,
+            configuration.simulator,
+            result.trial,
+            RecordedEnvironment(records, result),
+            recorder,
+        )
+        return recorder, found
+
+    @staticmethod
+    def first(configuration: Configuration) -> tuple[list[Record], TrialResult]:
+        journalling = _Journalling()
+        result = run_trial(
+            configuration.problem,
+            configuration.planning,
+            configuration.simulator,
+            1,
+            observer=journalling,
+        )
+        return journalling.records, result
+
+    @pytest.mark.parametrize("max_steps", [20, 500])
+    def test_the_beliefs_are_those_of_the_trial(self, tmp_path: Path, max_steps: int) -> None:
+        configuration = configuration_of(tmp_path, max_steps=max_steps)
+        records, result = self.first(configuration)
+        assert result.success == (max_steps == 500)
+        # The last performance is not written down on its own: the result says all of it.
+        recorder, again = self.again(configuration, records[:-1], result)
+        assert again.digest == result.digest
+        assert (again.success, again.steps) == (result.success, result.steps)
+        expected = TestRecorder.record(configuration).record
+        record = recorder.record
+        assert np.array_equal(record.estimates, expected.estimates)
+        assert np.array_equal(record.standard_deviations, expected.standard_deviations)
+        for seen, known in zip(record.sensing, expected.sensing, strict=True):
+            assert np.array_equal(seen.after, known.after)
+        assert record.true_states == []
+        assert record.rewards[:-1] == expected.rewards[:-1]
+        trial_figure(configuration, record, tmp_path / "trial.png")
+        assert (tmp_path / "trial.png").read_bytes().startswith(b"\x89PNG\r\n")
+
+    def test_what_was_decided_otherwise_is_refused(self, tmp_path: Path) -> None:
+        configuration = configuration_of(tmp_path)
+        records, result = self.first(configuration)
+        observed = records[0]
+        assert isinstance(observed, ObservedRecord)
+        other = msgspec.structs.replace(observed, sensing_action=observed.sensing_action ^ 1)
+        for spoilt in ([other, *records[1:]], records[:20], records[1:]):
+            with pytest.raises(RecordError, match="trial 1 is decided otherwise at step"):
+                self.again(configuration, spoilt, result)
 
 
 class TestFigure:

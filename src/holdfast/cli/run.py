@@ -30,7 +30,7 @@ from holdfast.runtime.command_line import MAX_JOBS
 if TYPE_CHECKING:
     from holdfast.configuration import Configuration
     from holdfast.outcome import TrialResult
-    from holdfast.recording.recorder import Recorder, TrialRecord
+    from holdfast.recording.recorder import RecordedEnvironment, Recorder, TrialRecord
     from holdfast.recording.run_directory import RunDirectory
     from holdfast.recording.tables import RunSummary
 
@@ -300,7 +300,7 @@ class _Options:
 
 def _run(options: _Options) -> None:
     from holdfast.cli.robot_run import RobotRun, is_robot_run, run_as_robot
-    from holdfast.recording.recorder import Recorder
+    from holdfast.recording.recorder import RecordedEnvironment, Recorder
     from holdfast.recording.run_directory import (
         FIGURE_NAME,
         RunDirectory,
@@ -327,11 +327,18 @@ def _run(options: _Options) -> None:
         notes = _Notes(options)
         display = run_display(configuration, quiet=quiet or options.log == "json")
         recorder = Recorder(trial=0)
+        recorded: RecordedEnvironment | None = None
         robot = RobotRun()
         summary: RunSummary | None = None
         started = perf_counter()
 
         def on_result(result: TrialResult) -> None:
+            nonlocal recorded
+            if result.trial == recorder.trial and configuration.environment.object is not None:
+                # Its steps are in the journal until the result is.
+                unfinished = directory.journal.unfinished()
+                records = [] if unfinished is None else unfinished.records
+                recorded = RecordedEnvironment(records, result)
             directory.add(result)
             display.show(result)
 
@@ -375,7 +382,7 @@ def _run(options: _Options) -> None:
             for text in _idle_services(configuration, summary, robot.refusals):
                 notes.note(text)
             with notes.while_it_lasts(f"drawing {FIGURE_NAME} ..."):
-                note = _draw_figure(configuration, directory, recorder)
+                note = _draw_figure(configuration, directory, recorder, recorded)
         except KeyboardInterrupt as interruption:
             command = options.resume_command(directory_path)
             finished = directory.journal.tally().finished
@@ -518,11 +525,21 @@ class _Notes:
 
 
 def _draw_figure(
-    configuration: Configuration, directory: RunDirectory, recorder: Recorder
+    configuration: Configuration,
+    directory: RunDirectory,
+    recorder: Recorder,
+    recorded: RecordedEnvironment | None,
 ) -> str | None:
     """Draw trial 0 and return None, or what is to be said about it."""
-    if configuration.environment.object is not None:
-        return None  # its world is not ours to look into
+    from holdfast.recording.run_directory import FIGURE_NAME
+
+    if configuration.environment.object is not None and recorded is None:
+        if (directory.path / FIGURE_NAME).exists():
+            return None
+        return (
+            f"no figure, because trial {recorder.trial} ended in an earlier part of the run: its "
+            "observations are kept only until the trial ends"
+        )
     if recorder.record.result is None:
         again_s = _time_of_sensing(directory, recorder.trial)
         if again_s > _LONGEST_REPETITION_S:
@@ -538,7 +555,7 @@ def _draw_figure(
         return "no figure, because matplotlib is not installed: pip install matplotlib"
 
     try:
-        note = _draw_trial(configuration, directory, recorder, trial_figure)
+        note = _draw_trial(configuration, directory, recorder, recorded, trial_figure)
     except (HoldfastError, KeyboardInterrupt):
         raise
     except BaseException as error:
@@ -562,20 +579,27 @@ def _draw_trial(
     configuration: Configuration,
     directory: RunDirectory,
     recorder: Recorder,
+    recorded: RecordedEnvironment | None,
     draw: Callable[[Configuration, TrialRecord, Path], None],
 ) -> str | None:
     from holdfast.recording.run_directory import FIGURE_NAME
     from holdfast.runtime.trial import run_trial
+    from holdfast.session.records import RecordError
 
     if recorder.record.result is None:
-        # It ran in a worker or in an earlier part of the run; a trial can always be run again.
-        run_trial(
-            configuration.problem,
-            configuration.planning,
-            configuration.simulator,
-            recorder.trial,
-            observer=recorder,
-        )
+        # It ran in a worker, in an earlier part of the run, or as a robot's: it is run again. A
+        # world of the user's answers what it has answered.
+        try:
+            run_trial(
+                configuration.problem,
+                configuration.planning,
+                configuration.simulator,
+                recorder.trial,
+                recorded,
+                observer=recorder,
+            )
+        except RecordError as error:
+            return f"no figure, because {error}"
     record: TrialRecord = recorder.record
     note = None
     if record.result is not None and record.result.decisions is not None:
@@ -585,5 +609,7 @@ def _draw_trial(
                 f"trial {recorder.trial} decided otherwise when it was run again for the figure, "
                 f"so the problem {configuration.problem_name} is not deterministic"
             )
+    if recorded is not None:
+        record.result = recorded.result  # the reward of its last step is there alone
     draw(configuration, record, directory.path / FIGURE_NAME)
     return note

@@ -1,7 +1,13 @@
-"""Looks on at one trial and keeps what a figure of it needs."""
+"""Looks on at one trial and keeps what a figure of it needs.
+
+A robot's own world cannot be run again for a figure. But all that the planner had of it is in the
+journal until the trial ends: the same observations, given to the same planner, lead to the same
+beliefs. What the world's true state was nobody knows.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -12,8 +18,16 @@ from holdfast.planning import PlanningState
 from holdfast.problems.problem import FloatArray
 from holdfast.runtime.environment import Environment
 from holdfast.runtime.trial import SensingStep, TaskStep
+from holdfast.session.messages import numbers_from, numbers_to
+from holdfast.session.records import (
+    ActingRecord,
+    ObservedRecord,
+    PerformedRecord,
+    Record,
+    RecordError,
+)
 
-__all__ = ["Recorder", "SensingRecord", "TrialRecord"]
+__all__ = ["RecordedEnvironment", "Recorder", "SensingRecord", "TrialRecord"]
 
 MAX_PARTICLES_KEPT = 500
 """Particles kept of a belief; more would not show in a figure."""
@@ -145,6 +159,73 @@ class Recorder:
         state = getattr(environment, "state", None)
         if state is not None:
             self.record.true_states.append(np.array(state, dtype=np.float64))
+
+
+class RecordedEnvironment:
+    """The world of a trial that has ended: it answers what its records say that it answered.
+
+    Parameters
+    ----------
+    records : sequence of Record
+        Of the trial, in the order in which they were written; the one of the last performance may
+        be missing.
+    result : TrialResult
+        What it came to.
+    """
+
+    def __init__(self, records: Sequence[Record], result: TrialResult) -> None:
+        self.result = result
+        self._records = [
+            record
+            for record in records
+            if isinstance(record, ObservedRecord | ActingRecord | PerformedRecord)
+        ]
+        self._next = 0
+        self._step = 0
+
+    def perform_sensing(self, sensing_action: int) -> FloatArray:
+        """Return the observation that was made.
+
+        Raises
+        ------
+        RecordError
+            If another sensing action was performed, or none.
+        """
+        record = self._take()
+        if not isinstance(record, ObservedRecord) or record.sensing_action != sensing_action:
+            raise self._otherwise()
+        return numbers_from(record.observation, len(record.observation) // 8)
+
+    def perform(self, task_action: FloatArray) -> float | None:
+        """Return the reward; None where there was none, or it is not in the records.
+
+        Raises
+        ------
+        RecordError
+            If another task action was performed, or none.
+        """
+        record = self._take()
+        if not isinstance(record, ActingRecord) or record.action != numbers_to(task_action):
+            raise self._otherwise()
+        self._step += 1
+        performed = self._take()
+        return performed.reward if isinstance(performed, PerformedRecord) else None
+
+    def is_done(self) -> bool:
+        """Tell whether the task was done."""
+        return self._step == self.result.steps and self.result.success
+
+    def _take(self) -> ObservedRecord | ActingRecord | PerformedRecord | None:
+        if self._next == len(self._records):
+            return None
+        self._next += 1
+        return self._records[self._next - 1]
+
+    def _otherwise(self) -> RecordError:
+        return RecordError(
+            f"trial {self.result.trial} is decided otherwise at step {self._step} when it is "
+            "computed again: the problem is not deterministic, or a service has decided otherwise"
+        )
 
 
 def _some_particles(belief: Belief) -> FloatArray:
