@@ -61,8 +61,6 @@ that they are the executed ones."""
 
 BASELINE = "random"
 
-_CHOOSING = tuple(way for way in WAYS if WAYS[way].method not in ("random", "fixed"))
-
 _DEFAULT = "action entropy, neighbours"
 """The project's; how it compares is told whether or not a difference was found."""
 
@@ -109,10 +107,11 @@ class Selectors:
         summary = _summary(tables)
         logarithms = _of_trials(tables, _logarithms)
         relative_steps = _relative_steps(logarithms)
-        rivals = _rivals(_CHOOSING, logarithms, "steps_ratio", statistics.ratio_of)
+        rivals = _rivals(_pairs(), logarithms, "steps_ratio", statistics.ratio_of)
         successes = _of_trials(tables, lambda table: table.numbers("success"))
-        # In steps all are compared with the baseline already.
-        rivals_in_success = _rivals((BASELINE, *_CHOOSING), successes, "success_gain", _as_it_is)
+        # In steps every way is compared with the baseline already.
+        pairs = [(_DEFAULT, BASELINE), *_pairs()]
+        rivals_in_success = _rivals(pairs, successes, "success_gain", _as_it_is)
         costs = _costs(tables)
         report.raw["selectors"] = raw
         report.summary |= {
@@ -266,8 +265,14 @@ def _relative_steps(logarithms: _Trials) -> Table:
     )
 
 
-def _rivals(ways: Sequence[str], trials: _Trials, name: str, shown: _Shown) -> Table:
-    """Return how each of some ways differs from each of those before it, everywhere."""
+def _pairs() -> list[tuple[str, str]]:
+    """Return each way that chooses with each of those before it."""
+    choosing = [way for way in WAYS if WAYS[way].method not in ("random", "fixed")]
+    return [(way, rival) for number, way in enumerate(choosing) for rival in choosing[:number]]
+
+
+def _rivals(pairs: Sequence[tuple[str, str]], trials: _Trials, name: str, shown: _Shown) -> Table:
+    """Return how the first way of each pair differs from the second one, everywhere."""
     return _compared(
         (
             {"problem": case, "way": way, "rival": rival},
@@ -277,8 +282,7 @@ def _rivals(ways: Sequence[str], trials: _Trials, name: str, shown: _Shown) -> T
             trials[case, rival],
         )
         for case in (*_CASES, *_GROUPS)
-        for number, way in enumerate(ways)
-        for rival in ways[:number]
+        for way, rival in pairs
     )
 
 

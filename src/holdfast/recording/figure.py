@@ -368,13 +368,21 @@ def _draw_workspace_legend(
     figure: SubFigure, problem: Problem, scene: Scene, record: TrialRecord
 ) -> None:
     handles: list[Line2D | Patch] = []
+    # Without a true path, the estimated one has the start, the bodies and the marks.
+    of_estimate = "" if record.true_states else ", estimated"
     if record.true_states:
         handles.append(Line2D([], [], color=_TRUE, label="true path"))
     handles += [
         Line2D([], [], color=_BELIEF, linestyle=(0, (4, 1.5)), label="estimated path"),
         _dot(_BELIEF, "o", "particles, older ones paler", size=3.5),
         Line2D(
-            [], [], marker="o", linestyle="", markerfacecolor="white", color=_TRUE, label="start"
+            [],
+            [],
+            marker="o",
+            linestyle="",
+            markerfacecolor="white",
+            color=_TRUE,
+            label=f"start{of_estimate}",
         ),
     ]
     if scene.goal is not None:
@@ -392,7 +400,7 @@ def _draw_workspace_legend(
             )
         )
     if scene.body is not None:
-        handles.append(Line2D([], [], color=_BODY, linewidth=0.9, label="body"))
+        handles.append(Line2D([], [], color=_BODY, linewidth=0.9, label=f"body{of_estimate}"))
     if len(scene.obstacles):
         handles.append(Patch(facecolor=_OBSTACLE, edgecolor=_OBSTACLE_EDGE, label="obstacle"))
     handles += _action_handles(problem, record)
