@@ -609,7 +609,7 @@ def test_what_happens_often_is_logged_now_and_then_with_its_number() -> None:
         while sum(1 + number for number in told) < 100:
             name, fields = events.get(timeout=PATIENCE_S)
             assert name == "refused"
-            omitted = fields.get("omitted", 0)
+            omitted = fields.get("similar_lines_omitted", 0)
             assert isinstance(omitted, int)
             told.append(omitted)
         assert sum(1 + number for number in told) == 100

@@ -18,7 +18,8 @@ resumed_trial, performed_unseen, trial, missed_ticks, stopped, note, interrupted
 By a service: ready, session_opened, session_taken_over, restored, refused, busy, evicted, stopping.
 By ``holdfast chaos``: chaos_trial, left_out, note, interrupted. By a command that ends with an
 error: error. Fields with a place of their own in the text form: ``from`` and ``to`` (of a change),
-``service``, ``reason``, ``duration_ms``.
+``service``, ``reason``, ``duration_ms``. Events that may come very often are written at most once
+in a while; the next such line then says how many were left out, as ``similar_lines_omitted``.
 """
 
 from __future__ import annotations

@@ -639,5 +639,5 @@ class ServiceShell:
             self._log(Noted("busy", {"turned_away_unread": unread}))
 
     def _log_one(self, note: Noted, omitted: int) -> None:
-        more = {"omitted": omitted} if omitted else {}
+        more = {"similar_lines_omitted": omitted} if omitted else {}
         self._events.event(note.event, **note.fields, **more)
