@@ -659,6 +659,13 @@ class TestRecordedEnvironment:
         trial_figure(configuration, record, tmp_path / "trial.png")
         assert (tmp_path / "trial.png").read_bytes().startswith(b"\x89PNG\r\n")
 
+    def test_a_failure_is_one_again(self, tmp_path: Path) -> None:
+        configuration = configuration_of(tmp_path)
+        records, result = self.first(configuration)
+        failed = msgspec.structs.replace(result, success=False, failed=True, steps=4)
+        _, again = self.again(configuration, records, failed)
+        assert (again.failed, again.steps) == (True, 4)
+
     def test_what_was_decided_otherwise_is_refused(self, tmp_path: Path) -> None:
         configuration = configuration_of(tmp_path)
         records, result = self.first(configuration)

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from holdfast.belief import Belief, estimate, standard_deviation
-from holdfast.outcome import TrialResult
+from holdfast.outcome import Done, TrialResult
 from holdfast.planning import PlanningState
 from holdfast.problems.problem import FloatArray
 from holdfast.runtime.environment import Environment
@@ -211,9 +211,11 @@ class RecordedEnvironment:
         performed = self._take()
         return performed.reward if isinstance(performed, PerformedRecord) else None
 
-    def is_done(self) -> bool:
-        """Tell whether the task was done."""
-        return self._step == self.result.steps and self.result.success
+    def is_done(self) -> Done:
+        """Tell whether the task was done, or had failed."""
+        if self._step < self.result.steps:
+            return False
+        return "failed" if self.result.failed else self.result.success
 
     def _take(self) -> ObservedRecord | ActingRecord | PerformedRecord | None:
         if self._next == len(self._records):
