@@ -26,6 +26,7 @@ __all__ = [
     "SensingDecision",
     "TaskDecision",
     "TrialResult",
+    "with_reward",
 ]
 
 FloatArray = npt.NDArray[np.float64]
@@ -137,6 +138,11 @@ class DecisionLog:
         return Decisions(self._action_size, bytes(self._log))
 
 
+def with_reward(total: float | None, reward: float | None) -> float | None:
+    """Return a sum of rewards with one more of them; None as long as there is none."""
+    return total if reward is None else (total or 0.0) + reward
+
+
 class TrialResult(msgspec.Struct, frozen=True, kw_only=True):
     """What is left of a trial: one row of ``trials.csv``, and the single sensing times.
 
@@ -152,8 +158,9 @@ class TrialResult(msgspec.Struct, frozen=True, kw_only=True):
         Whether the task ended in failure. If neither, the trial ran out of steps.
     steps : int
         Task actions performed.
-    reward : float
-        Sum of the rewards of all steps, 0 where the environment reports none.
+    reward : float or None
+        Sum of the rewards of the steps. A step without one adds nothing; None if there were steps
+        and none of them had one.
     sensing_decisions : int
         Sensing actions chosen.
     mean_sensing_ms : float
@@ -177,7 +184,7 @@ class TrialResult(msgspec.Struct, frozen=True, kw_only=True):
     # Journals that do not have it are of trials that could not fail.
     failed: bool = False
     steps: int
-    reward: float
+    reward: float | None
     sensing_decisions: int
     mean_sensing_ms: float
     recoveries: int

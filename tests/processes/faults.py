@@ -450,7 +450,7 @@ class World:
             answer = {"observation": shown.tolist()}
         else:
             action = np.array(command["task_action"])
-            answer = {"reward": float(environment.perform(action))}
+            answer = {"reward": environment.perform(action)}
             self.performed[self._trial].append(action.tobytes())
             self.moments_s.append(time.monotonic())
         self._call_hook(what, afterwards=True, step=step)

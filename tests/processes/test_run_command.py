@@ -288,6 +288,12 @@ class TestOutput:
         done = holdfast(workplace, *arguments, "--trials", "1")
         assert done.returncode == 0, done.stderr
         assert "figure" not in done.stderr
+        # It reports no reward, which is not a reward of 0.
+        assert "reward" not in done.stdout
+        assert summary(workplace / "out")["mean_reward"] is None
+        assert summary(workplace / "out")["mean_reward_of_successes"] is None
+        with (workplace / "out" / "trials.csv").open() as table:
+            assert [row["reward"] for row in csv.DictReader(table)] == [""]
         figure = workplace / "out" / "trial.png"
         assert figure.read_bytes().startswith(b"\x89PNG\r\n")
         # Of an earlier part of the run there are no observations: the figure stays as it is.

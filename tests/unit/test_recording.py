@@ -308,6 +308,19 @@ class TestTables:
         assert summary.mean_reward_of_successes == pytest.approx(-1.0)
         assert dict(_summary_rows(summary))["failed"] == "2 of 4 trials"
 
+    def test_the_mean_of_rewards_that_are_not_there_is_none(self) -> None:
+        """A trial without a reward has not earned 0."""
+        without = msgspec.structs.replace(result_of(1, success=False), reward=None)
+        builder = SummaryBuilder()
+        builder.add(result_of(0, reward=-1.0))
+        builder.add(without)
+        summary = builder.build(problem="p", seed=5, version="1", trials=2, wall_time_s=2.0)
+        assert summary.mean_reward is None
+        assert summary.mean_reward_of_successes == -1.0
+        assert "mean reward" not in dict(_summary_rows(summary))
+        (row,) = csv.DictReader(csv_lines([without]))
+        assert row["reward"] == ""
+
     def test_who_decided_is_told_where_it_is_known(self) -> None:
         builder = SummaryBuilder()
         result = result_of(0, sensing_ms=(1.0, 2.0))

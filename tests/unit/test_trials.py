@@ -6,6 +6,7 @@ import hashlib
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from holdfast.configuration import Configuration, load
@@ -71,7 +72,7 @@ def one(configuration: Configuration, trial: int = 0) -> TrialResult:
     return run_trial(configuration.problem, configuration.planning, configuration.simulator, trial)
 
 
-def decided(results: list[TrialResult]) -> list[tuple[int, str, float, int]]:
+def decided(results: list[TrialResult]) -> list[tuple[int, str, float | None, int]]:
     """Everything of a result but its times."""
     ordered = sorted(results, key=lambda result: result.trial)
     return [(result.trial, result.digest, result.reward, result.steps) for result in ordered]
@@ -152,7 +153,7 @@ class TestOneTrial:
                 self.sensed.append(sensing_action)
                 return super().perform_sensing(sensing_action)
 
-            def perform(self, task_action: FloatArray) -> float:
+            def perform(self, task_action: FloatArray) -> float | None:
                 self.performed.append(tuple(task_action.tolist()))
                 return super().perform(task_action)
 
@@ -248,6 +249,36 @@ class TestManyTrials:
         configuration = defective_configuration(tmp_path)
         with pytest.raises(TrialCrashError, match=r"(?s)Traceback.*not callable.*in trial [01]"):
             trials._run_in_workers(configuration, 2, iter(range(4)), 4, 1.0, lambda _: None)
+
+    def test_a_reward_that_nobody_defines_is_none(self, tmp_path: Path) -> None:
+        configuration = configuration_of(tmp_path)
+        problem, simulator = configuration.problem, configuration.simulator
+
+        class Sparing(SimulatedEnvironment):
+            """Reports the rewards of some steps."""
+
+            rewarded: tuple[int, ...] = ()
+
+            def perform(self, task_action: FloatArray) -> float | None:
+                super().perform(task_action)
+                return -2.0 if self.step in self.rewarded else None
+
+        for rewarded, reward in (((), None), ((2, 5), -4.0)):
+            environment = Sparing(problem, simulator.seed, 0)
+            environment.rewarded = rewarded
+            result = run_trial(problem, configuration.planning, simulator, 0, environment)
+            assert result.reward == reward
+            # It decides nothing.
+            assert result.digest == one(configuration).digest
+        # A trial without a step has earned nothing, which is a sum.
+        begun_in_the_goal = Sparing(problem, simulator.seed, 0)
+        begun_in_the_goal.state = np.zeros(3)
+        result = run_trial(problem, configuration.planning, simulator, 0, begun_in_the_goal)
+        assert (result.steps, result.reward) == (0, 0.0)
+
+    def test_a_problem_without_rewards_has_none(self) -> None:
+        room = load(Path(__file__).parents[2] / "examples" / "light_dark_room.yaml")
+        assert one(room).reward is None
 
     @pytest.mark.parametrize("reward", [float("nan"), float("inf"), float("-inf")])
     def test_a_reward_that_is_not_finite_is_refused(self, tmp_path: Path, reward: float) -> None:

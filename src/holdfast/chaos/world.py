@@ -88,7 +88,7 @@ class WitnessedWorld:
         """Draw an observation of the true state; that changes nothing, so it leaves no line."""
         return self._world.perform_sensing(sensing_action)
 
-    def perform(self, task_action: FloatArray) -> float:
+    def perform(self, task_action: FloatArray) -> float | None:
         """Append the action's line: with that it is performed."""
         action = np.ascontiguousarray(task_action, dtype=np.float64)
         line = (

@@ -250,7 +250,10 @@ class ProblemBase:
         return actions
 
     def reward(self, states: FloatArray, actions: FloatArray) -> FloatArray:
-        """Return zero: the task is judged by success alone."""
+        """Return zero: the task is judged by success alone.
+
+        A problem that does not override this has no reward, and its trials have none either.
+        """
         return np.zeros(np.broadcast_shapes(states.shape[:-1], actions.shape[:-1]))
 
     def scene(self) -> Scene | None:

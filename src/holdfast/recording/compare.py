@@ -275,7 +275,10 @@ def _count(first: TrialResult, second: TrialResult, found: _Found) -> None:
     found.trials += 1
     found.sensing_actions += first.sensing_decisions
     found.task_actions += first.steps
-    outcomes = [f"outcome {result.outcome}, reward {result.reward!r}" for result in (first, second)]
+    # Where there is no reward, earlier versions wrote 0.
+    outcomes = [
+        f"outcome {result.outcome}, reward {result.reward or 0.0!r}" for result in (first, second)
+    ]
     if outcomes[0] != outcomes[1] and not any("the world" in note for note in found.notes):
         found.notes.append(
             f"the world answered otherwise: trial {first.trial} has {outcomes[0]} in the first run "

@@ -148,8 +148,10 @@ def _title(configuration: Configuration, record: TrialRecord) -> str:
         outcome = _OUTCOMES[result.outcome]
         text += (
             f", trial {result.trial}: {outcome} in {result.steps:,} steps, "
-            f"{result.sensing_decisions:,} sensing actions, reward {result.reward:.4g}"
+            f"{result.sensing_decisions:,} sensing actions"
         )
+        if result.reward is not None:
+            text += f", reward {result.reward:.4g}"
         shown = len(record.actions)
         if shown < result.steps:
             text += f" (the first {shown:,} steps)"

@@ -67,7 +67,7 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
     success_rate_interval_95 : tuple of float, or None
         Wilson's interval for it.
     mean_reward : float or None
-        Mean of the rewards of all finished trials.
+        Mean of the rewards of all finished trials; None if one of them has none.
     mean_reward_of_successes : float or None
         The same of the successful ones alone, as earlier work reports it.
     mean_steps : float or None
@@ -132,9 +132,12 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def csv_row(result: TrialResult) -> list[str]:
-    """Return one row of ``trials.csv``; reading a number back gives the same number."""
+    """Return one row of ``trials.csv``; reading a number back gives the same number.
+
+    What there is none of, such as the reward of a trial without one, is an empty cell.
+    """
     return [
-        str(int(value)) if isinstance(value, bool) else str(value)
+        "" if value is None else str(int(value)) if isinstance(value, bool) else str(value)
         for value in (getattr(result, column) for column in CSV_COLUMNS)
     ]
 
@@ -174,6 +177,14 @@ def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
     return low, high
 
 
+def _sum(total: float | None, reward: float | None) -> float | None:
+    return None if total is None or reward is None else total + reward
+
+
+def _mean(total: float | None, count: int) -> float | None:
+    return None if total is None or not count else total / count
+
+
 class SummaryBuilder:
     """Adds up results, in the order of their trials, to a summary."""
 
@@ -181,8 +192,8 @@ class SummaryBuilder:
         self._finished = 0
         self._successes = 0
         self._failures = 0
-        self._reward = 0.0
-        self._reward_of_successes = 0.0
+        self._reward: float | None = 0.0
+        self._reward_of_successes: float | None = 0.0
         self._steps = 0
         self._sensing_decisions = 0
         self._unexplained = 0
@@ -193,10 +204,10 @@ class SummaryBuilder:
     def add(self, result: TrialResult) -> None:
         """Add the next result."""
         self._finished += 1
-        self._reward += result.reward
+        self._reward = _sum(self._reward, result.reward)
         if result.success:
             self._successes += 1
-            self._reward_of_successes += result.reward
+            self._reward_of_successes = _sum(self._reward_of_successes, result.reward)
         self._failures += result.failed
         self._steps += result.steps
         self._sensing_decisions += result.sensing_decisions
@@ -246,10 +257,8 @@ class SummaryBuilder:
             failures=self._failures,
             success_rate=self._successes / count if count else None,
             success_rate_interval_95=wilson_interval(self._successes, count) if count else None,
-            mean_reward=self._reward / count if count else None,
-            mean_reward_of_successes=(
-                self._reward_of_successes / self._successes if self._successes else None
-            ),
+            mean_reward=_mean(self._reward, count),
+            mean_reward_of_successes=_mean(self._reward_of_successes, self._successes),
             mean_steps=self._steps / count if count else None,
             sensing_decisions=self._sensing_decisions,
             unexplained_observations=self._unexplained,

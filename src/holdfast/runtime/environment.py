@@ -23,7 +23,7 @@ import numpy.typing as npt
 from holdfast import contract
 from holdfast.errors import ConfigurationError, EnvironmentFailedError, InvalidValueError
 from holdfast.outcome import Done
-from holdfast.problems.problem import Problem
+from holdfast.problems.problem import Problem, ProblemBase
 from holdfast.randomness import Purpose, stream
 from holdfast.user_code import find_class
 
@@ -160,13 +160,18 @@ class SimulatedEnvironment:
         shown: FloatArray = mean + np.sqrt(variance) * noise.normal(mean.shape)
         return shown
 
-    def perform(self, task_action: FloatArray) -> float:
-        """Move the true state by an executed task action and return the reward."""
+    def perform(self, task_action: FloatArray) -> float | None:
+        """Move the true state by an executed task action and return the reward.
+
+        None if the problem defines no reward.
+        """
         motion = stream(self._seed, self._trial, self.step, Purpose.WORLD_MOTION)
         problem = self._problem
         moved = problem.move(self.state, task_action, motion)
         self.state = contract.states_of(problem, "move", moved, self.state.shape)
         self.step += 1
+        if getattr(type(problem), "reward", None) is ProblemBase.reward:
+            return None
         return contract.scalar(problem, "reward", problem.reward(self.state, task_action))
 
     def is_done(self) -> bool:

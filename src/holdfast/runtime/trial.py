@@ -16,7 +16,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from holdfast.errors import EnvironmentFailedError, ProblemError
-from holdfast.outcome import DecisionLog, Done, TrialResult
+from holdfast.outcome import DecisionLog, Done, TrialResult, with_reward
 from holdfast.planning import (
     ObservationInfo,
     PlanningState,
@@ -154,7 +154,7 @@ def run_trial(
 
     log = DecisionLog(problem.action_size)
     sensing_ms: list[float] = []
-    total_reward = 0.0
+    total_reward: float | None = None
     unexplained = 0
     steps = 0
     done = _ask_done(environment)
@@ -181,7 +181,7 @@ def run_trial(
                 raise ProblemError(
                     f"the reward of step {steps} is {float(reward)}; it must be a finite number"
                 )
-            total_reward += float(reward)
+            total_reward = with_reward(total_reward, float(reward))
         log.acted(steps, executed)
         observer.acted(TaskStep(environment, state, task_info, executed, reward))
         state = advance(problem, planning, state, executed)
@@ -196,7 +196,7 @@ def run_trial(
         success=done is True,
         failed=done == "failed",
         steps=steps,
-        reward=total_reward,
+        reward=total_reward if steps else 0.0,
         sensing_decisions=len(sensing_ms),
         mean_sensing_ms=sum(sensing_ms) / len(sensing_ms) if sensing_ms else 0.0,
         recoveries=0,

@@ -22,7 +22,7 @@ import numpy.typing as npt
 
 from holdfast.belief import UNEXPLAINED_DEVIATIONS_SQUARED
 from holdfast.errors import HoldfastError, InvalidValueError
-from holdfast.outcome import DecisionLog, Done, TrialResult
+from holdfast.outcome import DecisionLog, Done, TrialResult, with_reward
 from holdfast.planning import ObservationInfo, Planner, PlanningState
 from holdfast.session.dispatcher import Dispatcher
 from holdfast.session.effects import (
@@ -108,7 +108,8 @@ class History:
         Of the same.
     actions : list of array
         Task actions that the records show to be performed, in order.
-    total_reward : float
+    total_reward : float or None
+        None as long as no step had a reward.
     pending : array or None
         A task action that was written down and of which nothing more is known.
     paused : bool
@@ -131,7 +132,7 @@ class History:
         self.num_observations = 0
         self.log = DecisionLog(planner.problem.action_size)
         self.actions: list[FloatArray] = []
-        self.total_reward = 0.0
+        self.total_reward: float | None = None
         self.pending: FloatArray | None = None
         self.paused = False
         self.num_unexplained = 0
@@ -162,7 +163,7 @@ class History:
         assert self.pending is not None
         self.log.acted(self.state.step, self.pending)
         self.state = planner.advance(self.state, self.pending)
-        self.total_reward += 0.0 if reward is None else reward
+        self.total_reward = with_reward(self.total_reward, reward)
         self.pending = None
 
 
@@ -682,7 +683,7 @@ class Robot:
             success=self._done is True,
             failed=self._done == "failed",
             steps=state.step,
-            reward=history.total_reward,
+            reward=history.total_reward if state.step else 0.0,
             sensing_decisions=history.num_observations,
             mean_sensing_ms=sum(sensing_ms) / len(sensing_ms) if sensing_ms else 0.0,
             recoveries=history.recoveries,

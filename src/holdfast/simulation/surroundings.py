@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from holdfast.outcome import TrialResult
+from holdfast.outcome import TrialResult, with_reward
 from holdfast.simulation.twins import Twins
 
 __all__ = ["Surroundings", "Violation"]
@@ -90,7 +90,7 @@ class Surroundings:
         assert shown is not None
         return shown
 
-    def act(self, step: int, action: FloatArray) -> tuple[float, bool]:
+    def act(self, step: int, action: FloatArray) -> tuple[float | None, bool]:
         """Perform a task action; return its reward and whether the task is done.
 
         Raises
@@ -137,9 +137,9 @@ class Surroundings:
                 f"trial {self._trial}: digest of the decisions {digest[:16]}, the undisturbed run "
                 f"has {twin.digest[:16]}"
             )
-        reward = 0.0
+        reward = None if twin.deeds else 0.0
         for deed in twin.deeds:
-            reward += deed.reward
+            reward = with_reward(reward, deed.reward)
         sensed = sum(deed.sensing_action is not None for deed in twin.deeds)
         for name, said, true in (
             ("success", result.success, self.done),

@@ -40,7 +40,7 @@ class Deed(NamedTuple):
         What it showed.
     action : bytes
         The task action, little-endian float64.
-    reward : float
+    reward : float or None
     done : bool
         Whether the task is done after it.
     """
@@ -48,7 +48,7 @@ class Deed(NamedTuple):
     sensing_action: int | None
     observation: FloatArray | None
     action: bytes
-    reward: float
+    reward: float | None
     done: bool
 
 
@@ -95,7 +95,7 @@ class _Recorder:
         again.state, again.step = world.state, world.step
         return again
 
-    def perform(self, task_action: FloatArray) -> float:
+    def perform(self, task_action: FloatArray) -> float | None:
         reward = self._environment.perform(task_action)
         sensing_action, shown = self._sensed or (None, None)
         written = np.asarray(task_action, dtype="<f8").tobytes()
