@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import msgspec
 import numpy as np
+import numpy.typing as npt
 import pytest
 
 from holdfast import planning
@@ -48,6 +49,9 @@ class InTenthsOfARadian(ProblemBase):
 
     def next_stage(self, estimates: FloatArray, stage: int | IntArray) -> int | IntArray:
         return PEG.next_stage(estimates / SCALE, stage)
+
+    def is_goal(self, states: FloatArray) -> npt.NDArray[np.bool_]:
+        return PEG.is_goal(states / SCALE)
 
 
 @pytest.fixture(scope="module")
