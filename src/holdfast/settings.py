@@ -103,7 +103,8 @@ class SelectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
     estimator : {"nearest_neighbor", "gaussian_mixture_upper", "gaussian_mixture_lower"}
         The estimate of the two entropies. A mixture takes few particles, as a sharp look leaves
         them, for certainty: use it with so many that they lie closer than its noise
-        (docs/results.md).
+        (docs/results.md). Distances between neighbours depend on the units of the coordinates;
+        with the motion noise as its own, the mixture does not.
     actions : {"commanded", "executed"}
         Whether ``action_entropy`` and ``action_covariance`` look at what the policy says or at what
         the limits leave of it.

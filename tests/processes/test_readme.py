@@ -13,6 +13,9 @@ from pathlib import Path
 
 import pytest
 
+from holdfast.outcome import TrialResult
+from holdfast.recording.tables import csv_lines
+
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 BLOCKS = re.findall(r"^```(\w+)\n(.*?)^```$", README, re.DOTALL | re.MULTILINE)
@@ -120,6 +123,38 @@ def test_nothing_is_left_to_fill_in(name: str) -> None:
     prose = re.sub(r"^```.*?^```$|`[^`\n]+`", "", text, flags=re.DOTALL | re.MULTILINE)
     left = re.findall(r"\b[A-Z0-9]+(?:_[A-Z0-9]+)+\b|\b(?:TODO|FIXME|TBD|XXX)\b", prose)
     assert left == []
+
+
+def test_the_comparison_of_two_runs_leaves_out_trials_without_a_step(tmp_path: Path) -> None:
+    """A trial may begin in the goal; then it does so in both runs, and has no ratio."""
+    (program,) = (program for program in PROGRAMS if "ttest_rel" in program)
+    steps = {"room": [0, 50, 60, 0, 80], "room-random": [0, 100, 120, 0, 160]}
+    for run_name, numbers in steps.items():
+        results = [
+            TrialResult(
+                trial=trial,
+                seed=0,
+                success=True,
+                steps=number,
+                reward=None,
+                sensing_decisions=number // 5,
+                mean_sensing_ms=0.1,
+                recoveries=0,
+                unexplained_observations=0,
+                digest="00" * 32,
+                sensing_ms=(),
+            )
+            for trial, number in enumerate(numbers)
+        ]
+        directory = tmp_path / "runs" / run_name
+        directory.mkdir(parents=True)
+        (directory / "trials.csv").write_text("".join(csv_lines(results)))
+    # The ratios are all the same, of which a test of their scatter has to say something, too.
+    varied = tmp_path / "runs" / "room" / "trials.csv"
+    varied.write_text(varied.read_text().replace(",80,", ",82,"))
+    done = run([sys.executable, "-W", "error", "-c", program], tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == "0.50 [0.49, 0.52] times the steps of random looks\n"
 
 
 @pytest.mark.parametrize("program", ALONE, ids=[f"program-{i}" for i in range(len(ALONE))])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import re
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from holdfast.experiments.registry import study_names
 
 DOCS = Path(__file__).parents[2] / "docs"
 PAGE = (DOCS / "results.md").read_text(encoding="utf-8")
+README = (DOCS.parent / "README.md").read_text(encoding="utf-8")
 ORIGINS = {
     path.parent.name: msgspec.json.decode(path.read_bytes())
     for path in sorted((DOCS / "results").glob("*/origin.json"))
@@ -53,6 +55,44 @@ def test_links_lead_somewhere() -> None:
     for target in re.findall(r"\]\(([^)#]+)[^)]*\)", PAGE):
         if "://" not in target:
             assert (DOCS / target).exists(), target
+
+
+def table_of(study: str, name: str) -> list[dict[str, str]]:
+    with (DOCS / "results" / study / f"{name}.csv").open(encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def test_both_pages_say_where_the_default_fails_more_often_than_random_looks() -> None:
+    default = "action entropy, neighbours"
+    losses = [
+        -100.0 * float(row["success_gain"])
+        for row in table_of("selectors", "selectors")
+        if row["problem"] == "three plates" and row["way"] == default
+    ]
+    *first, last = (f"{loss:.0f}" for loss in losses)
+    said = f"fails more often than random (?:looks|sensing)[*,:]* by {', '.join(first)} and {last} "
+    for page in (PAGE, README):
+        assert re.search(said, " ".join(page.split()))
+    # So it is among the rivals in success, everywhere.
+    rivals = table_of("selectors", "rivals_in_success")
+    against_random = [row["problem"] for row in rivals if row["rival"] == "random"]
+    assert against_random == list(dict.fromkeys(row["problem"] for row in rivals))
+    sure = {
+        row["problem"]: float(row["success_gain"])
+        for row in rivals
+        if row["rival"] == "random" and float(row["adjusted_p_value"]) < 0.01
+    }
+    assert {problem for problem, gain in sure.items() if gain < 0.0} == {"three plates"}
+
+
+def test_both_pages_say_what_more_particles_than_the_default_gain() -> None:
+    (row,) = (
+        row for row in table_of("parameters", "more_particles") if row["problem"].startswith("all")
+    )
+    assert (row["from"], row["to"]) == ("x 3", "x 10")
+    value, low, high = (float(row[f"steps_ratio{end}"]) for end in ("", "_low", "_high"))
+    assert f"{value:.2f} [{low:.2f}, {high:.2f}] times the steps of three times" in README
+    assert f"particles x 10 instead of x 3: {value:.3g} [{low:.3g}, {high:.3g}]" in PAGE
 
 
 def test_no_trial_is_committed() -> None:

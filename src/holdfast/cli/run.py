@@ -327,8 +327,8 @@ def _run(options: _Options) -> None:
         notes = _Notes(options)
         display = run_display(configuration, quiet=quiet or options.log == "json")
         recorder = Recorder(trial=0)
-        robot = RobotRun()
         recorded: RecordedEnvironment | None = None
+        robot = RobotRun()
         summary: RunSummary | None = None
         started = perf_counter()
 
