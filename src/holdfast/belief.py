@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from holdfast import _kernel, contract, numerics
-from holdfast.errors import InvalidValueError, ProblemError
+from holdfast.errors import InvalidValueError
 from holdfast.randomness import Stream
 
 __all__ = [
@@ -203,7 +203,9 @@ def update(
     """
     observed = np.ascontiguousarray(observation, dtype=np.float64).reshape(-1)
     if not numerics.all_finite(observed):
-        raise InvalidValueError(f"observation {observed}: every coordinate must be finite")
+        raise InvalidValueError(
+            f"observation {contract.in_brief(observed)}: every coordinate must be finite"
+        )
     if not contract.has_general_observations(problem):
         mean = contract.observation_mean(problem, belief.states, sensing_action)
         variance = contract.observation_variance(problem, belief.states, sensing_action, mean)
@@ -212,6 +214,10 @@ def update(
                 f"observation of {observed.shape[0]} coordinates: sensing action {sensing_action} "
                 f"gives {mean.shape[-1]}"
             )
+        # A comparison with NaN is false.
+        usable = (variance > 0.0).all() and numerics.all_finite(variance)
+        if not usable or not numerics.all_finite(mean):
+            raise contract.unusable_prediction(problem, sensing_action, mean, variance)
         log_likelihood, squared_distance = _gaussian_log_likelihood(
             observed, mean, variance, belief.weights
         )
@@ -236,10 +242,6 @@ def _gaussian_log_likelihood(
 
     The distance is Mahalanobis's, from what a particle expects; particles of weight 0 do not count.
     """
-    if not numerics.all_finite(mean):
-        raise ProblemError("observation_mean is not finite for a particle")
-    if not (variance > 0.0).all() or not numerics.all_finite(variance):
-        raise ProblemError(f"observation_variance {variance}: every entry must be > 0 and finite")
     # An observation of 1e200 is as good as one at infinity: no particle explains it.
     with np.errstate(over="ignore"):
         difference = observed - mean

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import functools
 import inspect
+import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -23,13 +24,16 @@ __all__ = [
     "check_problem",
     "executed_action",
     "has_general_observations",
+    "in_brief",
     "log_likelihood",
     "next_stage",
     "observation_mean",
     "observation_variance",
     "policy",
+    "sample_observation",
     "scalar",
     "states_of",
+    "unusable_prediction",
 ]
 
 FloatArray = npt.NDArray[np.float64]
@@ -37,6 +41,9 @@ FloatArray = npt.NDArray[np.float64]
 # The contract itself is holdfast.problems.problem.Problem. Here a problem is anything that may or
 # may not fulfil it.
 MAX_OBSERVATION_SIZE = 1024
+
+_EDGE = 4
+"""Entries of a long array that a message has, at either end."""
 
 PARAMETERS: Mapping[str, tuple[str, ...]] = {
     "initial_states": ("stream", "count"),
@@ -78,8 +85,11 @@ def check_problem(problem: Any) -> None:
     actions = getattr(problem, "sensing_actions", ())
     if isinstance(actions, str) or not isinstance(actions, Sequence) or not actions:
         raise ProblemError(
-            f"sensing_actions of {name} is {actions!r}: must be a sequence of labels, not empty"
+            f"sensing_actions of {name} is {actions!r:.80}: must be a sequence of labels, not empty"
         )
+    for label in actions:
+        if not isinstance(label, str):
+            raise ProblemError(f"sensing_actions of {name} has {label!r:.80}: labels must be text")
     labels = getattr(problem, "state_labels", ())
     if labels and len(labels) != problem.state_size:
         raise ProblemError(
@@ -90,9 +100,11 @@ def check_problem(problem: Any) -> None:
     if not isinstance(resolution, (int, float)) or not 0.0 < resolution < np.inf:
         raise ProblemError(f"resolution of {name} is {resolution!r}: must be positive and finite")
     variance = np.asarray(getattr(problem, "motion_variance", ()))
-    if variance.shape != (problem.action_size,) or not (variance >= 0.0).all():
+    numbers = variance.dtype.kind in "fiu" and variance.shape == (problem.action_size,)
+    if not numbers or not (variance >= 0.0).all():
         raise ProblemError(
-            f"motion_variance of {name} is {variance}: must be {problem.action_size} numbers >= 0"
+            f"motion_variance of {name} is {in_brief(variance)}: must be {problem.action_size} "
+            "numbers >= 0"
         )
     given = [
         function
@@ -175,6 +187,47 @@ def observation_variance(
     return checked
 
 
+def unusable_prediction(
+    problem: Any, sensing_action: int, mean: FloatArray, variance: FloatArray
+) -> ProblemError:
+    """Return the error about the first entry of a mean or variance that no observation can have.
+
+    Whether there is one the caller has found out, in less time than it takes to find it.
+    """
+    function, values, need = "observation_mean", mean, "finite"
+    unusable = ~np.isfinite(mean)
+    if not unusable.any():
+        function, values, need = "observation_variance", variance, "positive and finite"
+        # A comparison with NaN is false.
+        unusable = ~((variance > 0.0) & (variance < np.inf))
+    index = tuple(map(int, np.argwhere(unusable)[0]))
+    return ProblemError(
+        f"{function} of {_name(problem)}, sensing action {sensing_action}, is {values[index]} at "
+        f"{_written(index)} of shape {_written(values.shape)}: every entry must be {need}"
+    )
+
+
+def sample_observation(
+    problem: Any, state: FloatArray, sensing_action: int, stream: object
+) -> FloatArray:
+    """Return a checked observation that was drawn in one state, shape ``(observation_size,)``."""
+    drawn = problem.sample_observation(state, sensing_action, stream)
+    if not isinstance(drawn, np.ndarray) or drawn.dtype.kind not in "fiu" or drawn.ndim != 1:
+        raise _misfit(
+            problem,
+            f"sample_observation of sensing action {sensing_action}",
+            drawn,
+            "(observation_size,)",
+        )
+    if not 1 <= drawn.size <= MAX_OBSERVATION_SIZE or not np.isfinite(drawn).all():
+        raise ProblemError(
+            f"sample_observation of {_name(problem)} returned {in_brief(drawn)} of "
+            f"{drawn.size} coordinates: need 1 to {MAX_OBSERVATION_SIZE}, all of them finite"
+        )
+    checked: FloatArray = drawn
+    return checked
+
+
 def log_likelihood(
     problem: Any, states: FloatArray, sensing_action: int, observation: FloatArray
 ) -> FloatArray:
@@ -184,8 +237,8 @@ def log_likelihood(
         raise _misfit(problem, "log_likelihood", values, states.shape[:-1])
     if np.isnan(values).any() or (values == np.inf).any():
         raise ProblemError(
-            f"log_likelihood of {_name(problem)}, observation {observation} under sensing action "
-            f"{sensing_action}, is NaN or plus infinity for a particle"
+            f"log_likelihood of {_name(problem)}, observation {in_brief(observation)} under "
+            f"sensing action {sensing_action}, is NaN or plus infinity for a particle"
         )
     checked: FloatArray = values
     return checked
@@ -212,12 +265,14 @@ def executed_action(problem: Any, commanded: FloatArray) -> FloatArray:
 
 def next_stage(problem: Any, estimate: FloatArray, stage: int) -> int:
     """Return the checked stage that follows."""
-    value = int(_single(problem, "next_stage", problem.next_stage(estimate, stage)))
+    value = _single(problem, "next_stage", problem.next_stage(estimate, stage))
+    # NaN is not, either.
     if not 0 <= value < problem.num_stages:
         raise ProblemError(
-            f"next_stage of {_name(problem)} is {value}: allowed are 0 to {problem.num_stages - 1}"
+            f"next_stage of {_name(problem)} is {value!r:.40}: allowed are 0 to "
+            f"{problem.num_stages - 1}"
         )
-    return value
+    return int(value)
 
 
 def states_of(
@@ -229,7 +284,8 @@ def states_of(
     if not _kernel.all_finite(states):
         rows = states.reshape(-1, shape[-1])
         bad = int(np.argmin(np.isfinite(rows).all(axis=-1)))
-        raise ProblemError(f"{function} of {_name(problem)} put particle {bad} at {rows[bad]}")
+        where = in_brief(rows[bad])
+        raise ProblemError(f"{function} of {_name(problem)} put particle {bad} at {where}")
     contiguous = np.ascontiguousarray(states)
     contiguous.setflags(write=False)
     return contiguous
@@ -243,9 +299,24 @@ def scalar(problem: Any, function: str, value: object) -> float:
 def _single(problem: Any, function: str, value: object) -> Any:
     if type(value) in (int, float, bool):
         return value
-    if value is None or isinstance(value, (str, list, tuple)) or np.ndim(value) != 0:  # type: ignore[arg-type]
+    if isinstance(value, (list, tuple)):
+        raise _misfit(problem, function, value, ())
+    number = np.asarray(value)
+    if number.ndim != 0 or number.dtype.kind not in "fiub":
         raise _misfit(problem, function, value, ())
     return value
+
+
+def in_brief(values: object) -> str:
+    """Return an array on one line, a long one without its middle.
+
+    Parameters
+    ----------
+    values : array
+    """
+    return np.array2string(
+        np.asarray(values), max_line_width=sys.maxsize, threshold=2 * _EDGE, edgeitems=_EDGE
+    )
 
 
 def _is_array(value: object, dimensions: int) -> bool:

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from holdfast import _kernel, numerics
+from holdfast import _kernel, contract, numerics
 from holdfast.errors import InvalidValueError
 
 __all__ = ["GaussianMixture", "NearestNeighbor", "entropy"]
@@ -152,7 +152,9 @@ def kernel_estimator(
     if variance.shape != (dimension,):
         raise InvalidValueError(f"variance of shape {variance.shape}: need ({dimension},)")
     if not (variance > 0.0).all() or not np.isfinite(variance).all():
-        raise InvalidValueError(f"variance {variance}: every entry must be > 0 and finite")
+        raise InvalidValueError(
+            f"variance {contract.in_brief(variance)}: every entry must be > 0 and finite"
+        )
     two_pi_e = 17.079468445347132
     offset = 0.5 * dimension * float(numerics.log(two_pi_e))
     offset += 0.5 * numerics.sum(numerics.log(variance))

@@ -301,7 +301,10 @@ def choose_task_action(
     commanded = contract.policy(problem, estimated, stage)
     action = contract.executed_action(problem, commanded)
     if not numerics.all_finite(action):
-        raise ProblemError(f"policy of {problem.name} gives {action} in state {estimated}")
+        raise ProblemError(
+            f"policy of {problem.name} gives {contract.in_brief(action)} in state "
+            f"{contract.in_brief(estimated)}"
+        )
     return action, TaskInfo(estimated, commanded, stage)
 
 
@@ -328,7 +331,8 @@ def advance(
     action = np.asarray(task_action, dtype=np.float64)
     if action.shape != (problem.action_size,) or not numerics.all_finite(action):
         raise InvalidValueError(
-            f"task action {action}: {problem.name} needs {problem.action_size} finite coordinates"
+            f"task action {contract.in_brief(action)}: {problem.name} needs "
+            f"{problem.action_size} finite coordinates"
         )
     belief = state.belief
     # Computed again, not taken from whoever calls: the action may come from another machine.

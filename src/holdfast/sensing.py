@@ -228,8 +228,9 @@ def _noise_variance(problem: Problem, resolution: float | None, dimension: int) 
 def _require_bounded(problem: Problem, points: FloatArray, states: FloatArray, which: str) -> None:
     if (bad := first_unbounded(points)) is not None:
         raise ProblemError(
-            f"policy of {problem.name} returned {points[bad]} in {which} {states[bad]}: every "
-            f"coordinate must be finite and at most {LARGEST:g}"
+            f"policy of {problem.name} returned {contract.in_brief(points[bad])} in {which} "
+            f"{contract.in_brief(states[bad])}: every coordinate must be finite and at most "
+            f"{LARGEST:g}"
         )
 
 
@@ -256,14 +257,13 @@ def _predictions(problem: Problem, belief: Belief) -> tuple[list[int], FloatArra
             own_variance.T if own_variance.ndim > 1 else own_variance.reshape(-1, 1)
         )
         row += size
-    if not numerics.all_finite(predicted):
-        raise ProblemError(f"observation_mean of {problem.name} is not finite for a particle")
     # A comparison with NaN is false.
-    if not ((variance > 0.0) & (variance < np.inf)).all():
-        raise ProblemError(
-            f"observation_variance of {problem.name} has the entry {variance.min()}: every entry "
-            "must be positive and finite"
-        )
+    usable = ((variance > 0.0) & (variance < np.inf)).all()
+    if not usable or not numerics.all_finite(predicted):
+        for action, (mean, own_variance) in enumerate(zip(means, variances, strict=True)):
+            right = (own_variance > 0.0).all() and numerics.all_finite(own_variance)
+            if not right or not numerics.all_finite(mean):
+                raise contract.unusable_prediction(problem, action, mean, own_variance)
     return sizes, predicted, variance
 
 
@@ -280,7 +280,8 @@ def _general_log_weights(
     rows = []
     for action in range(len(problem.sensing_actions)):
         for i, particle in enumerate(particles):
-            observation = problem.sample_observation(  # type: ignore[attr-defined]
+            observation = contract.sample_observation(
+                problem,
                 belief.states[particle],
                 action,
                 hypotheses.substream(_GENERAL_OBSERVATIONS).substream(i),

@@ -214,3 +214,51 @@ def test_the_parameters_are_those_of_the_contract() -> None:
         if inspect.isfunction(member) and not name.startswith("_")
     }
     assert functions == contract.PARAMETERS
+
+
+def huge(value: float) -> np.ndarray:
+    return np.full(4000, value)
+
+
+@pytest.mark.parametrize(
+    ("attribute", "value", "message"),
+    [
+        (
+            "motion_variance",
+            huge(-1.0),
+            r"is \[-1\. -1\. -1\. -1\. \.\.\. -1\. -1\. -1\. -1\.\]: must",
+        ),
+        ("motion_variance", ["a", "b"], r"is \['a' 'b'\]: must be 1 numbers >= 0"),
+        ("sensing_actions", "x" * 4000, "is 'xxx.*: must be a sequence of labels"),
+        ("sensing_actions", [1, 2], "has 1: labels must be text"),
+        ("next_stage", lambda *_: 1e300, r"next_stage of .* is 1e\+300: allowed are 0 to 0"),
+        ("next_stage", lambda *_: float("nan"), "next_stage of .* is nan: allowed are 0 to 0"),
+        ("reward", lambda *_: object(), "reward of .* returned object .*: need one number"),
+        ("is_goal", lambda *_: huge(1.0), r"is_goal of .* shape \(4000,\): need one number"),
+        (
+            "policy",
+            lambda states, _: np.full((*states.shape[:-1], 1), np.nan),
+            r"returned \[nan nan\] in|policy of line .*\[nan",
+        ),
+        ("observation_mean", lambda s, _: np.full((*s.shape[:-1], 900), np.nan), r"is nan at \(0"),
+        ("observation_variance", lambda *_: -np.ones(1), r"is -1\.0 at \(0,\) of shape \(1,\)"),
+        ("sample_observation", lambda *_: "no", r"returned str \('no'\): need a float64 array"),
+        ("sample_observation", lambda *_: huge(0.0), "returned .* of 4000 coordinates: need 1 to"),
+        ("sample_observation", lambda *_: np.full(900, np.nan), r"\[nan nan nan nan \.\.\. nan"),
+        ("log_likelihood", lambda s, *_: np.full(len(s), np.nan), "is NaN or plus infinity for a"),
+    ],
+)
+def test_an_account_of_what_is_wrong_is_short(attribute: str, value: object, message: str) -> None:
+    """It names the function, the value and where it stands, on one line, however large all is."""
+    own = staticmethod(value) if callable(value) else value
+    problem: Any = type("Wrong", (Line,), {attribute: own})()
+    if attribute == "log_likelihood":
+        problem.sample_observation = lambda *_: np.zeros(900)
+    if attribute == "sample_observation":
+        problem.log_likelihood = lambda states, *_: np.zeros(len(states))
+    if attribute == "observation_mean":
+        problem.observation_variance = lambda *_: np.ones(900)
+    with pytest.raises(ProblemError, match=message) as refused:
+        run_a_step(problem)
+    assert "\n" not in str(refused.value)
+    assert len(str(refused.value)) < 300

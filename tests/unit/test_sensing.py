@@ -249,7 +249,10 @@ class TestBadInput:
     def test_observation_mean_not_finite(self, bad: float) -> None:
         mean = np.zeros((60, 1))
         mean[3] = bad
-        with pytest.raises(ProblemError, match="observation_mean of coordinates is not finite"):
+        with pytest.raises(
+            ProblemError,
+            match=r"observation_mean of coordinates, sensing action 0, is \S+ at \(3, 0\)",
+        ):
             choose(Broken(mean=mean), settings_of(), belief_of(1.0, 1.0))
 
     @pytest.mark.parametrize("bad", [0.0, -0.25, np.nan, np.inf])
@@ -258,12 +261,15 @@ class TestBadInput:
         of_one_particle[3] = bad
         for variance in (np.array([bad]), of_one_particle):
             with pytest.raises(
-                ProblemError, match=r"observation_variance of coordinates has the entry"
+                ProblemError,
+                match=r"observation_variance of coordinates, sensing action 0, is \S+ at \([03]",
             ):
                 choose(Broken(variance=variance), settings_of(), belief_of(1.0, 1.0))
 
     def test_negative_variance_is_named(self) -> None:
-        with pytest.raises(ProblemError, match=r"the entry -0\.25: every entry must be"):
+        with pytest.raises(
+            ProblemError, match=r"is -0\.25 at \(0,\) of shape \(1,\): every entry must be"
+        ):
             choose(Broken(variance=np.array([-0.25])), settings_of(), belief_of(1.0, 1.0))
 
     def test_mixture_without_a_motion_variance_for_the_states(self) -> None:

@@ -151,13 +151,14 @@ class SimulatedEnvironment:
                 f"{len(problem.sensing_actions) - 1}"
             )
         noise = stream(self._seed, self._trial, self.step, Purpose.WORLD_OBSERVATION)
-        draw = getattr(problem, "sample_observation", None)
-        if draw is not None:
-            observation: FloatArray = draw(self.state, sensing_action, noise)
-            return observation
+        if hasattr(problem, "sample_observation"):
+            return contract.sample_observation(problem, self.state, sensing_action, noise)
         mean = contract.observation_mean(problem, self.state, sensing_action)
         variance = contract.observation_variance(problem, self.state, sensing_action, mean)
-        shown: FloatArray = mean + np.sqrt(variance) * noise.normal(mean.shape)
+        with np.errstate(invalid="ignore"):
+            shown: FloatArray = mean + np.sqrt(variance) * noise.normal(mean.shape)
+        if not np.isfinite(shown).all():
+            raise contract.unusable_prediction(problem, sensing_action, mean, variance)
         return shown
 
     def perform(self, task_action: FloatArray) -> float | None:
