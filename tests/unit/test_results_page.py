@@ -65,7 +65,7 @@ def table_of(study: str, name: str) -> list[dict[str, str]]:
 def test_both_pages_say_where_the_default_fails_more_often_than_random_looks() -> None:
     default = "action entropy, neighbours"
     losses = [
-        -100.0 * float(row["success_gain"])
+        abs(min(0.0, 100.0 * float(row["success_gain"])))
         for row in table_of("selectors", "selectors")
         if row["problem"] == "three plates" and row["way"] == default
     ]
