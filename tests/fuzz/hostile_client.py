@@ -257,7 +257,7 @@ class _Client:
             try:
                 self._session = zenoh.open(configuration)
                 self.links += 1
-                for reply in self._session.liveliness().get("holdfast/**/alive", timeout=5.0):
+                for reply in self._session.liveliness().get("holdfast/1/**/alive", timeout=5.0):
                     if reply.ok is not None:
                         self._key = str(reply.ok.key_expr).removesuffix("alive") + "decide"
                         return
