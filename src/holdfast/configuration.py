@@ -31,6 +31,7 @@ import msgspec.inspect
 
 from holdfast.contract import GAUSSIAN_OBSERVATIONS, has_general_observations
 from holdfast.errors import ConfigurationError, HoldfastError, UnknownProblemError
+from holdfast.files import read_bounded
 from holdfast.problems import registry
 from holdfast.problems.problem import Problem, ProblemBase
 from holdfast.settings import (
@@ -288,8 +289,7 @@ def _section_and_key(name: str) -> tuple[str, str]:
 def _content(path: Path) -> bytes:
     """Return what is in the file, but no more than one byte over the limit."""
     try:
-        with path.open("rb") as file:
-            return file.read(MAX_BYTES + 1)
+        return read_bounded(path, MAX_BYTES + 1)
     except FileNotFoundError:
         raise ConfigurationError(f"{path}: there is no such file") from None
     except IsADirectoryError:

@@ -8,9 +8,12 @@ together, a key and its certificate, appear the same way.
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import re
+import select
 import shutil
+import stat
 import time
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -23,6 +26,7 @@ __all__ = [
     "OutputError",
     "claim_directory",
     "create_directory_atomically",
+    "read_bounded",
     "remove_unfinished",
     "write_atomically",
 ]
@@ -31,6 +35,9 @@ _MAX_DEFAULT_DIRECTORIES = 10_000
 
 _UNFINISHED = re.compile(r"\..+\.\d+\.tmp")
 _LONGEST_WRITE_S = 600.0
+
+_PIPE_TIMEOUT_S = 10.0
+_PIPE_PAUSE_S = 0.02
 
 
 class OutputError(HoldfastError):
@@ -49,6 +56,66 @@ class NewFile(NamedTuple):
 
     content: bytes
     mode: int
+
+
+def read_bounded(path: Path, most: int) -> bytes:
+    """Read a file that a person names, and neither wait for ever nor read without end.
+
+    A pipe is read, too: a shell's ``<(command)`` is one. It is waited for as long as there is no
+    writer yet, or nothing comes, but only so long.
+
+    Parameters
+    ----------
+    path : Path
+    most : int
+        Bytes after which nothing more is read.
+
+    Raises
+    ------
+    OSError
+        If it cannot be read, or is neither a file nor a pipe; ``strerror`` says what is wrong.
+    """
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    try:
+        mode = os.fstat(descriptor).st_mode
+        if stat.S_ISDIR(mode):
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+        if stat.S_ISFIFO(mode):
+            return _read_pipe(descriptor, most, named=not path.is_symlink())
+        if not stat.S_ISREG(mode):
+            raise OSError(errno.EINVAL, "it is a device or socket, not a file")
+        with os.fdopen(descriptor, "rb", closefd=False) as file:
+            return file.read(most)
+    finally:
+        os.close(descriptor)
+
+
+def _read_pipe(descriptor: int, most: int, *, named: bool) -> bytes:
+    content = bytearray()
+    deadline = time.monotonic() + _PIPE_TIMEOUT_S
+    poll = select.poll()
+    poll.register(descriptor, select.POLLIN)
+    while len(content) < most:
+        piece = b""
+        left_s = deadline - time.monotonic()
+        if left_s <= 0.0:
+            raise TimeoutError(
+                errno.ETIMEDOUT,
+                f"it is a pipe through which nothing came for {_PIPE_TIMEOUT_S:g} s",
+            )
+        if not poll.poll(1e3 * left_s):
+            continue
+        with contextlib.suppress(BlockingIOError):
+            piece = os.read(descriptor, most - len(content))
+            if not piece and (content or not named):
+                break
+        if piece:
+            content += piece
+            deadline = time.monotonic() + _PIPE_TIMEOUT_S
+        else:
+            # Nobody has opened it for writing yet.
+            time.sleep(_PIPE_PAUSE_S)
+    return bytes(content)
 
 
 def write_atomically(path: Path, content: bytes | Iterable[str]) -> None:

@@ -271,7 +271,7 @@ class TestBadInput:
     def test_variance_not_positive(self, bad: float, text: str) -> None:
         with pytest.raises(
             ProblemError,
-            match=rf"observation_variance of Direct, sensing action 1, is {text} at \(1,\) of shape",
+            match=rf"observation_variance of Direct, sensing action 1, is {text} at \(1,\)",
         ):
             update(Direct(1.0, bad), some_belief(), 1, [0.0, 0.0])
 

@@ -15,6 +15,7 @@ line that is made for people.
 from __future__ import annotations
 
 import sys
+from types import TracebackType
 
 __all__ = ["main"]
 
@@ -47,6 +48,7 @@ def _main() -> None:
 
     replace_closed_streams()
     forgive_unwritable_errors()
+    sys.excepthook = _tell_defect
     arguments = sys.argv[1:]
     try:
         allow_descriptors()
@@ -70,3 +72,11 @@ def _main() -> None:
         from holdfast.cli.endings import EXIT_SIGNAL, signal_of
 
         sys.exit(EXIT_SIGNAL + signal_of(interruption))
+
+
+def _tell_defect(
+    kind: type[BaseException], error: BaseException, trace: TracebackType | None
+) -> None:
+    from holdfast.cli.endings import tell_defect
+
+    tell_defect(kind, error, trace)

@@ -16,6 +16,7 @@ import typer
 from holdfast.cli.endings import EXIT_DIFFERENT, RunError, ended_by_signals, signal_of
 from holdfast.cli.options import MAX_SEED, MAX_TRIALS, location, whole_number
 from holdfast.errors import HoldfastError, InvalidValueError
+from holdfast.printable import printable
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -348,14 +349,14 @@ class _Show:
         if self._as_json:
             self._event("interrupted", reason=text, resume_command=command)
         else:
-            sys.stderr.write(f"\n{text}\nGo on with: {command}\n")
+            sys.stderr.write(printable(f"\n{text}\nGo on with: {command}\n"))
 
     def conclude(self, summary: ChaosSummary, directory: Path, note: str | None) -> None:
         if not self._as_json:
             self._print_table(summary)
             wrong = [outcome for outcome in self._series.outcomes if outcome.verdict != "identical"]
             for outcome in sorted(wrong, key=lambda outcome: outcome.trial):
-                sys.stdout.write(f"\n{self._account(outcome)}\n")
+                sys.stdout.write(printable(f"\n{self._account(outcome)}\n"))
             names = sorted(path.name for path in directory.iterdir() if path.is_file())
             sys.stdout.write(f"\n{directory}/\n  {'  '.join(names)}\n")
             sys.stdout.flush()

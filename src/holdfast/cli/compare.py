@@ -10,6 +10,7 @@ import typer
 
 from holdfast.cli.endings import EXIT_DIFFERENT
 from holdfast.cli.options import location
+from holdfast.printable import printable
 
 __all__ = ["compare"]
 
@@ -46,9 +47,9 @@ def compare(
     from holdfast.recording.compare import compare_runs
 
     found = compare_runs(first, second)
-    sys.stdout.write(found.to_json() if json else f"{found.describe()}\n")
+    sys.stdout.write(found.to_json() if json else f"{printable(found.describe())}\n")
     if not json:
         for note in found.notes:
-            sys.stderr.write(f"note: {note}\n")
+            sys.stderr.write(f"note: {printable(note)}\n")
     if not found.identical:
         raise typer.Exit(EXIT_DIFFERENT)

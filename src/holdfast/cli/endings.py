@@ -6,8 +6,10 @@ import contextlib
 import signal
 import sys
 from collections.abc import Iterator, Sequence
+from types import TracebackType
 
 from holdfast.errors import HoldfastError
+from holdfast.printable import printable
 from holdfast.runtime.command_line import wants_json
 
 __all__ = [
@@ -19,6 +21,7 @@ __all__ = [
     "RunError",
     "ended_by_signals",
     "signal_of",
+    "tell_defect",
     "tell_error",
 ]
 
@@ -72,7 +75,7 @@ def tell_error(error: HoldfastError, arguments: Sequence[str]) -> None:
         What stands after ``holdfast``; they say which of both.
     """
     if not wants_json(arguments):
-        sys.stderr.write(f"holdfast: error: {error}\n")
+        sys.stderr.write(f"holdfast: error: {printable(str(error))}\n")
         return
     from holdfast.runtime.logs import tell_event
 
@@ -86,6 +89,21 @@ def tell_error(error: HoldfastError, arguments: Sequence[str]) -> None:
         fields["resume_command"] = error.command
     component = {"serve": "service", "chaos": "chaos"}.get(arguments[0], "robot")
     tell_event(component, "error", **fields)
+
+
+def tell_defect(
+    kind: type[BaseException], error: BaseException, trace: TracebackType | None
+) -> None:
+    """Say on the standard error what nobody has expected, as the interpreter would.
+
+    Parameters
+    ----------
+    kind, error, trace
+        As those of :func:`sys.excepthook`.
+    """
+    import traceback
+
+    sys.stderr.write(printable("".join(traceback.format_exception(kind, error, trace))))
 
 
 class EndedBySignal(KeyboardInterrupt):

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from holdfast.cli.options import location, whole_number
+from holdfast.printable import printable
 
 if TYPE_CHECKING:
     from holdfast.runtime.credentials import KeyRing
@@ -73,7 +74,7 @@ def keys(
         hosts=host or (),
         days=days,
         renew=renew,
-        warn=lambda text: typer.echo(f"warning: {text}", err=True),
+        warn=lambda text: typer.echo(f"warning: {printable(text)}", err=True),
     )
     sys.stdout.write(_account(ring))
 

@@ -25,6 +25,7 @@ from holdfast.cli.options import MAX_SEED, MAX_TRIALS, location, number, whole_n
 from holdfast.cli.overrides import Override, combined, parse_assignment
 from holdfast.cli.terminal import duration, print_files, print_summary, run_display
 from holdfast.errors import HoldfastError, InvalidValueError
+from holdfast.printable import printable
 from holdfast.runtime.command_line import MAX_JOBS
 
 if TYPE_CHECKING:
@@ -494,14 +495,14 @@ class _Notes:
         if self._as_json:
             self._event("note", reason=text)
         else:
-            sys.stderr.write(f"note: {text}\n")
+            sys.stderr.write(f"note: {printable(text)}\n")
 
     def ended_early(self, how: str, kept: str, command: str) -> None:
         """Say how a run ended before its end, what is kept, and how to go on."""
         if self._as_json:
             self._event("interrupted", reason=f"{how}. {kept}", resume_command=command)
         else:
-            sys.stderr.write(f"\n{how}. {kept}\nGo on with: {command}\n")
+            sys.stderr.write(printable(f"\n{how}. {kept}\nGo on with: {command}\n"))
 
     @contextlib.contextmanager
     def while_it_lasts(self, text: str) -> Iterator[None]:

@@ -13,6 +13,7 @@ import typer
 from holdfast.cli.endings import EXIT_DIFFERENT, ended_by_signals
 from holdfast.cli.options import location, whole_number
 from holdfast.errors import HoldfastError
+from holdfast.files import read_bounded
 from holdfast.runtime.command_line import MAX_JOBS
 
 if TYPE_CHECKING:
@@ -25,6 +26,7 @@ __all__ = ["simulate"]
 _SEEDS = re.compile(r"([-+]?\d+):([-+]?\d+)", re.ASCII)
 _MAX_SEED = 10**12
 _MAX_DIGITS = 20
+_MAX_SCHEDULE_BYTES = 1024 * 1024
 
 
 def simulate(
@@ -118,7 +120,7 @@ def _run_file(path: Path, *, shrink: bool) -> None:
     from holdfast.simulation.schedule import ScheduleError, parse_schedule
 
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_bounded(path, _MAX_SCHEDULE_BYTES).decode()
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "it is not text in UTF-8"
         raise HoldfastError(f"{path}: cannot be read: {reason}") from error

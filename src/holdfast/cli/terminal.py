@@ -10,6 +10,8 @@ from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Protocol
 
+from holdfast.printable import printable
+
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.progress import Progress
@@ -147,7 +149,7 @@ class PlainProgress:
 
     def say(self, text: str) -> None:
         """Write a line."""
-        sys.stderr.write(f"{text}\n")
+        sys.stderr.write(f"{printable(text)}\n")
         sys.stderr.flush()
 
     def stop(self) -> None:
@@ -211,7 +213,7 @@ class LiveProgress:
 
     def say(self, text: str) -> None:
         """Print a line above it."""
-        self._console.print(text, highlight=False, markup=False, soft_wrap=True)
+        self._console.print(printable(text), highlight=False, markup=False, soft_wrap=True)
 
     def stop(self) -> None:
         """Take the line away."""
@@ -283,12 +285,14 @@ def print_summary(summary: RunSummary) -> None:
     """Print what a run came to."""
     from rich.console import Console
     from rich.table import Table
+    from rich.text import Text
 
     table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
     table.add_column(style="bold")
     table.add_column()
     for label, value in _summary_rows(summary):
-        table.add_row(label, value)
+        # Not as markup: tcp/[fe80::1]:7447 is no style.
+        table.add_row(label, Text(printable(value)))
     console = Console(highlight=False)
     console.print(table)
 
@@ -373,7 +377,7 @@ def print_files(directory: Path) -> None:
     from holdfast.recording.run_directory import output_names
 
     names = [name for name in output_names() if (directory / name).exists()]
-    sys.stdout.write(f"\n{directory}/\n  {'  '.join(names)}\n")
+    sys.stdout.write(printable(f"\n{directory}/\n  {'  '.join(names)}\n"))
     sys.stdout.flush()
 
 

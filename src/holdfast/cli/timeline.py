@@ -12,6 +12,8 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
+from holdfast.printable import printable
+
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.live import Live
@@ -245,7 +247,7 @@ class PlainShow:
 
     def say(self, line: Line) -> None:
         """Write a line."""
-        sys.stderr.write(plain_line(line) + "\n")
+        sys.stderr.write(printable(plain_line(line)) + "\n")
         sys.stderr.flush()
 
     def look(self, chronicle: Chronicle, now_s: float) -> None:

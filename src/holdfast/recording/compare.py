@@ -168,6 +168,8 @@ def _journal_path(run: Path) -> Path:
         return run / JOURNAL_NAME
     if not run.exists():
         raise OutputError(f"{run}: there is no such directory or journal, so no run to compare")
+    if not run.is_file():
+        raise OutputError(f"{run}: is a pipe or device, not a journal")
     _require_database(run)
     return run
 

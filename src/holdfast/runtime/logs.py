@@ -26,6 +26,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 import stat
 import sys
 import threading
@@ -39,6 +40,7 @@ from typing import Literal, NamedTuple, Protocol, Self, TextIO, TypeAlias
 import msgspec
 
 from holdfast.files import OutputError
+from holdfast.printable import printable
 
 __all__ = [
     "MAX_LINE_BYTES",
@@ -75,6 +77,9 @@ _BURST = 20
 _ROBOT = "robot"
 _COMPONENT_WIDTH = 8
 _EVENT_WIDTH = 18
+
+_OBEYED = re.compile("[\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069]")
+"""Control characters, and those that turn the direction of what follows."""
 
 # Units that a field's name ends in, and how they are written.
 _UNITS = {"_ms": "ms", "_us": "µs", "_s": "s", "_hz": "Hz", "_bytes": "bytes"}
@@ -489,8 +494,12 @@ def _compose_json(now_ns: int, component: str, name: str, fields: Mapping[str, o
 
 
 def _json(value: object) -> str:
-    """Encode plain data; what is not finite becomes null."""
-    return msgspec.json.encode(value).decode()
+    """Encode plain data; what is not finite becomes null, and a terminal obeys none of it."""
+    text = msgspec.json.encode(value).decode()
+    if text.isprintable():
+        return text
+    # The encoder escapes what is below the blank; of the rest a terminal obeys these, too.
+    return _OBEYED.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
 
 
 def _plain(key: str, value: object) -> object:
@@ -597,13 +606,4 @@ def _value(value: object, *, milliseconds: bool = False) -> str:
 def _readable(text: str, limit: int = MAX_VALUE_CHARACTERS) -> str:
     """Return a text without what would move a terminal's cursor or begin a line of its own."""
     text = _bounded(text, limit)
-    if text.isprintable():
-        return text
-    return "".join(
-        letter
-        if letter.isprintable()
-        else " "
-        if letter in "\n\t"
-        else letter.encode("unicode_escape").decode()
-        for letter in text
-    )
+    return printable(text.replace("\n", " ").replace("\t", " "), keep="")

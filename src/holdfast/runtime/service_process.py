@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
 from holdfast.errors import InvalidValueError, TransportError
+from holdfast.printable import printable
 
 if TYPE_CHECKING:
     from holdfast.runtime.endpoints import Endpoint, TlsFiles
@@ -297,7 +298,7 @@ def _warn(options: argparse.Namespace, text: str) -> None:
 
         tell_event(options.name, "credentials", reason=text)
     else:
-        sys.stderr.write(f"holdfast serve: warning: {text}\n")
+        sys.stderr.write(f"holdfast serve: warning: {printable(text)}\n")
 
 
 def _say_ready(options: argparse.Namespace, boot: str, where: dict[str, object]) -> None:
@@ -317,7 +318,7 @@ def _say_ready(options: argparse.Namespace, boot: str, where: dict[str, object])
         parts.append(f"offers metrics on port {where['metrics_port']}")
     # Nobody may be reading: that is no reason not to serve.
     with contextlib.suppress(OSError, ValueError):
-        sys.stdout.write(f"{options.name} {', '.join(parts)}\n")
+        sys.stdout.write(printable(f"{options.name} {', '.join(parts)}\n"))
         sys.stdout.flush()
 
 
