@@ -162,3 +162,9 @@ def test_what_needs_a_service_is_refused_without_one(path: Path) -> None:
     for words in (["--recovery", "never"], ["--set", "recovery.launch=never"]):
         with pytest.raises(HoldfastError, match=f"^{' '.join(words)} needs --service"):
             run_application(["run", str(path), *words])
+
+
+def test_what_needs_an_environment_is_refused_without_one(path: Path) -> None:
+    for words in ("environment.directory=x", "environment.arguments={port: 3}"):
+        with pytest.raises(HoldfastError, match=f"^--set {words} needs --environment"):
+            run_application(["run", str(path), "--set", words])

@@ -43,6 +43,9 @@ _MAX_RATE_HZ = 10_000.0
 _OF_SERVICES = ("recovery.launch", "offload.tls")
 """Keys without effect where no service is named."""
 
+_OF_ENVIRONMENTS = ("environment.directory", "environment.arguments")
+"""Keys without effect where no environment is named."""
+
 _LONGEST_REPETITION_S = 30.0
 """A trial that took longer is not run again for its figure."""
 
@@ -467,6 +470,11 @@ def _require_effect(options: _Options, configuration: Configuration, *, as_robot
             raise InvalidValueError(
                 f"{given.words} needs --service (or offload.services in "
                 f"{options.configuration_path}): without a service it would do nothing"
+            )
+        if given.key in _OF_ENVIRONMENTS and given.value and not configuration.environment.object:
+            raise InvalidValueError(
+                f"{given.words} needs --environment (or environment.object in "
+                f"{options.configuration_path}): without an environment it would do nothing"
             )
     if options.log == "json" and not as_robot:
         raise InvalidValueError(
