@@ -33,6 +33,7 @@ __all__ = [
     "sample_observation",
     "scalar",
     "states_of",
+    "truth",
     "unusable_prediction",
 ]
 
@@ -294,6 +295,14 @@ def states_of(
 def scalar(problem: Any, function: str, value: object) -> float:
     """Return one number that a function of the problem gave for one state."""
     return float(_single(problem, function, value))
+
+
+def truth(problem: Any, function: str, value: object) -> bool:
+    """Return what a function of the problem says of one state: true or false, or 1 or 0."""
+    single = _single(problem, function, value)
+    if single not in (0, 1):
+        raise ProblemError(f"{function} of {_name(problem)} is {single!r}: must be True or False")
+    return bool(single)
 
 
 def _single(problem: Any, function: str, value: object) -> Any:

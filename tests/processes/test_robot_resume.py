@@ -378,7 +378,7 @@ class TestWorld:
         assert robot.wait() == 2
         assert "the robot holds still in trial 0, step 22" in robot.output
         assert "perform has not returned within 1500 ms" in robot.output
-        assert "whether that task action was performed is not known" in robot.output
+        assert "whether its task action was performed is not known" in robot.output
         assert "Go on with: holdfast run" in robot.output
         story.finish(site.run(story.file, services=[cloud], resume=True))
 

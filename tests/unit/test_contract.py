@@ -118,6 +118,11 @@ MISFITS: dict[str, tuple[str, Any, str]] = {
         r"reward of line returned float64 of shape \(3,\): need one number",
     ),
     "several goals": ("is_goal", lambda *_: np.array([True]), "is_goal of line returned bool"),
+    "a distance as goal": (
+        "is_goal",
+        lambda *_: np.float64(5.3),
+        r"is_goal of line is .*5\.3.*: must be True or False",
+    ),
     "integer states": (
         "initial_states",
         lambda _self, _stream, count: np.zeros((count, 2), np.int64),

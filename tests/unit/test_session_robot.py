@@ -225,6 +225,7 @@ class World:
         )
         self.limited = PROBLEM.execute
         self.own_s = 0.005
+        self.counts = True
         self.own = self.decide
         self.verified: list[Verified] = []
         self.planner, self.simulator = Planner(PROBLEM, planning), simulator
@@ -285,7 +286,8 @@ class World:
         self.environment = self.environment_class(PROBLEM, self.simulator.seed, trial)
         for action in history.actions:
             self.environment.perform(action)
-        begun = Begun(self.environment.is_done(), self.environment.step)
+        performed = self.environment.step if self.counts else None
+        begun = Begun(self.environment.is_done(), performed)
         self.carry_out(
             self.robot.begin_trial(trial, history, begun, self.now, tail_is_certain=True)
         )
@@ -1126,8 +1128,13 @@ def test_a_tail_that_may_be_lost_stops_unless_the_environment_can_tell() -> None
     assert begin_after(settled, known + 1, tail_is_certain=False).stopped is not None
 
 
-def test_an_environment_that_fails_holds_the_robot() -> None:
+@pytest.mark.parametrize(
+    ("counts", "expected"), [(True, HeldError), (False, UnknownPerformanceError)]
+)
+def test_an_environment_that_fails_holds_the_robot(counts: bool, expected: type) -> None:
+    # One that counts can say later whether the action was performed; else nobody ever can.
     world = World()
+    world.counts = counts
     world.start()
 
     def fail(step: int) -> None:
@@ -1149,9 +1156,9 @@ def test_an_environment_that_fails_holds_the_robot() -> None:
     world.act = act_or_fail  # type: ignore[method-assign]
     world.run()
     assert world.stopped is not None
-    assert isinstance(world.stopped.error, HeldError)
-    assert "the arm is stuck" in str(world.stopped.error)
-    assert "not known" in str(world.stopped.error)
+    assert type(world.stopped.error) is expected
+    assert str(world.stopped.error).endswith(": the arm is stuck")
+    assert ("steps_performed" in str(world.stopped.error)) is not counts
     assert isinstance(world.journal[-1], ActingRecord)
 
 

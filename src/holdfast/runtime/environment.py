@@ -178,7 +178,7 @@ class SimulatedEnvironment:
     def is_done(self) -> bool:
         """Tell whether the true state is a goal."""
         problem = self._problem
-        return bool(contract.scalar(problem, "is_goal", problem.is_goal(self.state)))
+        return contract.truth(problem, "is_goal", problem.is_goal(self.state))
 
     def steps_performed(self) -> int:
         """Return the number of task actions performed, those of :meth:`after` included."""

@@ -271,6 +271,7 @@ class Robot:
         self._trial = 0
         self._done: Done = False
         self._in_environment = False
+        self._environment_counts = False
         self._sensing_action = 0
         self._computed_ms = 0.0
         self._unwritten: list[Record] = []
@@ -334,6 +335,7 @@ class Robot:
         self._trial = trial
         self._history = history
         self._done = begun.done
+        self._environment_counts = begun.steps_performed is not None
         self._in_environment = False
         self._unwritten = []
         self._next_tick = None
@@ -538,17 +540,24 @@ class Robot:
             self._stop(error)
 
     def _failed(self, event: EnvironmentFailed) -> None:
-        unknown = (
-            "; whether that task action was performed is not known"
-            if event.performance_unknown
-            else ""
-        )
-        self._stop(
-            HeldError(
-                f"the robot holds still in trial {self._trial}, step {event.step}: "
-                f"{event.text}{unknown}"
+        where = f"the robot holds still in trial {self._trial}, step {event.step}"
+        # The account of the failure comes last: it may have many lines.
+        if not event.performance_unknown:
+            self._stop(HeldError(f"{where}: {event.text}"))
+        elif self._environment_counts:
+            self._stop(
+                HeldError(
+                    f"{where}, and whether its task action was performed is not known: {event.text}"
+                )
             )
-        )
+        else:
+            self._stop(
+                UnknownPerformanceError(
+                    f"{where}, and nobody can say whether its task action was performed, because "
+                    "the environment has no method steps_performed; this trial cannot be gone on "
+                    f"with, since no action must be performed twice: {event.text}"
+                )
+            )
 
     # -- the loop --------------------------------------------------------------------------------
 
