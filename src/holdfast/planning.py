@@ -413,6 +413,10 @@ class Planner:
         """Predict the belief and go to the next step; see :func:`advance`."""
         return advance(self.problem, self.settings, state, task_action)
 
+    def choose_task_action(self, state: PlanningState) -> FloatArray:
+        """Choose the next task action."""
+        return choose_task_action(self.problem, self.settings, state)[0]
+
     def decide(self, state: PlanningState, max_actions: int) -> Decision:
         """Decide all that can be decided before something is sensed again."""
         actions, ahead = plan_until_sensing(self.problem, self.settings, state, max_actions)

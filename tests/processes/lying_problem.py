@@ -6,11 +6,15 @@ but the decisions tells such a service from an honest one.
 - ``far``: task actions beyond what a peg can be moved at once;
 - ``half``: task actions half as long;
 - ``sensing``: other sensing actions, and the right task actions.
+
+With ``HOLDFAST_TEST_OWN_PLANNER_HANGS`` a robot's own planner never comes to a decision.
 """
 
 from __future__ import annotations
 
 import os
+import threading
+import time
 
 import numpy as np
 import numpy.typing as npt
@@ -20,6 +24,7 @@ from holdfast.problems.peg_in_hole_2d import PegInHole2D
 FloatArray = npt.NDArray[np.float64]
 
 VARIABLE = "HOLDFAST_TEST_LIE"
+OWN_PLANNER_HANGS = "HOLDFAST_TEST_OWN_PLANNER_HANGS"
 
 
 class LyingPeg(PegInHole2D):
@@ -28,6 +33,8 @@ class LyingPeg(PegInHole2D):
     name = "lying_peg"
 
     def policy(self, states: FloatArray, stage: int | npt.NDArray[np.int64]) -> FloatArray:
+        if OWN_PLANNER_HANGS in os.environ and _is_verifying():
+            time.sleep(1e6)
         actions = super().policy(states, stage)
         # What is sensed is chosen by the actions of all particles; what is done, by one state's.
         many = states.ndim > 1 and len(states) > 1
@@ -38,3 +45,7 @@ class LyingPeg(PegInHole2D):
     def execute(self, actions: FloatArray) -> FloatArray:
         factor = {"far": 77.7, "half": 0.5}.get(os.environ.get(VARIABLE, ""), 1.0)
         return np.asarray(factor * super().execute(actions))
+
+
+def _is_verifying() -> bool:
+    return threading.current_thread().name == "holdfast-own-decisions"

@@ -20,7 +20,7 @@ from tests.processes.faults import (
     assert_identical,
     document_of,
 )
-from tests.processes.lying_problem import VARIABLE
+from tests.processes.lying_problem import OWN_PLANNER_HANGS, VARIABLE
 
 EXIT_WRONG_ANSWER = 3
 
@@ -94,6 +94,13 @@ def test_a_liar_without_anybody_else_ends_the_run_which_can_go_on(
     (told,) = robot.matching("error")
     assert told["reason"].startswith(f"no service will decide: {cloud.endpoint}: wrong_answer")
     assert "--resume" in told["resume_command"]
+    # The same one is not asked again, whoever runs it now.
+    performed = story.world.step
+    robot = site.run(story.file, services=[cloud], resume=True)
+    assert robot.wait() == EXIT_WRONG_ANSWER, robot.account()
+    (told,) = robot.matching("error")
+    assert "in an earlier part of this run" in told["reason"]
+    assert story.world.step == performed
     # With an honest service it comes to the decisions of a run without faults; that somebody has
     # lied is not forgotten.
     honest = site.service(*SERVES).start()
@@ -116,4 +123,20 @@ def test_honest_services_are_verified_and_decide_the_same(
     assert summary["not_deterministic"] == 0
     # Every part of every answer but those that came after the last one was compared.
     assert summary["verified_answers"] >= summary["sensing_decisions"] - 1 > 0
-    assert {verdict for _, _, verdict in verdicts_of(robot)} == {"same"}
+    assert {verdict for _, _, verdict in verdicts_of(robot)} == {"asked", "same"}
+    assert summary["unverified_answers"] == 0
+
+
+@pytest.mark.slow
+def test_what_is_not_computed_again_in_time_is_said(site: Site, references: References) -> None:
+    cloud = site.service(*SERVES).start()
+    story = Story(site, references, DOCUMENT, offload={"verify_share": 1.0})
+    robot = site.run(story.file, services=[cloud], variables={OWN_PLANNER_HANGS: "1"})
+    # The run does not wait for its own planner for ever.
+    story.finish(robot)
+    assert robot.matching("verifying")
+    summary = summary_of(robot)
+    assert summary["verified_answers"] == 0
+    assert summary["unverified_answers"] >= summary["sensing_decisions"] > 0
+    told = " ".join(event["reason"] for event in robot.matching("note"))
+    assert f"{summary['unverified_answers']} questions" in told

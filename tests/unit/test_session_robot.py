@@ -200,6 +200,7 @@ class World:
         planning: PlanningSettings = PLANNING,
         simulator: SimulatorSettings = SIMULATOR,
         verify_share: float = 0.05,
+        distrusted: tuple[str, ...] = (),
     ) -> None:
         self.now = 0.0
         self.offload = OffloadSettings(
@@ -222,6 +223,7 @@ class World:
             len(PROBLEM.sensing_actions),
             lambda actions: self.limited(actions),
             b"secret",
+            distrusted,
         )
         self.limited = PROBLEM.execute
         self.own_s = 0.005

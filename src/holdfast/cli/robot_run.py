@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
@@ -99,7 +99,7 @@ def run_as_robot(
         If the robot holds still and cannot go on.
     """
     from holdfast.recording.run_directory import EVENTS_NAME, TIMINGS_NAME, VERIFICATION_NAME
-    from holdfast.recording.timings import TimingTable, VerificationTable
+    from holdfast.recording.timings import TimingTable, VerificationTable, count_verified
     from holdfast.runtime.links import make_links
     from holdfast.runtime.logs import BoundedEventLog, EventLog, TeeEventLog
     from holdfast.runtime.robot_process import RobotProcess
@@ -120,7 +120,10 @@ def run_as_robot(
         timings = TimingTable(directory.path / TIMINGS_NAME)
         stack.callback(timings.close)
         on_verified: Callable[[Verified], None] = _ignore
+        distrusted: Collection[str] = ()
         if configuration.offload.services:
+            earlier = count_verified(directory.path / VERIFICATION_NAME)
+            distrusted = () if earlier is None else earlier.wrong
             verification = VerificationTable(directory.path / VERIFICATION_NAME)
             stack.callback(verification.close)
             on_verified = verification.add
@@ -137,6 +140,7 @@ def run_as_robot(
             on_verified,
             rate_hz,
             links.offload,
+            distrusted,
         )
         launcher = None if links.launcher is None else links.launcher(robot.deliver)
         robot.run(directory.journal.finished(), launcher)

@@ -413,11 +413,23 @@ def _run(options: _Options) -> None:
             print_files(directory_path)
         if note is not None:
             notes.note(note)
-        if _exit_code(summary):
+        if summary.unverified_answers:
+            notes.note(
+                f"{summary.unverified_answers} questions that were drawn to be answered by the "
+                "robot's own planner, too, were not: it failed, was too slow, or a part of the run "
+                "ended before; events.jsonl and verification.csv say more"
+            )
+        if summary.wrong_answers:
             notes.note(
                 "services answered otherwise than the robot's own planner; events.jsonl and "
                 "verification.csv say where"
             )
+        elif summary.not_deterministic:
+            notes.note(
+                "the robot's own planner came to two decisions in one state, so the problem is not "
+                "deterministic; events.jsonl says where"
+            )
+        if _exit_code(summary):
             raise SystemExit(_exit_code(summary))
 
 

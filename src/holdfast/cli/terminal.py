@@ -298,16 +298,18 @@ def print_summary(summary: RunSummary) -> None:
 
 
 def _verified_text(summary: RunSummary) -> str:
-    text = f"{counted(summary.verified_answers or 0, 'answer')} computed again on the robot: "
+    parts = [f"{counted(summary.verified_answers or 0, 'answer')} computed again on the robot"]
     wrong = summary.wrong_answers or {}
     if wrong:
         found = ", ".join(f"{count:,} of {service}" for service, count in wrong.items())
-        text += f"WRONG: {found}"
-    else:
-        text += "all the same"
+        parts[0] += f": WRONG: {found}"
+    elif summary.verified_answers:
+        parts[0] += ": all the same"
     if summary.not_deterministic:
-        text += f"; {summary.not_deterministic:,} more not deterministic"
-    return text
+        parts.append(f"{summary.not_deterministic:,} not deterministic")
+    if summary.unverified_answers:
+        parts.append(f"{summary.unverified_answers:,} not verified")
+    return "; ".join(parts)
 
 
 def _summary_rows(summary: RunSummary) -> list[tuple[str, str]]:
@@ -359,7 +361,7 @@ def _summary_rows(summary: RunSummary) -> list[tuple[str, str]]:
             wait_ms = summary.longest_wait_ms
             text = f"{wait_ms:,.0f}" if wait_ms >= 100.0 else f"{wait_ms:.3g}"
             rows.append(("longest wait", f"{text} ms for a decision"))
-    if summary.verified_answers:
+    if summary.verified_answers or summary.unverified_answers:
         rows.append(("verified", _verified_text(summary)))
     rows.append(("wall time", duration(summary.wall_time_s)))
     rows.append(("digest", summary.digest[:16]))

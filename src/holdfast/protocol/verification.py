@@ -11,14 +11,16 @@ In the first two cases the robot waits for its own planner and does what that sa
 goes on, and its planner computes while the robot moves. Whoever answered otherwise than the robot's
 own planner is not asked again in this run.
 
-Before a service is blamed the planner decides a second time. If it comes to something else than the
-first time, the problem itself is not deterministic, and nobody is to blame.
+Before a service is blamed for an action that was possible, the planner decides a second time, with
+an instance of the problem made anew. If it comes to something else than the first time, the problem
+itself is not deterministic, and nobody is to blame. Until then nothing that the service says is
+followed without asking the planner.
 """
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -28,7 +30,7 @@ from holdfast.errors import HoldfastError
 from holdfast.session.effects import Decide, Effect, Report, Verified
 from holdfast.session.events import Decided
 from holdfast.session.messages import DIGEST_SIZE, SensingAnswer
-from holdfast.session.question import Given, Provenance, Question
+from holdfast.session.question import Given, Provenance, Question, same_actions
 
 __all__ = ["OWN_PLANNER", "OwnDecisionError", "Verification", "WrongAnswer"]
 
@@ -79,8 +81,9 @@ class Verification:
 
     Attributes
     ----------
-    left_out : int
-        Questions that were drawn, but not computed again because too many waited.
+    limits_tell : bool
+        Whether an action that ``execute`` would change is a wrong one. False once a right one was
+        changed: the robot has to compare each action with its own planner's then.
     """
 
     def __init__(
@@ -98,10 +101,10 @@ class Verification:
         self._effects = effects
         self._asked: dict[int, Question] = {}
         self._number = 0
+        # By the question in which they differed from the robot's own planner.
+        self._suspects: dict[str, Question] = {}
         self._wrong: list[WrongAnswer] = []
-        # Some problems' limits also change what they have let through: then they tell nothing.
-        self._limits_tell = True
-        self.left_out = 0
+        self.limits_tell = True
 
     def __len__(self) -> int:
         return len(self._asked)
@@ -125,7 +128,7 @@ class Verification:
         str or None
             None if they are within the limits.
         """
-        if not self._limits_tell:
+        if not self.limits_tell:
             return None
         limited = self._limited(actions)
         # An action on a limit may be moved by a rounding error.
@@ -142,26 +145,41 @@ class Verification:
     def answered(self, question: Question, service: str) -> None:
         """Take note that a service has given a part of the answer to a question."""
         if question.own is not None:
-            self._judge(question)
-        elif not question.checked and service != self._exempt and self._is_drawn(question):
-            self.check(question)
+            if self._judge(question):
+                _use(question, question.own)
+        elif service in self._suspects:
+            self.dispute(question, service)
+        elif service != self._exempt and self._is_drawn(question):
+            self.check(question, service)
 
-    def check(self, question: Question) -> None:
-        """Let the robot's own planner answer a question when it has time."""
+    def check(self, question: Question, service: str) -> None:
+        """Let the robot's own planner answer a question when it has time.
+
+        Parameters
+        ----------
+        question : Question
+        service : str
+            Whose answer it is to be compared with.
+        """
         if question.checked:
             return
         question.checked = True
         if len(self._asked) < MAX_OPEN_CHECKS:
-            self._ask(question, urgent=False)
+            self._ask(question, service)
         else:
-            self.left_out += 1
+            self._note(question, service, "question", "left_out")
 
-    def dispute(self, question: Question) -> None:
+    def dispute(self, question: Question, service: str) -> None:
         """Let the robot's own planner answer a question before anything is done about it."""
-        if not question.disputed and question.own is None:
-            question.disputed = question.checked = True
-            # If it waits for the planner already, it may stand behind others.
-            self._ask(question, urgent=True)
+        if question.disputed or question.own is not None:
+            return
+        question.disputed = question.checked = True
+        for number, asked in self._asked.items():
+            if asked is question:
+                # It waits for the planner already, perhaps behind others.
+                self._effects.append(Decide(number, question.state, urgent=True, again=False))
+                return
+        self._ask(question, service, urgent=True)
 
     def _is_drawn(self, question: Question) -> bool:
         if self._share <= 0.0:
@@ -169,10 +187,15 @@ class Verification:
         drawn = hashlib.blake2b(question.digest, digest_size=8, key=self._secret).digest()
         return int.from_bytes(drawn, "big") < self._share * 2.0**64
 
-    def _ask(self, question: Question, *, urgent: bool) -> None:
+    def _ask(
+        self, question: Question, service: str, *, urgent: bool = False, again: bool = False
+    ) -> None:
         self._number += 1
         self._asked[self._number] = question
-        self._effects.append(Decide(self._number, question.state, urgent))
+        if not again:
+            # Before the answer is there: it may never come, and that is to be known.
+            self._note(question, service, "question", "asked")
+        self._effects.append(Decide(self._number, question.state, urgent, again))
 
     # -- the robot's own decisions ---------------------------------------------------------------
 
@@ -201,71 +224,77 @@ class Verification:
         question = self._asked.pop(event.number, None)
         if question is None:
             return True
-        if event.failure is not None:
-            self._failed(question, event.failure)
+        if question.own is None:
+            if event.failure is not None:
+                self._failed(question, event.failure, waits=question is current)
+                return True
+            question.own = event
+            differs = self._judge(question)
+            if question is not current or not (differs or question.disputed):
+                return True
+            question.disputed = False
+            tasks = question.tasks or []
+            if not same_actions(tasks[:performed], event.actions[:performed]):
+                return False
+            _use(question, event)
+            if not performed:
+                question.task_source = Provenance(OWN_PLANNER, event.computed_s, event.computed_s)
             return True
-        before = question.own
-        question.own = event
-        if before is not None:
-            question.own_is_certain = _same(before, event)
-            if not question.own_is_certain:
-                self._report(
-                    "not_deterministic",
-                    step=question.state.step,
-                    reason="the robot's own planner came to two decisions in one state, so the "
-                    "problem is not deterministic; the last one stands",
-                )
+        # It was asked again. If that failed, what it said first is all that there is.
+        question.own_is_certain = event.failure is not None or _same(question.own, event)
+        if not question.own_is_certain:
+            self._report(
+                "not_deterministic",
+                step=question.state.step,
+                reason="the robot's own planner came to two decisions in one state, so the "
+                "problem is not deterministic; the first one stands",
+            )
         self._judge(question)
-        return question is not current or self._settle(question, event, performed)
+        return True
 
-    def _judge(self, question: Question) -> None:
-        """Compare what services gave with the robot's own answer."""
-        own, certain = question.own, question.own_is_certain
+    def _judge(self, question: Question) -> bool:
+        """Compare what services gave with the robot's own answer; tell whether any differs."""
+        own = question.own
         assert own is not None
-        state = question.state
+        any_differs = False
         for given in question.given:
             if given.judged:
                 continue
             same = _agrees(given, own)
+            any_differs = any_differs or not same
             if same and given.outside_limits:
-                self._limits_tell = False
+                self._note_limits(question)
+            certain = True if given.outside_limits else question.own_is_certain
             if not same and certain is None:
-                # Perhaps the problem is not deterministic: the planner is asked once more.
+                self._suspects[given.service] = question
                 if question not in self._asked.values():
-                    question.disputed = True
-                    self._ask(question, urgent=True)
-                return
+                    self._ask(question, given.service, again=True)
+                continue
             given.judged = True
             verdict = "same" if same else "different" if certain else "not_deterministic"
-            self._effects.append(
-                Verified(state.trial, state.step, given.service, given.kind, verdict)
-            )
+            self._note(question, given.service, given.kind, verdict)
             if verdict == "different":
-                self._wrong.append(WrongAnswer(given.service, state.step, given.kind))
+                self._wrong.append(WrongAnswer(given.service, question.state.step, given.kind))
+        if question.own_is_certain is not None:
+            self._suspects = {
+                service: about for service, about in self._suspects.items() if about is not question
+            }
+        return any_differs
 
-    def _settle(self, question: Question, own: Decided, performed: int) -> bool:
-        """Let a disputed question have the robot's own answer."""
-        if not question.disputed or question in self._asked.values():
-            return True
-        question.disputed = False
-        tasks = question.tasks or []
-        if not _equal(tasks[:performed], own.actions[:performed]):
-            return False
-        source = Provenance(OWN_PLANNER, own.computed_s, own.computed_s)
-        if question.task_count:
-            question.tasks = list(own.actions)
-            question.task_source = None if performed else source
-        if question.sensing_step is not None and own.sensing_action is not None:
-            digest = own.ahead_digest[:DIGEST_SIZE]
-            question.sensing = SensingAnswer(
-                0, question.sensing_step, own.sensing_action, digest, 0
+    def _note_limits(self, question: Question) -> None:
+        if self.limits_tell:
+            self.limits_tell = False
+            self._report(
+                "limits_unknown",
+                step=question.state.step,
+                reason="the problem's execute changes what it has let through, so it does not say "
+                "which actions are possible; each task action of a service is compared with that "
+                "of the robot's own planner before it is performed",
             )
-            question.sensing_source = source
-        return True
 
-    def _failed(self, question: Question, text: str) -> None:
+    def _failed(self, question: Question, text: str, *, waits: bool) -> None:
         state = question.state
-        if question.disputed:
+        if waits and question.disputed:
             raise OwnDecisionError(
                 f"trial {state.trial}, step {state.step}: services answer differently, or outside "
                 f"the problem's limits, and the robot's own planner cannot decide: {text}"
@@ -274,17 +303,29 @@ class Verification:
         for given in question.given:
             if not given.judged:
                 given.judged = True
-                self._effects.append(
-                    Verified(state.trial, state.step, given.service, given.kind, "failed")
-                )
+                self._note(question, given.service, given.kind, "failed")
+
+    def _note(self, question: Question, service: str, kind: str, verdict: str) -> None:
+        state = question.state
+        self._effects.append(Verified(state.trial, state.step, service, kind, verdict))
 
     def _report(self, name: str, **fields: object) -> None:
         self._effects.append(Report(name, fields))
 
 
+def _use(question: Question, own: Decided) -> None:
+    """Give a question the robot's own answer."""
+    if question.task_count:
+        question.tasks = list(own.actions)
+    if question.sensing_step is not None and own.sensing_action is not None:
+        digest = own.ahead_digest[:DIGEST_SIZE]
+        question.sensing = SensingAnswer(0, question.sensing_step, own.sensing_action, digest, 0)
+        question.sensing_source = Provenance(OWN_PLANNER, own.computed_s, own.computed_s)
+
+
 def _agrees(given: Given, own: Decided) -> bool:
     if given.tasks is not None:
-        return _equal(given.tasks, own.actions)
+        return same_actions(given.tasks, own.actions)
     sensing = given.sensing
     assert sensing is not None
     # Chosen in another state than the one in which the robot arrives, it would be of no use.
@@ -294,14 +335,10 @@ def _agrees(given: Given, own: Decided) -> bool:
 
 def _same(first: Decided, second: Decided) -> bool:
     return (
-        _equal(first.actions, second.actions)
+        same_actions(first.actions, second.actions)
         and first.sensing_action == second.sensing_action
         and first.ahead_digest == second.ahead_digest
     )
-
-
-def _equal(first: Sequence[FloatArray], second: Sequence[FloatArray]) -> bool:
-    return len(first) == len(second) and all(map(np.array_equal, first, second))
 
 
 def _written(action: FloatArray) -> str:

@@ -90,6 +90,9 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
         By service: those that were not what the robot's own planner decides.
     not_deterministic : int or None
         Those of which nothing can be said: the robot's own planner came to two decisions.
+    unverified_answers : int or None
+        Questions that the robot's own planner was to answer as well and did not: it failed, too
+        many waited, or the process ended before.
     sensing_ms_median, sensing_ms_p99 : float or None
         Wall time of choosing a sensing action. Each decision counts once, as it was carried out,
         also those of earlier processes of a run that was resumed.
@@ -121,6 +124,7 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
     verified_answers: int | None
     wrong_answers: dict[str, int] | None
     not_deterministic: int | None
+    unverified_answers: int | None
     sensing_ms_median: float | None
     sensing_ms_p99: float | None
     wall_time_s: float
@@ -269,6 +273,7 @@ class SummaryBuilder:
             verified_answers=None if verified is None else verified.verified,
             wrong_answers=None if verified is None else verified.wrong,
             not_deterministic=None if verified is None else verified.not_deterministic,
+            unverified_answers=None if verified is None else verified.unverified,
             sensing_ms_median=median,
             sensing_ms_p99=p99,
             wall_time_s=round(wall_time_s, 3),

@@ -166,15 +166,20 @@ class VerificationCounts(NamedTuple):
     Attributes
     ----------
     verified : int
+        Parts of answers that were compared.
     wrong : dict of str to int
         By service: those that are not what the robot's own planner decides.
     not_deterministic : int
         Those of which nothing can be said, because the robot's own planner came to two decisions.
+    unverified : int
+        Questions that were to be answered by the robot's own planner and were not: it failed, too
+        many waited, or the process ended before.
     """
 
     verified: int
     wrong: dict[str, int]
     not_deterministic: int
+    unverified: int
 
 
 def count_verified(path: Path) -> VerificationCounts | None:
@@ -191,16 +196,22 @@ def count_verified(path: Path) -> VerificationCounts | None:
     """
     verified = not_deterministic = 0
     wrong: Counter[str] = Counter()
+    asked: set[tuple[str, str]] = set()
+    answered: set[tuple[str, str]] = set()
     try:
-        for row in _rows(path, len(VERIFICATION_COLUMNS)):
-            service, verdict = row[2], row[4]
+        for trial, step, service, _, verdict, *_ in _rows(path, len(VERIFICATION_COLUMNS)):
+            if verdict in ("asked", "left_out"):
+                asked.add((trial, step))
+            elif verdict in ("same", "different", "not_deterministic"):
+                answered.add((trial, step))
             verified += verdict in ("same", "different")
             not_deterministic += verdict == "not_deterministic"
             if verdict == "different":
                 wrong[service] += 1
     except (OSError, csv.Error):
         return None
-    return VerificationCounts(verified, dict(wrong.most_common()), not_deterministic)
+    unverified = len(asked - answered)
+    return VerificationCounts(verified, dict(wrong.most_common()), not_deterministic, unverified)
 
 
 class AnswerCounts(NamedTuple):

@@ -53,6 +53,9 @@ class OwnDecisions:
         """Let a question be answered; one that is urgent before those that are not."""
         with self._changed:
             if effect.urgent:
+                self._waiting = deque(
+                    each for each in self._waiting if each.number != effect.number
+                )
                 self._waiting.appendleft(effect)
             else:
                 self._waiting.append(effect)
@@ -86,7 +89,7 @@ class OwnDecisions:
     def _decided(self, effect: Decide) -> Decided:
         began = monotonic()
         try:
-            if self._planner is None:
+            if self._planner is None or effect.again:
                 self._planner = self._make_planner()
             planner = self._planner
             actions, sensing_action, ahead = planner.decide(effect.state, MAX_TASK_ACTIONS)

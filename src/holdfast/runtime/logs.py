@@ -13,7 +13,8 @@ a number, a text of a megabyte or with control characters in it cost at most the
 Names of events in use. By the robot: status, launch, launched, launch_failed, recovery_exited,
 retry, hedge, restore, restored, service_appeared, service_vanished, service_suspected, unreachable,
 late_replies, waiting, holding, resumed, busy, refused, malformed_reply, disagreement,
-wrong_answer, not_deterministic, verification_failed, prefetch_unused, unexplained, filter_diverged,
+wrong_answer, not_deterministic, verification_failed, distrusted,
+limits_unknown, verifying, prefetch_unused, unexplained, filter_diverged,
 resumed_trial, performed_unseen, trial, missed_ticks, stopped, note, interrupted.
 By a service: ready, session_opened, session_taken_over, restored, refused, busy, evicted, stopping.
 By ``holdfast chaos``: chaos_trial, left_out, note, interrupted. By a command that ends with an

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import math
 import os
 import signal
 import sys
@@ -68,6 +69,9 @@ __all__ = ["Launcher", "RobotProcess", "StepJournal", "opening_of"]
 
 _LONGEST_SLEEP_S = 1.0
 """A signal that comes just before the loop sleeps does not wake it; this late it is heard."""
+
+_LAST_VERIFICATION_S = 10.0
+"""When all trials are finished, what is still being computed again is waited for this long."""
 
 _DEAF_S = 0.005
 """When the loop did not listen for longer than this, no service is blamed for that time."""
@@ -174,6 +178,8 @@ class RobotProcess:
         Task actions a second; None acts as soon as possible.
     offload : OffloadSettings or None
         Instead of the configuration's.
+    distrusted : collection of str
+        Services that have answered wrongly in an earlier part of the run.
     """
 
     def __init__(
@@ -190,6 +196,7 @@ class RobotProcess:
         on_verified: Callable[[Verified], None],
         rate_hz: float | None = None,
         offload: OffloadSettings | None = None,
+        distrusted: Collection[str] = (),
     ) -> None:
         self._configuration = configuration
         self._transport = transport
@@ -211,7 +218,7 @@ class RobotProcess:
         self._starting: tuple[int, History, bool] | None = None
         self._finished: set[int] = set()
         self._numbers = iter(range(configuration.simulator.num_trials))
-        self._all_performed = False
+        self._verify_until = math.inf
         self._ended = False
         self._interrupted: int | None = None
         problem = configuration.problem
@@ -228,6 +235,7 @@ class RobotProcess:
             len(problem.sensing_actions),
             functools.partial(contract.executed_action, problem),
             os.urandom(32),
+            distrusted,
         )
         self._own = OwnDecisions(
             lambda: Planner(
@@ -316,7 +324,7 @@ class RobotProcess:
 
     def _loop(self) -> None:
         robot = self._robot
-        while not self._ended:
+        while not self._ended and monotonic() < self._verify_until:
             wake_at = robot.next_wakeup()
             try:
                 timeout_s = _LONGEST_SLEEP_S
@@ -356,7 +364,7 @@ class RobotProcess:
             )
         elif not isinstance(event, Begun):
             self._carry_out(robot.handle(event, now))
-            if self._all_performed and isinstance(event, Decided):
+            if self._verify_until < math.inf and isinstance(event, Decided):
                 self._ended = not robot.num_unverified
 
     def _carry_out(self, effects: list[Effect]) -> None:
@@ -429,15 +437,13 @@ class RobotProcess:
             following = next((n for n in self._numbers if n not in self._finished), None)
             if following is None:
                 # What is being computed again is still worth knowing.
-                left_out = self._robot.num_unverifiable
-                if left_out:
+                left = self._robot.num_unverified
+                if left:
                     self._events.event(
-                        "note",
-                        reason=f"{left_out} answers that were to be computed again "
-                        "(offload.verify_share) were not: this robot is too slow for so many",
+                        "verifying", reason=f"{left} answers are still being computed again"
                     )
-                self._all_performed = True
-                self._ended = not self._robot.num_unverified
+                self._verify_until = monotonic() + _LAST_VERIFICATION_S
+                self._ended = not left
                 return
             trial, records, tail_is_certain = following, (), True
         self._replayed = trial

@@ -23,7 +23,7 @@ when the local one is started in :mod:`~holdfast.session.launches`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -75,6 +75,8 @@ class Dispatcher:
         What the problem's ``execute`` makes of actions, shape ``(count, action_size)`` in and out.
     secret : bytes
         Known to this robot alone: with it, it is drawn which answers are computed again.
+    distrusted : collection of str
+        Services that have answered wrongly in an earlier part of the run.
 
     Attributes
     ----------
@@ -102,6 +104,7 @@ class Dispatcher:
         num_sensing_actions: int,
         limited: Callable[[FloatArray], FloatArray],
         secret: bytes,
+        distrusted: Collection[str] = (),
     ) -> None:
         timeout_s = 1e-3 * offload.detection_timeout_ms
         wanted = recovery_settings.launch != "never"
@@ -111,6 +114,12 @@ class Dispatcher:
         self._launch_at_start = recovery_settings.launch == "at_start"
         self.effects: list[Effect] = []
         self._services = KnownServices(services, recovery if wanted else None, timeout_s)
+        for service in self._services:
+            if service.name in distrusted:
+                service.distrust(
+                    "answered otherwise than the robot's own planner in an earlier part of this "
+                    "run; name another service, or begin anew in another directory"
+                )
         self._calls = Calls(session, epoch, opening, self.effects)
         self._verification = Verification(
             offload.verify_share, secret, recovery, limited, self.effects
@@ -138,6 +147,9 @@ class Dispatcher:
     def start(self, now: float) -> None:
         """Begin the run."""
         self._startup_until = now + self._startup_s
+        for service in self._services:
+            if service.distrusted is not None:
+                self._report("distrusted", service=service.name, reason=service.distrusted)
         if self._services.local is not None and self._launch_at_start:
             self._launches.want(now)
             self._work(now)
@@ -220,20 +232,27 @@ class Dispatcher:
         self._drop_wrong_services()
         self._work(now)
 
-    def doubt(self) -> None:
-        """Let the robot's own planner answer the question: what came of it was of no use."""
-        if self.question is not None:
-            self._verification.check(self.question)
+    def check(self) -> None:
+        """Let the robot's own planner answer the question, too: its answer was of no use."""
+        question = self.question
+        if question is not None and question.given:
+            self._verification.check(question, question.given[0].service)
+
+    def dispute(self) -> None:
+        """Let the robot's own planner answer the question before anything is done about it."""
+        question = self.question
+        if question is not None and question.given:
+            self._verification.dispute(question, question.given[0].service)
+
+    @property
+    def limits_tell(self) -> bool:
+        """Whether an action that the problem's ``execute`` would change is a wrong one."""
+        return self._verification.limits_tell
 
     @property
     def num_unverified(self) -> int:
         """Questions that the robot's own planner still has to answer."""
         return len(self._verification)
-
-    @property
-    def num_unverifiable(self) -> int:
-        """Questions that it should have answered, but too many waited."""
-        return self._verification.left_out
 
     def recovery_exited(self, launch: int, reason: str, now: float) -> None:
         """Take note that a process of the local service has ended, or could not be started.
@@ -276,6 +295,8 @@ class Dispatcher:
         if self._calls:
             due += [service.detector.deadline() for service in services]
             due.append(self._calls.first_sent_at() + self._limit_s)
+        if question is not None and question.disputed and question.needed_at is not None:
+            due.append(question.needed_at + self._limit_s)
         if question is not None and question.is_open:
             if not self._is_being_asked(question, self._worked_at):
                 due += [
@@ -348,7 +369,7 @@ class Dispatcher:
             return
         self._drop_wrong_services()
         if question is self.question:
-            if news.at_work:
+            if news.at_work and not question.disputed:
                 self._standstill.let_go(now)
             elif news in (News.LACKS, News.LACKS_STATE):
                 self._send(service, question, now, whole_state=news is News.LACKS_STATE, also=True)
@@ -392,7 +413,7 @@ class Dispatcher:
             question = self.question
             if question is not None and any(g.service == wrong.service for g in question.given):
                 # What it said last was perhaps not looked at yet.
-                self._verification.dispute(question)
+                self._verification.dispute(question, wrong.service)
 
     # -- deciding whom to ask --------------------------------------------------------------------
 
@@ -410,7 +431,10 @@ class Dispatcher:
         if question is None:
             self._note_lost_cloud(now)
             return
-        if not question.is_open:
+        if question.disputed:
+            self._wait_for_own_planner(question, now)
+            return
+        if question.complete:
             self._standstill.let_go(now)
             self._note_lost_cloud(now)
             return
@@ -425,6 +449,19 @@ class Dispatcher:
             self._note_lost_cloud(now)
         else:
             self._choose(question, now)
+
+    def _wait_for_own_planner(self, question: Question, now: float) -> None:
+        self._standstill.hold(question, "the robot's own planner decides", now)
+        needed_at = question.needed_at
+        if needed_at is not None and now >= needed_at + self._limit_s:
+            state = question.state
+            self._stop(
+                OwnDecisionError(
+                    f"trial {state.trial}, step {state.step}: services answer differently, or "
+                    "outside the problem's limits, and the robot's own planner has not decided "
+                    f"within {1e3 * self._limit_s:g} ms, which is offload.decision_timeout_ms"
+                )
+            )
 
     def _look_for_silence(self, now: float) -> None:
         if not self._calls:

@@ -82,12 +82,16 @@ class Decide(NamedTuple):
     state : PlanningState
         Of the question.
     urgent : bool
-        Whether the robot waits for it: then it comes before those that are not.
+        Whether the robot waits for it: then it comes before those that are not. It may have been
+        asked with this number before.
+    again : bool
+        Whether it was answered before; then with an instance of the problem that is made anew.
     """
 
     number: int
     state: PlanningState
     urgent: bool
+    again: bool
 
 
 class Verified(NamedTuple):
@@ -99,9 +103,11 @@ class Verified(NamedTuple):
         Of the question.
     service : str
         Whose answer it was.
-    kind : {"task", "sensing"}
-    verdict : {"same", "different", "not_deterministic", "failed"}
-        The last two: the robot's own planner does not agree with itself, or has failed.
+    kind : {"question", "task", "sensing"}
+    verdict : {"asked", "left_out", "same", "different", "not_deterministic", "failed"}
+        Of a question: it is to be answered by the robot's own planner, or too many such wait. Of a
+        part of an answer: the last two say that the planner does not agree with itself, or has
+        failed.
     """
 
     trial: int

@@ -9,6 +9,7 @@ say the same, or show that somebody errs. Then the robot's own planner answers
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -27,7 +28,7 @@ from holdfast.session.messages import (
 )
 from holdfast.settings import PlanningSettings
 
-__all__ = ["Given", "Provenance", "Question"]
+__all__ = ["Given", "Provenance", "Question", "same_actions"]
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -42,6 +43,13 @@ class Provenance(NamedTuple):
 
 _MAX_GIVEN = 64
 """Bound on the parts of answers that are kept to be compared; services that differ are few."""
+
+
+def same_actions(first: Sequence[FloatArray], second: Sequence[FloatArray]) -> bool:
+    """Tell whether task actions are the same, bit for bit, as in a digest: 0.0 is not -0.0."""
+    return len(first) == len(second) and all(
+        one.tobytes() == other.tobytes() for one, other in zip(first, second, strict=True)
+    )
 
 
 class Given:
@@ -85,7 +93,7 @@ class Given:
         return (
             self.tasks is not None
             and other.tasks is not None
-            and all(map(np.array_equal, self.tasks, other.tasks))
+            and same_actions(self.tasks, other.tasks)
         )
 
 

@@ -179,7 +179,7 @@ class Replies:
                     kind=given.kind,
                     reason=f"{why}; the robot's own planner decides",
                 )
-            self._verification.dispute(question)
+            self._verification.dispute(question, name)
         self._verification.answered(question, name)
 
     def _was_answered(self, call: Call, reply: TaskAnswer | SensingAnswer, now: float) -> News:

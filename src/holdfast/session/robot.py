@@ -53,7 +53,7 @@ from holdfast.session.messages import (
     numbers_from,
     numbers_to,
 )
-from holdfast.session.question import Provenance, Question
+from holdfast.session.question import Provenance, Question, same_actions
 from holdfast.session.records import (
     ActingRecord,
     ObservedRecord,
@@ -293,11 +293,6 @@ class Robot:
     def num_unverified(self) -> int:
         """Answers that the robot's own planner still has to compute again."""
         return self._dispatcher.num_unverified
-
-    @property
-    def num_unverifiable(self) -> int:
-        """Answers that it should have computed again, but too many waited."""
-        return self._dispatcher.num_unverifiable
 
     @property
     def trial(self) -> int | None:
@@ -602,7 +597,7 @@ class Robot:
         ):
             # Chosen for another state than this: the service's belief has drifted from ours.
             self._report("prefetch_unused", trial=self._trial, step=state.step)
-            self._dispatcher.doubt()
+            self._dispatcher.check()
             self._ask(self._planner.digest(state), now)
             self._dispatcher.need(now)
             return
@@ -633,6 +628,12 @@ class Robot:
         if not self._is_due(now):
             return
         action = question.tasks[offset]
+        if not self._dispatcher.limits_tell and question.own is None:
+            own = self._planner.choose_task_action(state)
+            if not same_actions([own], [action]):
+                self._dispatcher.dispute()
+                self._dispatcher.need(now)
+                return
         self._write(ActingRecord(state.step, numbers_to(action)))
         history = self._history
         assert history is not None

@@ -442,7 +442,7 @@ class RobotNode:
         self._agenda.after(_DECIDES_AFTER_S, self._happens, self.process, self._heard, event)
 
     def _verified(self, effect: Verified) -> None:
-        if effect.verdict != "same":
+        if effect.verdict not in ("asked", "same"):
             raise Violation(f"{effect.service} is said to have answered wrongly: {effect}")
 
     def _launch(self, effect: Launch) -> None:
