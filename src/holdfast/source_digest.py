@@ -6,9 +6,13 @@ So what is compared are the sources themselves, byte by byte: neither the machin
 Python changes them, nor whether a module is compiled. The kernel is told by the sources that it was
 built of.
 
-A problem's code is that of its class, of the classes that it is derived from, and of all that these
-import from beside them. What nobody can see from there is not part of it: files of data, modules
-that are compiled and have no source here, and other packages that are installed.
+A problem's code is that of the module that a configuration names, of the problem's class, of the
+classes that it is derived from, and of all that these import from beside them, or from a folder
+below that they have put on the import path. It is read from the sources, not from what happens to
+be loaded: of two processes with the same code one may have loaded more. So what nobody can see from
+there is not part of it: files of data, modules that are compiled and have no source here, other
+packages that are installed, a module imported under a name made at run time, and one in another
+folder that is imported only while a function runs.
 """
 
 from __future__ import annotations
@@ -53,15 +57,22 @@ def _core_files() -> frozenset[Path]:
     return frozenset((*_PACKAGE.glob("*.py"), *(_PACKAGE / "problems").glob("*.py")))
 
 
-def problem_digest(problem_class: type) -> str:
-    """Return the digest of a problem's code beyond holdfast's core, in hexadecimal."""
+def problem_digest(problem_class: type, named_in: str | None = None) -> str:
+    """Return the digest of a problem's code beyond holdfast's core, in hexadecimal.
+
+    Parameters
+    ----------
+    problem_class : type
+    named_in : str or None
+        As for :func:`problem_sources`.
+    """
     digest = hashlib.blake2b(digest_size=_DIGEST_SIZE)
-    for module, source in sorted(problem_sources(problem_class).items()):
+    for module, source in sorted(problem_sources(problem_class, named_in).items()):
         digest.update(f"{module} {source}\n".encode())
     return digest.hexdigest()
 
 
-def problem_sources(problem_class: type) -> dict[str, str]:
+def problem_sources(problem_class: type, named_in: str | None = None) -> dict[str, str]:
     """Return the digest of each source of a problem's code beyond holdfast's core.
 
     It is what is on the disk now: whoever wants to know what was loaded asks at once.
@@ -69,6 +80,10 @@ def problem_sources(problem_class: type) -> dict[str, str]:
     Parameters
     ----------
     problem_class : type
+    named_in : str or None
+        Module that the problem's name in a configuration leads to
+        (:func:`holdfast.problems.registry.problem_module`). It need not be the one in which the
+        class is defined, and may have made the class or changed it.
 
     Returns
     -------
@@ -77,25 +92,28 @@ def problem_sources(problem_class: type) -> dict[str, str]:
         loaded and has no source here.
     """
     found: dict[str, str] = {}
-    for name in dict.fromkeys(derived.__module__ for derived in problem_class.__mro__):
-        top = name.partition(".")[0]
-        if top in _LIBRARIES or top in sys.stdlib_module_names:
-            continue
-        file = getattr(sys.modules.get(name), "__file__", None)
+    defined_in = [derived.__module__ for derived in problem_class.__mro__]
+    for start in dict.fromkeys([named_in or defined_in[0], *defined_in]):
+        file = getattr(sys.modules.get(start), "__file__", None)
         if file is None or Path(file).resolve() in _core_files():
             continue
-        sources = follow_imports([name], _places_from(name, Path(file)))
-        found.setdefault(name, "")
+        top = start.partition(".")[0]
+        # A user's module may be called as one of the standard library's.
+        if top in _LIBRARIES or (top in sys.stdlib_module_names and not _is_users(Path(file))):
+            continue
+        base = Path(file).parents[start.count(".") + (Path(file).stem == "__init__")]
+        sources = follow_imports(
+            [start], _places_from(top, base), loaded=functools.partial(_loaded_below, base)
+        )
+        found.setdefault(start, "")
         for module, path in sources.items():
             content = path.read_bytes()
             found[module] = hashlib.blake2b(content, digest_size=_SOURCE_DIGEST_SIZE).hexdigest()
     return found
 
 
-def _places_from(name: str, file: Path) -> Callable[[str], Path | None]:
-    """Return what finds the sources of a module's own package and, if a user's, beside it."""
-    base = file.parents[name.count(".") + (file.stem == "__init__")]
-    top = name.partition(".")[0]
+def _places_from(top: str, base: Path) -> Callable[[str], Path | None]:
+    """Return what finds the sources of a package and, if a user's, those beside it."""
 
     def locate(module: str) -> Path | None:
         first = module.partition(".")[0]
@@ -104,13 +122,21 @@ def _places_from(name: str, file: Path) -> Callable[[str], Path | None]:
         for path in (place / "__init__.py", place.with_suffix(".py")):
             if path.is_file():
                 wanted = path not in _core_files() if ours else True
-                return path if wanted and (ours or first == top or _is_beside(path)) else None
+                return path if wanted and (ours or first == top or _is_users(path)) else None
         return None
 
     return locate
 
 
-def _is_beside(path: Path) -> bool:
+def _loaded_below(base: Path, module: str) -> Path | None:
+    """Return the source of a user's module that is loaded from a folder below another's."""
+    file = getattr(sys.modules.get(module), "__file__", None)
+    if file is None or not Path(file).resolve().is_relative_to(base.resolve()):
+        return None
+    return Path(file) if Path(file).suffix == ".py" and _is_users(Path(file)) else None
+
+
+def _is_users(path: Path) -> bool:
     """Tell whether a source is a user's: in a folder of libraries, others' lie beside it."""
     # A service that starts has no need of it, and a robot may wait for that service.
     from holdfast.user_code import is_users_file
@@ -119,7 +145,11 @@ def _is_beside(path: Path) -> bool:
 
 
 def follow_imports(
-    modules: Iterable[str], locate: Callable[[str], Path | None], *, places: bool = False
+    modules: Iterable[str],
+    locate: Callable[[str], Path | None],
+    *,
+    loaded: Callable[[str], Path | None] | None = None,
+    places: bool = False,
 ) -> dict[str, Path]:
     """Return the sources of modules and of all that they import, directly or not.
 
@@ -132,6 +162,9 @@ def follow_imports(
     locate : callable
         Returns the source of a module, None for one that is not to be followed, and for a name that
         is no module.
+    loaded : callable or None
+        Is asked as well where ``locate`` has none, but only for what a module imports while it is
+        itself imported: in each process that has loaded the one, the other is loaded, too.
     places : bool
         Whether what a string names as ``module:attribute``, as registries do, counts as imported.
 
@@ -146,42 +179,68 @@ def follow_imports(
         If a source cannot be read.
     """
     found: dict[str, Path] = {}
-    waiting = list(modules)
+    waiting = [(name, False) for name in modules]
     seen = set(waiting)
     while waiting:
-        name = waiting.pop()
-        path = locate(name)
+        name, at_once = waiting.pop()
+        path = found.get(name) or locate(name)
+        if path is None and at_once and loaded is not None:
+            path = loaded(name)
         # A module's own package is imported with it.
-        following = [name.rpartition(".")[0]]
-        if path is not None:
+        following = [(name.rpartition(".")[0], at_once)]
+        if path is not None and name not in found:
             found[name] = path
             following += _imported_by(path, name, places=places)
-        new = [each for each in dict.fromkeys(following) if each and each not in seen]
+        new = [each for each in dict.fromkeys(following) if each[0] and each not in seen]
         waiting += new
         seen.update(new)
     return found
 
 
-def _imported_by(path: Path, name: str, *, places: bool) -> list[str]:
-    """Return the names that a module imports, and what may be a module's among those."""
+def _imported_by(path: Path, name: str, *, places: bool) -> list[tuple[str, bool]]:
+    """Return the names that a module imports, and what may be a module's among those.
+
+    With each goes whether it is imported at once, when the module is, not while a function runs.
+    """
     import ast
 
     try:
-        nodes = ast.walk(ast.parse(path.read_bytes()))
+        tree = ast.parse(path.read_bytes())
     except (SyntaxError, ValueError):
         return []  # it was never imported
-    names: list[str] = []
-    for node in nodes:
-        if isinstance(node, ast.Import):
-            names += [alias.name for alias in node.names]
-        elif isinstance(node, ast.ImportFrom):
-            module = _absolute(node, name, path)
-            names += [module, *(f"{module}.{alias.name}" for alias in node.names)]
-        elif places and isinstance(node, ast.Constant) and isinstance(node.value, str):
-            module, _, attribute = node.value.partition(":")
-            if attribute.isidentifier() and all(map(str.isidentifier, module.split("."))):
-                names.append(module)
-    return names
+    functions = [
+        node
+        for node in ast.walk(tree)
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda)
+    ]
+    later = {node for function in functions for node in ast.walk(function)}
+    return [
+        (module, node not in later)
+        for node in ast.walk(tree)
+        for module in _imported_in(node, path, name, places=places)
+    ]
+
+
+def _imported_in(node: ast.AST, path: Path, name: str, *, places: bool) -> list[str]:
+    """Return the names that one node of a module's syntax imports."""
+    import ast
+
+    if isinstance(node, ast.Import):
+        return [alias.name for alias in node.names]
+    if isinstance(node, ast.ImportFrom):
+        module = _absolute(node, name, path)
+        return [module, *(f"{module}.{alias.name}" for alias in node.names)]
+    if isinstance(node, ast.Call) and node.args:
+        called = node.func.attr if isinstance(node.func, ast.Attribute) else node.func
+        called = called.id if isinstance(called, ast.Name) else called
+        wanted = node.args[0]
+        if called in ("import_module", "__import__") and isinstance(wanted, ast.Constant):
+            return [wanted.value] if isinstance(wanted.value, str) else []
+    if places and isinstance(node, ast.Constant) and isinstance(node.value, str):
+        module, _, attribute = node.value.partition(":")
+        if attribute.isidentifier() and all(map(str.isidentifier, module.split("."))):
+            return [module]
+    return []
 
 
 def _absolute(node: ast.ImportFrom, name: str, path: Path) -> str:

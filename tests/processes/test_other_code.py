@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
+import pytest
 from tests.processes.faults import (
     LOST,
     PATIENT,
@@ -94,3 +95,66 @@ class TestOlderCopyOfTheProblem:
             robot.output
         )
         assert "deploy the same version on both" in robot.output
+
+
+IMPLEMENTED = """
+from holdfast.problems.peg_in_hole_2d import PegInHole2D
+
+class P(PegInHole2D):
+    name = "p"
+    GAIN = 1.0
+    def execute(self, actions):
+        return self.GAIN * super().execute(actions)
+
+def make(gain):
+    class Made(P):
+        name = "made"
+        GAIN = gain
+    return Made
+"""
+WRITTEN_BY_A_USER = {
+    "a name of the standard library": ("turtle:P", {"turtle.py": IMPLEMENTED}, "GAIN = 1.0"),
+    "made by a function": (
+        "mine:P",
+        {"impl.py": IMPLEMENTED, "mine.py": "from impl import make\nP = make(1.0)\n"},
+        "make(1.0)",
+    ),
+    "changed after it was imported": (
+        "mine:P",
+        {"impl.py": IMPLEMENTED, "mine.py": "from impl import P\nP.GAIN = 1.0\n"},
+        "P.GAIN = 1.0",
+    ),
+    "from a folder put on the path": (
+        "mine:P",
+        {
+            "lib/helper.py": IMPLEMENTED + "\nSIZE = 1.0\n",
+            "mine.py": "import pathlib, sys\n"
+            "sys.path.insert(0, str(pathlib.Path(__file__).parent / 'lib'))\n"
+            "import helper\nfrom holdfast.problems.peg_in_hole_2d import PegInHole2D\n"
+            "class P(PegInHole2D):\n    name = 'p'\n    GAIN = helper.SIZE\n",
+        },
+        "SIZE = 1.0",
+    ),
+}
+
+
+class TestWhereTheCodeIsWritten:
+    @pytest.mark.parametrize("written", WRITTEN_BY_A_USER)
+    def test_a_change_is_refused_and_a_copy_is_not(self, site: Site, written: str) -> None:
+        name, sources, constant = WRITTEN_BY_A_USER[written]
+        services = []
+        for place, value in (("older", "0.5"), ("same", "1.0"), ("", "1.0")):
+            for file, text in sources.items():
+                path = site.directory / place / file
+                path.parent.mkdir(exist_ok=True, parents=True)
+                path.write_text(text.replace(constant, constant.replace("1.0", value)))
+            if place:
+                folder = str(site.directory / place)
+                services.append(site.service("--problem", name, "--problem-directory", folder))
+        older, same = (service.start() for service in services)
+        document = {**DOCUMENT, "problem": name}
+        robot = site.run(site.configure(document, offload=PATIENT), services=[older, same])
+        robot.finish()
+        (refused,) = robot.matching("refused")
+        assert (refused["service"], refused["code"]) == (older.endpoint, "other_code")
+        assert services_in_order(robot) == [same.endpoint]

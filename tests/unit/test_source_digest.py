@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import hashlib
 import importlib
 import json
@@ -133,6 +134,75 @@ class TestProblem:
         arm = arm_of(folder)
         (folder / "arm_tables.py").write_text("import (")
         assert set(problem_sources(arm)) == OF_THE_ARM - {"arm_tables_more"}
+
+    def test_a_module_that_is_called_as_one_of_the_standard_library(
+        self, folder: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.delitem(sys.modules, "turtle", raising=False)
+        text = "import cmd, arm_late\nimport queue\nclass P: pass\n"
+        (folder / "turtle.py").write_text(text)
+        (folder / "cmd.py").write_text("X = 1\n")
+        assert "turtle" in sys.stdlib_module_names
+        try:
+            sources = problem_sources(registry.problem_class("turtle:P", folder), "turtle")
+        finally:
+            sys.modules.pop("turtle", None)
+            sys.modules.pop("cmd", None)
+        assert set(sources) == {"turtle", "cmd", "arm_late"}
+
+    def test_the_standard_librarys_own_are_no_part(self) -> None:
+        class Derived(argparse.Namespace):
+            pass
+
+        assert "argparse" not in problem_sources(Derived)
+
+    def test_the_module_that_the_configuration_names(self, folder: Path) -> None:
+        (folder / "arm_mine.py").write_text(
+            "from arm_problem import Arm\nimport arm_stranger\nArm.LENGTH = 2\n"
+        )
+        named_in = registry.problem_module("arm_mine:Arm")
+        arm = registry.problem_class("arm_mine:Arm", folder)
+        assert set(problem_sources(arm, named_in)) == {*OF_THE_ARM, "arm_mine", "arm_stranger"}
+        before = problem_digest(arm, named_in)
+        (folder / "arm_mine.py").write_text("from arm_problem import Arm\nArm.LENGTH = 3\n")
+        assert problem_digest(arm, named_in) != before
+
+    def test_a_folder_that_is_put_on_the_import_path(self, folder: Path) -> None:
+        sources = {
+            "arm_paths.py": "import sys, pathlib, importlib\n"
+            "sys.path.insert(0, str(pathlib.Path(__file__).parent / 'lib'))\n"
+            "import arm_helper\n"
+            "arm_stranger = importlib.import_module('arm_stranger')\n"
+            "class Arm:\n"
+            "    def __init__(self):\n        import arm_lazy\n",
+            "lib/arm_helper.py": "import arm_deeper\n",
+            "lib/arm_deeper.py": "",
+            "lib/arm_lazy.py": "",
+            "lib/arm_of_another.py": "",
+        }
+        for name, text in sources.items():
+            (folder / name).parent.mkdir(exist_ok=True)
+            (folder / name).write_text(text)
+        arm = registry.problem_class("arm_paths:Arm", folder)
+        expected = {"arm_paths", "arm_helper", "arm_deeper", "arm_stranger"}
+        assert set(problem_sources(arm, "arm_paths")) == expected
+        # What one process alone has loaded makes no difference: an instance, an environment.
+        arm()
+        importlib.import_module("arm_of_another")
+        assert "arm_lazy" in sys.modules
+        assert set(problem_sources(arm, "arm_paths")) == expected
+
+    @pytest.mark.parametrize(
+        ("name", "module"),
+        [
+            ("mine:P", "mine"),
+            ("my.own:P", "my.own"),
+            ("capsule_robot", "holdfast.problems.capsule_robot"),
+            ("nobody", None),
+        ],
+    )
+    def test_where_a_name_leads(self, name: str, module: str | None) -> None:
+        assert registry.problem_module(name) == module
 
 
 class TestCore:

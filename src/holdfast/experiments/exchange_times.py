@@ -27,7 +27,7 @@ from holdfast.experiments.tables import Cell, Table
 from holdfast.experiments.tasks import TaskError
 from holdfast.experiments.trial_batches import problem_of
 from holdfast.planning import advance, choose_sensing_action, digest, initial_state, observe
-from holdfast.problems.registry import problem_class
+from holdfast.problems.registry import problem_class, problem_module
 from holdfast.runtime.endpoints import ServiceAddress
 from holdfast.runtime.leash import leash
 from holdfast.runtime.own_planner import OWN_PLANNER, OwnPlanner
@@ -131,7 +131,10 @@ def measure_exchange(**exchange: Any) -> Table:
         particle_filter=ParticleFilterSettings(num_particles=wanted.particles),
         selector=SelectorSettings(estimator="nearest_neighbor"),
     )
-    code = core_version(), problem_digest(problem_class(wanted.problem))
+    code = (
+        core_version(),
+        problem_digest(problem_class(wanted.problem), problem_module(wanted.problem)),
+    )
     opening = Opening(wanted.problem, {}, {}, settings, wanted.seed, *code)
     turns = [turn for trial in range(wanted.num_trials) for turn in _turns(wanted, settings, trial)]
     rows: list[tuple[Cell, ...]] = []

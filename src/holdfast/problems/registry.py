@@ -14,7 +14,7 @@ from typing import Any
 
 from holdfast.errors import UnknownProblemError
 
-__all__ = ["BUILT_IN", "names", "problem_class"]
+__all__ = ["BUILT_IN", "names", "problem_class", "problem_module"]
 
 GROUP = "holdfast.problems"
 
@@ -68,3 +68,25 @@ def problem_class(name: str, search_directory: Path | None = None) -> type[Any]:
         search_directory=search_directory,
         error_type=UnknownProblemError,
     )
+
+
+def problem_module(name: str) -> str | None:
+    """Return the name of the module in which a problem's class is looked up.
+
+    Parameters
+    ----------
+    name : str
+        A registered name, or ``module:Class``.
+
+    Returns
+    -------
+    str or None
+        None for a name that is not registered.
+    """
+    place = name if ":" in name else BUILT_IN.get(name)
+    if place is None and name:
+        import importlib.metadata
+
+        found = importlib.metadata.entry_points(group=GROUP, name=name)
+        place = next((entry_point.value for entry_point in found), None)
+    return None if place is None else place.partition(":")[0].strip()

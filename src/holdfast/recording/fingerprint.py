@@ -11,6 +11,7 @@ from collections.abc import Mapping
 
 from holdfast import __version__
 from holdfast.configuration import Configuration
+from holdfast.problems.registry import problem_module
 from holdfast.source_digest import core_version, problem_sources
 
 __all__ = ["difference", "fingerprint"]
@@ -37,7 +38,12 @@ def fingerprint(configuration: Configuration) -> dict[str, str]:
     return {
         _VERSION: __version__,
         _CORE: core_version(),
-        _SOURCES: json.dumps(problem_sources(type(configuration.problem)), sort_keys=True),
+        _SOURCES: json.dumps(
+            problem_sources(
+                type(configuration.problem), problem_module(configuration.problem_name)
+            ),
+            sort_keys=True,
+        ),
     }
 
 

@@ -26,7 +26,7 @@ from holdfast.configuration import Configuration
 from holdfast.errors import HoldfastError, TrialError
 from holdfast.outcome import TrialResult
 from holdfast.planning import Planner
-from holdfast.problems.registry import problem_class
+from holdfast.problems.registry import problem_class, problem_module
 from holdfast.robot.own_decisions import OwnDecisions
 from holdfast.runtime.diagnosis import MissingServices
 from holdfast.runtime.environment import EnvironmentMaker
@@ -148,7 +148,7 @@ def opening_of(configuration: Configuration) -> Opening:
         configuration.planning,
         configuration.simulator.seed,
         core_version(),
-        problem_digest(problem_class(name, configuration.problem_directory)),
+        problem_digest(problem_class(name, configuration.problem_directory), problem_module(name)),
     )
 
 

@@ -114,7 +114,10 @@ class KnownProblems:
         }
         # Now, for what is on the disk can be replaced while it runs as it was loaded.
         self._core_version = core_version()
-        self._digests = {each: problem_digest(each) for each in self._classes.values()}
+        self._digests = {
+            name: problem_digest(each, registry.problem_module(name))
+            for name, each in self._classes.items()
+        }
         self._names: frozenset[str] | None = None
         # msgspec (0.22) finds out about a struct's fields when the first one is made, and crashes
         # if a second thread makes one meanwhile.
@@ -150,19 +153,20 @@ class KnownProblems:
         return build_problem(name, found, opening.model, opening.state_space_planner)
 
     def _require_same_code(self, opening: Opening, found: type[Any]) -> None:
-        if found not in self._digests:
-            self._digests[found] = problem_digest(found)
+        name = opening.problem
+        if name not in self._digests:
+            self._digests[name] = problem_digest(found, registry.problem_module(name))
         differences = [
             f"{what} is {here} on this service, {there or 'not told'} on the robot"
             for what, here, there in (
                 ("holdfast", self._core_version, opening.core_version),
-                ("the digest of the problem's code", self._digests[found], opening.problem_digest),
+                ("the digest of the problem's code", self._digests[name], opening.problem_digest),
             )
             if here != there
         ]
         if differences:
             raise OtherCodeError(
-                f"problem {opening.problem}: {' and '.join(differences)}; they may decide "
+                f"problem {name}: {' and '.join(differences)}; they may decide "
                 "differently, so deploy the same version on both, then start the service again"
             )
 
