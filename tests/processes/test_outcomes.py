@@ -92,6 +92,19 @@ class Forgetful(Lander):
 
 class Wrong(Lander):
     ending = {0: True, 1: "crashed"}
+
+
+class Absent(Lander):
+    # Does not count, and at step 4 of trial 1 what it says is no answer until a person mends it.
+    def __init__(self, trial, resumed):
+        super().__init__(trial, resumed)
+        self.steps_performed = None
+
+    def is_done(self):
+        num_moves = len(self.moves.read_text())
+        if self.trial == 1 and num_moves == 5 and not Path("mended").exists():
+            return None
+        return self.ending.get(self.trial, False) if num_moves >= 6 else False
 """
 
 CONFIGURATION = """
@@ -227,3 +240,22 @@ def test_a_run_from_before_trials_could_fail_goes_on(tmp_path: Path) -> None:
     assert [row["success"] for row in rows] == ["0", "1", "0"]
     assert rows[2]["digest"] == AS_BEFORE
     assert [event["step"] for event in events_of(out) if event["event"] == "resumed_trial"] == [21]
+
+
+def test_an_answer_that_is_none_after_a_move_is_mended_and_the_move_is_not_made_again(
+    tmp_path: Path,
+) -> None:
+    command = Command(tmp_path, "Absent")
+    done = command.run()
+    assert done.returncode == 2
+    assert "trial 1, step 4, whose task action was performed" in done.stderr
+    assert 'is_done returned None; it must return True, False or "failed"' in done.stderr
+    assert "--resume" in done.stderr
+    (tmp_path / "mended").touch()
+    done = command.run("--resume")
+    assert done.returncode == 0, done.stderr
+    assert [len((tmp_path / f"moves-{trial}").read_text()) for trial in range(3)] == [6, 6, 9]
+    with (command.out / "trials.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["outcome"] for row in rows] == ["succeeded", "failed", "truncated"]
+    assert [float(row["reward"]) for row in rows] == [-6.0, -6.0, -9.0]

@@ -238,15 +238,17 @@ class TestFailures:
         assert not failed.performance_unknown
 
     @pytest.mark.parametrize(
-        ("method", "unknown"),
+        ("method", "unknown", "performed"),
         [
-            ("steps_performed", False),
-            ("perform_sensing", False),
-            ("perform", True),
-            ("is_done", True),
+            ("steps_performed", False, False),
+            ("perform_sensing", False, False),
+            ("perform", True, False),
+            ("is_done", False, True),
         ],
     )
-    def test_a_method_that_raises(self, method: str, unknown: bool, bench: Bench) -> None:
+    def test_a_method_that_raises(
+        self, method: str, unknown: bool, performed: bool, bench: Bench
+    ) -> None:
         robot = Robot()
         performer = bench.open(robot, resumed=True)
         if method == "steps_performed":
@@ -262,6 +264,7 @@ class TestFailures:
                 performer.perform(5, ACTION)
         failed = bench.failure()
         assert (failed.step, failed.what, failed.performance_unknown) == (5, method, unknown)
+        assert (failed.performed, failed.reward) == (performed, -1.0 if performed else None)
         assert failed.text.startswith(
             f"robot: {method} raised ValueError: the motor is hot\n  File"
         )
@@ -340,8 +343,9 @@ class TestFailures:
         assert failed.what == method
         assert failed.text.startswith(f"robot: {method} returned ")
         assert expected in failed.text
-        # It was performed, but nobody was told so: the journal's record of it stays open.
-        assert failed.performance_unknown == (method in ("perform", "is_done"))
+        # What perform returned may mean that it was not performed; what is_done did does not.
+        assert failed.performance_unknown == (method == "perform")
+        assert failed.performed == (method == "is_done")
 
     def test_numbers_of_other_kinds_will_do(self, bench: Bench) -> None:
         robot = Robot(
@@ -486,7 +490,7 @@ class TestStalls:
 
     @pytest.mark.parametrize(
         ("method", "unknown"),
-        [("perform_sensing", False), ("perform", True), ("is_done", True)],
+        [("perform_sensing", False), ("perform", True), ("is_done", False)],
     )
     def test_a_method_that_does_not_return(
         self, method: str, unknown: bool, threaded: Bench
@@ -505,6 +509,7 @@ class TestStalls:
             method,
             f"robot: {method} has not returned within 1000 ms, which is environment.timeout_ms",
             unknown,
+            *((True, -1.0) if method == "is_done" else ()),
         )
         performer.perform(8, ACTION)
         assert threaded.failure()[:2] == (8, method)

@@ -1164,6 +1164,32 @@ def test_an_environment_that_fails_holds_the_robot(counts: bool, expected: type)
     assert isinstance(world.journal[-1], ActingRecord)
 
 
+@pytest.mark.parametrize("counts", [True, False])
+def test_what_fails_after_an_action_was_performed_leaves_it_in_the_journal(counts: bool) -> None:
+    world = World()
+    world.counts = counts
+    world.start()
+    act = world.act
+
+    def act_and_fail(effect: Act) -> None:
+        act(effect)
+        if effect.step == 5:
+            failure = EnvironmentFailed(5, "is_done", "returned None", False, True, -2.5)
+            world.heap = []
+            world.after(0.1, lambda: world.robot.handle(failure, world.now))
+
+    world.act = act_and_fail  # type: ignore[method-assign]
+    world.run()
+    assert world.stopped is not None
+    assert type(world.stopped.error) is HeldError
+    assert "step 5, whose task action was performed: returned None" in str(world.stopped.error)
+    assert world.journal[-1] == PerformedRecord(5, -2.5)
+    # The effects come in this order: what is to be written down is, before the robot stops.
+    resumed = begin_after(tuple(world.journal), None)
+    assert resumed.stopped is None
+    assert resumed.robot.step == 6
+
+
 def test_pause_writes_everything_down_and_a_new_robot_goes_on() -> None:
     world = World(simulator=SimulatorSettings(num_trials=1, max_steps=14, seed=11))
     world.on_act = lambda step: (

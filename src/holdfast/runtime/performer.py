@@ -142,6 +142,9 @@ class _CheckedEnvironment:
         self._sizes: dict[int, int | None] = {}
         # What is being called. Read by another thread when it takes too long.
         self._method = name
+        # The reward of the task action that was performed in the call that goes on, if one was.
+        # Read by another thread, too.
+        self._performed: tuple[float | None] | None = None
         self.environment: Environment | None = None
 
     def begin(self, step: int) -> EnvironmentEvent:
@@ -171,6 +174,7 @@ class _CheckedEnvironment:
             return self._failed(step, error)
 
     def perform(self, step: int, task_action: FloatArray) -> EnvironmentEvent:
+        self._performed = None
         self._method = "perform"
         begun = False
         try:
@@ -179,12 +183,13 @@ class _CheckedEnvironment:
             action = np.array(task_action, dtype=np.float64)
             begun = True
             reward = self._reward(environment.perform(action))
+            self._performed = (reward,)
             self._method = "is_done"
             return Acted(step, reward, self._done(environment.is_done()))
         except self._passed_on:
             raise
         except BaseException as error:  # noqa: BLE001 - a SystemExit would end a thread unheard
-            return self._failed(step, error, performance_unknown=begun)
+            return self._failed(step, error, performance_begun=begun)
 
     def close(self) -> None:
         close = getattr(self.environment, "close", None)
@@ -198,17 +203,24 @@ class _CheckedEnvironment:
                 return
 
     def stalled(
-        self, step: int, timeout_ms: float, *, performance_unknown: bool
+        self, step: int, timeout_ms: float, *, performance_begun: bool
     ) -> EnvironmentFailed:
         """Return what is said of a call that takes too long."""
         method = self._method
-        return EnvironmentFailed(
-            step,
-            method,
+        text = (
             f"{self._called(method)} has not returned within {timeout_ms:g} ms, which is "
-            "environment.timeout_ms",
-            performance_unknown,
+            "environment.timeout_ms"
         )
+        return self._failure(step, method, text, performance_begun=performance_begun)
+
+    def _failure(
+        self, step: int, method: str, text: str, *, performance_begun: bool
+    ) -> EnvironmentFailed:
+        performed = self._performed
+        if not performance_begun or performed is None:
+            return EnvironmentFailed(step, method, text, performance_begun)
+        # Nobody but is_done has failed: what ``perform`` came to is known.
+        return EnvironmentFailed(step, method, text, False, True, *performed)
 
     def _begun(self) -> Environment:
         if self.environment is None:
@@ -216,7 +228,7 @@ class _CheckedEnvironment:
         return self.environment
 
     def _failed(
-        self, step: int, error: BaseException, *, performance_unknown: bool = False
+        self, step: int, error: BaseException, *, performance_begun: bool = False
     ) -> EnvironmentFailed:
         called = self._called(self._method)
         text = account_of_user_error(error, called)
@@ -225,7 +237,7 @@ class _CheckedEnvironment:
         elif text is None:
             message = f": {error}" if str(error) else ""
             text = f"{called} raised {type(error).__name__}{message}"
-        return EnvironmentFailed(step, self._method, text, performance_unknown)
+        return self._failure(step, self._method, text, performance_begun=performance_begun)
 
     def _called(self, method: str) -> str:
         return self._name if method == self._name else f"{self._name}: {method}"
@@ -506,11 +518,9 @@ class ThreadedPerformer:
                     call.deadline = now + min(now - wakes_at, 1e-3 * self._timeout_ms)
                 elif now >= call.deadline:
                     self._current = None
-                    unknown = call.kind == "perform"
+                    begun = call.kind == "perform"
                     self._finish(
-                        self._checked.stalled(
-                            call.step, self._timeout_ms, performance_unknown=unknown
-                        )
+                        self._checked.stalled(call.step, self._timeout_ms, performance_begun=begun)
                     )
 
     def _finish(self, event: EnvironmentEvent) -> None:

@@ -131,12 +131,18 @@ class EnvironmentFailed(NamedTuple):
     performance_unknown : bool
         True if the step's task action may have been performed: it was begun, and no
         :class:`Acted` came of it. Only the environment can say.
+    performed : bool
+        True if the step's task action was performed, and it is what came after that failed.
+    reward : float or None
+        Of that task action, as in :class:`Acted`.
     """
 
     step: int
     what: str
     text: str
     performance_unknown: bool
+    performed: bool = False
+    reward: float | None = None
 
 
 EnvironmentEvent: TypeAlias = Begun | Sensed | Acted | EnvironmentFailed

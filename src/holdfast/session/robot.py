@@ -525,17 +525,26 @@ class Robot:
             )
 
     def _acted(self, event: Acted) -> None:
+        self._done = event.done
+        self._performed(event.reward)
+
+    def _performed(self, reward: float | None) -> None:
         history = self._history
         assert history is not None
-        self._unwritten.append(PerformedRecord(history.state.step, event.reward))
-        self._done = event.done
+        self._unwritten.append(PerformedRecord(history.state.step, reward))
         try:
-            history.performed(self._planner, event.reward)
+            history.performed(self._planner, reward)
         except HoldfastError as error:
             self._stop(error)
 
     def _failed(self, event: EnvironmentFailed) -> None:
         where = f"the robot holds still in trial {self._trial}, step {event.step}"
+        if event.performed:
+            # What is written down now needs no environment that counts when the run goes on.
+            self._performed(event.reward)
+            if self._stopped:
+                return
+            where += ", whose task action was performed"
         # The account of the failure comes last: it may have many lines.
         if not event.performance_unknown:
             self._stop(HeldError(f"{where}: {event.text}"))
