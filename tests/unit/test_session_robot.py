@@ -227,7 +227,6 @@ class World:
         )
         self.limited = PROBLEM.execute
         self.own_s = 0.005
-        self.counts = True
         self.own = self.decide
         self.verified: list[Verified] = []
         self.planner, self.simulator = Planner(PROBLEM, planning), simulator
@@ -288,8 +287,7 @@ class World:
         self.environment = self.environment_class(PROBLEM, self.simulator.seed, trial)
         for action in history.actions:
             self.environment.perform(action)
-        performed = self.environment.step if self.counts else None
-        begun = Begun(self.environment.is_done(), performed)
+        begun = Begun(self.environment.is_done(), self.environment.step)
         self.carry_out(
             self.robot.begin_trial(trial, history, begun, self.now, tail_is_certain=True)
         )
@@ -1136,13 +1134,12 @@ def test_a_tail_that_may_be_lost_stops_unless_the_environment_can_tell() -> None
 def test_an_environment_that_fails_holds_the_robot(counts: bool, expected: type) -> None:
     # One that counts can say later whether the action was performed; else nobody ever can.
     world = World()
-    world.counts = counts
     world.start()
 
     def fail(step: int) -> None:
         if step == 5:
             world.heap.clear()
-            failure = EnvironmentFailed(5, "perform", "the arm is stuck", True)
+            failure = EnvironmentFailed(5, "perform", "the arm is stuck", True, counts=counts)
             world.after(0.1, lambda: world.robot.handle(failure, world.now))
 
     world.on_act = fail
@@ -1167,7 +1164,6 @@ def test_an_environment_that_fails_holds_the_robot(counts: bool, expected: type)
 @pytest.mark.parametrize("counts", [True, False])
 def test_what_fails_after_an_action_was_performed_leaves_it_in_the_journal(counts: bool) -> None:
     world = World()
-    world.counts = counts
     world.start()
     act = world.act
 

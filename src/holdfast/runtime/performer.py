@@ -218,7 +218,9 @@ class _CheckedEnvironment:
     ) -> EnvironmentFailed:
         performed = self._performed
         if not performance_begun or performed is None:
-            return EnvironmentFailed(step, method, text, performance_begun)
+            asked = getattr(self.environment, "steps_performed", None)
+            counts = callable(asked) or not performance_begun
+            return EnvironmentFailed(step, method, text, performance_begun, counts=counts)
         # Nobody but is_done has failed: what ``perform`` came to is known.
         return EnvironmentFailed(step, method, text, False, True, *performed)
 

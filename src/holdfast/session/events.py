@@ -135,6 +135,8 @@ class EnvironmentFailed(NamedTuple):
         True if the step's task action was performed, and it is what came after that failed.
     reward : float or None
         Of that task action, as in :class:`Acted`.
+    counts : bool
+        Whether the environment counts its steps, so that it can be asked later what it has done.
     """
 
     step: int
@@ -143,6 +145,7 @@ class EnvironmentFailed(NamedTuple):
     performance_unknown: bool
     performed: bool = False
     reward: float | None = None
+    counts: bool = True
 
 
 EnvironmentEvent: TypeAlias = Begun | Sensed | Acted | EnvironmentFailed

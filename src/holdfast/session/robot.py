@@ -271,7 +271,6 @@ class Robot:
         self._trial = 0
         self._done: Done = False
         self._in_environment = False
-        self._environment_counts = False
         self._sensing_action = 0
         self._computed_ms = 0.0
         self._unwritten: list[Record] = []
@@ -330,7 +329,6 @@ class Robot:
         self._trial = trial
         self._history = history
         self._done = begun.done
-        self._environment_counts = begun.steps_performed is not None
         self._in_environment = False
         self._unwritten = []
         self._next_tick = None
@@ -548,7 +546,7 @@ class Robot:
         # The account of the failure comes last: it may have many lines.
         if not event.performance_unknown:
             self._stop(HeldError(f"{where}: {event.text}"))
-        elif self._environment_counts:
+        elif event.counts:
             self._stop(
                 HeldError(
                     f"{where}, and whether its task action was performed is not known: {event.text}"
