@@ -220,7 +220,7 @@ class TestOutput:
         (status,) = [event for event in events if event["event"] == "status"]
         assert status["reason"] == f"{service} has not appeared"
         (note,) = [event for event in events if event["event"] == "note"]
-        assert note["reason"].startswith(f"{service} decided nothing")
+        assert note["reason"] == f"{service} decided nothing: connection refused"
         found = summary(workplace / "out")
         decided = found["sensing_decisions_by_service"]
         assert decided == {"cloud_active_sensing_recovery": found["sensing_decisions"]}
@@ -645,6 +645,15 @@ def test_values_instead_of_the_files(workplace: Path) -> None:
             'selector.method, given instead of what peg.yaml says, is "dance',
         ),
         ("selektor.method=random", "selektor is not a known section; did you mean selector?"),
+        (
+            "simulator.max_step=9",
+            "holdfast: error: simulator.max_step is not a known key; did you mean max_steps?",
+        ),
+        ("selector.method=entropy", "did you mean action_entropy or state_entropy?"),
+        (
+            "environment.arguments.noise=0.2",
+            "write --set 'environment.arguments={noise: 0.2}'",
+        ),
     ],
 )
 def test_a_wrong_value_instead_of_the_files(workplace: Path, assignment: str, message: str) -> None:
