@@ -104,7 +104,7 @@ $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
 
 $(INSTALLED_FIGURES): pyproject.toml $(NATIVE_SOURCES) | $(BIN)/python
-	$(BIN)/python -m pip install --disable-pip-version-check -q -e ".[figures]"
+	$(BIN)/python -m pip install --disable-pip-version-check -q -e ".[figures,service]"
 	@touch $@
 
 $(INSTALLED_DEV): pyproject.toml $(NATIVE_SOURCES) | $(BIN)/python

@@ -366,7 +366,11 @@ class _Source:
             if homes
             else f"is not a known {what}{_close_match(str(path[-1]), allowed)}"
         )
-        return self.error(path, f"{hint}\nallowed: {', '.join(allowed) or 'no keys'}")
+        text = f"{hint}\nallowed: {', '.join(allowed) or 'no keys'}"
+        if len(path) == 2 and self.is_overridden(path):
+            # The key itself was given instead of the file's, which has nothing to do with it.
+            return ConfigurationError(f"{dotted(path)} {text}")
+        return self.error(path, text)
 
 
 def _build(
@@ -921,9 +925,13 @@ def _lengths(
 
 
 def _close_match(text: str, allowed: Iterable[str]) -> str:
-    """Return a question after the nearest of the allowed texts, or nothing."""
-    close = difflib.get_close_matches(text.lower(), list(allowed), n=1)
-    return f"; did you mean {close[0]}?" if close else ""
+    """Return a question after the allowed texts of which this is a part, or after the nearest."""
+    texts = list(allowed)
+    part = rf"(?:^|_){re.escape(text.lower())}(?:_|$)"
+    close = [each for each in texts if re.search(part, each)]
+    if len(close) != 2:
+        close = difflib.get_close_matches(text.lower(), texts, n=1)
+    return f"; did you mean {' or '.join(close)}?" if close else ""
 
 
 def _kind(value: Any) -> str:

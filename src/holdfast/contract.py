@@ -22,6 +22,7 @@ from holdfast.errors import ProblemError
 
 __all__ = [
     "check_problem",
+    "check_sizes",
     "executed_action",
     "has_general_observations",
     "in_brief",
@@ -75,14 +76,8 @@ def check_problem(problem: Any) -> None:
         If an attribute is missing or out of bounds, a function cannot be called as it will be, or
         only one of ``log_likelihood`` and ``sample_observation`` is there.
     """
-    kind = type(problem).__name__
-    name = getattr(problem, "name", "")
-    if not isinstance(name, str) or not name:
-        raise ProblemError(f"name of {kind} is {name!r}: must be a text, not empty")
-    for attribute in ("state_size", "action_size", "num_stages"):
-        size = getattr(problem, attribute, None)
-        if not isinstance(size, int) or size < 1:
-            raise ProblemError(f"{attribute} of {name} is {size!r}: must be a whole number >= 1")
+    check_sizes(problem)
+    name = problem.name
     actions = getattr(problem, "sensing_actions", ())
     if isinstance(actions, str) or not isinstance(actions, Sequence) or not actions:
         raise ProblemError(
@@ -119,6 +114,24 @@ def check_problem(problem: Any) -> None:
     for function, parameters in PARAMETERS.items():
         if hasattr(problem, function):
             _check_parameters(name, function, getattr(problem, function), parameters)
+
+
+def check_sizes(problem: Any) -> None:
+    """Check what any use of a problem needs first: its name and its numbers of coordinates.
+
+    Raises
+    ------
+    ProblemError
+        If one of them is missing or out of bounds.
+    """
+    kind = type(problem).__name__
+    name = getattr(problem, "name", "")
+    if not isinstance(name, str) or not name:
+        raise ProblemError(f"name of {kind} is {name!r}: must be a text, not empty")
+    for attribute in ("state_size", "action_size", "num_stages"):
+        size = getattr(problem, attribute, None)
+        if not isinstance(size, int) or size < 1:
+            raise ProblemError(f"{attribute} of {name} is {size!r}: must be a whole number >= 1")
 
 
 def _check_parameters(name: str, function: str, own: Any, parameters: tuple[str, ...]) -> None:

@@ -101,7 +101,7 @@ class SelectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
     sensing_action : int
         Index of the sensing action that ``fixed`` chooses.
     estimator : {"nearest_neighbor", "gaussian_mixture_upper", "gaussian_mixture_lower"}
-        The estimate of the two entropies. A mixture takes few particles, as a sharp look leaves
+        How the two entropies are estimated. A mixture takes few particles, as a sharp look leaves
         them, for certainty: use it with so many that they lie closer than its noise
         (docs/results.md). Distances between neighbours depend on the units of the coordinates;
         with the motion noise as its own, the mixture does not.
@@ -167,9 +167,9 @@ class OffloadSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
     startup_timeout_ms : float
         At the start of a run, how long to wait for a service that has never been seen yet.
     lease_ms : float
-        How long this robot may be silent before services give up the link to it. Each end says
-        this of itself: how long a service may be silent before robots give it up, that one says
-        (``holdfast serve --lease-ms``). For the local service, which the robot starts, it is both.
+        How long this robot may be silent before services give up the link to it. Each side sets how
+        long it may be silent: the robot here, a service by ``holdfast serve --lease-ms``. For the
+        local service, which the robot starts, it is both.
     decision_deadline_ms : float or None
         A decision that is not there this long after it was needed is asked of the local service
         as well, if that is running; the first answer wins.

@@ -12,6 +12,7 @@ from holdfast.experiments.statistics import (
     agreement_of_means,
     agreement_of_rates,
     cells_of,
+    independent_difference,
     logarithms_of_steps,
     mean_interval,
     paired_difference,
@@ -19,6 +20,7 @@ from holdfast.experiments.statistics import (
     ratio_of,
     smallest_levels,
 )
+from holdfast.recording.tables import wilson_interval
 
 
 def test_mean_interval_is_students() -> None:
@@ -93,6 +95,15 @@ def test_agreement() -> None:
     assert agreement_of_means(values, 0.0, 800) == pytest.approx(1.0)
     assert agreement_of_means(values, 3.0, 800) < 1e-9
     assert math.isnan(agreement_of_means(values[:1], 0.0, 800))
+
+
+def test_the_difference_of_two_rates_has_newcombes_interval() -> None:
+    # The first example of Newcombe's table II (1998): 56 of 70 and 48 of 80.
+    first, second = (
+        Interval(successes / trials, *wilson_interval(successes, trials))
+        for successes, trials in ((56, 70), (48, 80))
+    )
+    assert independent_difference(first, second) == pytest.approx((0.2, 0.0524, 0.3339), abs=5e-5)
 
 
 def test_smallest_levels_are_holms() -> None:

@@ -282,6 +282,17 @@ class TestTrial:
         assert result.success
 
 
+def test_without_its_controller_the_example_says_why_in_time() -> None:
+    settings = load(EXAMPLE / "own_robot.yaml").environment
+    assert 1e3 * settings.arguments["connect_timeout_s"] < settings.timeout_ms
+    controller = Controller(Path())
+    controller.port = free_port()
+    maker = load_environment(configuration_for(controller, {"connect_timeout_s": 0.1}))
+    failed = Watched(maker).begin()
+    assert isinstance(failed, EnvironmentFailed)
+    assert "Connection refused" in failed.text
+
+
 class Watched:
     """A performer with the queue of its events."""
 

@@ -8,6 +8,7 @@ import re
 import shlex
 import subprocess
 import sys
+import tomllib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -114,6 +115,20 @@ def test_make_targets_exist() -> None:
         if command.startswith("make "):
             done = run(["make", "--dry-run", *shlex.split(command)[1:]], ROOT)
             assert done.returncode == 0, f"{command}\n{done.stderr}"
+
+
+def test_what_is_installed_keeps_the_editable_installation_and_suffices() -> None:
+    """A plain ``pip install .`` would replace what ``make demo`` has installed."""
+    installed = re.findall(r"pip install (-e )?'\.\[(.+?)\]'", README)
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    known = set(project["optional-dependencies"])
+    assert installed
+    for editable, extras in installed:
+        assert editable
+        assert set(extras.split(",")) <= known
+    # What `holdfast keys` needs is named before it is used, and the demo's environment has it.
+    assert README.index("'.[service]'") < README.index("holdfast keys")
+    assert '-e ".[figures,service]"' in (ROOT / "Makefile").read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("name", ["README.md", "ARCHITECTURE.md"])

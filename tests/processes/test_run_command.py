@@ -220,7 +220,7 @@ class TestOutput:
         (status,) = [event for event in events if event["event"] == "status"]
         assert status["reason"] == f"{service} has not appeared"
         (note,) = [event for event in events if event["event"] == "note"]
-        assert note["reason"].startswith(f"{service} decided nothing")
+        assert note["reason"] == f"{service} decided nothing: connection refused"
         found = summary(workplace / "out")
         decided = found["sensing_decisions_by_service"]
         assert decided == {"cloud_active_sensing_recovery": found["sensing_decisions"]}
@@ -511,18 +511,24 @@ class TestErrors:
         assert event["reason"].startswith(expected), event
         assert event["component"] == ("service" if command[0] == "serve" else "robot")
 
-    def test_with_log_json_the_error_says_how_to_go_on(self, workplace: Path) -> None:
-        (workplace / "my_robot.py").write_text(BROKEN_ROBOT)
+    @pytest.mark.parametrize("counts", [False, True])
+    def test_with_log_json_the_error_says_how_to_go_on(self, workplace: Path, counts: bool) -> None:
+        # One that counts its steps can say later whether the action was performed.
+        counting = "    def steps_performed(self):\n        return 0\n" if counts else ""
+        (workplace / "my_robot.py").write_text(f"{BROKEN_ROBOT.rstrip()}\n{counting}")
         arguments = ("run", "peg.yaml", "--environment", "my_robot:MyRobot", "--out", "out")
         done = holdfast(workplace, *arguments, "--log", "json")
         assert done.returncode == 2
         *_, last = map(json.loads, done.stderr.splitlines())
         assert last["event"] == "error"
-        assert last["reason"].startswith("the robot holds still in trial 0, step 0: ")
+        assert last["reason"].startswith("the robot holds still in trial 0, step 0, and ")
         assert f'File "{workplace / "my_robot.py"}", line ' in last["details"]
-        command = last["resume_command"]
-        assert command.startswith("holdfast run peg.yaml --environment my_robot:MyRobot ")
-        assert command.endswith("--out out --resume")
+        command = last.get("resume_command", "")
+        assert command.startswith("holdfast run peg.yaml --environment my_robot:MyRobot ") is counts
+        assert command.endswith("--out out --resume") is counts
+        again = holdfast(workplace, *arguments, "--resume")
+        assert again.returncode == 2
+        assert ("the gripper is stuck" in again.stderr) is counts
 
     def test_what_a_problem_raises_is_shown_without_our_frames(self, workplace: Path) -> None:
         (workplace / "broken.py").write_text(
@@ -645,6 +651,15 @@ def test_values_instead_of_the_files(workplace: Path) -> None:
             'selector.method, given instead of what peg.yaml says, is "dance',
         ),
         ("selektor.method=random", "selektor is not a known section; did you mean selector?"),
+        (
+            "simulator.max_step=9",
+            "holdfast: error: simulator.max_step is not a known key; did you mean max_steps?",
+        ),
+        ("selector.method=entropy", "did you mean action_entropy or state_entropy?"),
+        (
+            "environment.arguments.noise=0.2",
+            "write --set 'environment.arguments={noise: 0.2}'",
+        ),
     ],
 )
 def test_a_wrong_value_instead_of_the_files(workplace: Path, assignment: str, message: str) -> None:

@@ -735,7 +735,7 @@ class TestOverrides:
                 ["tcp/a:1", "tcp/a:1"],
                 r"services\[1\], given instead of what .*run.yaml says, is",
             ),
-            ("offload.lease", 3, "offload.lease, given instead of .* is not a known key; did you"),
+            ("offload.lease", 3, "^offload.lease is not a known key; did you mean lease_ms"),
             ("recovery.launch", "now", 'recovery.launch, given instead .*run.yaml says, is "now"'),
             ("ofload.lease_ms", 3, "ofload.* is not a known section; did you mean offload"),
         ],

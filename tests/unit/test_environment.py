@@ -13,7 +13,12 @@ import pytest
 from scipy import stats
 
 from holdfast.configuration import load
-from holdfast.errors import ConfigurationError, EnvironmentFailedError, InvalidValueError
+from holdfast.errors import (
+    ConfigurationError,
+    EnvironmentFailedError,
+    InvalidValueError,
+    ProblemError,
+)
 from holdfast.problems import registry
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.problems.problem import FloatArray, Problem
@@ -343,3 +348,11 @@ class TestLoadEnvironment:
         with pytest.raises(ConfigurationError, match=expected) as caught:
             loaded(name, arguments=arguments)
         assert "run.yaml: environment." in str(caught.value)
+
+
+def test_a_problem_without_its_state_size_hears_of_that_first() -> None:
+    class Sizeless(PegInHole2D):
+        state_size = 0
+
+    with pytest.raises(ProblemError, match=r"^state_size of peg_in_hole_2d is 0: must be a whole"):
+        SimulatedEnvironment(Sizeless(), 1, 0)

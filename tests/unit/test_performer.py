@@ -530,7 +530,8 @@ class TestStalls:
         assert threaded.event() == EnvironmentFailed(
             2,
             "robot",
-            "robot has not returned within 20 ms, which is environment.timeout_ms",
+            "the constructor of robot has not returned within 20 ms, which is "
+            "environment.timeout_ms",
             False,
         )
         released.set()

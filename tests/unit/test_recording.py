@@ -22,7 +22,7 @@ from holdfast.configuration import Configuration, load
 from holdfast.files import OutputError, write_atomically
 from holdfast.outcome import Decisions, TrialResult
 from holdfast.planning import Planner, digest
-from holdfast.recording.figure import _draw_workspace, trial_figure
+from holdfast.recording.figure import _draw_entropies, _draw_workspace, trial_figure
 from holdfast.recording.journal import Journal
 from holdfast.recording.recorder import MAX_PARTICLES_KEPT, RecordedEnvironment, Recorder
 from holdfast.recording.run_directory import (
@@ -700,6 +700,30 @@ class TestFigure:
         for edge in (picture[0], picture[-1], picture[:, 0], picture[:, -1]):
             assert (edge == 1.0).all()
         assert (picture < 1.0).any()
+
+    @pytest.mark.parametrize(
+        ("method", "label"),
+        [
+            ("action_entropy", "expected entropy of\nthe actions (nats)"),
+            ("state_entropy", "expected entropy of\nthe state (nats)"),
+            ("action_covariance", "expected covariance\nof the actions (trace)"),
+        ],
+    )
+    def test_the_scores_say_of_what_they_are_and_which_were_not_chosen(
+        self, method: str, label: str
+    ) -> None:
+        overrides = {"selector.method": method, "simulator.max_steps": 12}
+        configuration = load(EXAMPLES / "peg_in_hole_2d.yaml", overrides=overrides)
+        record = TestRecorder.record(configuration, trial=0).record
+        panel = Figure().subplots()
+        _draw_entropies(panel, configuration, record)
+        assert panel.get_ylabel() == label
+        legend = panel.get_legend()
+        assert legend is not None
+        assert [text.get_text() for text in legend.get_texts()] == [
+            "chosen",
+            "not chosen (hollow)",
+        ]
 
     @pytest.mark.parametrize("method", ["action_entropy", "random"])
     @pytest.mark.parametrize("problem", ["peg_in_hole_2d", "capsule_robot", "peg_in_hole_3d"])

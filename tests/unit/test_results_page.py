@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import csv
 import re
+from collections.abc import Callable
 from pathlib import Path
 
 import msgspec
 import pytest
 
+from holdfast.experiments import parameters, published_2017
 from holdfast.experiments.registry import study_names
+from holdfast.experiments.tables import Cell, Table
 
 DOCS = Path(__file__).parents[2] / "docs"
 PAGE = (DOCS / "results.md").read_text(encoding="utf-8")
@@ -93,6 +96,50 @@ def test_both_pages_say_what_more_particles_than_the_default_gain() -> None:
     value, low, high = (float(row[f"steps_ratio{end}"]) for end in ("", "_low", "_high"))
     assert f"{value:.2f} [{low:.2f}, {high:.2f}] times the steps of three times" in README
     assert f"particles x 10 instead of x 3: {value:.3g} [{low:.3g}, {high:.3g}]" in PAGE
+
+
+def typed_table(study: str, name: str) -> Table:
+    """Return a committed table with the types that the study gave it."""
+    rows = table_of(study, name)
+    texts = {"problem", "estimator", "parameter", "value", "reference", "logged", "selector"}
+    texts |= {"from", "to"}
+
+    def cell_of(column: str, text: str) -> Cell:
+        if column in texts:
+            return text
+        if not text:
+            return None
+        return int(text) if re.fullmatch(r"-?\d+", text) else float(text)
+
+    return Table.of_records(
+        [{name: cell_of(name, text) for name, text in row.items()} for row in rows]
+    )
+
+
+@pytest.mark.parametrize(
+    ("study", "findings", "tables"),
+    [
+        ("published_2017", published_2017._findings, ["published_2017"]),
+        ("parameters", parameters._findings, ["parameters", "together", "more_particles"]),
+    ],
+)
+def test_findings_follow_from_the_committed_tables(
+    study: str, findings: Callable[..., list[str]], tables: list[str]
+) -> None:
+    assert findings(*(typed_table(study, name) for name in tables)) == ORIGINS[study]["findings"]
+
+
+def test_both_pages_say_how_far_from_the_logged_successes_the_emulated_ones_may_be() -> None:
+    said = [
+        re.search(r"largest difference is \+(\S+) points \[\+(\S+), \+(\S+)\]", finding)
+        for finding in ORIGINS["published_2017"]["findings"]
+        if "emulated less logged successes" in finding
+    ]
+    value, low, high = max(
+        (each.groups() for each in said if each), key=lambda ends: float(ends[0])
+    )
+    assert f"largest difference is of {value} points [{low}, {high}]" in " ".join(PAGE.split())
+    assert f"(the largest is {value} points [{low}, {high}])" in " ".join(README.split())
 
 
 def test_no_trial_is_committed() -> None:

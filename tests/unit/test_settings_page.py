@@ -5,11 +5,20 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
+from typing import get_args, get_type_hints
 
 import msgspec
 import pytest
 
-from holdfast.settings import EnvironmentSettings, OffloadSettings, RecoverySettings
+from holdfast.settings import (
+    ActiveSensingSettings,
+    EnvironmentSettings,
+    OffloadSettings,
+    ParticleFilterSettings,
+    RecoverySettings,
+    SelectorSettings,
+    SimulatorSettings,
+)
 
 PAGE = (Path(__file__).parents[2] / "docs" / "settings.md").read_text(encoding="utf-8")
 
@@ -17,6 +26,10 @@ PAGE = (Path(__file__).parents[2] / "docs" / "settings.md").read_text(encoding="
 @pytest.mark.parametrize(
     ("section", "settings"),
     [
+        ("particle_filter", ParticleFilterSettings()),
+        ("active_sensing", ActiveSensingSettings()),
+        ("selector", SelectorSettings()),
+        ("simulator", SimulatorSettings()),
         ("offload", OffloadSettings()),
         ("recovery", RecoverySettings()),
         ("environment", EnvironmentSettings()),
@@ -30,3 +43,21 @@ def test_each_key_stands_there_with_its_default(section: str, settings: object) 
         (key, value if isinstance(value, str) else json.dumps(value))
         for key, value in defaults.items()
     ]
+
+
+@pytest.mark.parametrize(
+    ("key", "settings"),
+    [
+        ("estimate", ParticleFilterSettings),
+        ("method", SelectorSettings),
+        ("estimator", SelectorSettings),
+        ("actions", SelectorSettings),
+        ("launch", RecoverySettings),
+        ("journal_survives", RecoverySettings),
+    ],
+)
+def test_each_choice_stands_in_its_row(key: str, settings: type[msgspec.Struct]) -> None:
+    (row,) = re.findall(rf"^\| `{key}` \|.*", PAGE, re.MULTILINE)
+    choices = get_args(get_type_hints(settings)[key])
+    assert choices
+    assert [choice for choice in choices if f"`{choice}`" not in row] == []

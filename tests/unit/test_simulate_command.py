@@ -102,6 +102,20 @@ def test_ctrl_c_says_how_to_go_on() -> None:
     assert "bit for bit" not in done.output
 
 
+def test_runs_that_stopped_are_told_apart() -> None:
+    def explored(seeds: range, jobs: int, on_batch: object) -> None:
+        del jobs
+        assert callable(on_batch)
+        on_batch(seeds, Tally(runs=len(seeds), held=46))
+
+    with mock.patch("holdfast.simulation.exploration.explore", explored):
+        done = simulate("--seeds", "0:500")
+    assert done.output.endswith(
+        "500 runs decided as the runs without faults do, bit for bit; the 46 that stopped on "
+        "purpose did so up to where they stopped.\n"
+    )
+
+
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [

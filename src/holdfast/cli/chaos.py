@@ -43,8 +43,8 @@ _N_EXPLAINED = (
     "did not need what was struck, or its run was over."
 )
 _DASH_EXPLAINED = (
-    "-: never measured. That it was struck itself no robot tells; to a local service none goes "
-    "back; times of faults that overlap (combination) belong to none of them."
+    "-: never measured. A robot cannot report its own death, and no robot returns to a local "
+    "service; times of faults that overlap (combination) belong to none of them."
 )
 
 

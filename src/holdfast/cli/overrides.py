@@ -44,7 +44,7 @@ def parse_assignment(assignment: str) -> Override:
     Raises
     ------
     InvalidValueError
-        If it is not of that form, or no value stands there.
+        If it is not of that form, names a key below a key, or no value stands there.
     ConfigurationError
         If the value is no YAML.
     """
@@ -55,6 +55,12 @@ def parse_assignment(assignment: str) -> Override:
     if not (equals and dot and section and key):
         raise InvalidValueError(
             f"--set {assignment}: must be SECTION.KEY=VALUE, such as selector.method=random"
+        )
+    inner, below, rest = key.partition(".")
+    if below:
+        raise InvalidValueError(
+            f"--set {assignment}: only whole keys of a section can be set; write --set "
+            f"'{section}.{inner}={{{rest}: {text}}}'"
         )
     value = read(text.encode(), f"--set {name}").data
     if value is None and text.strip() not in ("null", "~"):

@@ -29,22 +29,28 @@ class RobotRun(NamedTuple):
         Of the rate.
     refusals : dict of str
         Why a service was asked no more, by its name.
+    unreachable : dict of str
+        Why a service could not be reached when it was missed last, by its name.
     """
 
     missed_ticks: int = 0
     refusals: Mapping[str, str] = {}
+    unreachable: Mapping[str, str] = {}
 
 
-class _Refusals:
-    """An event sink that remembers which services refused for good."""
+class _Reasons:
+    """An event sink that remembers which services refused for good or could not be reached."""
 
     def __init__(self) -> None:
-        self.reasons: dict[str, str] = {}
+        self.refusals: dict[str, str] = {}
+        self.unreachable: dict[str, str] = {}
 
     def event(self, name: str, /, **fields: object) -> None:
         """Take an event."""
         if name == "refused" and fields["final"]:
-            self.reasons[str(fields["service"])] = f"{fields['code']}: {fields['reason']}"
+            self.refusals[str(fields["service"])] = f"{fields['code']}: {fields['reason']}"
+        elif name == "unreachable":
+            self.unreachable[str(fields["service"])] = str(fields["reason"])
 
     def close(self) -> None:
         """Take no more."""
@@ -106,10 +112,10 @@ def run_as_robot(
 
     with contextlib.ExitStack() as stack:
         # What is only for people on a terminal is kept in the file all the same.
-        refusals = _Refusals()
+        reasons = _Reasons()
         sinks: list[EventSink] = [
             EventLog(directory.path / EVENTS_NAME, format="json", component="robot"),
-            refusals,
+            reasons,
         ]
         if not quiet:
             sinks.append(EventLog(sys.stderr, format=log_format, component="robot"))
@@ -144,7 +150,7 @@ def run_as_robot(
         )
         launcher = None if links.launcher is None else links.launcher(robot.deliver)
         robot.run(directory.journal.finished(), launcher)
-        return RobotRun(robot.missed_ticks, refusals.reasons)
+        return RobotRun(robot.missed_ticks, reasons.refusals, reasons.unreachable)
 
 
 def _ignore(verified: Verified) -> None:

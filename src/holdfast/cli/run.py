@@ -6,7 +6,7 @@ import contextlib
 import shlex
 import signal
 import sys
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
@@ -23,12 +23,13 @@ from holdfast.cli.endings import (
 )
 from holdfast.cli.options import MAX_SEED, MAX_TRIALS, location, number, whole_number
 from holdfast.cli.overrides import Override, combined, parse_assignment
-from holdfast.cli.terminal import duration, print_files, print_summary, run_display
+from holdfast.cli.terminal import counted, duration, print_files, print_summary, run_display
 from holdfast.errors import HoldfastError, InvalidValueError
 from holdfast.printable import printable
 from holdfast.runtime.command_line import MAX_JOBS
 
 if TYPE_CHECKING:
+    from holdfast.cli.robot_run import RobotRun
     from holdfast.configuration import Configuration
     from holdfast.outcome import TrialResult
     from holdfast.recording.recorder import RecordedEnvironment, Recorder, TrialRecord
@@ -380,10 +381,11 @@ def _run(options: _Options) -> None:
             if not quiet:
                 print_summary(summary)
             if robot.missed_ticks:
-                notes.note(f"{robot.missed_ticks} ticks of --rate were missed")
+                were = "was" if robot.missed_ticks == 1 else "were"
+                notes.note(f"{counted(robot.missed_ticks, 'tick')} of --rate {were} missed")
             for service, reason in robot.refusals.items():
                 notes.note(f"{service} was asked no more: {reason}")
-            for text in _idle_services(configuration, summary, robot.refusals):
+            for text in _idle_services(configuration, summary, robot):
                 notes.note(text)
             with notes.while_it_lasts(f"drawing {FIGURE_NAME} ..."):
                 note = _draw_figure(configuration, directory, recorder, recorded)
@@ -440,18 +442,21 @@ def _exit_code(summary: RunSummary | None) -> int:
     return 0
 
 
-def _idle_services(
-    configuration: Configuration, summary: RunSummary, refusals: Collection[str]
-) -> list[str]:
+def _idle_services(configuration: Configuration, summary: RunSummary, robot: RobotRun) -> list[str]:
     """Say which of the services named decided nothing without a refusal: perhaps mistyped."""
     sensing = summary.sensing_decisions_by_service
     task = summary.task_answers_by_service
     if sensing is None or task is None or not summary.finished:
         return []
     return [
-        f"{service} decided nothing; events.jsonl says why"
+        f"{service} decided nothing"
+        + (
+            f": {robot.unreachable[service]}"
+            if service in robot.unreachable
+            else "; events.jsonl says why"
+        )
         for service in configuration.offload.services
-        if service not in sensing and service not in task and service not in refusals
+        if service not in sensing and service not in task and service not in robot.refusals
     ]
 
 

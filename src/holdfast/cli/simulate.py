@@ -199,10 +199,12 @@ def _explore(seeds: range, jobs: int, *, shrink: bool) -> None:
         _print_finding(tally, shrink=shrink)
         raise typer.Exit(EXIT_DIFFERENT)
     runs = counted(tally.runs, "run")
-    sys.stdout.write(
-        f"\n{runs} decided as the runs without faults do, bit for bit"
-        f"{', those that stopped up to there' if tally.held else ''}.\n"
+    stopped = (
+        f"; the {tally.held:,} that stopped on purpose did so up to where they stopped"
+        if tally.held
+        else ""
     )
+    sys.stdout.write(f"\n{runs} decided as the runs without faults do, bit for bit{stopped}.\n")
 
 
 def _print_tally(tally: Tally, seeds: range, elapsed_s: float) -> None:

@@ -341,6 +341,19 @@ def _findings(summary: Table, together: Table, more_particles: Table) -> list[st
         for row in together.rows()
         if _is_told(row)
     ]
+    untold: dict[str, list[dict[str, Cell]]] = {}
+    for row in together.rows():
+        if not _is_told(row):
+            untold.setdefault(f"{row['estimator']}, {row['parameter']}", []).append(row)
+    findings += [
+        f"{_TOGETHER}, {name} ({', '.join(str(row['value']) for row in rows)}): no difference in "
+        "steps found (paired t-test, least Holm-adjusted p "
+        f"{min(number_of(row['steps_adjusted_p_value']) for row in rows):.2g}); single 95 % "
+        "intervals lie within "
+        f"{min(number_of(row['steps_ratio_low']) for row in rows):.3g} and "
+        f"{max(number_of(row['steps_ratio_high']) for row in rows):.3g} times the steps"
+        for name, rows in untold.items()
+    ]
     findings += [
         f"{row['problem']}, {row['estimator']}, particles {row['to']} instead of {row['from']}: "
         f"{_interval(row, 'steps_ratio')} times the steps and "

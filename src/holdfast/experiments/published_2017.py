@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from functools import partial
 from importlib import resources
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -20,7 +20,7 @@ import numpy as np
 
 from holdfast.experiments import statistics
 from holdfast.experiments.study import Report, Results, Scale
-from holdfast.experiments.tables import Cell, Table
+from holdfast.experiments.tables import Cell, Table, number_of
 from holdfast.experiments.tasks import Task
 from holdfast.experiments.trial_batches import TrialSeries, trial_tasks
 from holdfast.recording.tables import wilson_interval
@@ -262,6 +262,16 @@ def _findings(summary: Table) -> list[str]:
                 if tested.size
                 else f"{problem}, {what}: too few successes to compare"
             )
+        rows = [row for row in summary.rows() if row["problem"] == problem]
+        # That no difference was found says little unless it is said how large one may be.
+        findings += [
+            f"{problem}, emulated less logged {what}: {text}"
+            for what, text in (
+                ("successes", _largest(map(_successes_apart, rows), ".1f", 100.0, " points")),
+                ("mean rewards of successful trials", _largest(map(_rewards_apart, rows), ".2g")),
+            )
+            if text
+        ]
         logged, sound = summary.numbers("success_logged")[here], summary.numbers("success_sound")
         low = summary.numbers("success_sound_low")[here]
         above = int(np.count_nonzero(low > summary.numbers("success_logged_high")[here]))
@@ -281,6 +291,50 @@ def _findings(summary: Table) -> list[str]:
             "intervals are in the table)"
         )
     return findings
+
+
+def _successes_apart(row: Mapping[str, Cell]) -> statistics.Interval:
+    emulated, logged = (
+        statistics.Interval(
+            *(number_of(row[f"success_{way}{end}"]) for end in ("", "_low", "_high"))
+        )
+        for way in ("emulated", "logged")
+    )
+    return statistics.independent_difference(emulated, logged)
+
+
+def _rewards_apart(row: Mapping[str, Cell]) -> statistics.Interval:
+    """Return the difference of mean rewards; the logged ones are taken to scatter as ours do."""
+    emulated = statistics.Interval(
+        *(number_of(row[f"reward_of_successes_emulated{end}"]) for end in ("", "_low", "_high"))
+    )
+    counts = (
+        number_of(row[f"success_{way}"]) * number_of(row[trials])
+        for way, trials in (("emulated", "trials"), ("logged", "trials_logged"))
+    )
+    ours, others = counts
+    if not (ours and others):
+        return statistics.Interval(math.nan, math.nan, math.nan)
+    half = math.sqrt(ours / others) * (emulated.high - emulated.value)
+    value = number_of(row["reward_of_successes_logged"])
+    logged = statistics.Interval(value, value - half, value + half)
+    return statistics.independent_difference(emulated, logged)
+
+
+def _largest(
+    differences: Iterable[statistics.Interval], form: str, scale: float = 1.0, unit: str = ""
+) -> str | None:
+    """Say which of some differences is the largest, and within what all their intervals lie."""
+    known = [each for each in differences if all(map(math.isfinite, each))]
+    if not known:
+        return None
+    largest = max(known, key=lambda each: abs(each.value))
+    ends = (*largest, min(each.low for each in known), max(each.high for each in known))
+    value, low, high, least, most = (f"{scale * end:+{form}}" for end in ends)
+    return (
+        f"the largest difference is {value}{unit} [{low}, {high}], and all intervals of "
+        f"{len(known)} rows lie within {least} and {most} (single 95 % intervals, by Newcombe)"
+    )
 
 
 def _level(p_value: float) -> str:

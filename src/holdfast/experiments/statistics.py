@@ -167,6 +167,23 @@ def paired_rates(first: BoolArray, second: BoolArray) -> tuple[Interval, float]:
     return interval, float(stats.binomtest(first_alone, either_alone).pvalue)
 
 
+def independent_difference(first: Interval, second: Interval) -> Interval:
+    """Return ``first - second`` of two values that are independent, from their intervals.
+
+    For two rates with Wilson's intervals that is Newcombe's interval; for two means, nearly
+    Student's.
+
+    Source: R. G. Newcombe, "Interval estimation for the difference between independent
+    proportions: comparison of eleven methods", 1998, method 10.
+    """
+    difference = first.value - second.value
+    return Interval(
+        difference,
+        difference - math.hypot(first.value - first.low, second.high - second.value),
+        difference + math.hypot(first.high - first.value, second.value - second.low),
+    )
+
+
 def agreement_of_rates(successes: int, trials: int, others: int, other_trials: int) -> float:
     """Return the p-value of Fisher's exact test that two rates are the same."""
     from scipy import stats

@@ -3,7 +3,7 @@
 On the left is the workspace, with the way that was gone, the way that was believed, and the
 belief's particles at some of the sensing steps. On the right each coordinate of the state runs over
 the steps, above a strip that shows what was sensed when, and how much the alternatives differed in
-entropy.
+what is minimised.
 Every sensing action has a colour and a marker of its own, so that a print in grey reads as well.
 
 This module imports matplotlib; import it only where a figure is wanted.
@@ -129,7 +129,7 @@ def trial_figure(configuration: Configuration, record: TrialRecord, path: Path) 
         )
         _draw_coordinates(panels[: problem.state_size], problem, record)
         _draw_choices(panels[-2], problem, record)
-        _draw_entropies(panels[-1], problem, record)
+        _draw_entropies(panels[-1], configuration, record)
         for panel in panels:
             panel.grid(visible=True)
             panel.margins(x=0.01)
@@ -544,9 +544,18 @@ def _draw_choices(panel: Axes, problem: Problem, record: TrialRecord) -> None:
     panel.set_ylabel("sensed")
 
 
-def _draw_entropies(panel: Axes, problem: Problem, record: TrialRecord) -> None:
-    """Draw every sensing action's entropy at each sensing step; the lowest was chosen."""
-    panel.set_ylabel("entropy (nats)")
+_SCORES = {
+    "action_entropy": "expected entropy of\nthe actions (nats)",
+    "state_entropy": "expected entropy of\nthe state (nats)",
+    "action_covariance": "expected covariance\nof the actions (trace)",
+}
+"""What is drawn of the alternatives, by the method that weighs them."""
+
+
+def _draw_entropies(panel: Axes, configuration: Configuration, record: TrialRecord) -> None:
+    """Draw every sensing action's score at each sensing step; the lowest was chosen."""
+    problem = configuration.problem
+    panel.set_ylabel(_SCORES.get(configuration.planning.selector.method, ""), fontsize=7.0)
     panel.yaxis.set_major_locator(MaxNLocator(nbins=4))
     known = [sensing for sensing in record.sensing if sensing.entropies is not None]
     if not known:
@@ -563,6 +572,30 @@ def _draw_entropies(panel: Axes, problem: Problem, record: TrialRecord) -> None:
         steps, entropies.min(axis=1), entropies.max(axis=1), color="#B4B9C0", linewidth=0.8
     )
     size = _marker_size(record)
+    panel.legend(
+        handles=[
+            Line2D([], [], marker="o", linestyle="", markersize=4.5, color=_BODY, label="chosen"),
+            Line2D(
+                [],
+                [],
+                marker="o",
+                linestyle="",
+                markersize=3.5,
+                markerfacecolor="white",
+                markeredgecolor=_BODY,
+                markeredgewidth=0.7,
+                label="not chosen (hollow)",
+            ),
+        ],
+        loc="lower right",
+        bbox_to_anchor=(1.0, 1.0),
+        ncols=2,
+        fontsize=7.5,
+        borderpad=0.1,
+        borderaxespad=0.1,
+        columnspacing=1.2,
+        handletextpad=0.3,
+    )
     for action in range(len(problem.sensing_actions)):
         color, marker = _look(action)
         won = chosen == action

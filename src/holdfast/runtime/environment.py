@@ -115,6 +115,7 @@ class SimulatedEnvironment:
         self._seed = seed
         self._trial = trial
         self.step = 0
+        contract.check_sizes(problem)
         initial = stream(seed, trial, 0, Purpose.WORLD_INITIAL_STATE)
         drawn = problem.initial_states(initial, 1)
         shape = (1, problem.state_size)

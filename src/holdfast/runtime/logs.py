@@ -561,6 +561,8 @@ def _compose_text(now_ns: int, component: str, name: str, fields: Mapping[str, o
 def _sentence(fields: Mapping[str, object]) -> str:
     """Arrange fields: what changed and who (why), the rest, how long it took."""
     rest = {key: value for key, value in fields.items() if value is not None}
+    if "outcome" in rest:
+        rest.pop("success", None)  # which it says, too
     head = []
     if "from" in rest and "to" in rest:
         head.append(f"{_value(rest.pop('from'))} -> {_value(rest.pop('to'))}")

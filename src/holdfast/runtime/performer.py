@@ -207,9 +207,10 @@ class _CheckedEnvironment:
     ) -> EnvironmentFailed:
         """Return what is said of a call that takes too long."""
         method = self._method
+        made = method == self._name
+        called = f"the constructor of {method}" if made else self._called(method)
         text = (
-            f"{self._called(method)} has not returned within {timeout_ms:g} ms, which is "
-            "environment.timeout_ms"
+            f"{called} has not returned within {timeout_ms:g} ms, which is environment.timeout_ms"
         )
         return self._failure(step, method, text, performance_begun=performance_begun)
 
