@@ -178,7 +178,7 @@ class Unsteady(PegInHole2D):
     name = "unsteady"
 
     def policy(self, states, stage):
-        return super().policy(states, stage) / (1.0 + 0.01 * next(_COUNT))
+        return 0.0 * super().policy(states, stage) + 1e-5 * next(_COUNT)
 """
 
 
