@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import sys
 from typing import Any
 
 import pytest
@@ -23,6 +24,7 @@ from tests.processes.faults import (
 from tests.processes.lying_problem import OWN_PLANNER_HANGS, VARIABLE
 
 EXIT_WRONG_ANSWER = 3
+WITH_FIGURES = (sys.executable, "-m", "holdfast")
 
 DOCUMENT = {
     **document_of("peg_in_hole_2d", max_steps=40),
@@ -140,3 +142,53 @@ def test_what_is_not_computed_again_in_time_is_said(site: Site, references: Refe
     assert summary["unverified_answers"] >= summary["sensing_decisions"] > 0
     told = " ".join(event["reason"] for event in robot.matching("note"))
     assert f"{summary['unverified_answers']} questions" in told
+
+
+@pytest.mark.parametrize(("what", "kind"), [("half", "task"), ("sensing", "sensing")])
+@pytest.mark.parametrize("simulated", [True, False])
+def test_a_lie_that_nobody_computed_again_is_found_when_the_figure_is_drawn(
+    what: str, kind: str, simulated: bool, site: Site
+) -> None:
+    cloud = liar(site, what)
+    offload = {**PATIENT, "verify_share": 0.0}
+    if simulated:
+        file = site.configure(DOCUMENT, offload=offload)
+    else:
+        _, file = site.world(DOCUMENT, offload=offload)
+    robot = site.run(file, services=[cloud], command=WITH_FIGURES)
+    assert robot.wait() == EXIT_WRONG_ANSWER, robot.account()
+    assert summary_of(robot)["wrong_answers"] == {}
+    told = [event["reason"] for event in robot.matching("note") if "trial 0" in event["reason"]]
+    assert len(told) == 1
+    assert f"{cloud.endpoint} answered with another {kind} action at step " in told[0]
+    assert "deterministic" not in told[0]
+
+
+UNSTEADY = """
+import itertools
+import sys
+
+from holdfast.problems.peg_in_hole_2d import PegInHole2D
+
+# Two processes never count alike, nor do two runs in one.
+_COUNT = itertools.count(300 if "serve" in sys.argv else 0)
+
+
+class Unsteady(PegInHole2D):
+    name = "unsteady"
+
+    def policy(self, states, stage):
+        return 0.0 * super().policy(states, stage) + 1e-5 * next(_COUNT)
+"""
+
+
+def test_a_problem_that_is_not_deterministic_is_not_a_services_fault(site: Site) -> None:
+    (site.directory / "unsteady.py").write_text(UNSTEADY)
+    name = "unsteady:Unsteady"
+    cloud = site.service("--problem", name, "--problem-directory", str(site.directory)).start()
+    document = {**document_of("peg_in_hole_2d", max_steps=20), "problem": name}
+    file = site.configure(document, offload={**PATIENT, "verify_share": 0.0})
+    robot = site.run(file, services=[cloud], command=WITH_FIGURES)
+    assert robot.wait() == 0, robot.account()
+    told = " ".join(event["reason"] for event in robot.matching("note"))
+    assert f"so the problem {name} is not deterministic" in told

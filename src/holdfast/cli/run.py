@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import typer
 
@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from holdfast.configuration import Configuration
     from holdfast.outcome import TrialResult
     from holdfast.recording.recorder import RecordedEnvironment, Recorder, TrialRecord
+    from holdfast.recording.repetition import Repetition
     from holdfast.recording.run_directory import RunDirectory
     from holdfast.recording.tables import RunSummary
 
@@ -388,7 +389,7 @@ def _run(options: _Options) -> None:
             for text in _idle_services(configuration, summary, robot):
                 notes.note(text)
             with notes.while_it_lasts(f"drawing {FIGURE_NAME} ..."):
-                note = _draw_figure(configuration, directory, recorder, recorded)
+                remark = _draw_figure(configuration, directory, recorder, recorded)
         except KeyboardInterrupt as interruption:
             command = options.resume_command(directory_path)
             finished = directory.journal.tally().finished
@@ -413,8 +414,8 @@ def _run(options: _Options) -> None:
             raise RunError(error, resume, _exit_code(summary) or EXIT_ERROR) from error
         if not quiet:
             print_files(directory_path)
-        if note is not None:
-            notes.note(note)
+        if remark is not None:
+            notes.note(remark.text)
         if summary.unverified_answers:
             notes.note(
                 f"{summary.unverified_answers} questions that were drawn to be answered by the "
@@ -431,8 +432,9 @@ def _run(options: _Options) -> None:
                 "the robot's own planner came to two decisions in one state, so the problem is not "
                 "deterministic; events.jsonl says where"
             )
-        if _exit_code(summary):
-            raise SystemExit(_exit_code(summary))
+        exit_code = _exit_code(summary) or (remark.exit_code if remark is not None else 0)
+        if exit_code:
+            raise SystemExit(exit_code)
 
 
 def _exit_code(summary: RunSummary | None) -> int:
@@ -550,26 +552,33 @@ class _Notes:
         tell_event("robot", name, **fields)
 
 
+class _Remark(NamedTuple):
+    """What is to be said about the figure, and the exit code if that was not in order."""
+
+    text: str
+    exit_code: int = 0
+
+
 def _draw_figure(
     configuration: Configuration,
     directory: RunDirectory,
     recorder: Recorder,
     recorded: RecordedEnvironment | None,
-) -> str | None:
+) -> _Remark | None:
     """Draw trial 0 and return None, or what is to be said about it."""
     from holdfast.recording.run_directory import FIGURE_NAME
 
     if configuration.environment.object is not None and recorded is None:
         if (directory.path / FIGURE_NAME).exists():
             return None
-        return (
+        return _Remark(
             f"no figure, because trial {recorder.trial} ended in an earlier part of the run: its "
             "observations are kept only until the trial ends"
         )
     if recorder.record.result is None:
         again_s = _time_of_sensing(directory, recorder.trial)
         if again_s > _LONGEST_REPETITION_S:
-            return (
+            return _Remark(
                 f"no figure, because trial {recorder.trial} would have to be run again for it, "
                 f"with {duration(again_s)} of sensing decisions"
             )
@@ -578,10 +587,10 @@ def _draw_figure(
     except ImportError as error:
         if error.name is None or error.name.split(".")[0] != "matplotlib":
             raise
-        return "no figure, because matplotlib is not installed: pip install matplotlib"
+        return _Remark("no figure, because matplotlib is not installed: pip install matplotlib")
 
     try:
-        note = _draw_trial(configuration, directory, recorder, recorded, trial_figure)
+        return _draw_trial(configuration, directory, recorder, recorded, trial_figure)
     except (HoldfastError, KeyboardInterrupt):
         raise
     except BaseException as error:
@@ -591,7 +600,6 @@ def _draw_figure(
         if account is None:
             raise
         raise HoldfastError(f"the figure of trial {recorder.trial}: {account}") from error
-    return note
 
 
 def _time_of_sensing(directory: RunDirectory, trial: int) -> float:
@@ -607,35 +615,58 @@ def _draw_trial(
     recorder: Recorder,
     recorded: RecordedEnvironment | None,
     draw: Callable[[Configuration, TrialRecord, Path], None],
-) -> str | None:
+) -> _Remark | None:
+    from holdfast.recording.repetition import repeat
     from holdfast.recording.run_directory import FIGURE_NAME
-    from holdfast.runtime.trial import run_trial
-    from holdfast.session.records import RecordError
 
+    trial = recorder.trial
+    remark = None
     if recorder.record.result is None:
         # It ran in a worker, in an earlier part of the run, or as a robot's: it is run again. A
         # world of the user's answers what it has answered.
-        try:
-            run_trial(
-                configuration.problem,
-                configuration.planning,
-                configuration.simulator,
-                recorder.trial,
-                recorded,
-                observer=recorder,
-            )
-        except RecordError as error:
-            return f"no figure, because {error}"
+        kept = directory.journal.decisions(trial)
+        found = repeat(configuration, kept, trial, recorded, observer=recorder)
+        if found.deviation is not None:
+            remark = _remark_on(found, configuration, directory, trial, recorded)
+        if found.error is not None:
+            return remark
     record: TrialRecord = recorder.record
-    note = None
-    if record.result is not None and record.result.decisions is not None:
-        kept = directory.journal.decisions(recorder.trial)
-        if kept.log != record.result.decisions.log:
-            note = (
-                f"trial {recorder.trial} decided otherwise when it was run again for the figure, "
-                f"so the problem {configuration.problem_name} is not deterministic"
-            )
     if recorded is not None:
         record.result = recorded.result  # the reward of its last step is there alone
     draw(configuration, record, directory.path / FIGURE_NAME)
-    return note
+    return remark
+
+
+def _remark_on(
+    found: Repetition,
+    configuration: Configuration,
+    directory: RunDirectory,
+    trial: int,
+    recorded: RecordedEnvironment | None,
+) -> _Remark:
+    """Say who was wrong if a trial was decided otherwise when it was run again."""
+    from holdfast.recording.repetition import repeat, wrong_service
+    from holdfast.recording.run_directory import TIMINGS_NAME
+
+    def again() -> Repetition:
+        world = None if recorded is None else recorded.from_the_beginning()
+        kept = directory.journal.decisions(trial)
+        return repeat(configuration, kept, trial, world, anew=True)
+
+    assert found.deviation is not None
+    step, kind = found.deviation
+    service = wrong_service(found, again, directory.path / TIMINGS_NAME, trial)
+    missing = "the figure: " if found.error is None else "no figure, because "
+    if service is not None:
+        return _Remark(
+            f"{missing}trial {trial} was run again for it by the robot's own planner, twice, and "
+            f"came to other decisions, both times to the same: {service} answered with another "
+            f"{kind} action at step {step}",
+            EXIT_WRONG_ANSWER,
+        )
+    if found.error is not None:
+        return _Remark(f"no figure, because {found.error}")
+    return _Remark(
+        f"trial {trial} decided otherwise when it was run again for the figure, "
+        f"so the problem {configuration.problem_name} is not deterministic"
+    )

@@ -27,13 +27,38 @@ from holdfast.session.records import (
     RecordError,
 )
 
-__all__ = ["RecordedEnvironment", "Recorder", "SensingRecord", "TrialRecord"]
+__all__ = [
+    "DecidedOtherwiseError",
+    "RecordedEnvironment",
+    "Recorder",
+    "SensingRecord",
+    "TrialRecord",
+]
 
 MAX_PARTICLES_KEPT = 500
 """Particles kept of a belief; more would not show in a figure."""
 
 MAX_STEPS_KEPT = 100_000
 """Steps kept of a trial, so that a recorder's memory is bounded."""
+
+
+class DecidedOtherwiseError(RecordError):
+    """A trial is decided otherwise when it is computed again.
+
+    Attributes
+    ----------
+    step : int
+    kind : {"sensing", "task"} or None
+        Of the decision in the records; None where they end.
+    """
+
+    def __init__(self, trial: int, step: int, kind: str | None) -> None:
+        super().__init__(
+            f"trial {trial} is decided otherwise at step {step} when it is computed again: the "
+            "problem is not deterministic, or a service has decided otherwise"
+        )
+        self.step = step
+        self.kind = kind
 
 
 @dataclass(frozen=True)
@@ -183,17 +208,21 @@ class RecordedEnvironment:
         self._next = 0
         self._step = 0
 
+    def from_the_beginning(self) -> RecordedEnvironment:
+        """Return the same world before the trial."""
+        return RecordedEnvironment(self._records, self.result)
+
     def perform_sensing(self, sensing_action: int) -> FloatArray:
         """Return the observation that was made.
 
         Raises
         ------
-        RecordError
+        DecidedOtherwiseError
             If another sensing action was performed, or none.
         """
         record = self._take()
         if not isinstance(record, ObservedRecord) or record.sensing_action != sensing_action:
-            raise self._otherwise()
+            raise self._otherwise(record)
         return numbers_from(record.observation, len(record.observation) // 8)
 
     def perform(self, task_action: FloatArray) -> float | None:
@@ -201,12 +230,12 @@ class RecordedEnvironment:
 
         Raises
         ------
-        RecordError
+        DecidedOtherwiseError
             If another task action was performed, or none.
         """
         record = self._take()
         if not isinstance(record, ActingRecord) or record.action != numbers_to(task_action):
-            raise self._otherwise()
+            raise self._otherwise(record)
         self._step += 1
         performed = self._take()
         return performed.reward if isinstance(performed, PerformedRecord) else None
@@ -223,11 +252,10 @@ class RecordedEnvironment:
         self._next += 1
         return self._records[self._next - 1]
 
-    def _otherwise(self) -> RecordError:
-        return RecordError(
-            f"trial {self.result.trial} is decided otherwise at step {self._step} when it is "
-            "computed again: the problem is not deterministic, or a service has decided otherwise"
-        )
+    def _otherwise(self, record: Record | None) -> DecidedOtherwiseError:
+        kinds = {ObservedRecord: "sensing", ActingRecord: "task"}
+        kind = None if record is None else kinds.get(type(record))
+        return DecidedOtherwiseError(self.result.trial, self._step, kind)
 
 
 def _some_particles(belief: Belief) -> FloatArray:

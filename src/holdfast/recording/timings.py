@@ -26,6 +26,7 @@ __all__ = [
     "VerificationTable",
     "count_answers",
     "count_verified",
+    "deciders",
 ]
 
 TIMING_COLUMNS = (
@@ -275,6 +276,29 @@ def count_answers(path: Path, trials: Container[int]) -> AnswerCounts | None:
         return None
     settle()
     return AnswerCounts(dict(sensing.most_common()), dict(task.most_common()), longest_ms)
+
+
+def deciders(path: Path, trial: int) -> dict[tuple[int, str], str]:
+    """Return who made the decisions of a trial, by step and kind, from ``timings.csv``.
+
+    Parameters
+    ----------
+    path : Path
+    trial : int
+
+    Returns
+    -------
+    dict
+        Empty if there is no such table; of a decision that was asked for again, whose was used.
+    """
+    decided: dict[tuple[int, str], str] = {}
+    try:
+        for number, step, kind, service, *_ in _rows(path, 6):
+            if number == str(trial) and step.isdigit():
+                decided[int(step), kind] = service
+    except (OSError, csv.Error):
+        return {}
+    return decided
 
 
 def _rows(path: Path, least: int) -> Iterator[list[str]]:

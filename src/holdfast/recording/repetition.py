@@ -1,0 +1,142 @@
+"""Who was wrong if a trial comes out otherwise when it is run again.
+
+A planner that decides twice alike, and not as the services did, is believed: the problem has just
+shown that it is deterministic, and the services have the same code. If it decides otherwise each
+time, nothing can be said of anybody but the problem.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import zip_longest
+from pathlib import Path
+from typing import NamedTuple
+
+from holdfast.configuration import Configuration
+from holdfast.outcome import Decisions, SensingDecision, TrialResult
+from holdfast.protocol.verification import OWN_PLANNER
+from holdfast.recording.recorder import DecidedOtherwiseError, RecordedEnvironment
+from holdfast.recording.timings import deciders
+from holdfast.runtime.trial import NULL_OBSERVER, TrialObserver, run_trial
+
+__all__ = ["Deviation", "Repetition", "repeat", "wrong_service"]
+
+
+class Deviation(NamedTuple):
+    """Where a trial that is run again is first decided otherwise.
+
+    Attributes
+    ----------
+    step : int
+    kind : {"sensing", "task"} or None
+        Of the decision; None if no decision differs but what the robot made of its observation,
+        or where the trial ended.
+    """
+
+    step: int
+    kind: str | None
+
+
+class Repetition(NamedTuple):
+    """What a trial came to when it was run again.
+
+    Attributes
+    ----------
+    decisions : Decisions or None
+        None if its recorded world could not answer any more.
+    deviation : Deviation or None
+        From the trial as it was; None if there is none.
+    error : DecidedOtherwiseError or None
+        What the recorded world had to say.
+    """
+
+    decisions: Decisions | None
+    deviation: Deviation | None
+    error: DecidedOtherwiseError | None = None
+
+
+def repeat(
+    configuration: Configuration,
+    kept: Decisions,
+    trial: int,
+    recorded: RecordedEnvironment | None,
+    *,
+    anew: bool = False,
+    observer: TrialObserver = NULL_OBSERVER,
+) -> Repetition:
+    """Run a trial again with the planner in this process.
+
+    Parameters
+    ----------
+    configuration : Configuration
+    kept : Decisions
+        Of the trial as it was.
+    trial : int
+    recorded : RecordedEnvironment or None
+        Its world, from the beginning; None for a simulated one.
+    anew : bool
+        Whether to build the problem anew, as a service does.
+    observer : TrialObserver
+    """
+    problem = configuration.problem
+    if anew:
+        problem = Configuration.from_plain(configuration.plain()).problem
+    try:
+        result: TrialResult = run_trial(
+            problem, configuration.planning, configuration.simulator, trial, recorded, observer
+        )
+    except DecidedOtherwiseError as error:
+        return Repetition(None, Deviation(error.step, error.kind), error)
+    assert result.decisions is not None
+    return Repetition(result.decisions, _deviation(kept, result.decisions))
+
+
+def _deviation(kept: Decisions, again: Decisions) -> Deviation | None:
+    if kept.log == again.log:
+        return None
+    step = 0
+    for one, other in zip_longest(kept, again):
+        known = one if one is not None else other
+        step = known.step
+        if one == other:
+            continue
+        if one is None or other is None:
+            return Deviation(step, None)
+        if isinstance(one, SensingDecision):
+            same = isinstance(other, SensingDecision) and one[:2] == other[:2]
+            return Deviation(step, None if same else "sensing")
+        return Deviation(step, "task")
+    return Deviation(step, None)
+
+
+def wrong_service(
+    first: Repetition, again: Callable[[], Repetition], timings: Path, trial: int
+) -> str | None:
+    """Return the service that decided otherwise than this process does, if one certainly did.
+
+    Parameters
+    ----------
+    first : Repetition
+        With a deviation.
+    again : callable
+        Runs the trial once more; it is not called where no service decided.
+    timings : Path
+        The run's ``timings.csv``.
+    trial : int
+
+    Returns
+    -------
+    str or None
+        None if the decision was the robot's own, or the trial comes out otherwise each time.
+    """
+    assert first.deviation is not None
+    step, kind = first.deviation
+    decided = {at: service for (at, of), service in deciders(timings, trial).items() if of == kind}
+    # An answer has the task actions up to the next sensing step.
+    at = max((at for at in decided if at <= step), default=None)
+    service = None if at is None else decided[at]
+    if service in (None, OWN_PLANNER):
+        return None
+    second = again()
+    same = (second.decisions, second.deviation) == (first.decisions, first.deviation)
+    return service if same else None
