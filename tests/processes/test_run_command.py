@@ -59,6 +59,9 @@ class MyRobot:
 
     def is_done(self):
         return False
+
+    def steps_performed(self):
+        return 0
 """
 
 MY_WORLD = """
@@ -518,7 +521,9 @@ class TestErrors:
         assert done.returncode == 2
         *_, last = map(json.loads, done.stderr.splitlines())
         assert last["event"] == "error"
-        assert last["reason"].startswith("the robot holds still in trial 0, step 0: ")
+        assert last["reason"].startswith(
+            "the robot holds still in trial 0, step 0, and whether its "
+        )
         assert f'File "{workplace / "my_robot.py"}", line ' in last["details"]
         command = last["resume_command"]
         assert command.startswith("holdfast run peg.yaml --environment my_robot:MyRobot ")

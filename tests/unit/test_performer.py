@@ -142,7 +142,7 @@ class TestEvents:
         robot = Robot()
         performer = bench.open(robot)
         performer.begin()
-        assert bench.event() == Begun(False, None)
+        assert bench.event() == Begun(False, None, True)
         performer.sense(0, 2)
         sensed = bench.event()
         assert isinstance(sensed, Sensed)
@@ -173,7 +173,7 @@ class TestEvents:
         robot = Robot(is_done=failed)
         performer = bench.open(robot)
         performer.begin()
-        assert bench.event() == Begun("failed", None)
+        assert bench.event() == Begun("failed", None, True)
         performer.perform(0, ACTION)
         acted = bench.event()
         assert acted == Acted(0, -1.0, "failed")
@@ -183,14 +183,14 @@ class TestEvents:
     def test_the_count_is_asked_for_after_a_crash_alone(self, bench: Bench) -> None:
         robot = Robot(is_done=True)
         bench.open(robot, resumed=True).begin(4)
-        assert bench.event() == Begun(True, 4)
+        assert bench.event() == Begun(True, 4, True)
         assert [method for method, _ in robot.calls] == ["steps_performed", "is_done"]
 
     def test_an_environment_need_not_count(self, bench: Bench) -> None:
         robot = Robot()
         robot.steps_performed = None  # type: ignore[assignment, method-assign]
         bench.open(robot, resumed=True).begin()
-        assert bench.event() == Begun(False, None)
+        assert bench.event() == Begun(False, None, False)
 
     def test_what_was_handed_over_stays_what_it_was(self, bench: Bench) -> None:
         shown = np.array([1.0])
@@ -256,7 +256,7 @@ class TestFailures:
             performer.begin(5)
         else:
             performer.begin(5)
-            assert bench.event() == Begun(False, 4)
+            assert bench.event() == Begun(False, 4, True)
             robot.answers[method] = fail
             if method == "perform_sensing":
                 performer.sense(5, 0)
@@ -356,7 +356,7 @@ class TestFailures:
         )
         performer = bench.open(robot, resumed=True)
         performer.begin()
-        assert bench.event() == Begun(False, 2**40)
+        assert bench.event() == Begun(False, 2**40, True)
         performer.sense(0, 0)
         sensed = bench.event()
         assert isinstance(sensed, Sensed)
@@ -477,7 +477,7 @@ class TestThreads:
         assert performer.environment is robot
         with pytest.raises(KeyboardInterrupt):
             performer.perform(0, ACTION)
-        assert events == [Begun(False, None)]
+        assert events == [Begun(False, None, True)]
 
     @pytest.mark.parametrize("timeout_ms", [0.0, -1.0, float("nan")])
     def test_a_timeout_is_positive(self, timeout_ms: float) -> None:
@@ -568,7 +568,7 @@ class TestMakePerformer:
             maker, 1, events.append, resumed=True, performed=[ACTION, ACTION]
         )
         performer.begin(2)
-        assert events == [Begun(False, 2)]
+        assert events == [Begun(False, 2, True)]
         assert isinstance(performer, InlinePerformer)
         assert isinstance(performer.environment, SimulatedEnvironment)
         assert performer.environment.state.tobytes() == lived.state.tobytes()
@@ -583,7 +583,7 @@ class TestMakePerformer:
         performer = make_performer(maker, 6, queue.put, resumed=True)
         assert isinstance(performer, ThreadedPerformer)
         performer.begin()
-        assert queue.get(timeout=PATIENCE_S) == Begun(True, 6)
+        assert queue.get(timeout=PATIENCE_S) == Begun(True, 6, True)
         performer.close(PATIENCE_S)
 
     def test_what_is_no_robot_names_what_it_lacks(self) -> None:

@@ -157,7 +157,7 @@ class _CheckedEnvironment:
                 self._method = "steps_performed"
                 count = self._count(ask())
             self._method = "is_done"
-            return Begun(self._done(environment.is_done()), count)
+            return Begun(self._done(environment.is_done()), count, callable(ask))
         except self._passed_on:
             raise
         except BaseException as error:  # noqa: BLE001 - a SystemExit would end a thread unheard

@@ -79,10 +79,13 @@ class Begun(NamedTuple):
     steps_performed : int or None
         Task actions performed in this trial so far, as the environment itself has counted; None if
         it was not asked or does not count.
+    counts: bool
+        Whether it can be asked for that number, now or when the run is resumed.
     """
 
     done: Done
     steps_performed: int | None
+    counts: bool = False
 
 
 class Sensed(NamedTuple):

@@ -330,7 +330,7 @@ class Robot:
         self._trial = trial
         self._history = history
         self._done = begun.done
-        self._environment_counts = begun.steps_performed is not None
+        self._environment_counts = begun.counts or begun.steps_performed is not None
         self._in_environment = False
         self._unwritten = []
         self._next_tick = None
