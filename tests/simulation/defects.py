@@ -414,8 +414,8 @@ _defect(
     "That an action was performed is not written down, as the next one says so.",
     Edit(
         Robot,
-        "_acted",
-        "self._unwritten.append(PerformedRecord(history.state.step, event.reward))",
+        "_performed",
+        "self._unwritten.append(PerformedRecord(history.state.step, reward))",
         "pass",
     ),
 )

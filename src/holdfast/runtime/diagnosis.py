@@ -194,7 +194,7 @@ def _connect_quic(place: Endpoint, files: TlsFiles | None, timeout_s: float) -> 
     if error is None:
         return None
     # As with TLS, that comes after the robot's part of the handshake; not always with the reason.
-    if "by peer" in error or "connection lost" in error:
+    if any(words in error for words in ("by peer", "connection lost", "Connection closed")):
         return "refuses this robot's certificate (is it of the same authority?)"
     if "UnknownIssuer" in error:
         return _BY_ANOTHER_AUTHORITY
