@@ -237,10 +237,9 @@ def _serve(options: argparse.Namespace) -> int:
     problems = KnownProblems(options.problem, options.problem_directory or Path.cwd())
 
     def describe_error(error: BaseException) -> str:
-        from holdfast.user_code import account_of_user_error
+        from holdfast.user_code import describe_problem_error
 
-        account = account_of_user_error(error, "the problem")
-        return account or f"{type(error).__name__}: {error}"
+        return describe_problem_error("the problem", error)
 
     service = Service(problems, workers, limits, describe_error)
     events = EventLog(sys.stderr, format=options.log, component=options.name)
