@@ -1,0 +1,1 @@
+"""The service's process: what computes decisions for robots."""

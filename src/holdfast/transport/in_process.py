@@ -1,0 +1,212 @@
+"""A wire that is none: robots and services of one event loop, with the manners of a real one.
+
+What one end sends, the other one hears in a later turn of the loop, so that neither end ever runs
+inside the other; a service can be taken away and come back with a new memory. Nothing is copied.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Iterable
+
+from holdfast.errors import InvalidValueError, TransportError
+from holdfast.session.events import TransportEvent
+from holdfast.transport.calls import CallTable, too_large
+from holdfast.transport.contract import DEFAULT_MAX_MESSAGE_BYTES, IncomingCall
+
+__all__ = ["InProcessNetwork", "InProcessRobotTransport", "InProcessServiceTransport"]
+
+
+class InProcessNetwork:
+    """Joins the robot's ends and the service's ends that it has made.
+
+    Parameters
+    ----------
+    max_message_bytes : int
+        A larger request is refused, a larger reply is dropped.
+    """
+
+    def __init__(self, *, max_message_bytes: int = DEFAULT_MAX_MESSAGE_BYTES) -> None:
+        self._max_message_bytes = max_message_bytes
+        self._robots: list[InProcessRobotTransport] = []
+        self._services: list[InProcessServiceTransport] = []
+
+    def robot(self, services: Iterable[str]) -> InProcessRobotTransport:
+        """Make a robot's end that knows services of these names."""
+        return InProcessRobotTransport(self, services, self._max_message_bytes)
+
+    def service(self, name: str, boot: str, robot: str | None = None) -> InProcessServiceTransport:
+        """Make a service's end; it is there from its ``start`` to its ``close``.
+
+        Parameters
+        ----------
+        name, boot : str
+        robot : str or None, optional
+            As whom the robots that call it count, as if they had shown a certificate.
+        """
+        return InProcessServiceTransport(self, name, boot, robot, self._max_message_bytes)
+
+    def _find(self, name: str) -> InProcessServiceTransport | None:
+        """Return the service of this name that started last."""
+        return next((each for each in reversed(self._services) if each.name == name), None)
+
+
+class _InProcessCall:
+    """A call, which both ends hold."""
+
+    __slots__ = ("_loop", "_number", "_payload", "_robot_end", "_service_end")
+
+    def __init__(
+        self,
+        number: int,
+        robot_end: InProcessRobotTransport,
+        service_end: InProcessServiceTransport,
+        payload: bytes,
+    ) -> None:
+        self._number = number
+        self._robot_end = robot_end
+        self._service_end = service_end
+        self._payload = payload
+        self._loop = asyncio.get_running_loop()
+
+    @property
+    def payload(self) -> bytes:
+        return self._payload
+
+    @property
+    def robot(self) -> str | None:
+        return self._service_end.robot
+
+    def reply(self, payload: bytes) -> None:
+        if len(payload) <= self._service_end.max_message_bytes:
+            calls = self._robot_end.calls
+            self._loop.call_soon(calls.replied, self._number, self._service_end, payload)
+
+    def end(self) -> None:
+        self._loop.call_soon(self._robot_end.calls.ended, self._number, self._service_end)
+        self._service_end.open_calls.discard(self)
+
+
+class InProcessRobotTransport:
+    """The robot's end; made by :meth:`InProcessNetwork.robot`."""
+
+    def __init__(
+        self, network: InProcessNetwork, services: Iterable[str], max_message_bytes: int
+    ) -> None:
+        self._network = network
+        self._services = frozenset(services)
+        self._max_message_bytes = max_message_bytes
+        self.calls = CallTable()
+
+    def start(self, deliver: Callable[[TransportEvent], None]) -> None:
+        """Begin to deliver events: see :mod:`~holdfast.transport.contract`."""
+        self.calls.open(deliver)
+        self._network._robots.append(self)
+        for service in self._network._services:
+            self.appeared(service)
+
+    def call(self, service: str, call: int, payload: bytes) -> None:
+        """Send a request."""
+        if service not in self._services:
+            raise InvalidValueError(f"service {service!r}: known are {sorted(self._services)}")
+        peer = self._network._find(service)
+        if not self.calls.begin(call, peer):
+            return
+        loop = asyncio.get_running_loop()
+        if len(payload) > self._max_message_bytes:
+            refusal = too_large(len(payload), self._max_message_bytes)
+            loop.call_soon(self.calls.replied, call, peer, refusal)
+        elif peer is not None:
+            loop.call_soon(peer.received, _InProcessCall(call, self, peer, payload))
+            return
+        loop.call_soon(self.calls.ended, call, peer)
+
+    def abandon(self, call: int) -> None:
+        """Give a call up."""
+        self.calls.abandon(call)
+
+    async def close(self, timeout_s: float = 1.0) -> None:
+        """Forget all calls and deliver nothing more. May be repeated."""
+        del timeout_s
+        self.calls.close()
+        if self in self._network._robots:
+            self._network._robots.remove(self)
+
+    def appeared(self, service: InProcessServiceTransport) -> None:
+        """Hear, in a later turn, that a service is there."""
+        if service.name in self._services:
+            asyncio.get_running_loop().call_soon(self.calls.appeared, service.name, service.boot)
+
+    def vanished(self, service: InProcessServiceTransport) -> None:
+        """Hear, in a later turn, that a service is gone."""
+        if service.name in self._services:
+            asyncio.get_running_loop().call_soon(
+                self.calls.vanished, service.name, service.boot, service
+            )
+
+
+class InProcessServiceTransport:
+    """The service's end; made by :meth:`InProcessNetwork.service`."""
+
+    def __init__(
+        self,
+        network: InProcessNetwork,
+        name: str,
+        boot: str,
+        robot: str | None,
+        max_message_bytes: int,
+    ) -> None:
+        self._network = network
+        self._deliver: Callable[[IncomingCall], None] | None = None
+        self._started = False
+        self.name = name
+        self.boot = boot
+        self.robot = robot
+        self.max_message_bytes = max_message_bytes
+        self.open_calls: set[_InProcessCall] = set()
+
+    @property
+    def endpoints(self) -> tuple[str, ...]:
+        """None: there is nothing to connect to."""
+        return ()
+
+    async def start(self, deliver: Callable[[IncomingCall], None]) -> None:
+        """Be there for robots.
+
+        Raises
+        ------
+        TransportError
+            If it was started before.
+        """
+        if self._started:
+            raise TransportError(f"service {self.name}/{self.boot} was started before")
+        self._started = True
+        self._deliver = deliver
+        self._network._services.append(self)
+        for robot in self._network._robots:
+            robot.appeared(self)
+
+    def stop_listening(self) -> None:
+        """Be seen by no more robots than those that see it."""
+        if self in self._network._services:
+            self._network._services.remove(self)
+
+    async def close(self, timeout_s: float = 1.0) -> None:
+        """Be seen no more, and end all calls. May be repeated."""
+        del timeout_s
+        deliver, self._deliver = self._deliver, None
+        if deliver is None:
+            return
+        self.stop_listening()
+        for robot in self._network._robots:
+            robot.vanished(self)
+        for call in list(self.open_calls):
+            call.end()
+
+    def received(self, call: _InProcessCall) -> None:
+        """Take a call that a robot has sent."""
+        if self._deliver is None:
+            call.end()
+            return
+        self.open_calls.add(call)
+        self._deliver(call)
