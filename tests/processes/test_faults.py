@@ -12,7 +12,6 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -30,7 +29,6 @@ from tests.processes.faults import (
     RECOVERY,
     RESTORED,
     References,
-    Service,
     Site,
     Story,
     document_of,
