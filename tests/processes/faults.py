@@ -715,6 +715,10 @@ class Story:
         """Return what waits until the robot has come to a status so many times."""
         return lambda: self.running.wait_for("status", count, to=to)
 
+    def seen(self, service: Service, count: int = 1) -> Hook:
+        """Return what waits until the robot has seen a service appear so many times."""
+        return lambda: self.running.wait_for("service_appeared", count, service=service.endpoint)
+
     @property
     def running(self) -> Robot:
         assert self.site.robot is not None

@@ -12,7 +12,6 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -30,7 +29,6 @@ from tests.processes.faults import (
     RECOVERY,
     RESTORED,
     References,
-    Service,
     Site,
     Story,
     document_of,
@@ -513,17 +511,11 @@ class TestReplicas:
         steps = sensing_steps(document)
         first, second = site.service().start(), site.service().start()
         story = Story(site, references, document)
-
-        def seen(service: Service, count: int) -> Callable[[], object]:
-            return lambda: story.running.wait_for(
-                "service_appeared", count, service=service.endpoint
-            )
-
-        story.at("begin", 0, seen(first, 1), seen(second, 1))
+        story.at("begin", 0, story.seen(first), story.seen(second))
         story.at("sense", steps[1], first.kill)
-        story.at("perform", steps[2], first.start, seen(first, 2))
+        story.at("perform", steps[2], first.start, story.seen(first, 2))
         story.at("sense", steps[3], second.kill)
-        story.at("perform", steps[4], second.start, seen(second, 2))
+        story.at("perform", steps[4], second.start, story.seen(second, 2))
         story.at("sense", steps[5], first.kill)
         robot = story.run(first, second)
         # One of them could always be asked, so nothing else was needed.
@@ -537,6 +529,7 @@ class TestReplicas:
         steps = sensing_steps(document)
         first, second = site.service().start(), site.service().start()
         story = Story(site, references, document)
+        story.at("begin", 0, story.seen(first), story.seen(second))
         story.at("sense", steps[1], first.kill, second.kill)
         story.at("perform", steps[3], second.start, story.status(KEEP_ALIVE))
         robot = story.run(first, second)
@@ -548,6 +541,8 @@ class TestReplicas:
         steps = sensing_steps(document)
         first, second = site.service().start(), site.service().start()
         story = Story(site, references, document, offload=QUICK)
+        # Nobody takes the place of one that is not there yet but the local service.
+        story.at("begin", 0, story.seen(first), story.seen(second))
         story.at("sense", steps[1], first.stop)
         story.at("perform", steps[3], first.resume)
         robot = story.run(first, second)

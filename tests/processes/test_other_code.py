@@ -74,11 +74,13 @@ class TestOlderCopyOfTheProblem:
         said = f"{cloud.endpoint} was asked no more: other_code: {refused['reason']}"
         assert robot.matching("note", reason=said)
 
-    def test_another_service_with_the_same_code_decides(self, site: Site) -> None:
+    def test_another_service_with_the_same_code_is_waited_for(self, site: Site) -> None:
         shutil.copy(EXAMPLE, site.directory)
         file = site.configure(DOCUMENT, offload=PATIENT)
-        older, current = older_copy(site).start(), current_copy(site).start()
+        older, current = older_copy(site).start(), current_copy(site)
         robot = site.run(file, services=[older, current])
+        robot.wait_for("refused")
+        current.start()
         robot.finish()
         assert robot.statuses() == []
         assert services_in_order(robot) == [current.endpoint]

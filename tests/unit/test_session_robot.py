@@ -795,6 +795,44 @@ def test_deadline_hedges_within_its_budget() -> None:
     assert cloud.requests
 
 
+@pytest.mark.parametrize("comes", [True, False])
+def test_at_the_start_one_that_refuses_makes_nobody_give_up_those_to_come(comes: bool) -> None:
+    world = World(services=("older", "current"))
+    startup_s = 1e-3 * world.offload.startup_timeout_ms
+    world.services["older"].rule = lambda request: [
+        Refused(request.number, "other_code", "another copy of the problem")
+    ]
+    world.services["current"].up = False
+    world.start(present=False)
+    world.bring_up("older")
+    if comes:
+        world.bring_up("current", 0.9 * startup_s)
+    world.run()
+    world.assert_same_as_without_faults()
+    assert [fields["final"] for fields in world.reports("refused")] == [True]
+    lost = [at for at, e in world.trace if isinstance(e, Report) and e.name == "status"]
+    assert lost == ([] if comes else [startup_s])
+    assert {sent.service for sent in world.sent} == {"older", "current" if comes else LOCAL}
+
+
+@pytest.mark.parametrize("services", [("older",), ("older", "gone")])
+def test_at_the_start_nobody_is_waited_for_where_the_others_refuse_or_were_there(
+    services: tuple[str, ...],
+) -> None:
+    world = World(services=services)
+    world.services["older"].rule = lambda request: [
+        Refused(request.number, "other_code", "another copy of the problem")
+    ]
+    world.start(present=False)
+    world.bring_up("older")
+    world.carry_out(world.robot.handle(Appeared("gone", "1"), world.now))
+    world.carry_out(world.robot.handle(Vanished("gone", "1"), world.now))
+    world.run()
+    world.assert_same_as_without_faults()
+    (launch,) = [at for at, e in world.trace if isinstance(e, Launch)]
+    assert launch < 1e-3 * world.offload.startup_timeout_ms
+
+
 def test_a_problem_that_every_service_refuses_stops_the_robot() -> None:
     world = World()
 

@@ -493,8 +493,8 @@ class Dispatcher:
         return any(call.service.detector.trusted for call in calls)
 
     def _is_starting(self) -> bool:
-        """Tell whether a service may still be on its way up."""
-        return self._startup_until is not None and not self._services.any_seen()
+        """Tell whether the services that could decide may still be on their way up."""
+        return self._startup_until is not None and self._services.all_to_come()
 
     def _choose(self, question: Question, now: float) -> None:
         services = self._services

@@ -336,9 +336,13 @@ class KnownServices:
         """Return the service of a name; None if there is none."""
         return self._by_name.get(name)
 
-    def any_seen(self) -> bool:
-        """Tell whether a service of the cloud was ever there."""
-        return any(service.detector.seen for service in self.cloud)
+    def all_to_come(self) -> bool:
+        """Tell whether no service of the cloud was ever there; those that refuse do not count.
+
+        If all refuse, none is to come.
+        """
+        seen = [each.detector.seen for each in self.cloud if each.refused is None]
+        return bool(seen) and not any(seen)
 
     def any_reliable(self) -> bool:
         """Tell whether a service of the cloud can be counted on."""
