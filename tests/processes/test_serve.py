@@ -617,7 +617,7 @@ def test_a_service_is_ready_without_what_it_does_not_need() -> None:
     """Start-up time is recovery time: nothing heavy but NumPy is loaded."""
     program = """
 import json, sys, threading
-from holdfast.runtime import service_process
+from holdfast.service import process as service_process
 ready = service_process._say_ready
 def tell(*arguments):
     ready(*arguments)

@@ -33,7 +33,7 @@ def main(arguments):
     print(arguments, sorted(heavy & sys.modules.keys()))
     return 7
 
-module = types.ModuleType("holdfast.runtime.service_process")
+module = types.ModuleType("holdfast.service.process")
 module.main = main
 sys.modules[module.__name__] = module
 import holdfast.cli
@@ -96,7 +96,7 @@ def main(arguments):
     print("told", end="")
     {ending}
 
-module = types.ModuleType("holdfast.runtime.service_process")
+module = types.ModuleType("holdfast.service.process")
 module.main = main
 sys.modules[module.__name__] = module
 import holdfast.cli

@@ -53,7 +53,7 @@ def _main() -> None:
     try:
         allow_descriptors()
         if arguments[:1] == ["serve"]:
-            from holdfast.runtime.service_process import main as serve
+            from holdfast.service.process import main as serve
 
             sys.exit(serve(arguments[1:]))
         from holdfast.cli.application import run_application

@@ -9,6 +9,6 @@ __all__ = ["serve"]
 
 def serve(context: typer.Context) -> None:
     """Decide for robots, as a service; see holdfast serve --help."""
-    from holdfast.runtime.service_process import main
+    from holdfast.service.process import main
 
     raise typer.Exit(main(context.args))
