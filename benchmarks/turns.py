@@ -25,7 +25,7 @@ from holdfast.planning import (
     observe,
 )
 from holdfast.problems.problem import Problem
-from holdfast.runtime.endpoints import ServiceAddress
+from holdfast.transport.endpoints import ServiceAddress
 from holdfast.runtime.environment import SimulatedEnvironment
 from holdfast.runtime.transport.zenoh_transport import ZenohRobotTransport
 from holdfast.session.events import Appeared, Ended, Replied, TransportEvent

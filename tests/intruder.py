@@ -15,7 +15,7 @@ from typing import Literal, Self, TypeAlias, TypeVar
 
 import zenoh
 
-from holdfast.runtime.endpoints import TlsFiles
+from holdfast.transport.endpoints import TlsFiles
 from holdfast.runtime.transport.zenoh_transport import KEY_VERSION
 
 Mode: TypeAlias = Literal["client", "peer", "router"]

@@ -16,7 +16,7 @@ from tests.intruder import MODES, Intruder
 from tests.processes.faults import References, Site, Story, document_of
 from tests.processes.test_tls import secure
 
-from holdfast.runtime.endpoints import TlsFiles
+from holdfast.transport.endpoints import TlsFiles
 from holdfast.session.messages import (
     MessageError,
     Refused,

@@ -18,7 +18,7 @@ from tests.ports import free_port
 
 from holdfast.runtime.credentials import make_credentials
 from holdfast.runtime.diagnosis import MissingServices, why_unreachable
-from holdfast.runtime.endpoints import TlsFiles
+from holdfast.transport.endpoints import TlsFiles
 from holdfast.runtime.transport.zenoh_transport import ZenohServiceTransport
 
 TIMEOUT_S = 20.0

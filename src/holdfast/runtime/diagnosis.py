@@ -19,7 +19,7 @@ from time import monotonic
 from typing import TYPE_CHECKING
 
 from holdfast.errors import HoldfastError
-from holdfast.runtime.endpoints import Endpoint, TlsFiles, parse_endpoint
+from holdfast.transport.endpoints import Endpoint, TlsFiles, parse_endpoint
 from holdfast.runtime.logs import EventSink
 
 if TYPE_CHECKING:
