@@ -36,12 +36,12 @@ from tests.ports import free_port
 from tests.processes.faults import PATIENT
 
 from holdfast.errors import InvalidValueError, TransportError
-from holdfast.transport.endpoints import PrivateSocket, ServiceAddress, TlsFiles
 from holdfast.runtime.transport.contract import IncomingCall, RobotTransport, ServiceTransport
 from holdfast.runtime.transport.in_process import InProcessNetwork
 from holdfast.runtime.transport.zenoh_transport import ZenohRobotTransport, ZenohServiceTransport
 from holdfast.session.events import Appeared, Ended, Replied, TransportEvent, Vanished
 from holdfast.session.messages import Refused, decode_reply
+from holdfast.transport.endpoints import PrivateSocket, ServiceAddress, TlsFiles
 
 PATIENCE_S = 30.0
 LEASE_MS = 2000.0

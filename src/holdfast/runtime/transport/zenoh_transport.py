@@ -56,14 +56,6 @@ from time import monotonic
 import zenoh
 
 from holdfast.errors import InvalidValueError, TransportError
-from holdfast.transport.endpoints import (
-    Endpoint,
-    ServiceAddress,
-    TlsFiles,
-    check_credentials,
-    free_port,
-    parse_endpoint,
-)
 from holdfast.runtime.last_threads import join_until
 from holdfast.runtime.senders import NOBODY, Senders
 from holdfast.runtime.transport.calls import (
@@ -75,6 +67,14 @@ from holdfast.runtime.transport.calls import (
 )
 from holdfast.runtime.transport.contract import IncomingCall
 from holdfast.session.events import TransportEvent
+from holdfast.transport.endpoints import (
+    Endpoint,
+    ServiceAddress,
+    TlsFiles,
+    check_credentials,
+    free_port,
+    parse_endpoint,
+)
 
 __all__ = [
     "KEY_VERSION",
