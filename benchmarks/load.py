@@ -26,7 +26,6 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from benchmarks.processes import usage_of
 from benchmarks.robots import configuration_for
 from benchmarks.turns import Turn, recorded_turns
-from holdfast.runtime.endpoints import ServiceAddress
 from holdfast.runtime.robot_process import opening_of
 from holdfast.runtime.transport.zenoh_transport import ZenohRobotTransport
 from holdfast.session.events import Appeared, Ended, Replied, TransportEvent, Vanished
@@ -42,6 +41,7 @@ from holdfast.session.messages import (
     decode_reply,
     encode,
 )
+from holdfast.transport.endpoints import ServiceAddress
 
 _SERVICE = "cloud"
 _NUM_TRIALS = 12

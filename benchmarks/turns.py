@@ -25,7 +25,6 @@ from holdfast.planning import (
     observe,
 )
 from holdfast.problems.problem import Problem
-from holdfast.runtime.endpoints import ServiceAddress
 from holdfast.runtime.environment import SimulatedEnvironment
 from holdfast.runtime.transport.zenoh_transport import ZenohRobotTransport
 from holdfast.session.events import Appeared, Ended, Replied, TransportEvent
@@ -44,6 +43,7 @@ from holdfast.session.messages import (
     numbers_to,
 )
 from holdfast.settings import PlanningSettings
+from holdfast.transport.endpoints import ServiceAddress
 
 __all__ = ["Asked", "Asker", "Caller", "Turn", "decided_in_process", "recorded_turns"]
 

@@ -15,8 +15,8 @@ from typing import Literal, Self, TypeAlias, TypeVar
 
 import zenoh
 
-from holdfast.runtime.endpoints import TlsFiles
 from holdfast.runtime.transport.zenoh_transport import KEY_VERSION
+from holdfast.transport.endpoints import TlsFiles
 
 Mode: TypeAlias = Literal["client", "peer", "router"]
 

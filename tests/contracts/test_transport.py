@@ -36,12 +36,12 @@ from tests.ports import free_port
 from tests.processes.faults import PATIENT
 
 from holdfast.errors import InvalidValueError, TransportError
-from holdfast.runtime.endpoints import PrivateSocket, ServiceAddress, TlsFiles
 from holdfast.runtime.transport.contract import IncomingCall, RobotTransport, ServiceTransport
 from holdfast.runtime.transport.in_process import InProcessNetwork
 from holdfast.runtime.transport.zenoh_transport import ZenohRobotTransport, ZenohServiceTransport
 from holdfast.session.events import Appeared, Ended, Replied, TransportEvent, Vanished
 from holdfast.session.messages import Refused, decode_reply
+from holdfast.transport.endpoints import PrivateSocket, ServiceAddress, TlsFiles
 
 PATIENCE_S = 30.0
 LEASE_MS = 2000.0
@@ -1017,7 +1017,7 @@ def bare_session(endpoint: str, authority: Path) -> zenoh.Session:
 SERVICE = """
 import sys, threading, time
 from pathlib import Path
-from holdfast.runtime.endpoints import TlsFiles
+from holdfast.transport.endpoints import TlsFiles
 from holdfast.runtime.transport.zenoh_transport import ZenohServiceTransport
 
 def stream(call):
@@ -1197,7 +1197,7 @@ def answered(robot: RobotTransport, inbox: Inbox, numbers: Iterator[int]) -> boo
 
 ROBOT_THAT_ENDS = """
 import sys, threading
-from holdfast.runtime.endpoints import ServiceAddress
+from holdfast.transport.endpoints import ServiceAddress
 from holdfast.runtime.transport.zenoh_transport import ZenohRobotTransport
 from holdfast.session.events import Appeared, Ended
 

@@ -24,7 +24,6 @@ from tests.unit.test_session_service import Robot as ReferenceRobot
 from tests.unit.test_session_service import content
 
 from holdfast.planning import encode_checkpoint
-from holdfast.runtime.endpoints import ServiceAddress
 from holdfast.runtime.transport.zenoh_transport import ZenohRobotTransport
 from holdfast.session.events import Appeared, Ended, Replied, TransportEvent
 from holdfast.session.messages import (
@@ -34,6 +33,7 @@ from holdfast.session.messages import (
     decode_reply,
     encode,
 )
+from holdfast.transport.endpoints import ServiceAddress
 
 __all__ = ["main"]
 

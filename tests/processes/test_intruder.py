@@ -16,7 +16,6 @@ from tests.intruder import MODES, Intruder
 from tests.processes.faults import References, Site, Story, document_of
 from tests.processes.test_tls import secure
 
-from holdfast.runtime.endpoints import TlsFiles
 from holdfast.session.messages import (
     MessageError,
     Refused,
@@ -26,6 +25,7 @@ from holdfast.session.messages import (
     encode,
     numbers_to,
 )
+from holdfast.transport.endpoints import TlsFiles
 
 DOCUMENT = document_of("peg_in_hole_2d")
 INTERVAL = DOCUMENT["simulator"]["sensing_intervals"] + 1

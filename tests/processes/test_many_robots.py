@@ -28,7 +28,6 @@ from tests.questions import request_of
 
 from holdfast.configuration import Configuration, load
 from holdfast.planning import initial_state
-from holdfast.runtime.endpoints import ServiceAddress
 from holdfast.runtime.robot_process import opening_of
 from holdfast.runtime.transport.calls import DEFAULT_MAX_MESSAGE_BYTES
 from holdfast.runtime.transport.zenoh_transport import ZenohRobotTransport
@@ -44,6 +43,7 @@ from holdfast.session.messages import (
     encode,
     sealed,
 )
+from holdfast.transport.endpoints import ServiceAddress
 
 PEG = "peg_in_hole_2d"
 

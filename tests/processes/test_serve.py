@@ -23,7 +23,6 @@ import pytest
 from tests.processes.faults import PATIENT
 from tests.unit.test_session_service import Robot, content, planning_of
 
-from holdfast.runtime.endpoints import PrivateSocket, ServiceAddress, TlsFiles
 from holdfast.runtime.transport.zenoh_transport import ZenohRobotTransport
 from holdfast.session.events import Appeared, Ended, Replied, TransportEvent, Vanished
 from holdfast.session.messages import (
@@ -37,6 +36,7 @@ from holdfast.session.messages import (
     encode,
     sealed,
 )
+from holdfast.transport.endpoints import PrivateSocket, ServiceAddress, TlsFiles
 
 PATIENCE_S = 30.0
 COMMAND = [sys.executable, "-m", "holdfast", "serve"]

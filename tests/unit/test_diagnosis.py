@@ -18,8 +18,8 @@ from tests.ports import free_port
 
 from holdfast.runtime.credentials import make_credentials
 from holdfast.runtime.diagnosis import MissingServices, why_unreachable
-from holdfast.runtime.endpoints import TlsFiles
 from holdfast.runtime.transport.zenoh_transport import ZenohServiceTransport
+from holdfast.transport.endpoints import TlsFiles
 
 TIMEOUT_S = 20.0
 """Generous: a test that passes does not wait for it."""

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from holdfast.errors import TransportError
-from holdfast.runtime.endpoints import (
+from holdfast.transport.endpoints import (
     Endpoint,
     PrivateSocket,
     TlsFiles,
@@ -25,11 +25,11 @@ from holdfast.runtime.endpoints import (
         ("tcp/127.0.0.1:7447", Endpoint("tcp", "127.0.0.1", 7447)),
         ("tcp/localhost:0", Endpoint("tcp", "localhost", 0)),
         ("tls/planner.example.org:65535", Endpoint("tls", "planner.example.org", 65535)),
-        ("quic/[::1]:7447", Endpoint("quic", "::1", 7447)),
+        ("udp/[::1]:7447", Endpoint("udp", "::1", 7447)),
         ("tcp/[fe80::1%eth0]:7447", Endpoint("tcp", "fe80::1%eth0", 7447)),
         ("tcp/cloud_1:80", Endpoint("tcp", "cloud_1", 80)),
-        ("unixsock-stream//run/s", Endpoint("unixsock-stream", "/run/s", 0)),
-        ("unixsock-stream/s", Endpoint("unixsock-stream", "s", 0)),
+        ("unix//run/s", Endpoint("unix", "/run/s", 0)),
+        ("unix/s", Endpoint("unix", "s", 0)),
     ],
 )
 def test_an_endpoint_is_read_and_written(text: str, expected: Endpoint) -> None:
@@ -40,11 +40,12 @@ def test_an_endpoint_is_read_and_written(text: str, expected: Endpoint) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "does not begin with a protocol.*tcp, tls, quic and unixsock-stream"),
+        ("", "does not begin with a protocol.*tcp, tls, udp and unix"),
         ("127.0.0.1:7447", r"does not begin with a protocol.*as in tcp/127\.0\.0\.1:7447"),
         ("localhost", "does not begin with a protocol"),
         ("TCP/localhost:1", "does not begin with a protocol"),
-        ("udp/127.0.0.1:7447", "protocol udp is not allowed.*larger than one datagram.*quic"),
+        ("quic/127.0.0.1:7447", r"quic is not allowed \(over UDP, services are at udp/HOST:PORT\)"),
+        ("unixsock-stream//run/s", r"not allowed \(a local socket is written unix/PATH\)"),
         ("ws/127.0.0.1:7447", "protocol ws is not allowed"),
         ("http/localhost:80", r"protocol http is not allowed; allowed are tcp"),
         ("tcp/localhost", "has no port: write tcp/HOST:PORT"),
@@ -67,9 +68,9 @@ def test_an_endpoint_is_read_and_written(text: str, expected: Endpoint) -> None:
         ("tcp/*:7447", r"'\*' is no host name or address"),
         ("tcp/localhost:7447#iface=eth0", "options after"),
         ("tcp/localhost:7447?rel=0", "options after"),
-        ("unixsock-stream/", "has no path"),
-        ("unixsock-stream//", "has no path"),
-        ("unixsock-stream//" + "x" * 107, "a path of 108 bytes; .* at most 107"),
+        ("unix/", "has no path"),
+        ("unix//", "has no path"),
+        ("unix//" + "x" * 107, "a path of 108 bytes; .* at most 107"),
     ],
 )
 def test_what_is_no_endpoint_is_refused_with_the_reason(text: str, message: str) -> None:
@@ -86,13 +87,13 @@ def test_what_is_no_endpoint_is_refused_with_the_reason(text: str, message: str)
         ("tcp/[::ffff:127.0.0.1]:1", True),
         ("tcp/localhost:1", True),
         ("tcp/LOCALHOST:1", True),
-        ("unixsock-stream//run/s", True),
+        ("unix//run/s", True),
         ("tcp/0.0.0.0:1", False),
         ("tcp/[::]:1", False),
         ("tcp/[::ffff:10.0.0.1]:1", False),
         ("tcp/10.0.0.1:1", False),
         ("tcp/localhost.example.org:1", False),
-        ("quic/planner:1", False),
+        ("udp/planner:1", False),
     ],
 )
 def test_loopback_is_what_only_this_machine_can_reach(text: str, expected: bool) -> None:
@@ -109,9 +110,7 @@ def test_credentials_go_with_the_protocols_that_use_them(tmp_path: Path) -> None
     files = TlsFiles(*(tmp_path / name for name in ("authority.pem", "certificate.pem", "key.pem")))
     for file in (files.authority, files.certificate, files.key):
         file.touch()
-    tcp, tls, unix = map(
-        parse_endpoint, ("tcp/localhost:1", "tls/localhost:1", "unixsock-stream//run/s")
-    )
+    tcp, tls, unix = map(parse_endpoint, ("tcp/localhost:1", "tls/localhost:1", "unix//run/s"))
     check_credentials(tcp, None)
     check_credentials(tls, files)
     check_credentials(unix, None)
@@ -125,11 +124,11 @@ def test_credentials_go_with_the_protocols_that_use_them(tmp_path: Path) -> None
         check_credentials(tls, files)
 
 
-@pytest.mark.parametrize("text", ["tcp/127.0.0.1:0", "quic/localhost:0"])
+@pytest.mark.parametrize("text", ["tcp/127.0.0.1:0", "udp/localhost:0"])
 def test_a_free_port_can_be_listened_on(text: str) -> None:
     endpoint = parse_endpoint(text)
     port = free_port(endpoint)
-    kind = socket.SOCK_DGRAM if endpoint.protocol == "quic" else socket.SOCK_STREAM
+    kind = socket.SOCK_DGRAM if endpoint.protocol == "udp" else socket.SOCK_STREAM
     with socket.socket(socket.AF_INET, kind) as probe:
         probe.bind(("127.0.0.1", port))
 

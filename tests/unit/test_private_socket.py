@@ -12,11 +12,11 @@ from pathlib import Path
 import pytest
 
 from holdfast.errors import TransportError
-from holdfast.runtime.endpoints import PrivateSocket
+from holdfast.transport.endpoints import PrivateSocket
 
 MAKES_ONE_AND_WAITS = """
 import sys
-from holdfast.runtime.endpoints import PrivateSocket
+from holdfast.transport.endpoints import PrivateSocket
 local = PrivateSocket()
 print(local.endpoint, flush=True)
 sys.stdin.read()

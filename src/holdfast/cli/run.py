@@ -472,7 +472,7 @@ def _require_effect(options: _Options, configuration: Configuration, *, as_robot
         )
     if configuration.offload.services:
         # Before a directory is claimed: a mistyped one shall leave nothing behind.
-        from holdfast.runtime.endpoints import check_credentials, parse_endpoint
+        from holdfast.transport.endpoints import check_credentials, parse_endpoint
 
         endpoints = [parse_endpoint(service) for service in configuration.offload.services]
         tls = None

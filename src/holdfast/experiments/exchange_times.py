@@ -28,7 +28,6 @@ from holdfast.experiments.tasks import TaskError
 from holdfast.experiments.trial_batches import problem_of
 from holdfast.planning import advance, choose_sensing_action, digest, initial_state, observe
 from holdfast.problems.registry import problem_class, problem_module
-from holdfast.runtime.endpoints import ServiceAddress
 from holdfast.runtime.leash import leash
 from holdfast.runtime.own_planner import OWN_PLANNER, OwnPlanner
 from holdfast.runtime.transport.contract import RobotTransport
@@ -50,6 +49,7 @@ from holdfast.session.messages import (
 )
 from holdfast.settings import ParticleFilterSettings, PlanningSettings, SelectorSettings
 from holdfast.source_digest import core_version, problem_digest
+from holdfast.transport.endpoints import ServiceAddress
 
 __all__ = ["COLUMNS", "Exchange", "measure_exchange"]
 

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias
 
 from holdfast.errors import HoldfastError
 from holdfast.files import NewFile, create_directory_atomically, write_atomically
-from holdfast.runtime.endpoints import TlsFiles
+from holdfast.transport.endpoints import TlsFiles
 
 if TYPE_CHECKING:
     import ssl

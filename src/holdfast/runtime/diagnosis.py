@@ -19,8 +19,8 @@ from time import monotonic
 from typing import TYPE_CHECKING
 
 from holdfast.errors import HoldfastError
-from holdfast.runtime.endpoints import Endpoint, TlsFiles, parse_endpoint
 from holdfast.runtime.logs import EventSink
+from holdfast.transport.endpoints import Endpoint, TlsFiles, parse_endpoint
 
 if TYPE_CHECKING:
     import ssl

@@ -94,13 +94,13 @@ def make_links(configuration: Configuration, log_path: Path | None, events: Even
 def _zenoh_links(configuration: Configuration, log_path: Path | None, events: EventSink) -> Links:
     # Only a robot that has services needs these.
     from holdfast.runtime.credentials import load_credentials
-    from holdfast.runtime.endpoints import (
+    from holdfast.runtime.transport.zenoh_transport import ZenohRobotTransport
+    from holdfast.transport.endpoints import (
         PrivateSocket,
         ServiceAddress,
         check_credentials,
         parse_endpoint,
     )
-    from holdfast.runtime.transport.zenoh_transport import ZenohRobotTransport
 
     offload = configuration.offload
     tls = None

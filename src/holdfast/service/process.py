@@ -21,7 +21,7 @@ from holdfast.errors import InvalidValueError, TransportError
 from holdfast.printable import printable
 
 if TYPE_CHECKING:
-    from holdfast.runtime.endpoints import Endpoint, TlsFiles
+    from holdfast.transport.endpoints import Endpoint, TlsFiles
 
 __all__ = ["DEFAULT_NAME", "main"]
 
@@ -196,7 +196,7 @@ def _serve(options: argparse.Namespace) -> int:
     if options.until_stdin_closes and sys.stdin is None:
         raise InvalidValueError("--until-stdin-closes: this process has no standard input")
     # In the order in which they are needed, so that a mistake in the options is told at once.
-    from holdfast.runtime.endpoints import parse_endpoint
+    from holdfast.transport.endpoints import parse_endpoint
 
     tls = None
     if options.tls is not None:

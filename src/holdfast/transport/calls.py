@@ -7,12 +7,12 @@ the table delivers its end, and what comes later finds nothing.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable
+from collections.abc import Callable
 
 from holdfast.errors import InvalidValueError
 from holdfast.session.events import Appeared, Ended, Replied, TransportEvent, Vanished
 
-__all__ = ["CallTable", "too_large"]
+__all__ = ["CallTable", "PendingCall", "too_large"]
 
 
 def too_large(size_bytes: int, max_message_bytes: int) -> bytes:
@@ -29,19 +29,39 @@ def too_large(size_bytes: int, max_message_bytes: int) -> bytes:
     )
 
 
+class PendingCall:
+    """A call in flight.
+
+    Its number may be used again as soon as it is abandoned, so what comes of it is told apart by
+    this object.
+
+    Attributes
+    ----------
+    number : int
+    peer : object
+        Whoever was asked.
+    """
+
+    __slots__ = ("number", "peer")
+
+    def __init__(self, number: int, peer: object) -> None:
+        self.number = number
+        self.peer = peer
+
+
 class CallTable:
     """Calls in flight of one robot's end; delivers each one's events in order and one end."""
 
     def __init__(self) -> None:
-        self._peers: dict[int, Hashable] = {}
+        self._pending: dict[int, PendingCall] = {}
         self._deliver: Callable[[TransportEvent], None] | None = None
 
     def open(self, deliver: Callable[[TransportEvent], None]) -> None:
         """Begin to deliver."""
         self._deliver = deliver
 
-    def begin(self, call: int, peer: Hashable) -> bool:
-        """Enter a call to a peer; return False if the table is closed.
+    def begin(self, number: int, peer: object) -> PendingCall | None:
+        """Enter a call to a peer; return None if the table is closed.
 
         Raises
         ------
@@ -49,45 +69,47 @@ class CallTable:
             If a call of this number is in flight.
         """
         if self._deliver is None:
-            return False
-        if call in self._peers:
-            raise InvalidValueError(f"call {call} is in flight already")
-        self._peers[call] = peer
-        return True
+            return None
+        if number in self._pending:
+            raise InvalidValueError(f"call {number} is in flight already")
+        call = self._pending[number] = PendingCall(number, peer)
+        return call
 
-    def is_pending(self, call: int, peer: Hashable) -> bool:
-        """Whether a call to this peer has neither ended nor been abandoned."""
-        return call in self._peers and self._peers[call] == peer
+    def is_pending(self, call: PendingCall) -> bool:
+        """Whether a call has neither ended nor been abandoned."""
+        return self._pending.get(call.number) is call
 
-    def replied(self, call: int, peer: Hashable, payload: bytes) -> None:
+    def replied(self, call: PendingCall, payload: bytes) -> None:
         """Deliver a reply, if the call is still in flight."""
-        if self._deliver is not None and self.is_pending(call, peer):
-            self._deliver(Replied(call, payload))
+        if self._deliver is not None and self.is_pending(call):
+            self._deliver(Replied(call.number, payload))
 
-    def ended(self, call: int, peer: Hashable) -> None:
+    def ended(self, call: PendingCall) -> None:
         """Deliver the end of a call, if it is still in flight."""
-        if self._deliver is not None and self.is_pending(call, peer):
-            del self._peers[call]
-            self._deliver(Ended(call))
+        if self._deliver is not None and self.is_pending(call):
+            del self._pending[call.number]
+            self._deliver(Ended(call.number))
 
-    def abandon(self, call: int) -> None:
+    def abandon(self, number: int) -> PendingCall | None:
         """Take a call out without delivering anything."""
-        self._peers.pop(call, None)
+        return self._pending.pop(number, None)
 
     def appeared(self, service: str, boot: str) -> None:
         """Deliver that a service is there."""
         if self._deliver is not None:
             self._deliver(Appeared(service, boot))
 
-    def vanished(self, service: str, boot: str, peer: Hashable) -> None:
+    def vanished(self, service: str, boot: str, peer: object) -> None:
         """Deliver that a service is gone, then the ends of its calls."""
         if self._deliver is None:
             return
+        # Those of now: who hears that it is gone may at once use a number again.
+        calls = [call for call in self._pending.values() if call.peer is peer]
         self._deliver(Vanished(service, boot))
-        for call in [call for call, asked in self._peers.items() if asked == peer]:
-            self.ended(call, peer)
+        for call in calls:
+            self.ended(call)
 
     def close(self) -> None:
         """Forget all calls and deliver nothing more."""
         self._deliver = None
-        self._peers.clear()
+        self._pending.clear()

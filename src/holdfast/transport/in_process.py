@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable
 
 from holdfast.errors import InvalidValueError, TransportError
 from holdfast.session.events import TransportEvent
-from holdfast.transport.calls import CallTable, too_large
+from holdfast.transport.calls import CallTable, PendingCall, too_large
 from holdfast.transport.contract import DEFAULT_MAX_MESSAGE_BYTES, IncomingCall
 
 __all__ = ["InProcessNetwork", "InProcessRobotTransport", "InProcessServiceTransport"]
@@ -54,16 +54,16 @@ class InProcessNetwork:
 class _InProcessCall:
     """A call, which both ends hold."""
 
-    __slots__ = ("_loop", "_number", "_payload", "_robot_end", "_service_end")
+    __slots__ = ("_call", "_loop", "_payload", "_robot_end", "_service_end")
 
     def __init__(
         self,
-        number: int,
+        call: PendingCall,
         robot_end: InProcessRobotTransport,
         service_end: InProcessServiceTransport,
         payload: bytes,
     ) -> None:
-        self._number = number
+        self._call = call
         self._robot_end = robot_end
         self._service_end = service_end
         self._payload = payload
@@ -80,10 +80,10 @@ class _InProcessCall:
     def reply(self, payload: bytes) -> None:
         if len(payload) <= self._service_end.max_message_bytes:
             calls = self._robot_end.calls
-            self._loop.call_soon(calls.replied, self._number, self._service_end, payload)
+            self._loop.call_soon(calls.replied, self._call, payload)
 
     def end(self) -> None:
-        self._loop.call_soon(self._robot_end.calls.ended, self._number, self._service_end)
+        self._loop.call_soon(self._robot_end.calls.ended, self._call)
         self._service_end.open_calls.discard(self)
 
 
@@ -110,16 +110,17 @@ class InProcessRobotTransport:
         if service not in self._services:
             raise InvalidValueError(f"service {service!r}: known are {sorted(self._services)}")
         peer = self._network._find(service)
-        if not self.calls.begin(call, peer):
+        pending = self.calls.begin(call, peer)
+        if pending is None:
             return
         loop = asyncio.get_running_loop()
         if len(payload) > self._max_message_bytes:
             refusal = too_large(len(payload), self._max_message_bytes)
-            loop.call_soon(self.calls.replied, call, peer, refusal)
+            loop.call_soon(self.calls.replied, pending, refusal)
         elif peer is not None:
-            loop.call_soon(peer.received, _InProcessCall(call, self, peer, payload))
+            loop.call_soon(peer.received, _InProcessCall(pending, self, peer, payload))
             return
-        loop.call_soon(self.calls.ended, call, peer)
+        loop.call_soon(self.calls.ended, pending)
 
     def abandon(self, call: int) -> None:
         """Give a call up."""

@@ -56,14 +56,6 @@ from time import monotonic
 import zenoh
 
 from holdfast.errors import InvalidValueError, TransportError
-from holdfast.runtime.endpoints import (
-    Endpoint,
-    ServiceAddress,
-    TlsFiles,
-    check_credentials,
-    free_port,
-    parse_endpoint,
-)
 from holdfast.runtime.last_threads import join_until
 from holdfast.runtime.senders import NOBODY, Senders
 from holdfast.runtime.transport.calls import (
@@ -75,6 +67,14 @@ from holdfast.runtime.transport.calls import (
 )
 from holdfast.runtime.transport.contract import IncomingCall
 from holdfast.session.events import TransportEvent
+from holdfast.transport.endpoints import (
+    Endpoint,
+    ServiceAddress,
+    TlsFiles,
+    check_credentials,
+    free_port,
+    parse_endpoint,
+)
 
 __all__ = [
     "KEY_VERSION",
@@ -949,7 +949,7 @@ def connection_error(endpoint: Endpoint, tls: TlsFiles | None, timeout_s: float)
     )
     # One attempt, whose error is told.
     settings["connect"] = {
-        "endpoints": [str(endpoint)],
+        "endpoints": [_in_zenoh_s_words(endpoint)],
         "exit_on_failure": True,
         "timeout_ms": 0,
     }
@@ -987,6 +987,11 @@ def _access(*, coming: Sequence[str], going: Sequence[str]) -> dict[str, object]
     }
 
 
+def _in_zenoh_s_words(endpoint: Endpoint) -> str:
+    text = str(endpoint)
+    return text.replace("unix/", "unixsock-stream/", 1) if endpoint.is_local_socket else text
+
+
 def _settings(
     listen: list[Endpoint],
     connect: list[Endpoint],
@@ -997,7 +1002,7 @@ def _settings(
     open_timeout_ms: int = _OPEN_TIMEOUT_MS,
 ) -> dict[str, object]:
     link: dict[str, object] = {
-        "protocols": sorted({endpoint.protocol for endpoint in [*listen, *connect]}),
+        "protocols": sorted({_in_zenoh_s_words(e).split("/")[0] for e in [*listen, *connect]}),
         "tx": {
             "lease": round(lease_ms),
             "batch_size": _BATCH_BYTES,
@@ -1028,9 +1033,9 @@ def _settings(
     return {
         "mode": "peer",
         "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
-        "listen": {"endpoints": [str(endpoint) for endpoint in listen], "exit_on_failure": True},
+        "listen": {"endpoints": [*map(_in_zenoh_s_words, listen)], "exit_on_failure": True},
         "connect": {
-            "endpoints": [str(endpoint) for endpoint in connect],
+            "endpoints": [*map(_in_zenoh_s_words, connect)],
             "exit_on_failure": False,
             "retry": retry,
         },

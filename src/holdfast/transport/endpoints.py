@@ -1,9 +1,8 @@
-"""Where a service is, in Zenoh's form: what is allowed, and what would be unsafe.
+"""Where a service is: which endpoints there are, and which of them would be unsafe.
 
 An endpoint is a protocol and a place: ``tcp/127.0.0.1:7447``, ``tls/planner.example:7447``,
-``unixsock-stream//run/holdfast/robot.sock``. Zenoh itself takes much more than holdfast can keep
-its promises with, and finds some mistakes only later, in the background, without a word. So every
-endpoint is read here first, and what cannot work is refused with the reason.
+``udp/planner.example:7447``, ``unix//run/holdfast/robot.sock``. Every endpoint is read here before
+anything is opened, and what cannot work is refused with the reason.
 """
 
 from __future__ import annotations
@@ -30,35 +29,34 @@ __all__ = [
     "ServiceAddress",
     "TlsFiles",
     "check_credentials",
+    "check_endpoint",
+    "check_name",
     "free_port",
     "parse_endpoint",
 ]
 
-PROTOCOLS = ("tcp", "tls", "quic", "unixsock-stream")
+PROTOCOLS = ("tcp", "tls", "udp", "unix")
 """What an endpoint may begin with."""
 
-ENCRYPTED_PROTOCOLS = frozenset({"tls", "quic"})
+ENCRYPTED_PROTOCOLS = frozenset({"tls", "udp"})
 """Those in which both ends prove by a certificate who they are."""
 
 MAX_SOCKET_PATH_BYTES = 107
 """Bound on the path of a local socket: the system's ``sockaddr_un`` has room for no more."""
 
-_UNIX = "unixsock-stream"
+_UNIX = "unix"
 
-_REFUSED = {
-    "udp": "it loses whatever is larger than one datagram and repeats nothing; "
-    "quic is the reliable protocol over UDP",
-    "ws": "holdfast is not tested over it",
-    "serial": "holdfast is not tested over it",
-    "vsock": "holdfast is not tested over it",
-    "unixpipe": "unixsock-stream is the local protocol that finds a dead peer at once",
+_RENAMED = {
+    "quic": "over UDP, services are at udp/HOST:PORT",
+    "unixsock-stream": "a local socket is written unix/PATH",
 }
+"""Protocols of earlier releases, and what to write instead."""
 
 _LOCK = "lock"
-_LONGEST_SUFFIX = ".1000000000.lock"  # what the transport appends for a socket and its lock
 _HOST_NAME = re.compile(
     r"(?=.{1,253}\Z)[A-Za-z0-9_]([A-Za-z0-9_-]*[A-Za-z0-9_])?(\.[A-Za-z0-9_-]+)*"
 )
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
 _NUMBERS = re.compile(r"[0-9.]+")
 
 
@@ -81,16 +79,16 @@ class TlsFiles(msgspec.Struct, frozen=True):
 
 
 class Endpoint(NamedTuple):
-    """A protocol and a place, checked. ``str`` gives it back in Zenoh's form.
+    """A protocol and a place, checked. ``str`` gives the text back.
 
     Attributes
     ----------
     protocol : str
         One of :data:`PROTOCOLS`.
     host : str
-        Name or address, an IPv6 address without its brackets; for ``unixsock-stream`` the path.
+        Name or address, an IPv6 address without its brackets; for ``unix`` the path.
     port : int
-        0 means any free port, where something listens; for ``unixsock-stream`` always 0.
+        0 means any free port, where something listens; for ``unix`` always 0.
     """
 
     protocol: str
@@ -145,7 +143,7 @@ class ServiceAddress(NamedTuple):
     Attributes
     ----------
     endpoint : str
-        In Zenoh's form.
+        See :func:`parse_endpoint`.
     listens : bool
         False: the service listens there and the robot connects. True: the robot listens there and
         the service connects, which a service that the robot itself launches does; it is then seen
@@ -169,7 +167,7 @@ class PrivateSocket:
     Attributes
     ----------
     endpoint : str
-        ``unixsock-stream/PATH``.
+        ``unix/PATH``.
 
     Raises
     ------
@@ -188,7 +186,7 @@ class PrivateSocket:
             self._lock = _locked(self._directory)
         self.endpoint = f"{_UNIX}/{self._directory / 's'}"
         try:
-            parse_endpoint(self.endpoint + _LONGEST_SUFFIX)
+            parse_endpoint(self.endpoint)
         except TransportError as error:
             self.remove()
             raise TransportError(
@@ -244,12 +242,12 @@ def _remove_directory(directory: Path) -> None:
 
 
 def parse_endpoint(text: str) -> Endpoint:
-    """Read an endpoint in Zenoh's form.
+    """Read an endpoint.
 
     Parameters
     ----------
     text : str
-        ``PROTOCOL/HOST:PORT``, with an IPv6 address in brackets, or ``unixsock-stream/PATH``.
+        ``PROTOCOL/HOST:PORT``, with an IPv6 address in brackets, or ``unix/PATH``.
 
     Raises
     ------
@@ -263,10 +261,10 @@ def parse_endpoint(text: str) -> Endpoint:
             f"as in tcp/127.0.0.1:7447"
         )
     if protocol not in PROTOCOLS:
-        reason = _REFUSED.get(protocol)
+        instead = _RENAMED.get(protocol)
         raise TransportError(
             f"endpoint {text!r}: protocol {protocol} is not allowed"
-            + (f" ({reason})" if reason else "")
+            + (f" ({instead})" if instead else "")
             + f"; allowed are {_listed(PROTOCOLS)}, as in tcp/127.0.0.1:7447"
         )
     if "?" in place or "#" in place:
@@ -290,6 +288,38 @@ def parse_endpoint(text: str) -> Endpoint:
     return Endpoint(protocol, _host(text, protocol, host), int(port_text))
 
 
+def check_endpoint(text: str, *, listens: bool) -> Endpoint:
+    """Read the endpoint of one end of a link.
+
+    Raises
+    ------
+    TransportError
+        If it is none, or is to be connected to and has port 0.
+    """
+    endpoint = parse_endpoint(text)
+    if not listens and endpoint.port == 0 and not endpoint.is_local_socket:
+        raise TransportError(
+            f"endpoint {endpoint}: port 0 is for listening; to connect, give the port, "
+            f"as in {endpoint.with_port(7447)}"
+        )
+    return endpoint
+
+
+def check_name(what: str, name: str) -> None:
+    """Check that a name can be told to the other end.
+
+    Raises
+    ------
+    TransportError
+        If it cannot; the message says what it is the name of.
+    """
+    if not _NAME.fullmatch(name):
+        raise TransportError(
+            f"{what} {name!r}: allowed are 1 to 100 letters, digits, '_', '-' and '.', "
+            f"beginning with a letter or digit"
+        )
+
+
 def check_credentials(endpoint: Endpoint, tls: TlsFiles | None) -> None:
     """Check that an endpoint has the credentials that its protocol needs, and no others.
 
@@ -309,7 +339,7 @@ def check_credentials(endpoint: Endpoint, tls: TlsFiles | None) -> None:
     if not endpoint.is_encrypted and not endpoint.is_local_socket:
         raise TransportError(
             f"endpoint {endpoint}: {endpoint.protocol} does not use the credentials that were "
-            f"given (--tls); write tls/... or quic/..., or leave them out"
+            f"given (--tls); write tls/... or udp/..., or leave them out"
         )
     if endpoint.is_encrypted:
         for file in (tls.authority, tls.certificate, tls.key):
@@ -330,7 +360,7 @@ def free_port(endpoint: Endpoint) -> int:
     TransportError
         If this machine has no such address.
     """
-    kind = socket.SOCK_DGRAM if endpoint.protocol == "quic" else socket.SOCK_STREAM
+    kind = socket.SOCK_DGRAM if endpoint.protocol == "udp" else socket.SOCK_STREAM
     try:
         family, _, _, _, address = socket.getaddrinfo(
             endpoint.host, 0, type=kind, flags=socket.AI_PASSIVE

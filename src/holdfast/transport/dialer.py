@@ -1,0 +1,166 @@
+"""Connects to an endpoint, again and again, until somebody is there.
+
+A service that is started again is to be used at once, however far away it is. So a new attempt
+begins every few hundredths of a second, and none waits for the one before, which may hang on a path
+that is cut or on a process that stands still. The longer nobody is there, the longer the pauses:
+in proportion, so that waiting for the next attempt adds two per cent to any outage.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import ipaddress
+import socket
+import threading
+from collections.abc import Callable
+from typing import Final, TypeAlias
+
+from holdfast.transport.endpoints import Endpoint
+from holdfast.transport.links import Link
+
+__all__ = ["Dialer"]
+
+_FIRST_PAUSE_S: Final = 0.02
+_LAST_PAUSE_S: Final = 1.0
+_SHARE_OF_OUTAGE: Final = 0.02
+
+_CONNECT_TIMEOUT_S: Final = 2.0
+"""For the answer to an attempt; the next ones have long begun."""
+
+_NEXT_LINK_S: Final = 0.25
+"""After a connection has come about, so long no second one is taken beside it."""
+
+_REFUSED_PAUSE_S: Final = 1.0
+"""After one of the ends did not want the other."""
+
+_RESOLVE_AGAIN_S: Final = 5.0
+
+_Address: TypeAlias = tuple[socket.AddressFamily, object]
+
+
+class Dialer:
+    """Makes links to an endpoint while it is wanted to.
+
+    Parameters
+    ----------
+    endpoint : Endpoint
+    make_link : callable
+        Makes the link of a new connection.
+    """
+
+    def __init__(self, endpoint: Endpoint, make_link: Callable[[], Link]) -> None:
+        self._endpoint = endpoint
+        self._make_link = make_link
+        self._loop = asyncio.get_running_loop()
+        self._attempts: set[asyncio.Task[None]] = set()
+        self._links: set[Link] = set()
+        self._next: asyncio.TimerHandle | None = None
+        self._absent_since: float | None = None
+        self._connected_at = float("-inf")
+        self._turn = 0
+        self._resolved_at = float("-inf")
+        self._addresses: list[_Address] = []
+        if endpoint.is_local_socket:
+            self._addresses = [(socket.AF_UNIX, endpoint.host)]
+        else:
+            with contextlib.suppress(ValueError):
+                version = ipaddress.ip_address(endpoint.host).version
+                family = socket.AF_INET if version == 4 else socket.AF_INET6
+                self._addresses = [(family, (endpoint.host, endpoint.port))]
+        self._is_name = not self._addresses
+
+    def start(self, *, refused: bool = False) -> None:
+        """Begin to connect, or go on; after a refusal only after a while."""
+        now = self._loop.time()
+        if self._absent_since is None:
+            self._absent_since = now
+        if self._next is not None:
+            if not refused:
+                return
+            self._next.cancel()
+        self._connected_at = float("-inf")
+        self._next = self._loop.call_later(_REFUSED_PAUSE_S if refused else 0.0, self._attempt)
+
+    def stop(self, winner: Link | None = None) -> None:
+        """Connect no more, and end all links that were made but this one."""
+        if self._next is not None:
+            self._next.cancel()
+            self._next = None
+        for attempt in self._attempts:
+            attempt.cancel()
+        for link in list(self._links):
+            if link is not winner:
+                link.end("was not needed: another connection was first", goodbye="")
+        self._links.clear()
+
+    def succeeded(self) -> None:
+        """Take note that somebody is there who is what was looked for."""
+        self._absent_since = None
+
+    def ended(self, link: Link) -> None:
+        """Take note that a link has ended; it need not be one of this dialler's."""
+        if link in self._links:
+            self._links.discard(link)
+            if not self._links:
+                self._connected_at = float("-inf")
+
+    # -- attempts --------------------------------------------------------------------------------
+
+    def _attempt(self) -> None:
+        now = self._loop.time()
+        absent_s = 0.0 if self._absent_since is None else now - self._absent_since
+        pause_s = min(max(_FIRST_PAUSE_S, _SHARE_OF_OUTAGE * absent_s), _LAST_PAUSE_S)
+        self._next = self._loop.call_later(pause_s, self._attempt)
+        if self._is_name and now >= self._resolved_at + _RESOLVE_AGAIN_S:
+            self._resolved_at = now
+            # The search for an address can take many seconds and cannot be broken off.
+            threading.Thread(target=self._resolve, name="holdfast-resolve", daemon=True).start()
+        if not self._addresses or now < self._connected_at + _NEXT_LINK_S:
+            return
+        family, address = self._addresses[self._turn % len(self._addresses)]
+        self._turn += 1
+        attempt = self._loop.create_task(self._connect(family, address))
+        self._attempts.add(attempt)
+        attempt.add_done_callback(self._attempts.discard)
+
+    async def _connect(self, family: socket.AddressFamily, address: object) -> None:
+        try:
+            stream = socket.socket(family, socket.SOCK_STREAM)
+        except OSError:
+            return  # no descriptor is free
+        try:
+            stream.setblocking(False)
+            async with asyncio.timeout(_CONNECT_TIMEOUT_S):
+                await self._loop.sock_connect(stream, address)  # type: ignore[arg-type]
+            now = self._loop.time()
+            if now < self._connected_at + _NEXT_LINK_S:
+                stream.close()
+                return
+            self._connected_at = now
+            link = self._make_link()
+            self._links.add(link)
+            await link.connect(stream)
+        except OSError:  # a timeout is one, too
+            stream.close()
+        except asyncio.CancelledError:
+            stream.close()
+            raise
+
+    def _resolve(self) -> None:
+        """Look up the host's addresses; on a thread of its own."""
+        endpoint = self._endpoint
+        try:
+            found = socket.getaddrinfo(endpoint.host, endpoint.port, type=socket.SOCK_STREAM)
+        except (OSError, UnicodeError):
+            return  # those of before may still be right
+        addresses: list[_Address] = [(entry[0], entry[4]) for entry in found]
+
+        def take() -> None:
+            self._addresses = addresses
+            if self._next is not None and not self._attempts and not self._links:
+                self._next.cancel()
+                self._attempt()
+
+        with contextlib.suppress(RuntimeError):  # the loop is closed
+            self._loop.call_soon_threadsafe(take)

@@ -1,0 +1,268 @@
+"""The bytes on a stream: a magic word, then frames; what is no frame of ours is found at once.
+
+A stream has no messages, so each is put into a frame: its length, its kind, the call that it
+belongs to, and its bytes. Whatever connects to a port may send anything, so nothing here believes a
+length: it is compared with its bound before any memory is taken. A message above the bound is
+passed over, byte for byte, and its sender hears so; anything else that is wrong ends the link, with
+a reason for the log. Nothing here knows a socket.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from typing import Final, Literal, NamedTuple, TypeAlias
+
+import msgspec
+
+from holdfast import __version__
+from holdfast.errors import TransportError
+from holdfast.printable import printable
+from holdfast.transport.endpoints import check_name
+
+__all__ = [
+    "CALL",
+    "END",
+    "GOODBYE",
+    "HELLO",
+    "LAST",
+    "MAGIC",
+    "MAX_HELLO_BYTES",
+    "PING",
+    "REPLY",
+    "WIRE_VERSION",
+    "Frame",
+    "FrameDecoder",
+    "FrameError",
+    "Hello",
+    "Role",
+    "decode_hello",
+    "encode_frame",
+    "encode_goodbye",
+    "encode_hello",
+    "read_goodbye",
+]
+
+Role: TypeAlias = Literal["robot", "service"]
+
+WIRE_VERSION: Final = 1
+"""Of the frames and the hello. The messages have a version of their own."""
+
+MAGIC: Final = b"holdfast"
+"""The first bytes of either end."""
+
+HELLO: Final = 1  # who speaks; the first frame, and no other
+CALL: Final = 2  # a request
+REPLY: Final = 3  # one of the replies to a call
+END: Final = 4  # no more replies to a call
+LAST: Final = 5  # a reply and the end
+PING: Final = 6  # this end lives
+GOODBYE: Final = 7  # why this end closes the link, in words
+
+MAX_HELLO_BYTES: Final = 4096
+_MAX_GOODBYE_BYTES: Final = 1024
+
+_HEADER: Final = struct.Struct("<IBI")  # bytes that follow it, kind, call
+
+
+class FrameError(TransportError):
+    """What came is no frame of ours; the text completes a sentence about whoever sent it."""
+
+
+class Frame(NamedTuple):
+    """A frame that has come.
+
+    Attributes
+    ----------
+    kind, call : int
+    payload : bytes
+    passed_over_bytes : int
+        Of a message that is larger than allowed and is not kept, so that the payload is empty.
+    """
+
+    kind: int
+    call: int
+    payload: bytes
+    passed_over_bytes: int = 0
+
+
+class Hello(msgspec.Struct, frozen=True):
+    """Who is at an end of a link.
+
+    Attributes
+    ----------
+    version : int
+        :data:`WIRE_VERSION` of its code.
+    release : str
+        Of its code.
+    role : {"robot", "service"}
+    name : str
+        A robot's may be empty.
+    incarnation : str
+        Of this process; another one is another process, with another memory.
+    lease_ms : float
+        When nothing comes from it for this long, the link may be given up.
+    """
+
+    version: int
+    release: str
+    role: Role
+    name: str
+    incarnation: str
+    lease_ms: float
+
+
+class _Version(msgspec.Struct):
+    """What every version's hello has."""
+
+    version: int
+    release: str = "unknown"
+
+
+def encode_frame(kind: int, call: int = 0, payload: bytes = b"") -> bytes:
+    """Return a frame's bytes."""
+    return _HEADER.pack(len(payload), kind, call) + payload
+
+
+def encode_hello(role: Role, name: str, incarnation: str, lease_ms: float) -> bytes:
+    """Return the first bytes of this end: the magic word and its hello."""
+    hello = Hello(WIRE_VERSION, __version__, role, name, incarnation, lease_ms)
+    return MAGIC + encode_frame(HELLO, 0, msgspec.msgpack.encode(hello))
+
+
+def encode_goodbye(reason: str) -> bytes:
+    """Return the last frame of this end."""
+    return encode_frame(GOODBYE, 0, reason.encode(errors="replace")[:_MAX_GOODBYE_BYTES])
+
+
+def read_goodbye(payload: bytes) -> str:
+    """Return the reason in a goodbye, fit to be shown; empty if there is none."""
+    return printable(payload.decode(errors="replace"))
+
+
+def decode_hello(payload: bytes) -> Hello:
+    """Return what the other end says of itself.
+
+    Raises
+    ------
+    FrameError
+        If it is of another version, or malformed.
+    """
+    try:
+        version = msgspec.msgpack.decode(payload, type=_Version)
+        if version.version != WIRE_VERSION:
+            raise FrameError(
+                f"is holdfast {printable(version.release[:40])} with version {version.version} of "
+                f"the wire; here is holdfast {__version__} with version {WIRE_VERSION}: install "
+                "the same release at both ends"
+            )
+        hello = msgspec.msgpack.decode(payload, type=Hello)
+    except msgspec.MsgspecError as error:
+        raise FrameError(f"sends a malformed hello: {printable(str(error))}") from None
+    try:
+        check_name("incarnation", hello.incarnation)
+        if hello.role == "service" or hello.name:
+            check_name("name", hello.name)
+    except TransportError as error:
+        raise FrameError(f"sends a malformed hello: {error}") from None
+    if not 1.0 <= hello.lease_ms <= 3.6e6:
+        raise FrameError(f"sends a hello with a lease of {hello.lease_ms:g} ms (1 to 3.6e6)")
+    return hello
+
+
+class FrameDecoder:
+    """Makes frames of the bytes of one stream, however they are cut.
+
+    Parameters
+    ----------
+    max_message_bytes : int
+        A larger request or reply is passed over.
+    """
+
+    def __init__(self, max_message_bytes: int) -> None:
+        self._buffer = bytearray()
+        self._passing_over = 0
+        self._has_magic = False
+        self._greeted = False
+        self._bounds = {
+            CALL: max_message_bytes,
+            REPLY: max_message_bytes,
+            LAST: max_message_bytes,
+            END: 0,
+            PING: 0,
+            GOODBYE: _MAX_GOODBYE_BYTES,
+        }
+
+    @property
+    def held_bytes(self) -> int:
+        """Of a frame that has not come as a whole."""
+        return len(self._buffer)
+
+    def feed(self, data: bytes) -> list[Frame]:
+        """Take bytes and return the frames that are complete with them.
+
+        Raises
+        ------
+        FrameError
+            If they are no frames of ours. Nothing may be fed after that.
+        """
+        buffer = self._buffer
+        source: bytes | bytearray = data
+        if buffer:
+            buffer += data
+            source = buffer
+        end = len(source)
+        at = 0
+        if not self._has_magic:
+            if not MAGIC.startswith(source[: len(MAGIC)]):
+                raise FrameError(_what_speaks(bytes(source[:16])))
+            if end >= len(MAGIC):
+                self._has_magic = True
+                at = len(MAGIC)
+        frames: list[Frame] = []
+        while self._has_magic:
+            if self._passing_over:
+                passed = min(self._passing_over, end - at)
+                self._passing_over -= passed
+                at += passed
+            start = at + _HEADER.size
+            if start > end:
+                break
+            size, kind, call = _HEADER.unpack_from(source, at)
+            if size > self._bound(kind):
+                if kind not in (CALL, REPLY, LAST):
+                    raise FrameError(f"sends a frame of kind {kind} with {size} bytes")
+                frames.append(Frame(kind, call, b"", size))
+                self._passing_over = size
+                at = start
+                continue
+            if start + size > end:
+                break
+            self._greeted = True
+            with memoryview(source) as view:
+                frames.append(Frame(kind, call, bytes(view[start : start + size])))
+            at = start + size
+        if source is buffer:
+            del buffer[:at]
+        elif at < end:
+            buffer += memoryview(data)[at:]
+        return frames
+
+    def _bound(self, kind: int) -> int:
+        if not self._greeted:
+            if kind != HELLO:
+                raise FrameError(f"begins with a frame of kind {kind} instead of a hello")
+            return MAX_HELLO_BYTES
+        bound = self._bounds.get(kind)
+        if bound is None:
+            raise FrameError(f"sends a frame of the unknown kind {kind}")
+        return bound
+
+
+def _what_speaks(first: bytes) -> str:
+    """Say what it may be that does not begin with the magic word."""
+    if first[:2] == b"\x16\x03":
+        return "speaks TLS at an endpoint that does not (tls/... goes with tls/...)"
+    if re.match(rb"(GET|HEAD|POST|PUT|OPTIONS|CONNECT|PRI|HTTP)\b", first):
+        return "speaks HTTP"
+    return f"does not speak holdfast: it begins with {first!r}"

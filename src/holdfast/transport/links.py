@@ -1,0 +1,428 @@
+"""One stream to one peer: it speaks frames over a socket, and finds out when the peer is gone.
+
+A stream that is closed is a peer that is gone: the system closes those of a process that dies. What
+only falls silent is given up after a while, so each end says regularly that it lives. And a peer
+that does not read must cost nobody else anything: what cannot be sent waits in a buffer with a
+bound, nothing here waits for it, and who never empties it loses the link.
+
+Each end opens with a hello. With TLS the robot speaks first, without it whoever dialled; the other
+end answers, so that nothing is told to a port scanner.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import socket
+import ssl
+from typing import Final, NamedTuple, Protocol
+
+from holdfast.transport.frames import (
+    GOODBYE,
+    HELLO,
+    PING,
+    Frame,
+    FrameDecoder,
+    FrameError,
+    Hello,
+    decode_hello,
+    encode_frame,
+    encode_goodbye,
+    read_goodbye,
+)
+from holdfast.transport.tls import PeerCertificate, TlsStream
+
+__all__ = ["HalfReceived", "Link", "LinkOwner", "LinkRefusedError", "LinkSettings"]
+
+OPENING_TIMEOUT_S: Final = 5.0
+"""For a connection to become a link: the handshake and the other end's hello."""
+
+STALLED_S: Final = 10.0
+"""A peer that takes nothing of what is to be sent to it for this long does not read."""
+
+_UNSENT_BYTES_AT_LEAST: Final = 4 << 20
+"""May wait for any peer, however small its messages must be."""
+
+_UNSENT_IN_SYSTEM_BYTES: Final = 128 * 1024
+"""May wait in the system: then even a slow link is seen to move every few seconds."""
+
+_PINGS_IN_LEASE: Final = 3
+_CLOSE_TIMEOUT_S: Final = 1.0
+_PING: Final = encode_frame(PING)
+
+
+class LinkRefusedError(Exception):
+    """The link is not wanted by this end; the text completes a sentence about the other end."""
+
+
+class HalfReceived:
+    """Bounds the memory that half-received messages of all links together take.
+
+    Parameters
+    ----------
+    max_bytes : int
+        When they take more, the link is ended whose message began first.
+    """
+
+    def __init__(self, max_bytes: int) -> None:
+        self._max_bytes = max_bytes
+        self._sizes: dict[Link, int] = {}
+        self._total = 0
+
+    def note(self, link: Link, size_bytes: int) -> None:
+        """Take note of what a link holds now."""
+        before = self._sizes.get(link, 0)
+        if size_bytes:
+            self._sizes[link] = size_bytes
+        elif before:
+            del self._sizes[link]
+        self._total += size_bytes - before
+        while self._total > self._max_bytes:
+            oldest = next(iter(self._sizes))
+            self._total -= self._sizes.pop(oldest)
+            oldest.end("has not finished a message, and others need the memory")
+
+
+class LinkSettings(NamedTuple):
+    """What all links of one end have in common.
+
+    Attributes
+    ----------
+    hello : bytes
+        This end's first bytes.
+    lease_ms : float
+        This end lets itself be heard several times in this time.
+    max_message_bytes : int
+    half_received : HalfReceived
+    """
+
+    hello: bytes
+    lease_ms: float
+    max_message_bytes: int
+    half_received: HalfReceived
+
+
+class LinkOwner(Protocol):
+    """Who is told what happens on a link."""
+
+    def established(self, link: Link) -> None:
+        """Hear that the TLS handshake is complete at this end; not called without TLS."""
+        ...
+
+    def greeted(self, link: Link, hello: Hello) -> None:
+        """Hear who the other end is; raise LinkRefusedError to refuse it."""
+        ...
+
+    def received(self, link: Link, frame: Frame) -> None:
+        """Take a frame of a call."""
+        ...
+
+    def lost(self, link: Link) -> None:
+        """Hear that the link has ended: once of each link, and nothing more of it after that."""
+        ...
+
+
+class Link(asyncio.Protocol):
+    """One stream; a protocol for asyncio, to be connected by it.
+
+    Parameters
+    ----------
+    owner : LinkOwner
+    settings : LinkSettings
+    speaks_first : bool
+        Whether this end says who it is before it knows who the other one is.
+    tls : TlsStream or None
+
+    Attributes
+    ----------
+    tls : TlsStream or None
+    connecting : Task or None
+        Of an accepted connection, which asyncio needs somebody to hold.
+    closed : Future
+        Done when the connection is closed.
+    hello : Hello or None
+        The other end's, once it has come.
+    peer : PeerCertificate or None
+        The other end's, once TLS is established.
+    reason : str
+        Why the link has ended, as the rest of a sentence about the other end; empty if that has
+        simply closed.
+    refused : bool
+        Whether it has ended because one of the ends does not want the other, so that to try again
+        at once is of no use.
+    """
+
+    def __init__(
+        self,
+        owner: LinkOwner,
+        settings: LinkSettings,
+        *,
+        speaks_first: bool,
+        tls: TlsStream | None = None,
+    ) -> None:
+        self._owner = owner
+        self._settings = settings
+        self._speaks_first = speaks_first
+        self.tls = tls
+        self._loop = asyncio.get_running_loop()
+        self._transport: asyncio.Transport | None = None
+        self._decoder = FrameDecoder(settings.max_message_bytes)
+        self._max_unsent_bytes = max(2 * settings.max_message_bytes, _UNSENT_BYTES_AT_LEAST)
+        self._ping_interval_s = 1e-3 * settings.lease_ms / _PINGS_IN_LEASE
+        now = self._loop.time()
+        self._silent_at = now + OPENING_TIMEOUT_S
+        self._patience_s = 0.0
+        self._moved_at = now
+        self._spoke = False
+        self._handed_over_bytes = self._moved_bytes = 0
+        self._timer = self._loop.call_at(self._silent_at, self._tick)
+        self._ended = False
+        self._told = False
+        self.closed: asyncio.Future[None] = self._loop.create_future()
+        self.connecting: asyncio.Task[object] | None = None
+        self.hello: Hello | None = None
+        self.peer: PeerCertificate | None = None
+        self.reason = ""
+        self.refused = False
+
+    @property
+    def max_message_bytes(self) -> int:
+        """A larger one is not sent."""
+        return self._settings.max_message_bytes
+
+    @property
+    def ended(self) -> bool:
+        """Whether nothing can be sent any more."""
+        return self._ended
+
+    async def connect(self, stream: socket.socket) -> None:
+        """Begin to speak over a connection; never raises."""
+        try:
+            await self._loop.create_connection(lambda: self, sock=stream)
+        except OSError as error:
+            stream.close()
+            self.connection_lost(error)
+
+    def send(self, data: bytes) -> None:
+        """Send frames; never waits. Of a link that has ended it goes nowhere."""
+        transport = self._transport
+        if self._ended or transport is None:
+            return
+        if self.tls is not None:
+            self.tls.send(data)
+            data = self.tls.take()
+        transport.write(data)
+        self._spoke = True
+        self._handed_over_bytes += len(data)
+        if transport.get_write_buffer_size() > self._max_unsent_bytes:
+            self.end("does not read what it is sent", abort=True)
+
+    def end(
+        self,
+        reason: str,
+        *,
+        goodbye: str | None = None,
+        refused: bool = False,
+        abort: bool = False,
+    ) -> None:
+        """End the link; the owner hears so in a later turn of the loop. May be repeated.
+
+        Parameters
+        ----------
+        reason : str
+            About the other end, for :attr:`reason`.
+        goodbye : str or None
+            What the other end is told before; empty text says no more than that.
+        refused : bool
+            For :attr:`refused`.
+        abort : bool
+            Whether what is still to be sent is thrown away.
+        """
+        if self._ended:
+            return
+        if goodbye is not None:
+            self.send(encode_goodbye(goodbye))
+            if self.ended:  # it does not read
+                return
+        self._ended = True
+        self.reason = reason
+        self.refused = refused
+        self._timer.cancel()
+        self._settings.half_received.note(self, 0)
+        self._loop.call_soon(self._tell)
+        transport = self._transport
+        if transport is None:
+            return
+        if abort:
+            transport.abort()
+            return
+        if self.tls is not None:
+            self.tls.close()
+            transport.write(self.tls.take())
+        transport.close()
+        self._timer = self._loop.call_later(_CLOSE_TIMEOUT_S, transport.abort)
+
+    # -- what asyncio tells ----------------------------------------------------------------------
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Begin to speak, if that is this end's part."""
+        assert isinstance(transport, asyncio.Transport)
+        if self._ended:
+            transport.abort()
+            self._transport = transport
+            return
+        self._transport = transport
+        stream = transport.get_extra_info("socket")
+        if stream is not None and stream.family != socket.AF_UNIX:
+            with contextlib.suppress(OSError):
+                stream.setsockopt(
+                    socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, _UNSENT_IN_SYSTEM_BYTES
+                )
+        if self.tls is None:
+            if self._speaks_first:
+                self.send(self._settings.hello)
+        elif self._speaks_first:
+            self.tls.begin()
+            transport.write(self.tls.take())
+
+    def data_received(self, data: bytes) -> None:
+        """Take what has come."""
+        if self._ended:
+            return
+        if self.hello is not None:
+            self._silent_at = self._loop.time() + self._patience_s
+        try:
+            tls = self.tls
+            if tls is not None:
+                data = self._decrypted(tls, data)
+                if self.ended:
+                    return
+            frames = self._decoder.feed(data)
+            self._settings.half_received.note(self, self._decoder.held_bytes)
+            for frame in frames:
+                if self.ended:
+                    return
+                self._take(frame)
+            if tls is not None and tls.ended:
+                self.end("")
+        except FrameError as error:
+            # Only one of our own kind is told why.
+            self.end(
+                str(error), goodbye=str(error) if self.hello is not None else None, refused=True
+            )
+        except LinkRefusedError as error:
+            self.end(str(error), goodbye=str(error), refused=True)
+
+    def eof_received(self) -> None:
+        """Let asyncio close this end, as the other one has."""
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Take note that the connection is gone, whoever has closed it."""
+        self._transport = None
+        self._timer.cancel()
+        if not self._ended:
+            self._ended = True
+            self.reason = str(exc) if exc is not None else ""
+            self._settings.half_received.note(self, 0)
+        self._tell()
+        if not self.closed.done():
+            self.closed.set_result(None)
+
+    # -- what comes ------------------------------------------------------------------------------
+
+    def _decrypted(self, tls: TlsStream, data: bytes) -> bytes:
+        was_established = tls.established
+        try:
+            data = tls.receive(data)
+        except ssl.SSLError as error:
+            assert self._transport is not None
+            self._transport.write(tls.take())  # it is told, in an alert
+            self.end(_what_is_wrong(error), refused=True)
+            return b""
+        if tls.established and not was_established:
+            self.peer = tls.peer()
+            assert self._transport is not None
+            self._transport.write(tls.take())
+            if self._speaks_first:
+                self.send(self._settings.hello)
+            self._owner.established(self)
+        return data
+
+    def _take(self, frame: Frame) -> None:
+        kind = frame.kind
+        if kind == PING:
+            return
+        if kind == HELLO:
+            if not self._speaks_first:
+                self.send(self._settings.hello)
+            try:
+                hello = decode_hello(frame.payload)
+            except FrameError as error:
+                raise LinkRefusedError(str(error)) from None
+            self._owner.greeted(self, hello)
+            self.hello = hello
+            self._patience_s = 1e-3 * hello.lease_ms
+            self._silent_at = self._loop.time() + self._patience_s
+            self._timer.cancel()
+            self._tick()
+        elif kind == GOODBYE:
+            reason = read_goodbye(frame.payload)
+            self.end(f"refuses this end, which {reason}" if reason else "", refused=reason != "")
+        else:
+            self._owner.received(self, frame)
+
+    def _tell(self) -> None:
+        if not self._told:
+            self._told = True
+            self._owner.lost(self)
+
+    # -- time ------------------------------------------------------------------------------------
+
+    def _tick(self) -> None:
+        """Look whether the other end lives and reads, and let it know that this one does."""
+        now = self._loop.time()
+        if now >= self._silent_at:
+            # If it is this process that stood still, what came meanwhile is still to be read.
+            self._loop.call_soon(self._loop.call_soon, self._give_up_if_silent)
+            return
+        transport = self._transport
+        if self.hello is not None and transport is not None:
+            if not self._spoke:
+                self.send(_PING)
+            self._spoke = False
+            unsent = transport.get_write_buffer_size()
+            moved_bytes = self._handed_over_bytes - unsent
+            if unsent == 0 or moved_bytes != self._moved_bytes:
+                self._moved_at, self._moved_bytes = now, moved_bytes
+            elif now >= self._moved_at + STALLED_S:
+                self.end("does not read what it is sent", abort=True)
+            if self._ended:
+                return
+        due = self._silent_at
+        if self.hello is not None:
+            due = min(due, now + self._ping_interval_s)
+        self._timer = self._loop.call_at(due, self._tick)
+
+    def _give_up_if_silent(self) -> None:
+        if self._ended:
+            return
+        if self._loop.time() < self._silent_at:
+            self._tick()
+        elif self.hello is None:
+            self.end(f"has said no hello within {OPENING_TIMEOUT_S:g} s", abort=True)
+        else:
+            self.end(f"was silent for {1e3 * self._patience_s:g} ms", abort=True)
+
+
+def _what_is_wrong(error: ssl.SSLError) -> str:
+    """Say what OpenSSL's error means, as the rest of a sentence about the other end."""
+    if isinstance(error, ssl.SSLCertVerificationError):
+        return f"has a certificate that is refused: {error.verify_message}"
+    reason = error.reason or ""
+    alert = reason.partition("_ALERT_")[2]
+    if alert:
+        return f"refuses this end's certificate ({alert.lower().replace('_', ' ')})"
+    if "PEER_DID_NOT_RETURN_A_CERTIFICATE" in reason:
+        return "shows no certificate"
+    text = reason.lower().replace("_", " ") if reason else str(error.args[-1])
+    return text if text.startswith("does ") else f"does not speak TLS 1.3 as expected: {text}"

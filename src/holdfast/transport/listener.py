@@ -1,0 +1,194 @@
+"""A socket that peers connect to, and the connections of which nothing is known yet.
+
+Anybody can open a connection, and most that are opened to a port of the internet say nothing or
+nonsense. So a connection costs next to nothing until its first byte has come; those that say
+nothing are closed after a while, and when there are too many the oldest goes.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import errno
+import os
+import socket
+import stat
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+from holdfast.errors import TransportError
+from holdfast.transport.endpoints import Endpoint
+from holdfast.transport.links import OPENING_TIMEOUT_S
+
+__all__ = ["Listener"]
+
+_BACKLOG: Final = 1024
+_ACCEPTED_AT_ONCE: Final = 32
+"""Before links that stand are heard again."""
+
+_PAUSE_S: Final = 0.1
+"""After the system has refused to accept: no descriptor is free."""
+
+_MAX_SILENT: Final = 256
+"""Connections of which no byte has come."""
+
+
+class Listener:
+    """Accepts connections, and hands over those of which a first byte has come.
+
+    Parameters
+    ----------
+    endpoint : Endpoint
+        Port 0 takes a free one.
+    accepted : callable
+        Gets the socket of such a connection.
+    speaks_first : bool
+        Whether it is this end that has to speak first: then connections are handed over at once.
+
+    Attributes
+    ----------
+    endpoint : Endpoint
+        Where it listens, port 0 replaced.
+
+    Raises
+    ------
+    TransportError
+        If it cannot listen there; the message names the endpoint.
+    """
+
+    def __init__(
+        self,
+        endpoint: Endpoint,
+        accepted: Callable[[socket.socket], None],
+        *,
+        speaks_first: bool = False,
+    ) -> None:
+        self._accepted = accepted
+        self._speaks_first = speaks_first
+        self._loop = asyncio.get_running_loop()
+        try:
+            self._socket = _listening(endpoint)
+        except OSError as error:
+            reason = error.strerror or str(error)
+            raise TransportError(f"cannot listen on {endpoint}: {reason}") from error
+        self._socket_file: os.stat_result | None = None
+        if endpoint.is_local_socket:
+            self._socket_file = Path(endpoint.host).stat()
+            self.endpoint = endpoint
+        else:
+            self.endpoint = endpoint.with_port(self._socket.getsockname()[1])
+        self._silent: dict[socket.socket, asyncio.TimerHandle] = {}
+        self._pause: asyncio.TimerHandle | None = None
+        self._loop.add_reader(self._socket, self._accept)
+
+    def close(self) -> None:
+        """Take no more connections, and close those of which nothing has come. May be repeated."""
+        if self._socket.fileno() < 0:
+            return
+        if self._pause is not None:
+            self._pause.cancel()
+        self._loop.remove_reader(self._socket)
+        if self._socket_file is not None:
+            path = Path(self.endpoint.host)
+            # Not if another one listens there meanwhile.
+            with contextlib.suppress(OSError):
+                if os.path.samestat(path.stat(), self._socket_file):
+                    path.unlink()
+        self._socket.close()
+        for connection in list(self._silent):
+            self._forget(connection)
+            connection.close()
+
+    def _accept(self) -> None:
+        for _ in range(_ACCEPTED_AT_ONCE):
+            try:
+                connection, _ = self._socket.accept()
+            except (BlockingIOError, InterruptedError):
+                return
+            except OSError as error:
+                if error.errno in (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM):
+                    self._loop.remove_reader(self._socket)
+                    self._pause = self._loop.call_later(_PAUSE_S, self._go_on)
+                return  # else it was gone before it was accepted
+            connection.setblocking(False)
+            if self._speaks_first:
+                self._accepted(connection)
+                continue
+            if len(self._silent) >= _MAX_SILENT:
+                oldest = next(iter(self._silent))
+                self._forget(oldest)
+                oldest.close()
+            self._silent[connection] = self._loop.call_later(
+                OPENING_TIMEOUT_S, self._look, connection
+            )
+            self._loop.add_reader(connection, self._look, connection)
+
+    def _go_on(self) -> None:
+        self._loop.add_reader(self._socket, self._accept)
+
+    def _look(self, connection: socket.socket) -> None:
+        """Hand a connection over if something has come, else close it."""
+        self._forget(connection)
+        try:
+            first = connection.recv(1, socket.MSG_PEEK)
+        except OSError:
+            first = b""
+        if first:
+            self._accepted(connection)
+        else:
+            connection.close()
+
+    def _forget(self, connection: socket.socket) -> None:
+        self._silent.pop(connection).cancel()
+        self._loop.remove_reader(connection)
+
+
+def _listening(endpoint: Endpoint) -> socket.socket:
+    """Return a socket that listens at an endpoint."""
+    if endpoint.is_local_socket:
+        _remove_stale_socket(endpoint)
+        family, address = socket.AF_UNIX, endpoint.host
+        made = socket.socket(family, socket.SOCK_STREAM)
+    else:
+        found = socket.getaddrinfo(
+            endpoint.host, endpoint.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+        )
+        family, _, _, _, address = found[0]  # type: ignore[assignment]
+        made = socket.socket(family, socket.SOCK_STREAM)
+        # A service that is started again may have the port of the one that died.
+        made.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        made.setblocking(False)
+        made.bind(address)
+        made.listen(_BACKLOG)
+    except BaseException:
+        made.close()
+        raise
+    return made
+
+
+def _remove_stale_socket(endpoint: Endpoint) -> None:
+    """Remove what a process has left that was killed.
+
+    Raises
+    ------
+    TransportError
+        If there is something else of that name, or somebody listens there.
+    """
+    path = Path(endpoint.host)
+    try:
+        if not stat.S_ISSOCK(path.lstat().st_mode):
+            raise TransportError(f"cannot listen on {endpoint}: there is a file of that name")
+    except FileNotFoundError:
+        return
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+        probe.setblocking(False)
+        try:
+            probe.connect(endpoint.host)
+        except ConnectionRefusedError:
+            path.unlink(missing_ok=True)
+            return
+        except BlockingIOError:
+            pass  # somebody listens who does not keep up
+    raise TransportError(f"cannot listen on {endpoint}: another process listens there")

@@ -1,0 +1,344 @@
+"""The robot's end of streams: a link to each service, and the calls that are on their way on it.
+
+A service is there from the moment that its link is, and gone when that ends. Over TLS the robot
+need not wait for the service to say which process it is: the handshake has proved that it is the
+service, and told whether it is the process that the robot knew. So the first question to a service
+that was started again is on its way a round trip sooner.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+import ssl
+from collections.abc import Callable, Mapping
+from itertools import count
+
+from holdfast.errors import InvalidValueError, TransportError
+from holdfast.session.events import TransportEvent
+from holdfast.transport.calls import CallTable, PendingCall, too_large
+from holdfast.transport.contract import DEFAULT_MAX_MESSAGE_BYTES
+from holdfast.transport.dialer import Dialer
+from holdfast.transport.endpoints import (
+    Endpoint,
+    ServiceAddress,
+    TlsFiles,
+    check_credentials,
+    check_endpoint,
+    check_name,
+)
+from holdfast.transport.frames import (
+    CALL,
+    END,
+    LAST,
+    REPLY,
+    Frame,
+    FrameError,
+    Hello,
+    encode_frame,
+    encode_hello,
+)
+from holdfast.transport.links import HalfReceived, Link, LinkRefusedError, LinkSettings
+from holdfast.transport.listener import Listener
+from holdfast.transport.tls import TlsStream, client_context
+
+__all__ = ["StreamRobotTransport"]
+
+_CALL_NUMBERS = 1 << 32
+
+
+class StreamRobotTransport:
+    """The robot's end: see :class:`~holdfast.transport.contract.RobotTransport`.
+
+    Parameters
+    ----------
+    services : mapping of str to ServiceAddress
+        Where each service is, by the robot's name for it.
+    name : str
+        The robot's; may be empty.
+    incarnation : str
+        Of this process.
+    lease_ms : float
+        Services give this robot up when nothing comes from it for this long; it lets itself be
+        heard more often. How long a service may be silent, the service says.
+    max_message_bytes : int
+        A larger request is refused here, a larger reply is dropped.
+    tls : TlsFiles or None
+        The robot's credentials, for ``tls``.
+    on_refused : callable or None
+        Is told the service and the reason when a service refuses this robot or is not what the
+        robot looks for; each reason once until the service is there again.
+
+    Raises
+    ------
+    TransportError
+        If an endpoint, a name or the credentials cannot be used.
+    """
+
+    def __init__(
+        self,
+        services: Mapping[str, ServiceAddress],
+        *,
+        name: str = "",
+        incarnation: str = "0",
+        lease_ms: float = 400.0,
+        max_message_bytes: int = DEFAULT_MAX_MESSAGE_BYTES,
+        tls: TlsFiles | None = None,
+        on_refused: Callable[[str, str], None] | None = None,
+    ) -> None:
+        if name:
+            check_name("name of a robot", name)
+        check_name("incarnation of a robot", incarnation)
+        self.settings = LinkSettings(
+            encode_hello("robot", name, incarnation, lease_ms),
+            lease_ms,
+            max_message_bytes,
+            HalfReceived(2 * max_message_bytes),
+        )
+        self.calls = CallTable()
+        self.on_refused = on_refused
+        self._services: dict[str, _Service] = {}
+        for service, address in services.items():
+            endpoint = check_endpoint(address.endpoint, listens=address.listens)
+            check_credentials(endpoint, tls)
+            if address.name is not None:
+                check_name("name of a service", address.name)
+            context = client_context(tls) if tls is not None and endpoint.is_encrypted else None
+            self._services[service] = _Service(self, service, address, endpoint, context)
+        self._started = False
+        self._closed = False
+
+    def endpoint_of(self, service: str) -> str:
+        """Return the endpoint of a service.
+
+        For one that the robot listens for, where to connect; port 0 is replaced by the start.
+        """
+        return str(self._service(service).endpoint)
+
+    def start(self, deliver: Callable[[TransportEvent], None]) -> None:
+        """Begin to connect, and to deliver events; returns at once, connected or not.
+
+        Raises
+        ------
+        TransportError
+            If the robot cannot listen where it should.
+        """
+        if self._started or self._closed:
+            raise TransportError("this transport was started before; make another one")
+        self._started = True
+        self.calls.open(deliver)
+        try:
+            for service in self._services.values():
+                service.start()
+        except TransportError:
+            self._stop()
+            raise
+
+    def call(self, service: str, call: int, payload: bytes) -> None:
+        """Send a request; never waits."""
+        to = self._service(service)
+        link = to.current
+        pending = self.calls.begin(call, link)
+        if pending is None:
+            return
+        if link is not None and len(payload) <= self.settings.max_message_bytes:
+            to.send(link, pending, payload)
+            return
+        loop = asyncio.get_running_loop()
+        if len(payload) > self.settings.max_message_bytes:
+            refusal = too_large(len(payload), self.settings.max_message_bytes)
+            loop.call_soon(self.calls.replied, pending, refusal)
+        loop.call_soon(self.calls.ended, pending)
+
+    def abandon(self, call: int) -> None:
+        """Give a call up: nothing more of it is delivered, not even its end."""
+        self.calls.abandon(call)
+
+    async def close(self, timeout_s: float = 1.0) -> None:
+        """Close all links, within this time whatever the other ends do. May be repeated."""
+        closing = self._stop()
+        if closing:
+            await asyncio.wait(closing, timeout=timeout_s)
+
+    def _stop(self) -> list[asyncio.Future[None]]:
+        self._closed = True
+        self.calls.close()
+        return [closing for service in self._services.values() for closing in service.stop()]
+
+    def _service(self, service: str) -> _Service:
+        try:
+            return self._services[service]
+        except KeyError:
+            raise InvalidValueError(
+                f"service {service!r}: known are {sorted(self._services)}"
+            ) from None
+
+
+class _Service:
+    """One service, as a robot sees it: the owner of its links.
+
+    Attributes
+    ----------
+    endpoint : Endpoint
+        Where it listens or, for one that connects, where the robot does.
+    """
+
+    def __init__(
+        self,
+        robot: StreamRobotTransport,
+        name: str,
+        address: ServiceAddress,
+        endpoint: Endpoint,
+        context: ssl.SSLContext | None,
+    ) -> None:
+        self._robot = robot
+        self._name = name
+        self._address = address
+        self._context = context
+        self._listener: Listener | None = None
+        self._dialer: Dialer | None = None
+        # Those over which it is seen, with the boot that was told, the newest last. There are
+        # several only where the robot listens.
+        self._links: dict[Link, str] = {}
+        self._made: set[Link] = set()
+        self._calls: dict[Link, dict[int, PendingCall]] = {}
+        self._numbers = count()
+        # What the last hello said, under which boot that was told, and whether the handshake alone
+        # is believed: not after one to which no hello came.
+        self._incarnation: str | None = None
+        self._boot = ""
+        self._handshake_is_enough = False
+        self._early = count(1)
+        self._told_reasons: set[str] = set()
+        self._stopped = False
+        self.endpoint = endpoint
+
+    @property
+    def current(self) -> Link | None:
+        """The link over which it is called."""
+        link = next(reversed(self._links), None)
+        return None if link is None or link.ended else link
+
+    def start(self) -> None:
+        if self._address.listens:
+            self._listener = Listener(
+                self.endpoint, self._accepted, speaks_first=self._context is not None
+            )
+            self.endpoint = self._listener.endpoint
+        else:
+            self._dialer = Dialer(self.endpoint, self._make_link)
+            self._dialer.start()
+
+    def stop(self) -> list[asyncio.Future[None]]:
+        self._stopped = True
+        if self._listener is not None:
+            self._listener.close()
+        if self._dialer is not None:
+            self._dialer.stop()
+        links = list(self._made)
+        for link in links:
+            link.end("", goodbye="")
+        return [link.closed for link in links]
+
+    def send(self, link: Link, pending: PendingCall, payload: bytes) -> None:
+        number = next(self._numbers) % _CALL_NUMBERS
+        self._calls[link][number] = pending
+        link.send(encode_frame(CALL, number, payload))
+
+    # -- links -----------------------------------------------------------------------------------
+
+    def _make_link(self) -> Link:
+        tls = None
+        if self._context is not None:
+            host = None if self._address.listens else self.endpoint.host
+            tls = TlsStream(self._context, host, self._incarnation)
+        link = Link(
+            self,
+            self._robot.settings,
+            speaks_first=tls is not None or not self._address.listens,
+            tls=tls,
+        )
+        self._made.add(link)
+        return link
+
+    def _accepted(self, connection: socket.socket) -> None:
+        link = self._make_link()
+        link.connecting = asyncio.get_running_loop().create_task(link.connect(connection))
+
+    def established(self, link: Link) -> None:
+        """Take note that the other end has proved to be a service."""
+        if not self._handshake_is_enough or self._address.listens or self._links:
+            return
+        assert link.tls is not None
+        same = link.tls.is_known_incarnation
+        # What the process is called is not known yet: whatever it is, it is another one.
+        self._appeared(link, self._boot if same else f"not-named-yet-{next(self._early)}")
+
+    def greeted(self, link: Link, hello: Hello) -> None:
+        """Take note of what the other end says of itself."""
+        if hello.role != "service":
+            raise LinkRefusedError("is a robot, and a service was expected")
+        wanted = self._address.name
+        if wanted is not None and hello.name != wanted:
+            raise LinkRefusedError(f"is the service {hello.name}, and {wanted} was expected")
+        if self._stopped:
+            return
+        boot = self._links.get(link)
+        if boot is None:
+            boot = self._boot if hello.incarnation == self._incarnation else hello.incarnation
+        self._incarnation, self._boot = hello.incarnation, boot
+        self._handshake_is_enough = True
+        self._told_reasons.clear()
+        if self._dialer is not None:
+            self._dialer.succeeded()
+        if link not in self._links:
+            self._appeared(link, boot)
+
+    def _appeared(self, link: Link, boot: str) -> None:
+        self._links[link] = boot
+        self._calls[link] = {}
+        if self._dialer is not None:
+            self._dialer.stop(link)
+        self._robot.calls.appeared(self._name, boot)
+
+    def received(self, link: Link, frame: Frame) -> None:
+        """Take a reply, or the end of a call."""
+        calls = self._calls.get(link)
+        if calls is None:
+            raise FrameError("answers before it has been asked")
+        if frame.kind not in (REPLY, LAST, END):
+            raise FrameError(f"is a service and sends a frame of kind {frame.kind}")
+        call = calls.get(frame.call)
+        if call is None:
+            return  # it has ended
+        if frame.kind != END and not frame.passed_over_bytes:
+            self._robot.calls.replied(call, frame.payload)
+        if frame.kind != REPLY:
+            calls.pop(frame.call, None)
+            self._robot.calls.ended(call)
+
+    def lost(self, link: Link) -> None:
+        """Take note that a link has ended."""
+        self._made.discard(link)
+        self._calls.pop(link, None)
+        was_current = next(reversed(self._links), None) is link
+        boot = self._links.pop(link, None)
+        if link.hello is None and boot is not None:
+            self._handshake_is_enough = False
+        dialer = self._dialer
+        if dialer is not None:
+            dialer.ended(link)
+        if self._stopped:
+            return
+        on_refused = self._robot.on_refused
+        if link.refused and on_refused is not None and link.reason not in self._told_reasons:
+            self._told_reasons.add(link.reason)
+            on_refused(self._name, link.reason)
+        if boot is not None:
+            self._robot.calls.vanished(self._name, boot, link)
+            older = next(reversed(self._links), None)
+            if older is not None and was_current:
+                # An older one is still there: from now on it is the one that is called.
+                self._robot.calls.appeared(self._name, self._links[older])
+        if dialer is not None and not self._links and (boot is not None or link.refused):
+            dialer.start(refused=link.refused)

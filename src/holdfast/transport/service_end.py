@@ -1,0 +1,337 @@
+"""The service's end of streams: links of many robots, and the calls that come over them.
+
+A reply is sent when the call ends or this turn of the loop does, whichever comes first: so the last
+reply and the end of a call are one frame.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Final
+
+from holdfast.errors import TransportError
+from holdfast.transport.calls import too_large
+from holdfast.transport.contract import DEFAULT_MAX_MESSAGE_BYTES, IncomingCall
+from holdfast.transport.dialer import Dialer
+from holdfast.transport.endpoints import (
+    Endpoint,
+    TlsFiles,
+    check_credentials,
+    check_endpoint,
+    check_name,
+)
+from holdfast.transport.frames import (
+    CALL,
+    END,
+    LAST,
+    REPLY,
+    Frame,
+    FrameError,
+    Hello,
+    encode_frame,
+    encode_hello,
+)
+from holdfast.transport.links import HalfReceived, Link, LinkRefusedError, LinkSettings
+from holdfast.transport.listener import Listener
+from holdfast.transport.tls import PeerCertificate, TlsStream, server_context
+
+__all__ = ["MAX_LINKS", "StreamServiceTransport"]
+
+MAX_LINKS: Final = 4096
+"""Of robots, at the same time."""
+
+_MAX_UNGREETED: Final = 256
+"""Connections that have sent something, but no hello yet."""
+
+
+class _StreamCall:
+    """A request as the service sees it; see :class:`~holdfast.transport.contract.IncomingCall`."""
+
+    __slots__ = ("_calls", "_link", "_loop", "_number", "_open", "_reply", "payload", "robot")
+
+    def __init__(
+        self,
+        link: Link,
+        number: int,
+        payload: bytes,
+        calls: set[_StreamCall],
+        loop: asyncio.AbstractEventLoop,
+    ) -> None:
+        self._link = link
+        self._number = number
+        self._calls = calls
+        self._loop = loop
+        self._reply: bytes | None = None
+        self._open = True
+        self.payload = payload
+        self.robot = None if link.peer is None else link.peer.name
+
+    def reply(self, payload: bytes) -> None:
+        """Send a reply. A robot that is gone is no error."""
+        if not self._open or len(payload) > self._link.max_message_bytes:
+            return
+        if self._reply is None:
+            self._loop.call_soon(self._flush)
+        else:
+            self._flush()
+        self._reply = payload
+
+    def end(self) -> None:
+        """End the call. May be repeated."""
+        if not self._open:
+            return
+        self._open = False
+        self._calls.discard(self)
+        reply, self._reply = self._reply, None
+        if reply is None:
+            self._link.send(encode_frame(END, self._number))
+        else:
+            self._link.send(encode_frame(LAST, self._number, reply))
+
+    def _flush(self) -> None:
+        reply, self._reply = self._reply, None
+        if reply is not None:
+            self._link.send(encode_frame(REPLY, self._number, reply))
+
+
+class StreamServiceTransport:
+    """The service's end: see :class:`~holdfast.transport.contract.ServiceTransport`.
+
+    Parameters
+    ----------
+    name : str
+        Under which robots know the service.
+    boot : str
+        Of this process; no other one may ever have had it.
+    listen, connect : sequence of str
+        Endpoints at which robots connect, and of robots that listen.
+    lease_ms : float
+        Robots give this service up when nothing comes from it for this long; it lets itself be
+        heard more often. How long a robot may be silent, the robot says.
+    max_message_bytes : int
+        A larger request is refused and not kept.
+    tls : TlsFiles or None
+        The service's credentials, for ``tls``.
+    on_event : callable or None
+        Is told what is worth a line of a log: ``link_refused`` with ``reason`` and, if it is known,
+        ``robot``; ``robot_connected`` and ``robot_disconnected`` with ``robot``.
+
+    Raises
+    ------
+    TransportError
+        If an endpoint, the name, the boot or the credentials cannot be used.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        *,
+        boot: str,
+        listen: Sequence[str] = (),
+        connect: Sequence[str] = (),
+        lease_ms: float = 400.0,
+        max_message_bytes: int = DEFAULT_MAX_MESSAGE_BYTES,
+        tls: TlsFiles | None = None,
+        on_event: Callable[..., None] | None = None,
+    ) -> None:
+        check_name("name of a service", name)
+        check_name("boot of a service", boot)
+        if not listen and not connect:
+            raise TransportError(
+                f"service {name} has no endpoint: give one, as in tcp/127.0.0.1:7447"
+            )
+        self._listen = [check_endpoint(text, listens=True) for text in listen]
+        self._connect = [check_endpoint(text, listens=False) for text in connect]
+        for endpoint in (*self._listen, *self._connect):
+            check_credentials(endpoint, tls)
+        self._boot = boot
+        self._tls = tls
+        self._context = None if tls is None else server_context(tls, boot)
+        self._settings = LinkSettings(
+            encode_hello("service", name, boot, lease_ms),
+            lease_ms,
+            max_message_bytes,
+            HalfReceived(2 * max_message_bytes),
+        )
+        self._on_event = on_event
+        self._deliver: Callable[[IncomingCall], None] | None = None
+        self._started = False
+        self._listeners: list[Listener] = []
+        self._dialers: dict[Endpoint, Dialer] = {}
+        self._dialled: dict[Link, Dialer] = {}
+        self._ungreeted: dict[Link, None] = {}
+        self._links: dict[Link, set[_StreamCall]] = {}
+        self._closing: set[asyncio.Future[None]] = set()
+
+    @property
+    def endpoints(self) -> tuple[str, ...]:
+        """Where robots can connect; once started, with the ports that were free instead of 0."""
+        return tuple(str(endpoint) for endpoint in self._listen)
+
+    async def start(self, deliver: Callable[[IncomingCall], None]) -> None:
+        """Listen, be seen, and deliver calls; returns when robots can connect.
+
+        Raises
+        ------
+        TransportError
+            If it cannot listen there; the message names the endpoint.
+        """
+        if self._started:
+            raise TransportError("this transport was started before; make another one")
+        self._started = True
+        self._deliver = deliver
+        try:
+            for endpoint in self._listen:
+                self._listeners.append(Listener(endpoint, partial(self._accepted, endpoint)))
+        except TransportError:
+            self.stop_listening()
+            raise
+        self._listen = [listener.endpoint for listener in self._listeners]
+        for endpoint in self._connect:
+            dialer = Dialer(endpoint, partial(self._make_dialled, endpoint))
+            self._dialers[endpoint] = dialer
+            dialer.start()
+
+    def stop_listening(self) -> None:
+        """Take no new links; those that stand go on. May be repeated."""
+        for listener in self._listeners:
+            listener.close()
+        for dialer in self._dialers.values():
+            dialer.stop()
+
+    async def close(self, timeout_s: float = 1.0) -> None:
+        """End all calls, send what was to be sent, and close all links, within this time."""
+        self._deliver = None
+        self._started = True
+        self.stop_listening()
+        for link, calls in list(self._links.items()):
+            for call in list(calls):
+                call.end()
+            link.end("", goodbye="")
+        for link in list(self._ungreeted):
+            link.end("")
+        if self._closing:
+            await asyncio.wait(set(self._closing), timeout=timeout_s)
+
+    def end_links(self, condition: Callable[[PeerCertificate], bool], reason: str) -> int:
+        """End the links of robots whose certificate meets a condition.
+
+        Parameters
+        ----------
+        condition : callable
+        reason : str
+            What such a robot is told: the rest of a sentence about it.
+
+        Returns
+        -------
+        int
+            How many there were.
+        """
+        links = [
+            link
+            for link in (*self._links, *self._ungreeted)
+            if link.peer is not None and condition(link.peer)
+        ]
+        for link in links:
+            link.end(reason, goodbye=reason, refused=True)
+        return len(links)
+
+    def reload_credentials(self) -> None:
+        """Read the credentials anew, for the links that are yet to come.
+
+        Raises
+        ------
+        TransportError
+            If they cannot be used; then those of before are kept.
+        """
+        if self._tls is not None:
+            self._context = server_context(self._tls, self._boot)
+
+    # -- links -----------------------------------------------------------------------------------
+
+    def _make_link(self, endpoint: Endpoint, *, dialled: bool) -> Link:
+        tls = None
+        if endpoint.is_encrypted:
+            assert self._context is not None
+            tls = TlsStream(self._context)
+        link = Link(self, self._settings, speaks_first=dialled and tls is None, tls=tls)
+        if len(self._ungreeted) >= _MAX_UNGREETED:
+            next(iter(self._ungreeted)).end("has said no hello, and others wait", abort=True)
+        self._ungreeted[link] = None
+        self._closing.add(link.closed)
+        link.closed.add_done_callback(self._closing.discard)
+        return link
+
+    def _make_dialled(self, endpoint: Endpoint) -> Link:
+        link = self._make_link(endpoint, dialled=True)
+        self._dialled[link] = self._dialers[endpoint]
+        return link
+
+    def _accepted(self, endpoint: Endpoint, connection: socket.socket) -> None:
+        link = self._make_link(endpoint, dialled=False)
+        link.connecting = asyncio.get_running_loop().create_task(link.connect(connection))
+
+    def established(self, link: Link) -> None:
+        """Nothing: a robot says who it is next."""
+
+    def greeted(self, link: Link, hello: Hello) -> None:
+        """Take note of a robot."""
+        if hello.role != "robot":
+            raise LinkRefusedError("is a service, and a robot was expected")
+        if len(self._links) >= MAX_LINKS:
+            raise LinkRefusedError(f"is one too many: {MAX_LINKS} robots are connected")
+        if self._deliver is None:
+            return
+        self._ungreeted.pop(link, None)
+        self._links[link] = set()
+        dialer = self._dialled.get(link)
+        if dialer is not None:
+            dialer.succeeded()
+            dialer.stop(link)
+        self._tell("robot_connected", robot=_name(link, hello))
+
+    def received(self, link: Link, frame: Frame) -> None:
+        """Take a request."""
+        calls = self._links.get(link)
+        if calls is None:
+            return
+        if frame.kind != CALL:
+            raise FrameError(f"is a robot and sends a frame of kind {frame.kind}")
+        if frame.passed_over_bytes:
+            refusal = too_large(frame.passed_over_bytes, self._settings.max_message_bytes)
+            link.send(encode_frame(LAST, frame.call, refusal))
+            return
+        deliver = self._deliver
+        if deliver is None:
+            link.send(encode_frame(END, frame.call))
+            return
+        call = _StreamCall(link, frame.call, frame.payload, calls, asyncio.get_running_loop())
+        calls.add(call)
+        deliver(call)
+
+    def lost(self, link: Link) -> None:
+        """Take note that a link has ended."""
+        self._ungreeted.pop(link, None)
+        was_there = self._links.pop(link, None) is not None
+        if was_there and link.hello is not None:
+            self._tell("robot_disconnected", robot=_name(link, link.hello), reason=link.reason)
+        elif link.reason:
+            fields = {"robot": link.peer.name} if link.peer is not None else {}
+            self._tell("link_refused", reason=link.reason, **fields)
+        dialer = self._dialled.pop(link, None)
+        if dialer is not None:
+            dialer.ended(link)
+            if self._deliver is not None and (was_there or link.refused):
+                dialer.start(refused=link.refused)
+
+    def _tell(self, name: str, **fields: object) -> None:
+        if self._on_event is not None:
+            self._on_event(name, **fields)
+
+
+def _name(link: Link, hello: Hello) -> str:
+    """Return a robot's name; a certificate's counts for more than its own word."""
+    return link.peer.name if link.peer is not None else hello.name

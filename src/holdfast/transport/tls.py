@@ -1,0 +1,207 @@
+"""TLS for one link, in memory: bytes of the stream in, bytes of the messages out.
+
+Both ends show a certificate, TLS 1.3 is the only version, and the one authority that is believed is
+our own. The robot is always the client, whoever dialled: so its certificate can do no more than
+ask, and it looks for the service's host in the service's certificate.
+
+The link reads the socket itself and has the ``ssl`` module decrypt in memory. So nothing of a
+handshake is begun before the other end has sent its first byte, and a port scanner costs no more
+than its connection.
+
+A handshake also tells the robot whether it is the process that it knew, a round trip before that
+process can say so: the robot offers "holdfast/" and the incarnation among the protocols that it
+speaks (ALPN), and a service takes its own.
+"""
+
+from __future__ import annotations
+
+import ssl
+from typing import Any, NamedTuple
+
+from holdfast.errors import TransportError
+from holdfast.transport.endpoints import TlsFiles
+
+__all__ = ["PeerCertificate", "TlsStream", "client_context", "server_context"]
+
+_ANY_INCARNATION = "holdfast"
+_READ_BYTES = 256 * 1024
+
+
+class PeerCertificate(NamedTuple):
+    """The certificate with which the other end has proved who it is.
+
+    Attributes
+    ----------
+    name : str
+        Its common name.
+    serial_number : int
+    expires_at : float
+        In seconds since 1970.
+    der : bytes
+        The whole of it.
+    """
+
+    name: str
+    serial_number: int
+    expires_at: float
+    der: bytes
+
+
+def client_context(files: TlsFiles) -> ssl.SSLContext:
+    """Return what a robot's links need.
+
+    Raises
+    ------
+    TransportError
+        If the credentials cannot be used.
+    """
+    return _context(ssl.PROTOCOL_TLS_CLIENT, files)
+
+
+def server_context(files: TlsFiles, incarnation: str) -> ssl.SSLContext:
+    """Return what a service's links need.
+
+    Raises
+    ------
+    TransportError
+        If the credentials cannot be used.
+    """
+    context = _context(ssl.PROTOCOL_TLS_SERVER, files)
+    context.num_tickets = 0  # nothing is resumed: who comes again shows the certificate again
+    context.set_alpn_protocols([_of(incarnation), _ANY_INCARNATION])
+    return context
+
+
+def _context(protocol: int, files: TlsFiles) -> ssl.SSLContext:
+    context = ssl.SSLContext(protocol)
+    context.minimum_version = ssl.TLSVersion.TLSv1_3
+    context.verify_mode = ssl.CERT_REQUIRED
+    try:
+        context.load_verify_locations(cafile=files.authority)
+        # Without the empty password, an encrypted key would ask for one on the terminal.
+        context.load_cert_chain(files.certificate, files.key, password="")
+    except (OSError, ssl.SSLError) as error:
+        raise TransportError(
+            f"credentials {files.certificate.parent} cannot be used: {error}"
+        ) from error
+    return context
+
+
+def _of(incarnation: str) -> str:
+    return f"{_ANY_INCARNATION}/{incarnation}"
+
+
+class TlsStream:
+    """One end of TLS on one stream.
+
+    Parameters
+    ----------
+    context : SSLContext
+    host : str or None
+        For a robot: the name or address that the certificate must be for; None if the service has
+        dialled, which has no address that a robot would know.
+    known : str or None
+        For a robot: the incarnation of the service that it knew last.
+
+    Attributes
+    ----------
+    established : bool
+        Whether the handshake is complete at this end. At the robot's it is before the service has
+        looked at the robot's certificate.
+    ended : bool
+        Whether the other end has said that nothing more will come.
+    """
+
+    def __init__(
+        self, context: ssl.SSLContext, host: str | None = None, known: str | None = None
+    ) -> None:
+        self._is_server = context.protocol == ssl.PROTOCOL_TLS_SERVER
+        if not self._is_server:
+            context.check_hostname = host is not None
+            names = [_ANY_INCARNATION]
+            context.set_alpn_protocols([_of(known), *names] if known is not None else names)
+        self._known = known
+        self._incoming = ssl.MemoryBIO()
+        self._outgoing = ssl.MemoryBIO()
+        self._tls = context.wrap_bio(
+            self._incoming, self._outgoing, server_side=self._is_server, server_hostname=host
+        )
+        self._has_first_byte = False
+        self.established = False
+        self.ended = False
+
+    @property
+    def is_known_incarnation(self) -> bool:
+        """For a robot: whether the service is the process that it knew, once established."""
+        return self._known is not None and self._tls.selected_alpn_protocol() == _of(self._known)
+
+    def begin(self) -> None:
+        """Begin the handshake, at the robot's end."""
+        self._shake_hands()
+
+    def receive(self, data: bytes) -> bytes:
+        """Take bytes of the stream; return those of messages.
+
+        Raises
+        ------
+        ssl.SSLError
+            If the other end does not speak TLS, or does not prove who it is.
+        """
+        if not self._has_first_byte:
+            self._has_first_byte = True
+            if self._is_server and data[:1] != b"\x16":
+                raise ssl.SSLError("does not speak TLS at an endpoint that does")
+        self._incoming.write(data)
+        if not self.established:
+            self._shake_hands()
+            if not self.established:
+                return b""
+        parts = []
+        try:
+            while self._incoming.pending or self._tls.pending():
+                part = self._tls.read(_READ_BYTES)
+                if not part:
+                    self.ended = True
+                    break
+                parts.append(part)
+        except ssl.SSLWantReadError:
+            pass
+        except ssl.SSLZeroReturnError:
+            self.ended = True
+        return parts[0] if len(parts) == 1 else b"".join(parts)
+
+    def send(self, data: bytes) -> None:
+        """Take bytes of messages; what becomes of them is there to :meth:`take`."""
+        self._tls.write(data)
+
+    def take(self) -> bytes:
+        """Return the bytes that are to be sent, and forget them."""
+        return self._outgoing.read()
+
+    def close(self) -> None:
+        """Say that nothing more will come from this end."""
+        if self.established:
+            try:
+                self._tls.unwrap()
+            except ssl.SSLError:
+                return  # it is not waited for that the other end says so, too
+
+    def peer(self) -> PeerCertificate:
+        """Return the other end's certificate, once established."""
+        shown = self._tls.getpeercert() or {}
+        der = self._tls.getpeercert(binary_form=True) or b""
+        subject: Any = shown.get("subject", ())
+        names = [str(value) for part in subject for key, value in part if key == "commonName"]
+        return PeerCertificate(
+            names[-1] if names else "",
+            int(str(shown.get("serialNumber", "0")), 16),
+            float(ssl.cert_time_to_seconds(str(shown["notAfter"]))) if shown else 0.0,
+            der,
+        )
+
+    def _shake_hands(self) -> None:
+        try:
+            self._tls.do_handshake()
+        except ssl.SSLWantReadError:
+            return
+        self.established = True
