@@ -20,9 +20,9 @@ from holdfast.recording.run_directory import RunDirectory
 from holdfast.runtime.environment import load_environment
 from holdfast.runtime.links import make_links
 from holdfast.runtime.robot_process import RobotProcess
-from holdfast.runtime.transport.contract import RobotTransport
 from holdfast.session.effects import Timing
 from holdfast.session.events import TransportEvent
+from holdfast.transport.contract import RobotTransport
 
 __all__ = ["Notebook", "configuration_for", "robot_in_thread", "run_robot"]
 
@@ -194,8 +194,8 @@ class _NotedTransport:
         self._transport.call(service, call, payload)
         self._notebook.sent(service)
 
-    def close(self, timeout_s: float = 1.0) -> None:
-        self._transport.close(timeout_s)
+    async def close(self, timeout_s: float = 1.0) -> None:
+        await self._transport.close(timeout_s)
 
 
 def run_robot(

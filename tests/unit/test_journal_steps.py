@@ -441,7 +441,9 @@ class TestRun:
                 modes: list[int] = []
 
                 def note(statement: str, modes: list[int] = modes, own: Journal = journal) -> None:
-                    if statement == "COMMIT":
+                    # A single statement is a transaction by itself.
+                    alone = not own._connection.in_transaction and statement.startswith("INSERT")
+                    if statement == "COMMIT" or alone:
                         (mode,) = own._connection.execute("PRAGMA synchronous").fetchone()
                         modes.append(mode)
 

@@ -6,6 +6,8 @@ launched, finds the robot. With none named the planner is in the robot's own pro
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import functools
 from collections.abc import Callable
 from pathlib import Path
@@ -17,8 +19,10 @@ from holdfast.configuration import Configuration
 from holdfast.runtime.logs import EventSink
 from holdfast.runtime.own_planner import OWN_PLANNER, OwnPlanner
 from holdfast.runtime.recovery_launcher import RecoveryExited, RecoveryLauncher
-from holdfast.runtime.transport.contract import RobotTransport
+from holdfast.runtime.transport.contract import RobotTransport as ThreadedRobotTransport
+from holdfast.session.events import TransportEvent
 from holdfast.settings import OffloadSettings
+from holdfast.transport.contract import RobotTransport
 from holdfast.user_code import describe_problem_error
 
 __all__ = ["RECOVERY_SERVICE", "Links", "make_links"]
@@ -151,7 +155,33 @@ def _zenoh_links(configuration: Configuration, log_path: Path | None, events: Ev
     except BaseException:
         close()
         raise
-    return Links(transport, offload.services, recovery, launcher, offload, close)
+    return Links(_OnLoop(transport), offload.services, recovery, launcher, offload, close)
+
+
+class _OnLoop:
+    """A transport that delivers on threads of its own, as one that delivers on the loop."""
+
+    def __init__(self, transport: ThreadedRobotTransport) -> None:
+        self._transport = transport
+        self.call = transport.call
+        self.abandon = transport.abandon
+
+    def start(self, deliver: Callable[[TransportEvent], None]) -> None:
+        loop = asyncio.get_running_loop()
+        self._transport.start(lambda event: _hand_in(loop, deliver, event))
+
+    async def close(self, timeout_s: float = 1.0) -> None:
+        self._transport.close(timeout_s)
+
+
+def _hand_in(
+    loop: asyncio.AbstractEventLoop,
+    deliver: Callable[[TransportEvent], None],
+    event: TransportEvent,
+) -> None:
+    # The loop is closed if it is too late for events.
+    with contextlib.suppress(RuntimeError):
+        loop.call_soon_threadsafe(deliver, event)
 
 
 def _problem_arguments(configuration: Configuration) -> list[str]:

@@ -1,25 +1,28 @@
-"""The robot's process: one queue of events, one machine, and effects carried out in order.
+"""The robot's process: one event loop, one machine, and effects carried out in order.
 
-Everything that happens, on the wire, in the environment, to the local service, on the keyboard,
-comes as an event through one queue to one thread. That thread tells the machine
-(:class:`holdfast.session.robot.Robot`) and carries out what it asks for. It waits for nothing but
-the queue, so a robot that moves slowly still hears at once that a service has died.
+Everything that happens, on the wire, in the environment, to the local service, on the keyboard, is
+handled on one asyncio event loop: it is told to the machine
+(:class:`holdfast.session.robot.Robot`), and what the machine asks for is carried out. What is heard
+from inside an effect (a simulated world answers at once) waits until the effects before it are
+carried out. The loop waits for nothing but events, so a robot that moves slowly still hears at once
+that a service has died.
 """
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import functools
-import math
 import os
 import signal
+import socket
 import sys
 import threading
+from collections import deque
 from collections.abc import Callable, Collection, Iterator, Sequence
 from pathlib import Path
-from queue import Empty, SimpleQueue
 from time import monotonic
-from typing import NamedTuple, Protocol, TypeAlias
+from typing import Any, NamedTuple, Protocol, TypeAlias
 
 from holdfast import contract
 from holdfast.configuration import Configuration
@@ -33,7 +36,6 @@ from holdfast.runtime.environment import EnvironmentMaker
 from holdfast.runtime.logs import EventSink
 from holdfast.runtime.performer import Performer, make_performer
 from holdfast.runtime.recovery_launcher import RecoveryExited
-from holdfast.runtime.transport.contract import RobotTransport
 from holdfast.session.dispatcher import Dispatcher
 from holdfast.session.effects import (
     Abandon,
@@ -63,18 +65,19 @@ from holdfast.session.records import Record
 from holdfast.session.robot import HeldError, History, Robot, replay
 from holdfast.settings import OffloadSettings
 from holdfast.source_digest import core_version, problem_digest
+from holdfast.transport.contract import RobotTransport
 from holdfast.user_code import account_of_user_error, describe_problem_error
 
 __all__ = ["Launcher", "RobotProcess", "StepJournal", "opening_of"]
-
-_LONGEST_SLEEP_S = 1.0
-"""A signal that comes just before the loop sleeps does not wake it; this late it is heard."""
 
 _LAST_VERIFICATION_S = 10.0
 """When all trials are finished, what is still being computed again is waited for this long."""
 
 _DEAF_S = 0.005
 """When the loop did not listen for longer than this, no service is blamed for that time."""
+
+_TURN_S = 0.001
+"""After handling events for so long, the loop looks at the wire before it handles the next one."""
 
 _SWITCH_INTERVAL_S = 0.0005
 """How long a thread may hold the interpreter while the one that has the answer waits for it."""
@@ -210,15 +213,22 @@ class RobotProcess:
         self._on_result = on_result
         self._on_timing = on_timing
         self._on_verified = on_verified
-        self._queue: SimpleQueue[tuple[float, _Happening]] = SimpleQueue()
+        self._loop: asyncio.AbstractEventLoop | None = None
+        # What has happened and is not handled yet, with the time at which it happened.
+        self._happened: deque[tuple[float, _Happening]] = deque()
+        self._handling = False
         self._now = monotonic()
+        self._wake_at: float | None = None
+        self._listens_since = self._now
+        self._timer: asyncio.TimerHandle | None = None
+        self._error: BaseException | None = None
         self._launcher: Launcher | None = None
         self._performer: Performer | None = None
         self._replayed: int | None = None
         self._starting: tuple[int, History, bool] | None = None
         self._finished: set[int] = set()
         self._numbers = iter(range(configuration.simulator.num_trials))
-        self._verify_until = math.inf
+        self._verifying = False
         self._ended = False
         self._interrupted: int | None = None
         problem = configuration.problem
@@ -252,12 +262,15 @@ class RobotProcess:
         """Ticks of the rate that passed while the robot was not ready."""
         return self._robot.missed_ticks
 
-    def deliver(self, event: TransportEvent | EnvironmentEvent | Decided | RecoveryExited) -> None:
-        """Take an event from any thread."""
-        self._queue.put((monotonic(), event))
+    def deliver(self, event: EnvironmentEvent | Decided | RecoveryExited) -> None:
+        """Take an event from any thread; once the run has ended it is dropped."""
+        # The loop is closed if it is too late for events.
+        if self._loop is not None:
+            with contextlib.suppress(RuntimeError):
+                self._loop.call_soon_threadsafe(self._happens, event, monotonic())
 
     def run(self, finished: Collection[int], launcher: Launcher | None = None) -> None:
-        """Run all trials that are not finished.
+        """Run all trials that are not finished, on an event loop of its own.
 
         Parameters
         ----------
@@ -275,15 +288,15 @@ class RobotProcess:
         """
         self._finished = set(finished)
         self._launcher = launcher
+        self._loop = loop = asyncio.new_event_loop()
+        loop.set_exception_handler(self._loop_failed)
         before = sys.getswitchinterval()
         sys.setswitchinterval(_SWITCH_INTERVAL_S)
         try:
-            with self._signals_as_events():
-                self._transport.start(self.deliver)
-                self._now = monotonic()
-                self._carry_out(self._robot.start(self._now))
-                self._begin_next()
-                self._loop()
+            with self._signals_as_events(loop):
+                loop.call_soon(self._start)
+                loop.run_forever()
+                self._raise_error()
         except HoldfastError:
             self._salvage()
             raise
@@ -299,12 +312,14 @@ class RobotProcess:
             raise TrialError(text) from error
         finally:
             sys.setswitchinterval(before)
+            self._ended = True
             if self._performer is not None:
                 self._performer.close()
-            self._transport.close()
+            loop.run_until_complete(self._transport.close())
             self._own.close()
             if launcher is not None:
                 launcher.close()
+            loop.close()
         if self._interrupted is not None:
             signal.raise_signal(self._interrupted)
 
@@ -322,30 +337,94 @@ class RobotProcess:
             return f"trial {self._starting[0]} (seed {seed})"
         return f"trial {self._robot.trial} (seed {seed}), step {self._robot.step}"
 
-    def _loop(self) -> None:
-        robot = self._robot
-        while not self._ended and monotonic() < self._verify_until:
-            wake_at = robot.next_wakeup()
-            try:
-                timeout_s = _LONGEST_SLEEP_S
-                if wake_at is not None:
-                    timeout_s = min(max(0.0, wake_at - monotonic()), timeout_s)
-                came_at, event = self._queue.get(timeout=timeout_s)
-            except Empty:
-                began = monotonic()
-                if wake_at is not None and began - wake_at > _DEAF_S:
-                    # This process was stopped, or another one had its core.
-                    robot.was_deaf(began - wake_at)
-                self._now = began
-                self._carry_out(robot.wake(began))
-            else:
-                began = monotonic()
+    # -- on the loop -----------------------------------------------------------------------------
+
+    def _start(self) -> None:
+        with self._errors():
+            self._transport.start(self._happens)
+            self._now = monotonic()
+            self._carry_out(self._robot.start(self._now))
+            self._begin_next()
+        self._go_on()
+
+    def _happens(self, event: _Happening, at: float | None = None) -> None:
+        """Handle an event; if another one is being handled, after that."""
+        self._happened.append((monotonic() if at is None else at, event))
+        if not self._handling:
+            self._go_on()
+
+    def _wake(self) -> None:
+        self._timer = None
+        self._go_on(wake=self._wake_at is not None and monotonic() >= self._wake_at)
+
+    def _go_on(self, *, wake: bool = False) -> None:
+        """Handle what has happened, and have the loop wake up when the machine asks for it."""
+        began = now = monotonic()
+        if self._wake_at is not None:
+            # This process was stopped, or another one had its core: nobody is blamed for that.
+            self._was_deaf(now - max(self._wake_at, self._listens_since))
+        with self._errors():
+            if wake and not self._ended:
+                self._now = max(self._now, now)
+                self._carry_out(self._robot.wake(self._now))
+            while self._happened and not self._ended:
+                if now - began > _TURN_S:
+                    self._on_loop().call_soon(self._go_on)
+                    break
+                at, event = self._happened.popleft()
                 # When it happened, not when it is heard of: that may be long after.
-                self._now = max(self._now, came_at)
+                self._now = max(self._now, at)
                 self._handle(event, self._now)
-            spent_s = monotonic() - began
-            if spent_s > _DEAF_S:
-                robot.was_deaf(spent_s)
+                before, now = now, monotonic()
+                self._was_deaf(now - before)
+        if self._ended:
+            self._on_loop().stop()
+            return
+        self._listens_since = now
+        self._wake_at = wake_at = self._robot.next_wakeup()
+        # One that wakes the loop too early does no harm.
+        if wake_at is not None and (self._timer is None or wake_at < self._timer.when()):
+            if self._timer is not None:
+                self._timer.cancel()
+            self._timer = self._on_loop().call_at(wake_at, self._wake)
+
+    def _was_deaf(self, seconds: float) -> None:
+        if seconds > _DEAF_S:
+            self._robot.was_deaf(seconds)
+
+    @contextlib.contextmanager
+    def _errors(self) -> Iterator[None]:
+        """Let an error end the run; it is raised by :meth:`run`."""
+        self._handling = True
+        try:
+            yield
+        except KeyboardInterrupt:
+            raise
+        except BaseException as error:  # noqa: BLE001 - the problem is anybody's code
+            self._fail(error)
+        finally:
+            self._handling = False
+
+    def _fail(self, error: BaseException) -> None:
+        self._error = self._error or error
+        self._end()
+
+    def _raise_error(self) -> None:
+        if self._error is not None:
+            raise self._error
+
+    def _end(self) -> None:
+        self._ended = True
+        self._on_loop().stop()
+
+    def _loop_failed(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+        """Take an error of what else runs on the loop: nobody would wait for what it owes."""
+        del loop
+        self._fail(context.get("exception") or RuntimeError(context["message"]))
+
+    def _on_loop(self) -> asyncio.AbstractEventLoop:
+        assert self._loop is not None
+        return self._loop
 
     def _handle(self, event: _Happening, now: float) -> None:
         robot = self._robot
@@ -364,7 +443,7 @@ class RobotProcess:
             )
         elif not isinstance(event, Begun):
             self._carry_out(robot.handle(event, now))
-            if self._verify_until < math.inf and isinstance(event, Decided):
+            if self._verifying and isinstance(event, Decided):
                 self._ended = not robot.num_unverified
 
     def _carry_out(self, effects: list[Effect]) -> None:
@@ -402,7 +481,7 @@ class RobotProcess:
 
     def _launch(self, effect: Launch) -> None:
         if self._launcher is None:
-            self.deliver(RecoveryExited(effect.number, "there is none to be launched"))
+            self._happens(RecoveryExited(effect.number, "there is none to be launched"))
         else:
             self._launcher.launch(effect.number)
 
@@ -442,8 +521,9 @@ class RobotProcess:
                     self._events.event(
                         "verifying", reason=f"{left} answers are still being computed again"
                     )
-                self._verify_until = monotonic() + _LAST_VERIFICATION_S
+                self._verifying = True
                 self._ended = not left
+                self._on_loop().call_later(_LAST_VERIFICATION_S, self._end)
                 return
             trial, records, tail_is_certain = following, (), True
         self._replayed = trial
@@ -454,15 +534,20 @@ class RobotProcess:
         self._performer = make_performer(
             self._maker,
             trial,
-            self.deliver,
+            # A simulated world answers on this thread, and at once.
+            self._happens if self._maker.simulated else self.deliver,
             resumed=history.begun,
             performed=history.actions,
         )
         self._performer.begin(history.state.step)
 
     @contextlib.contextmanager
-    def _signals_as_events(self) -> Iterator[None]:
-        """Let the first signal that ends a process end it in order; the second one ends it."""
+    def _signals_as_events(self, loop: asyncio.AbstractEventLoop) -> Iterator[None]:
+        """Let the first signal that ends a process end it in order; the second one ends it.
+
+        Not by ``loop.add_signal_handler``: that hears of no signal, nor of the second one, while
+        the code of a problem runs, which may never return.
+        """
         if threading.current_thread() is not threading.main_thread():
             yield
             return
@@ -472,16 +557,27 @@ class RobotProcess:
             if (before := signal.getsignal(number)) is not signal.SIG_IGN
         }
 
-        def note(number: int, frame: object) -> None:
-            del frame
-            for handled, before in saved.items():
-                signal.signal(handled, before)
-            self._queue.put((monotonic(), _Interrupted(number)))
-
-        try:
-            for number in saved:
-                signal.signal(number, note)
-            yield
-        finally:
+        def restore() -> None:
             for number, before in saved.items():
                 signal.signal(number, before)
+
+        def note(number: int, frame: object) -> None:
+            del frame
+            restore()
+            loop.call_soon_threadsafe(self._happens, _Interrupted(number))
+
+        # A signal that comes just before the loop sleeps wakes it by a byte in this pair.
+        reader, writer = socket.socketpair()
+        with reader, writer:
+            for end in (reader, writer):
+                end.setblocking(False)
+            loop.add_reader(reader, reader.recv, 4096)
+            awakened_before = signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)
+            try:
+                for number in saved:
+                    signal.signal(number, note)
+                yield
+            finally:
+                restore()
+                signal.set_wakeup_fd(awakened_before)
+                loop.remove_reader(reader)
