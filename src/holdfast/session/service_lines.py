@@ -19,6 +19,7 @@ take. A service that would be too slow says so at once, so that the robot can as
 from __future__ import annotations
 
 from collections import OrderedDict
+from collections.abc import Iterator
 
 from holdfast.session.messages import Request
 from holdfast.session.service_jobs import Job
@@ -38,6 +39,9 @@ class _Line:
 
     def __contains__(self, work: Work) -> bool:
         return work in self._of.get(work.session.owner, ())
+
+    def __iter__(self) -> Iterator[Work]:
+        return (work for works in self._of.values() for work in works)
 
     def append(self, work: Work) -> None:
         """Let a work wait behind those of its owner; an owner who had none comes last."""

@@ -21,7 +21,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import lru_cache
 from typing import NamedTuple, TypeAlias
 
@@ -535,6 +535,9 @@ class _Epochs:
         self._count = 0
         # Owners in the order in which they were noted last.
         self._of: OrderedDict[Owner, OrderedDict[bytes, int]] = OrderedDict()
+
+    def __iter__(self) -> Iterator[SessionKey]:
+        return ((owner, session) for owner, epochs in self._of.items() for session in epochs)
 
     def get(self, key: SessionKey) -> int:
         """Return the epoch of a session; 0 if none is known."""
