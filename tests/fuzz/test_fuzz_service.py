@@ -31,7 +31,10 @@ from holdfast.session.service_sessions import Session, Work
 
 HONEST = (1, 2)
 KEYS = st.integers(100, 115)
-"""Sessions of the hostile ones: an honest robot's is 16 random bytes that nobody else knows."""
+"""Sessions of the hostile ones: an honest robot's is 16 random bytes that nobody else knows.
+
+Where they have a certificate of another name, they know these bytes, too.
+"""
 
 WORDS = st.sampled_from((0, 1, 2, 3, 64, 2**31, 2**32 - 1))
 
@@ -55,9 +58,15 @@ class HostileRobots(RuleBasedStateMachine):
         max_opening_bytes=st.sampled_from((1000, 1 << 20)),
         answers_per_session=st.integers(1, 8),
         max_calls_per_request=st.integers(1, 3),
+        max_sessions_per_robot=st.sampled_from((None, 1, 2)),
+        max_waiting_per_robot=st.sampled_from((1, 2, 50)),
+        certificates=st.sampled_from(((None, None), ("honest", "hostile"), ("honest", None))),
     )
-    def begin(self, workers: int, **limits: Any) -> None:
+    def begin(
+        self, workers: int, certificates: tuple[str | None, str | None], **limits: Any
+    ) -> None:
         self.limits = limits
+        self.honest_owner, self.hostile_owner = certificates
         self.bench = Bench(
             workers=workers, max_particles=200, max_work=100_000, max_steps=200, **limits
         )
@@ -67,7 +76,8 @@ class HostileRobots(RuleBasedStateMachine):
     @rule(index=st.integers(0, 1), whole=st.booleans())
     def an_honest_robot_asks(self, index: int, whole: bool) -> None:
         robot = self.robots[index]
-        call = self.bench.send(robot.restore() if whole else robot.request())
+        request = robot.restore() if whole else robot.request()
+        call = self.bench.send(request, self.honest_owner)
         self.asked[call] = (index, robot.right_answer())
 
     @rule(times=st.integers(1, 4), which=st.integers(0, 2))
@@ -86,7 +96,13 @@ class HostileRobots(RuleBasedStateMachine):
 
     def hostile(self, payload: bytes) -> None:
         self.sent.append(payload)
-        self.bench.send(payload)
+        self.bench.send(payload, self.hostile_owner)
+
+    def session_of(self, key: int) -> bytes:
+        """Return a hostile one's session, or an honest one's where that is another for them."""
+        if self.honest_owner != self.hostile_owner and key % 4 == 0:
+            return self.robots[key // 4 % 2].session
+        return key.to_bytes(16, "big")
 
     @rule(payload=strategies.spoilt(SPECIMENS["request"]), seals=st.booleans())
     def spoilt_bytes(self, payload: bytes, seals: bool) -> None:
@@ -99,7 +115,7 @@ class HostileRobots(RuleBasedStateMachine):
     @rule(key=KEYS, seed=st.integers(0, 2**32), changes=st.integers(1, 4))
     def a_request_that_is_nearly_right(self, key: int, seed: int, changes: int) -> None:
         chance = random.Random(seed)
-        request = chance.choice(corpus.requests(key.to_bytes(16, "big"), chance.choice((1, 2, 3))))
+        request = chance.choice(corpus.requests(self.session_of(key), chance.choice((1, 2, 3))))
         words = (0, 1, 2, 7, 64, 2**31, MAX_WORD)
         for _ in range(changes):
             match chance.choice(("number", "trial", "step", "sensed", "digest", "observed", "own")):
@@ -125,20 +141,20 @@ class HostileRobots(RuleBasedStateMachine):
 
     @rule(key=KEYS, epoch=WORDS, index=st.integers(0, 1000))
     def a_valid_request_of_any_epoch(self, key: int, epoch: int, index: int) -> None:
-        requests = corpus.requests(key.to_bytes(16, "big"), epoch)
+        requests = corpus.requests(self.session_of(key), epoch)
         self.hostile(encode(requests[index % len(requests)]))
 
     @precondition(lambda self: self.sent)
     @rule(index=st.integers(0, 10**6), times=st.integers(1, 6))
     def a_replay(self, index: int, times: int) -> None:
         for _ in range(times):
-            self.bench.send(self.sent[index % len(self.sent)])
+            self.bench.send(self.sent[index % len(self.sent)], self.hostile_owner)
 
     @rule(start=st.integers(0, 10**6), count=st.integers(1, 30))
     def a_flood_of_new_sessions(self, start: int, count: int) -> None:
         for key in range(start, start + count):
             request = corpus.requests((key + 10**6).to_bytes(16, "big"))[1]
-            self.bench.send(encode(request))
+            self.bench.send(encode(request), self.hostile_owner)
 
     # -- what must hold --------------------------------------------------------------------------
 
@@ -173,7 +189,8 @@ class HostileRobots(RuleBasedStateMachine):
         assert self.bench.ended == set(self.bench.replies)
         check_limits(self.bench, self.limits)
         for robot in self.robots:
-            assert content(self.bench.ask(robot.restore())) == robot.right_answer()
+            answer = self.bench.ask(robot.restore(), self.honest_owner)
+            assert content(answer) == robot.right_answer()
 
 
 def works_of(session: Session) -> list[Work]:
@@ -186,8 +203,23 @@ def check_limits(bench: Bench, limits: dict[str, Any]) -> None:
     sessions, lines, calls = service._sessions, service._lines, service._calls
     kept = list(sessions._sessions.values())
     assert statistics.sessions == len(kept) <= limits["max_sessions"]
-    assert len(sessions._epochs) <= max(4 * limits["max_sessions"], 4096)
-    assert not set(sessions._epochs) & set(sessions._sessions)
+    epochs = list(sessions._epochs)
+    assert len(epochs) == sessions._epochs._count <= max(4 * limits["max_sessions"], 4096)
+    assert not set(epochs) & set(sessions._sessions)
+    # Owners.
+    owners = {session.owner for session in kept}
+    assert set(sessions._holdings) == owners
+    for owner in owners:
+        theirs = [session for session in kept if session.owner == owner]
+        holding = sessions._holdings[owner]
+        assert holding.sessions == len(theirs)
+        assert holding.newcomers == sum(not session.served for session in theirs)
+        assert holding.state_bytes == sum(session.num_bytes for session in theirs)
+        assert holding.opening_bytes == sum(len(session.opening) for session in theirs)
+        if owner is not None and limits["max_sessions_per_robot"] is not None:
+            assert len(theirs) <= limits["max_sessions_per_robot"]
+            known = [session for session in theirs if not session.newcomer and not session.served]
+            assert len(known) <= 1
     # States.
     assert sum(session.num_bytes for session in kept) == sessions.state_bytes
     assert sum(session.size() for session in kept) <= sessions.state_bytes
@@ -204,14 +236,23 @@ def check_limits(bench: Bench, limits: dict[str, Any]) -> None:
     lined_up = [*lines._urgent, *lines._newcomers, *lines._later]
     held = [work for session in kept for work in session.held if work is not None]
     assert {id(work) for work in waiting} == {id(work) for work in (*lined_up, *held)}
-    assert lines._waiting_bytes == sum(work.size for work in waiting)
-    assert abs(lines._backlog_s - sum(work.cost_s for work in waiting)) < 1e-6
-    new = [work for work in waiting if work.newcomer]
-    assert lines._num_newcomers == len(new)
-    assert abs(lines._backlog_of_newcomers_s - sum(work.cost_s for work in new)) < 1e-6
+    assert set(lines._waiting_of) == {work.session.owner for work in waiting}
+    for owner in (*lines._waiting_of, "all"):
+        loads = lines._waiting if owner == "all" else lines._waiting_of[owner]
+        for newcomer in (False, True):
+            some = [
+                work
+                for work in waiting
+                if work.newcomer == newcomer and owner in ("all", work.session.owner)
+            ]
+            load = loads.of(newcomer=newcomer)
+            assert load.num == len(some)
+            assert load.num_bytes == sum(work.size for work in some)
+            assert abs(load.cost_s - sum(work.cost_s for work in some)) < 1e-6
     requested = [work for work in waiting if work.request is not None]
-    # Whoever was served before finds room, if newcomers have taken that of all.
-    assert len(requested) <= max(limits["max_waiting"], 2 * bench.workers)
+    # Whoever was served before finds room, if newcomers have taken that of all, and so does one
+    # owner, if another has.
+    assert len(requested) <= max(limits["max_waiting"], 2 * bench.workers) + 2 * bench.workers
     newcomers = sum(work.newcomer for work in requested)
     assert newcomers <= max((limits["max_waiting"] + 1) // 2, bench.workers)
     for session in kept:

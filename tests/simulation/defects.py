@@ -542,6 +542,11 @@ _defect(
     ),
 )
 _defect(
+    "session_of_anybody",
+    "A session is known by its bytes alone, whoever asks.",
+    Edit(Service, "receive_request", "(owner, request.session)", "(None, request.session)"),
+)
+_defect(
     "any_answer_ends_recovery",
     "The answer of the local service, too, is taken for the cloud's return.",
     Edit(

@@ -47,6 +47,11 @@ FOUND_AT_ONCE = [
         "run forgets_after_s=0.03 services_clock_offset_s=205448.849812",
         "no time passes",
     ),
+    (
+        "session_of_anybody",
+        "run certificates=true launch=never\ncrowd service=cloud-1 at=0.1 robots=3",
+        "has taken this session over",
+    ),
     # Every decision is right, so the checker of the failback alone sees it.
     (
         "given_up_cloud_never_tried",

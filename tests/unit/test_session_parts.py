@@ -128,7 +128,9 @@ class TestLines:
     def session(self, key: int) -> Session:
         robot = Robot(key=key)
         request = robot.request()
-        return Session(request, robot.opening, 1, ExpectedTimes(4.0, 0.001, 0.001))
+        return Session(
+            (None, request.session), request, robot.opening, 1, ExpectedTimes(4.0, 0.001, 0.001)
+        )
 
     def work(self, session: Session, name: bytes, since: float, *, prefetched: bool) -> Work:
         request: Request | None = None if prefetched else Robot().request()

@@ -127,11 +127,11 @@ class Bench:
                 self.notes.append(effect)
         assert len(self.jobs) <= self.workers
 
-    def send(self, message: Request | bytes) -> int:
+    def send(self, message: Request | bytes, owner: str | None = None) -> int:
         call = len(self.replies)
         self.replies[call] = []
         payload = message if isinstance(message, bytes) else encode(message)
-        self.apply(self.service.receive(call, payload, self.now))
+        self.apply(self.service.receive(call, payload, self.now, owner))
         return call
 
     def run(self, index: int = 0) -> None:
@@ -145,8 +145,8 @@ class Bench:
         while self.jobs:
             self.run()
 
-    def ask(self, message: Request | bytes) -> list[Reply]:
-        call = self.send(message)
+    def ask(self, message: Request | bytes, owner: str | None = None) -> list[Reply]:
+        call = self.send(message, owner)
         self.run_all()
         assert call in self.ended
         return self.replies[call]
@@ -1186,7 +1186,7 @@ class TestCapacity:
         robot = Robot()
         robot.sense()
         bench.send(robot.request())
-        waiting = bench.service._sessions.get(robot.session)
+        waiting = bench.service._sessions.get((None, robot.session))
         assert waiting is not None
         assert [work.request and work.request.opening for work in waiting.works.values()] == [None]
         bench.run_all()

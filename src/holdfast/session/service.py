@@ -48,8 +48,10 @@ from holdfast.session.service_lines import Lines
 from holdfast.session.service_sessions import (
     REQUESTED,
     ExpectedTimes,
+    Owner,
     Part,
     Session,
+    SessionKey,
     Sessions,
     Work,
 )
@@ -144,7 +146,7 @@ class Service:
 
     # -- what happens ----------------------------------------------------------------------------
 
-    def receive(self, call: int, payload: bytes, now: float) -> list[Effect]:
+    def receive(self, call: int, payload: bytes, now: float, owner: Owner = None) -> list[Effect]:
         """Take a request.
 
         Parameters
@@ -154,16 +156,24 @@ class Service:
         payload : bytes
         now : float
             Seconds of any clock that does not go back.
+        owner : str or None, optional
+            Name in the certificate with which the robot has proved who it is; None if it has not.
+            It reaches the sessions of this name alone.
         """
         request: Request | MessageError
         try:
             request = decode_request(payload)
         except MessageError as error:
             request = error.retold()
-        return self.receive_request(call, request, len(payload), now)
+        return self.receive_request(call, request, len(payload), now, owner)
 
     def receive_request(
-        self, call: int, request: Request | MessageError, size: int, now: float
+        self,
+        call: int,
+        request: Request | MessageError,
+        size: int,
+        now: float,
+        owner: Owner = None,
     ) -> list[Effect]:
         """Take a request that was decoded already: whoever locks the machine decodes before.
 
@@ -177,11 +187,13 @@ class Service:
             Bytes of the message.
         now : float
             Seconds of any clock that does not go back.
+        owner : str or None, optional
+            As for :meth:`receive`.
         """
         if isinstance(request, MessageError):
             self._calls.refuse(call, 0, request.code, str(request))
             return self._take()
-        self._received(call, request, size, now)
+        self._received(call, request, (owner, request.session), size, now)
         self._dispatch(now)
         return self._take()
 
@@ -232,9 +244,11 @@ class Service:
 
     # -- requests --------------------------------------------------------------------------------
 
-    def _received(self, call: int, request: Request, size: int, now: float) -> None:
-        session = self._sessions.get(request.session)
-        epoch = self._sessions.epoch_of(request.session)
+    def _received(
+        self, call: int, request: Request, key: SessionKey, size: int, now: float
+    ) -> None:
+        session = self._sessions.get(key)
+        epoch = self._sessions.epoch_of(key)
         if request.epoch < epoch:
             text = f"epoch {request.epoch}: a robot of epoch {epoch} has taken this session over"
             self._calls.refuse(call, request.number, "stale_epoch", text)
@@ -254,7 +268,7 @@ class Service:
             if opening is None:
                 self._calls.need_state(call, request.number, differs=False)
                 return
-            session = self._opened(call, request, opening, now)
+            session = self._opened(call, request, key, opening, now)
             if session is None:
                 return
         else:
@@ -276,7 +290,9 @@ class Service:
         elif work is _Fate.ANSWERED:
             self._supersede(session, None)
 
-    def _opened(self, call: int, request: Request, opening: Opening, now: float) -> Session | None:
+    def _opened(
+        self, call: int, request: Request, key: SessionKey, opening: Opening, now: float
+    ) -> Session | None:
         """Return a new session, or turn the robot away."""
         limits = self._limits
         count = opening.planning.particle_filter.num_particles
@@ -287,19 +303,22 @@ class Service:
             )
             self._calls.refuse(call, request.number, "invalid", text)
             return None
-        if self._lines.is_overloaded(now, newcomer=True):
-            self._sessions.note_epoch(request.session, request.epoch)
-            self._turn_away(call, request.number, request.session, now)
+        newcomer = self._sessions.is_newcomer(key[0])
+        if self._lines.is_overloaded(now, key[0], newcomer=newcomer):
+            self._sessions.note_epoch(key, request.epoch)
+            self._turn_away(call, request.number, key, now, newcomer=newcomer)
             return None
         times = ExpectedTimes(_INERTIA_OF_ONE, self._times.task_s, self._times.sensing_s)
-        session = Session(request, opening, limits.max_threads, times)
+        session = Session(key, request, opening, limits.max_threads, times)
         session.used_at = now
         while not self._sessions.has_room_for(session):
-            unused = self._sessions.unused(for_newcomer=True)
+            unused = self._sessions.unused_for(session)
             if unused is None:
                 # It is free once another robot has left, not once the next decision is computed.
-                self._sessions.note_epoch(request.session, request.epoch)
-                self._turn_away(call, request.number, request.session, now, _NO_ROOM_RETRY_MS)
+                self._sessions.note_epoch(key, request.epoch)
+                self._turn_away(
+                    call, request.number, key, now, _NO_ROOM_RETRY_MS, newcomer=newcomer
+                )
                 return None
             self._forget(unused, "room needed")
         self._sessions.add(session)
@@ -377,9 +396,9 @@ class Service:
             ),
             None,
         )
-        newcomer = not session.served
-        if waiting is None and self._lines.is_overloaded(now, newcomer=newcomer):
-            self._turn_away(call, request.number, request.session, now, newcomer=newcomer)
+        newcomer = session.newcomer
+        if waiting is None and self._lines.is_overloaded(now, session.owner, newcomer=newcomer):
+            self._turn_away(call, request.number, session.key, now, newcomer=newcomer)
             return _Fate.TURNED_AWAY
         if waiting is not None:
             # It keeps the turn of the request that it replaces, and adds nothing to the backlog.
@@ -533,15 +552,16 @@ class Service:
         self,
         call: int,
         number: int,
-        key: bytes,
+        key: SessionKey,
         now: float,
         least_ms: float = 1.0,
         *,
-        newcomer: bool = True,
+        newcomer: bool,
     ) -> None:
         lines = self._lines
-        wait_ms = max(least_ms, 1e3 * lines.wait_s(now, newcomer=newcomer))
-        self._calls.turn_away(call, number, key, wait_ms, lines.num_waiting)
+        owner, session = key
+        wait_ms = max(least_ms, 1e3 * lines.wait_s(now, owner, newcomer=newcomer))
+        self._calls.turn_away(call, number, session, wait_ms, lines.num_waiting)
 
     # -- sessions --------------------------------------------------------------------------------
 
@@ -550,7 +570,7 @@ class Service:
         sessions = self._sessions
         sessions.weigh(session)
         while sessions.too_heavy:
-            unused = sessions.unused()
+            unused = sessions.unused_of_heaviest()
             if unused is None or unused is session:
                 break
             self._forget(unused, "room needed")
@@ -565,7 +585,9 @@ class Service:
         self._note("evicted", session, reason=reason)
 
     def _note(self, event: str, session: Session, **fields: object) -> None:
-        self._effects.append(Noted(event, {"session": session.key[:4].hex(), **fields}))
+        owner, key = session.key
+        named = {} if owner is None else {"robot": owner}
+        self._effects.append(Noted(event, {**named, "session": key[:4].hex(), **fields}))
 
 
 def _described(error: BaseException) -> str:

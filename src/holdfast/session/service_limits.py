@@ -20,7 +20,11 @@ class ServiceLimits(msgspec.Struct, frozen=True, kw_only=True):
     ----------
     max_sessions : int
         Robots remembered; the one unused the longest is forgotten first, but for newcomers one
-        that was never served if these are half of them.
+        that was never served if these are half of them. Of robots with certificates it is one of
+        those that have the most sessions.
+    max_sessions_per_robot : int or None
+        Sessions with one robot's certificate; one more takes the place of the one unused the
+        longest. None: as many as there is room for.
     max_state_bytes : int
         Of all states remembered.
     max_opening_bytes : int
@@ -31,8 +35,10 @@ class ServiceLimits(msgspec.Struct, frozen=True, kw_only=True):
         Requests that wait for a worker; robots that were never served have half of it at most.
         (Or of these, and of those that were served, as many each as there are workers, if that is
         more: a service is never too small for one robot.)
+    max_waiting_per_robot : int
+        Of these, with one certificate.
     max_waiting_bytes : int
-        Of these requests, likewise.
+        Of these requests, likewise; with one certificate half of it at most.
     max_wait_ms : float
         A request that would wait longer than this, by estimate, is turned away; not as
         long as fewer wait than there are workers.
@@ -57,10 +63,12 @@ class ServiceLimits(msgspec.Struct, frozen=True, kw_only=True):
     """
 
     max_sessions: int = 1000
+    max_sessions_per_robot: int | None = None
     max_state_bytes: int = 256 << 20
     max_opening_bytes: int = 64 << 20
     max_idle_s: float = 600.0
     max_waiting: int = 1000
+    max_waiting_per_robot: int = 500
     max_waiting_bytes: int = 64 << 20
     max_wait_ms: float = 100.0
     max_calls_per_request: int = 8

@@ -8,6 +8,10 @@ every second turn at most while anybody else waits. Each session has one work in
 the one after it is held back until that has run. So a line is a row of turns, and a robot that asks
 much waits for itself, not others for it.
 
+In each line the owners of the sessions go by turns, and each owner's works in the order in which
+they came. So however many sessions one certificate opens, they have one robot's turn together. What
+has proved nothing is one owner, too.
+
 How long a request that came now would wait follows from what the works in the lines are expected to
 take. A service that would be too slow says so at once, so that the robot can ask elsewhere.
 """
@@ -15,13 +19,95 @@ take. A service that would be too slow says so at once, so that the robot can as
 from __future__ import annotations
 
 from collections import OrderedDict
+from collections.abc import Iterator
 
 from holdfast.session.messages import Request
 from holdfast.session.service_jobs import Job
 from holdfast.session.service_limits import ServiceLimits
-from holdfast.session.service_sessions import Session, Work
+from holdfast.session.service_sessions import Owner, Session, Work
 
 __all__ = ["Lines"]
+
+
+class _Line:
+    """Works that wait, their owners by turns."""
+
+    def __init__(self) -> None:
+        # Those whose turn comes next first.
+        self._of: OrderedDict[Owner, OrderedDict[Work, None]] = OrderedDict()
+        self._last_turn: dict[Owner, float] = {}
+
+    def __contains__(self, work: Work) -> bool:
+        return work in self._of.get(work.session.owner, ())
+
+    def __iter__(self) -> Iterator[Work]:
+        return (work for works in self._of.values() for work in works)
+
+    def append(self, work: Work) -> None:
+        """Let a work wait behind those of its owner; an owner who had none comes last."""
+        self._of.setdefault(work.session.owner, OrderedDict())[work] = None
+
+    def remove(self, work: Work) -> None:
+        """Take a work out, if it is there."""
+        owner = work.session.owner
+        works = self._of.get(owner)
+        if works is not None and works.pop(work, work) is None and not works:
+            del self._of[owner]
+            self._last_turn.pop(owner, None)
+
+    def end_turn(self, owner: Owner, now: float) -> None:
+        """Let an owner come last, if it has more."""
+        if owner in self._of:
+            self._of.move_to_end(owner)
+            self._last_turn[owner] = now
+
+    def first(self) -> Work | None:
+        """Return the work whose turn is next; None if none waits."""
+        works = next(iter(self._of.values()), None)
+        return None if works is None else next(iter(works))
+
+    def waits_since(self, work: Work) -> float:
+        """Return when a work came, or its owner's turn before, if that was later."""
+        return max(work.since, self._last_turn.get(work.session.owner, work.since))
+
+
+class _Load:
+    """How much works are, all together."""
+
+    __slots__ = ("cost_s", "num", "num_bytes")
+
+    def __init__(self) -> None:
+        self.num = 0
+        self.num_bytes = 0
+        self.cost_s = 0.0
+
+    def count(self, work: Work, sign: int) -> None:
+        """Add a work, or take it off."""
+        self.num += sign
+        self.num_bytes += sign * work.size
+        # Sums of floating-point numbers drift; what is empty is exactly empty.
+        self.cost_s = self.cost_s + sign * work.cost_s if self.num else 0.0
+
+
+class _Loads:
+    """How much waits, of newcomers and of those that were served before."""
+
+    __slots__ = ("known", "newcomers")
+
+    def __init__(self) -> None:
+        self.known = _Load()
+        self.newcomers = _Load()
+
+    @property
+    def num(self) -> int:
+        return self.known.num + self.newcomers.num
+
+    @property
+    def num_bytes(self) -> int:
+        return self.known.num_bytes + self.newcomers.num_bytes
+
+    def of(self, *, newcomer: bool) -> _Load:
+        return self.newcomers if newcomer else self.known
 
 
 class Lines:
@@ -32,30 +118,25 @@ class Lines:
     workers : int
         Jobs that may run at a time.
     limits : ServiceLimits
-
-    Attributes
-    ----------
-    num_waiting : int
-        Works that were not begun.
     """
 
     def __init__(self, workers: int, limits: ServiceLimits) -> None:
         self._workers = workers
         self._limits = limits
-        self._urgent: OrderedDict[Work, None] = OrderedDict()
-        self._newcomers: OrderedDict[Work, None] = OrderedDict()
-        self._later: OrderedDict[Work, None] = OrderedDict()
+        self._urgent, self._newcomers, self._later = _Line(), _Line(), _Line()
         self._patience_s = 1e-3 * limits.prefetch_patience_ms
         self._patience_of_newcomers_s = 1e-3 * limits.max_wait_ms
         # Whether a newcomer had the last turn for which others waited too.
         self._newcomer_went_first = False
         self._running: dict[Job, Work] = {}
-        self._waiting_bytes = 0
-        self._bytes_of_newcomers = 0
-        self._num_newcomers = 0
-        self._backlog_s = 0.0
-        self._backlog_of_newcomers_s = 0.0
-        self.num_waiting = 0
+        self._waiting = _Loads()
+        # Of those alone that have works which wait.
+        self._waiting_of: dict[Owner, _Loads] = {}
+
+    @property
+    def num_waiting(self) -> int:
+        """Works that were not begun."""
+        return self._waiting.num
 
     @property
     def num_running(self) -> int:
@@ -70,7 +151,7 @@ class Lines:
         if work.session.running[work.slot] is not None:
             work.session.held[work.slot] = work
         else:
-            self._line_of(work)[work] = None
+            self._line_of(work).append(work)
 
     def replace(self, work: Work, request: Request, *, sensing: bool, size: int) -> None:
         """Let a waiting work be of a newer request: it keeps its turn."""
@@ -91,29 +172,25 @@ class Lines:
         """Let a prefetched work go with the urgent ones: its robot stands still now."""
         work.urgent = True  # also if it is held back yet
         if work in self._later:
-            del self._later[work]
-            self._urgent[work] = None
+            self._later.remove(work)
+            self._urgent.append(work)
 
-    def _line_of(self, work: Work) -> OrderedDict[Work, None]:
+    def _line_of(self, work: Work) -> _Line:
         if not work.urgent:
             return self._later
         return self._newcomers if work.newcomer else self._urgent
 
     def _leave(self, work: Work) -> None:
         for line in (self._urgent, self._newcomers, self._later):
-            line.pop(work, None)
+            line.remove(work)
 
     def _count(self, work: Work, sign: int) -> None:
-        self.num_waiting += sign
-        self._waiting_bytes += sign * work.size
-        # Sums of floating-point numbers drift; an empty line is exactly empty.
-        self._backlog_s = self._backlog_s + sign * work.cost_s if self.num_waiting else 0.0
-        if work.newcomer:
-            self._num_newcomers += sign
-            self._bytes_of_newcomers += sign * work.size
-            self._backlog_of_newcomers_s += sign * work.cost_s
-        if not self._num_newcomers:
-            self._backlog_of_newcomers_s = 0.0
+        owner = work.session.owner
+        loads = self._waiting_of.setdefault(owner, _Loads())
+        for each in (self._waiting, loads):
+            each.of(newcomer=work.newcomer).count(work, sign)
+        if not loads.num:
+            del self._waiting_of[owner]
 
     # -- running ---------------------------------------------------------------------------------
 
@@ -122,7 +199,7 @@ class Lines:
         if len(self._running) >= self._workers:
             return None
         known = self._next_of_known()
-        newcomer = next(iter(self._newcomers), None)
+        newcomer = self._newcomers.first()
         if known is None or newcomer is None:
             work = known or newcomer
         elif self._goes_first(newcomer, known, now):
@@ -130,27 +207,40 @@ class Lines:
         else:
             work, self._newcomer_went_first = known, False
         if work is not None:
-            self._leave(work)
+            line = self._line_of(work)
+            line.remove(work)
+            line.end_turn(work.session.owner, now)
             self._count(work, -1)
         return work
 
     def _next_of_known(self) -> Work | None:
         """Return the next work of the robots that were served before; None if none waits."""
-        urgent = next(iter(self._urgent), None)
-        later = next(iter(self._later), None)
+        urgent, later = self._urgent.first(), self._later.first()
         if urgent is None or later is None:
             return urgent or later
-        return urgent if urgent.since <= later.since + self._patience_s else later
+        due = self._waits_since(later) + self._patience_s
+        return urgent if self._waits_since(urgent) <= due else later
 
     def _goes_first(self, newcomer: Work, known: Work, now: float) -> bool:
         """Tell whether a newcomer goes before a robot that was served before."""
+        came, known_since = self._waits_since(newcomer), self._waits_since(known)
         if known.urgent:
             return not self._newcomer_went_first and (
-                known.since > newcomer.since + self._patience_of_newcomers_s
+                known_since > came + self._patience_of_newcomers_s
             )
-        if now <= known.since + self._patience_s:
+        if now <= known_since + self._patience_s:
             return True
-        return not self._newcomer_went_first and newcomer.since <= known.since + self._patience_s
+        return not self._newcomer_went_first and came <= known_since + self._patience_s
+
+    def _waits_since(self, work: Work) -> float:
+        """Return since when a work waits for its turn.
+
+        The many works of one owner have been there for long, because they wait for each other. That
+        must not put them before another's that has just come.
+        """
+        if len(self._waiting_of) == 1:
+            return work.since
+        return self._line_of(work).waits_since(work)
 
     def begin(self, work: Work, job: Job, now: float) -> None:
         """Take note that a worker has a work that was taken."""
@@ -175,37 +265,71 @@ class Lines:
         for held in session.held:
             if held is not None and session.running[held.slot] is None:
                 session.held[held.slot] = None
-                self._line_of(held)[held] = None
+                self._line_of(held).append(held)
 
     # -- the wait --------------------------------------------------------------------------------
 
-    def is_overloaded(self, now: float, *, newcomer: bool) -> bool:
+    def is_overloaded(self, now: float, owner: Owner, *, newcomer: bool) -> bool:
         """Tell whether a request that came now is to be turned away."""
-        limits = self._limits
-        ahead = self.num_waiting - (0 if newcomer else self._num_newcomers)
+        limits, waiting = self._limits, self._waiting
+        ahead, ahead_s = self._ahead(now, owner, newcomer=newcomer)
         if ahead < self._workers:
             return False
+        newcomers = waiting.newcomers
         return (
-            self.num_waiting >= limits.max_waiting
-            or self._waiting_bytes >= limits.max_waiting_bytes
+            waiting.num >= limits.max_waiting
+            or waiting.num_bytes >= limits.max_waiting_bytes
             # Half of the room is kept for those that were served before.
-            or (newcomer and 2 * self._num_newcomers >= limits.max_waiting)
-            or (newcomer and 2 * self._bytes_of_newcomers >= limits.max_waiting_bytes)
+            or (newcomer and 2 * newcomers.num >= limits.max_waiting)
+            or (newcomer and 2 * newcomers.num_bytes >= limits.max_waiting_bytes)
+            or self._has_its_share(owner)
             # Nobody who was served before is turned away because of newcomers.
-            or 1e3 * self._ahead_s(now, newcomer=newcomer) > limits.max_wait_ms * self._workers
+            or 1e3 * ahead_s > limits.max_wait_ms * self._workers
         )
 
-    def wait_s(self, now: float, *, newcomer: bool) -> float:
+    def wait_s(self, now: float, owner: Owner, *, newcomer: bool) -> float:
         """Estimate how long a request that came now would wait for its answer to be begun."""
-        ahead_s = self._ahead_s(now, newcomer=newcomer)
+        _, ahead_s = self._ahead(now, owner, newcomer=newcomer)
         if not newcomer:
             # Of the newcomers as many at most are ahead as of the others: they go by turns.
-            ahead_s += min(ahead_s, self._backlog_of_newcomers_s)
+            ahead_s += min(ahead_s, self._goes_before(owner, newcomer=True)[1])
         return ahead_s / self._workers
 
-    def _ahead_s(self, now: float, *, newcomer: bool) -> float:
-        """Add up what the works ahead are expected to take, newcomers for newcomers alone."""
-        ahead_s = self._backlog_s - (0.0 if newcomer else self._backlog_of_newcomers_s)
+    def _has_its_share(self, owner: Owner) -> bool:
+        """Tell whether one certificate has as much of the room as one may have."""
+        own = self._waiting_of.get(owner)
+        if owner is None or own is None:
+            return False
+        limits = self._limits
+        return (
+            own.num >= limits.max_waiting_per_robot or 2 * own.num_bytes >= limits.max_waiting_bytes
+        )
+
+    def _ahead(self, now: float, owner: Owner, *, newcomer: bool) -> tuple[int, float]:
+        """Return how many works are ahead and what they may take, newcomers for newcomers alone."""
+        ahead, ahead_s = self._goes_before(owner, newcomer=False)
+        if newcomer:
+            others, others_s = self._goes_before(owner, newcomer=True)
+            ahead, ahead_s = ahead + others, ahead_s + others_s
         for work in self._running.values():
             ahead_s += max(0.0, work.cost_s - (now - work.started_at))
-        return ahead_s
+        return ahead, ahead_s
+
+    def _goes_before(self, owner: Owner, *, newcomer: bool) -> tuple[int, float]:
+        """Return what goes before one more work of an owner, in one of the lines.
+
+        That is what the owner has there, and of each other's works as many, and one more.
+        """
+        whole = self._waiting.of(newcomer=newcomer)
+        own = self._waiting_of.get(owner)
+        if not whole.num or (own is not None and len(self._waiting_of) == 1):
+            return whole.num, whole.cost_s
+        turns = 1 + (0 if own is None else own.of(newcomer=newcomer).num)
+        num, cost_s = 0, 0.0
+        for loads in self._waiting_of.values():
+            load = loads.of(newcomer=newcomer)
+            if load.num:
+                going = min(load.num, turns)
+                num += going
+                cost_s += load.cost_s * going / load.num
+        return num, cost_s

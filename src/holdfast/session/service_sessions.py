@@ -5,6 +5,12 @@ the next sensing step; of its answers, the last few. Whoever was forgotten is as
 and goes on. One thing outlives the memory: which of a robot's processes was the last, so that one
 that was replaced stays replaced.
 
+A session belongs to its *owner*: the name in the certificate with which the robot has proved who it
+is, None for all those that have proved nothing. All that is remembered stands under the owner and
+the session together, so the same sixteen bytes from another owner are another session: there is
+nothing to refuse, and nothing that a refusal could tell. Where room is needed it is taken from
+whoever holds the most.
+
 A session also lists the robot's *works*: the parts of answers that wait or run, each with the calls
 that wait for it. A part is known by the digest of the state that it is for, so the same question is
 the same work, however often it comes.
@@ -15,8 +21,9 @@ from __future__ import annotations
 import hashlib
 import math
 from collections import OrderedDict
+from collections.abc import Callable, Iterator
 from functools import lru_cache
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import msgspec
 
@@ -30,8 +37,10 @@ __all__ = [
     "PREFETCHED",
     "REQUESTED",
     "ExpectedTimes",
+    "Owner",
     "Part",
     "Session",
+    "SessionKey",
     "Sessions",
     "WaitingCall",
     "Work",
@@ -42,6 +51,12 @@ _LEAST_EPOCHS = 4096
 
 _SETTINGS_KEPT = 128
 """Settings that are shared by all robots that have the same."""
+
+Owner: TypeAlias = str | None
+"""Whose a session is: the name in a robot's certificate, None where nobody has proved anything."""
+
+SessionKey: TypeAlias = tuple[Owner, bytes]
+"""Names a session: whose it is, and the bytes that its requests carry."""
 
 REQUESTED, PREFETCHED = 0, 1
 """The slots of a session: a robot stands still for the first, the second is ahead of it."""
@@ -174,7 +189,7 @@ class Work:
         self.since = since
         self.slot = PREFETCHED if request is None else REQUESTED
         self.urgent = request is not None
-        self.newcomer = not session.served
+        self.newcomer = session.newcomer
         self.calls: dict[int, WaitingCall] = {}
         self.cost_s = session.expected_s(task=not sensing)
         self.running = False
@@ -192,6 +207,7 @@ class Session:
 
     Parameters
     ----------
+    key : SessionKey
     request : Request
         The one that opens it.
     opening : Opening
@@ -212,6 +228,7 @@ class Session:
         "epoch",
         "held",
         "key",
+        "newcomer",
         "num_bytes",
         "number",
         "opening",
@@ -227,9 +244,14 @@ class Session:
     )
 
     def __init__(
-        self, request: Request, opening: Opening, max_threads: int, times: ExpectedTimes
+        self,
+        key: SessionKey,
+        request: Request,
+        opening: Opening,
+        max_threads: int,
+        times: ExpectedTimes,
     ) -> None:
-        self.key = request.session
+        self.key = key
         self.epoch = request.epoch
         self.number = -1
         # Packed, it is one object instead of thousands, all of which the collector would look at
@@ -246,6 +268,8 @@ class Session:
         self.planning_single = _with_cores(opening.planning, 1)
         self.seed = opening.seed
         self.served = False
+        # Whether it goes with those of whom nobody knows who they are.
+        self.newcomer = True
         self.acknowledged: PlanningState | None = None
         self.ahead: PlanningState | None = None
         self.ahead_digest = b""
@@ -259,6 +283,11 @@ class Session:
         self.num_bytes = 0
         self.used_at = 0.0
         self.closed = False
+
+    @property
+    def owner(self) -> Owner:
+        """Whose it is."""
+        return self.key[0]
 
     def expected_s(self, *, task: bool) -> float:
         """Return how long a work may take, with the sensing part that follows a task part."""
@@ -290,6 +319,18 @@ class Session:
         return _size_of(self.acknowledged) + _size_of(self.ahead) + answers
 
 
+class _Holding:
+    """What one owner's sessions take, all together."""
+
+    __slots__ = ("newcomers", "opening_bytes", "sessions", "state_bytes")
+
+    def __init__(self) -> None:
+        self.sessions = 0
+        self.newcomers = 0
+        self.state_bytes = 0
+        self.opening_bytes = 0
+
+
 class Sessions:
     """The robots that are remembered, those unused the longest first.
 
@@ -307,9 +348,9 @@ class Sessions:
 
     def __init__(self, limits: ServiceLimits) -> None:
         self._limits = limits
-        self._sessions: OrderedDict[bytes, Session] = OrderedDict()
-        # Of sessions that were forgotten: a robot that was replaced stays replaced.
-        self._epochs: OrderedDict[bytes, int] = OrderedDict()
+        self._sessions: OrderedDict[SessionKey, Session] = OrderedDict()
+        self._holdings: dict[Owner, _Holding] = {}
+        self._epochs = _Epochs(max(4 * limits.max_sessions, _LEAST_EPOCHS))
         self._num_newcomers = 0
         self.state_bytes = 0
         self.opening_bytes = 0
@@ -317,50 +358,43 @@ class Sessions:
     def __len__(self) -> int:
         return len(self._sessions)
 
-    def get(self, key: bytes) -> Session | None:
+    def get(self, key: SessionKey) -> Session | None:
         """Return a robot's session; None if it is not remembered."""
         return self._sessions.get(key)
 
-    def epoch_of(self, key: bytes) -> int:
+    def epoch_of(self, key: SessionKey) -> int:
         """Return the epoch of a robot's last process, remembered or not; 0 if none is known."""
         session = self._sessions.get(key)
-        return session.epoch if session is not None else self._epochs.get(key, 0)
+        return session.epoch if session is not None else self._epochs.get(key)
 
-    def unused(self, *, for_newcomer: bool = False) -> Session | None:
-        """Return the session without work that was unused the longest.
+    def is_newcomer(self, owner: Owner) -> bool:
+        """Tell whether a new session of this owner is one of somebody of whom nothing is known.
 
-        For a newcomer, one of those that were never served, if these have half of the room already:
-        so however many come, they do not drive all others out.
+        To be somebody new costs nothing without a certificate. With one it does: so one session of
+        each that was never served goes with those that were.
         """
-        among_newcomers = for_newcomer and 2 * self._num_newcomers >= self._limits.max_sessions
-        return next(
-            (
-                each
-                for each in self._sessions.values()
-                if not each.works and not (among_newcomers and each.served)
-            ),
-            None,
-        )
+        holding = self._holdings.get(owner)
+        return owner is None or (holding is not None and holding.newcomers > 0)
 
     def serve(self, session: Session) -> None:
         """Take note that a robot has got an answer."""
-        self._num_newcomers -= not session.served
+        if not session.served:
+            self._num_newcomers -= 1
+            self._holdings[session.owner].newcomers -= 1
         session.served = True
-
-    def has_room_for(self, session: Session) -> bool:
-        """Tell whether one more fits without forgetting another; the only one always does."""
-        limits = self._limits
-        return not self._sessions or (
-            len(self._sessions) < limits.max_sessions
-            and self.opening_bytes + len(session.opening) <= limits.max_opening_bytes
-        )
+        session.newcomer = False
 
     def add(self, session: Session) -> None:
         """Remember a robot from now on."""
+        session.newcomer = self.is_newcomer(session.owner)
         self._sessions[session.key] = session
+        holding = self._holdings.setdefault(session.owner, _Holding())
+        holding.sessions += 1
+        holding.newcomers += 1
+        holding.opening_bytes += len(session.opening)
         self._num_newcomers += 1
         self.opening_bytes += len(session.opening)
-        self._epochs.pop(session.key, None)
+        self._epochs.forget(session.key)
 
     def use(self, session: Session, now: float) -> None:
         """Take note that a robot was heard, or worked for."""
@@ -371,17 +405,83 @@ class Sessions:
         """Forget all but the epoch of a robot for which nothing waits."""
         session.closed = True
         del self._sessions[session.key]
+        holding = self._holdings[session.owner]
+        holding.sessions -= 1
+        holding.newcomers -= not session.served
+        holding.opening_bytes -= len(session.opening)
         self._num_newcomers -= not session.served
-        self.state_bytes -= session.num_bytes
         self.opening_bytes -= len(session.opening)
+        self._count_state(session, 0)
+        if not holding.sessions:
+            del self._holdings[session.owner]
         self.note_epoch(session.key, session.epoch)
 
-    def note_epoch(self, key: bytes, epoch: int) -> None:
+    def note_epoch(self, key: SessionKey, epoch: int) -> None:
         """Remember the epoch of a robot that has no session: its processes before are replaced."""
-        self._epochs[key] = epoch
-        self._epochs.move_to_end(key)
-        while len(self._epochs) > max(4 * self._limits.max_sessions, _LEAST_EPOCHS):
-            self._epochs.popitem(last=False)
+        self._epochs.note(key, epoch)
+
+    # -- room for one more -----------------------------------------------------------------------
+
+    def has_room_for(self, session: Session) -> bool:
+        """Tell whether one more fits without forgetting another; the only one always does."""
+        return not self._sessions or not (
+            self._is_full_for(session.owner)
+            or self._has_all_sessions
+            or self._has_all_openings(session)
+        )
+
+    def unused_for(self, session: Session) -> Session | None:
+        """Return the session without work that is to be forgotten for a new one, if there is any.
+
+        If its owner has as many as one may have, one of its own. Else the one unused the longest of
+        those who hold the most of what is short; and of these one that was never served, if such
+        have half of the room already: so however many come, they do not drive all others out.
+        """
+        if self._is_full_for(session.owner):
+            owner = session.owner
+            return self._first_unused(lambda each: each.owner == owner)
+        newcomers = 2 * self._num_newcomers >= self._limits.max_sessions
+        if self._has_all_sessions:
+            return self._unused_of_most(lambda holding: holding.sessions, newcomers=newcomers)
+        return self._unused_of_most(lambda holding: holding.opening_bytes, newcomers=newcomers)
+
+    def _is_full_for(self, owner: Owner) -> bool:
+        most, holding = self._limits.max_sessions_per_robot, self._holdings.get(owner)
+        if owner is None or most is None or holding is None:
+            return False
+        return holding.sessions >= most
+
+    @property
+    def _has_all_sessions(self) -> bool:
+        return len(self._sessions) >= self._limits.max_sessions
+
+    def _has_all_openings(self, session: Session) -> bool:
+        return self.opening_bytes + len(session.opening) > self._limits.max_opening_bytes
+
+    def _unused_of_most(
+        self, amount: Callable[[_Holding], int], *, newcomers: bool
+    ) -> Session | None:
+        """Return the session without work that was unused the longest, of those who hold the most.
+
+        That is at least half of what anybody holds: among equals a few bytes more are no reason to
+        be forgotten each time. If all of these have work, it is one of the others.
+        """
+        holdings = self._holdings
+        if len(holdings) > 1:
+            least = max(map(amount, holdings.values())) / 2
+            found = self._first_unused(
+                lambda each: (
+                    amount(holdings[each.owner]) >= least and not (newcomers and each.served)
+                )
+            )
+            if found is not None:
+                return found
+        return self._first_unused(lambda each: not (newcomers and each.served))
+
+    def _first_unused(self, fits: Callable[[Session], bool]) -> Session | None:
+        return next(
+            (each for each in self._sessions.values() if not each.works and fits(each)), None
+        )
 
     # -- what was not heard for long -------------------------------------------------------------
 
@@ -401,21 +501,72 @@ class Sessions:
 
     def weigh(self, session: Session) -> None:
         """Count what a session's memory takes now."""
-        num_bytes = session.size()
-        self.state_bytes += num_bytes - session.num_bytes
-        session.num_bytes = num_bytes
+        self._count_state(session, session.size())
 
     @property
     def too_heavy(self) -> bool:
         """Whether all of them together take more than they may."""
         return self.state_bytes > self._limits.max_state_bytes
 
+    def unused_of_heaviest(self) -> Session | None:
+        """Return the session without work to be forgotten because all states take too much."""
+        return self._unused_of_most(lambda holding: holding.state_bytes, newcomers=False)
+
     def empty(self, session: Session) -> None:
         """Forget the states and answers of a robot, which is handed the state each time."""
         session.acknowledged = session.ahead = None
         session.answers.clear()
-        self.state_bytes -= session.num_bytes
-        session.num_bytes = 0
+        self._count_state(session, 0)
+
+    def _count_state(self, session: Session, num_bytes: int) -> None:
+        self.state_bytes += num_bytes - session.num_bytes
+        self._holdings[session.owner].state_bytes += num_bytes - session.num_bytes
+        session.num_bytes = num_bytes
+
+
+class _Epochs:
+    """The epochs of sessions that were forgotten: a robot that was replaced stays replaced.
+
+    Parameters
+    ----------
+    most : int
+        So many are remembered. Beyond that the oldest goes, of the owner that has the most.
+    """
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self._count = 0
+        # Owners in the order in which they were noted last.
+        self._of: OrderedDict[Owner, OrderedDict[bytes, int]] = OrderedDict()
+
+    def __iter__(self) -> Iterator[SessionKey]:
+        return ((owner, session) for owner, epochs in self._of.items() for session in epochs)
+
+    def get(self, key: SessionKey) -> int:
+        """Return the epoch of a session; 0 if none is known."""
+        owner, session = key
+        epochs = self._of.get(owner)
+        return 0 if epochs is None else epochs.get(session, 0)
+
+    def note(self, key: SessionKey, epoch: int) -> None:
+        """Remember an epoch."""
+        owner, session = key
+        self.forget(key)
+        self._of.setdefault(owner, OrderedDict())[session] = epoch
+        self._of.move_to_end(owner)
+        self._count += 1
+        if self._count > self._most:
+            largest = max(self._of, key=lambda each: len(self._of[each]))
+            self.forget((largest, next(iter(self._of[largest]))))
+
+    def forget(self, key: SessionKey) -> None:
+        """Forget the epoch of a session that is there again."""
+        owner, session = key
+        epochs = self._of.get(owner)
+        if epochs is not None and epochs.pop(session, None) is not None:
+            self._count -= 1
+            if not epochs:
+                del self._of[owner]
 
 
 def _key_of(data: object) -> bytes:

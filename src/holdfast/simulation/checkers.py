@@ -127,18 +127,18 @@ class WireChecker:
     """All messages between a robot and its services."""
 
     def __init__(self) -> None:
-        self._sent: dict[int, bytes] = {}
-        self._sessions: dict[int, tuple[bytes, int]] = {}
-        self._newest: dict[tuple[str, int, bytes], int] = {}
+        self._sent: dict[int, tuple[str | None, bytes]] = {}
+        self._sessions: dict[int, tuple[tuple[str | None, bytes], int]] = {}
+        self._newest: dict[tuple[str, int, tuple[str | None, bytes]], int] = {}
         self._unended: dict[tuple[str, int], int] = {}
         self._arrived: dict[int, tuple[str, int]] = {}
         self._ended: set[int] = set()
         self._replies: dict[int, int] = {}
         self._crowd = 0
 
-    def requested(self, call: int, payload: bytes) -> None:
-        """Take note of a request."""
-        self._sent[call] = payload
+    def requested(self, call: int, payload: bytes, owner: str | None = None) -> None:
+        """Take note of a request, and of the certificate with which it is sent."""
+        self._sent[call] = owner, payload
 
     def crowded(self, robots: int) -> None:
         """Take note that so many other robots ask, once each."""
@@ -165,10 +165,11 @@ class WireChecker:
         unended = self._unended[process] = self._unended.get(process, 0) + 1
         if unended > _MAX_UNENDED + self._crowd:
             raise Violation(f"{service} has {unended} calls that it has not ended")
-        if payload != self._sent[call]:
+        owner, sent = self._sent[call]
+        if payload != sent:
             return  # damaged: it says nothing
         request = _decode(payload[:-_CHECKSUM_BYTES])
-        session, epoch = request[_SESSION_AT], request[_EPOCH_AT]
+        session, epoch = (owner, request[_SESSION_AT]), request[_EPOCH_AT]
         self._sessions[call] = session, epoch
         place = service, boot, session
         self._newest[place] = max(epoch, self._newest.get(place, 0))

@@ -31,6 +31,9 @@ _LONGEST_CALL_S = 60.0
 _GOLDEN = 0.6180339887498949
 """Multiples of it fill the unit interval evenly: a jitter that needs no chance."""
 
+_ROBOT, _ANOTHER = "robot", "another"
+"""Names in certificates: of the robot that is looked at, and of all others."""
+
 Way = Literal["to", "from"]
 
 
@@ -281,17 +284,19 @@ class Network:
         call = _Call(link, self._process, number)
         self._open[number] = call
         key = self._key(call)
-        self._checker.requested(key, payload)
+        owner = _ROBOT if self._run.certificates else None
+        self._checker.requested(key, payload, owner)
         self._checker.open_calls(
             sum(each.link is link and not each.end_is_lost for each in self._open.values())
         )
-        self._send(link, "to", payload, self._request_arrives, key, link.service, link.boot)
+        self._send(link, "to", payload, self._request_arrives, key, owner, link.service, link.boot)
 
     def call_of_another(self, service: ServiceNode, payload: bytes) -> None:
         """Deliver a request of another robot, whose replies are not looked at."""
         self.messages += 1
-        self._checker.requested(self.messages, payload)
-        self._request_arrives(payload, self.messages, service, service.boot)
+        owner = _ANOTHER if self._run.certificates else None
+        self._checker.requested(self.messages, payload, owner)
+        self._request_arrives(payload, self.messages, owner, service, service.boot)
 
     def abandon(self, number: int) -> None:
         """Give a call up."""
@@ -385,7 +390,9 @@ class Network:
         link.arrived[way] = arrives
         self._agenda.at(arrives, do, *arguments)
 
-    def _request_arrives(self, payload: bytes, key: int, service: ServiceNode, boot: int) -> None:
+    def _request_arrives(
+        self, payload: bytes, key: int, owner: str | None, service: ServiceNode, boot: int
+    ) -> None:
         if boot != service.boot or not service.up:
             return
         if self._checker.has_arrived(key):
@@ -395,7 +402,7 @@ class Network:
             original, key = key, self.messages if call is None else self._key(call)
             self._checker.copied(original, key)
         self._checker.arrived(service.name, boot, key, payload)
-        service.receive(boot, key, payload)
+        service.receive(boot, key, payload, owner)
 
     def _reply_arrives(self, payload: bytes, key: int) -> None:
         call = self._calls.get(key)

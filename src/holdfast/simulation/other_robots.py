@@ -33,16 +33,20 @@ class OtherRobots:
         if request is None:
             if len(self._requests) >= _MOST:
                 self._requests.clear()
-            request = self._requests[key] = self._encoded(robot, trial)
+            request = self._requests[key] = self._encoded(robot.to_bytes(16, "big"), trial)
         return request
 
-    def _encoded(self, robot: int, trial: int) -> bytes:
+    def impostors_request(self, session: bytes, trial: int) -> bytes:
+        """Return the same for a session that is another's, as its next process would ask."""
+        return self._encoded(session, trial, epoch=2**31)
+
+    def _encoded(self, session: bytes, trial: int, epoch: int = 1) -> bytes:
         state = self._planner.initial_state(self._seed, trial)
         return encode(
             Request(
                 PROTOCOL_VERSION,
-                robot.to_bytes(16, "big"),
-                epoch=1,
+                session,
+                epoch=epoch,
                 number=1,
                 trial=trial,
                 step=0,

@@ -59,11 +59,12 @@ from holdfast.simulation.schedule import LOCAL_SERVICE, RunSettings
 from holdfast.simulation.surroundings import Surroundings, Violation
 from holdfast.simulation.twins import Twins
 
-__all__ = ["Host", "RobotNode", "Task"]
+__all__ = ["SESSION", "Host", "RobotNode", "Task"]
 
 FloatArray = npt.NDArray[np.float64]
 
-_SESSION = bytes(range(16))
+SESSION = bytes(range(16))
+"""Of the robot that is looked at."""
 _PERFORMS_AFTER_S = 0.0002
 """From the order until the body moves: the process may die in between."""
 
@@ -242,7 +243,7 @@ class RobotNode:
             LOCAL_SERVICE,
             self._offload,
             self._recovery,
-            _SESSION,
+            SESSION,
             self._disk.opened(),
             task.opening,
             task.planner.problem.action_size,

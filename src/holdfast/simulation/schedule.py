@@ -109,6 +109,9 @@ class RunSettings(_Item, frozen=True, kw_only=True, tag="run", tag_field="item")
         Robots that each service remembers.
     answers_kept : int
         By each service, for each robot.
+    certificates : bool
+        Whether the robot proves who it is, and the others of a crowd that they are another. One of
+        these then asks for the session of the robot that is looked at, as a later process of it.
     forgets_after_s : float
         A service forgets a robot that it did not hear for so long.
     environment : {"simulated", "counting", "not_counting"}
@@ -142,6 +145,7 @@ class RunSettings(_Item, frozen=True, kw_only=True, tag="run", tag_field="item")
     workers: Annotated[int, msgspec.Meta(ge=1, le=64)] = 2
     sessions_kept: Annotated[int, msgspec.Meta(ge=1)] = 100
     answers_kept: Annotated[int, msgspec.Meta(ge=1)] = 8
+    certificates: bool = False
     forgets_after_s: Seconds = 600.0
     environment: Literal["simulated", "counting", "not_counting"] = "counting"
     journal_survives: Literal["process_crash", "power_cut"] = "process_crash"
@@ -480,6 +484,10 @@ class _Draw:
     def _aims(self) -> random.Random:
         return random.Random(f"holdfast simulation {self._seed}: aims")
 
+    @cached_property
+    def _certificates(self) -> random.Random:
+        return random.Random(f"holdfast simulation {self._seed}: certificates")
+
     def schedule(self) -> Schedule:
         run = self._run()
         chance = self._chance
@@ -537,6 +545,7 @@ class _Draw:
             workers=any_of((1, 2)),
             sessions_kept=any_of((2, 100)),
             answers_kept=any_of((1, 8, 8)),
+            certificates=self._certificates.random() < 0.5,
             forgets_after_s=any_of((600.0, 600.0, 600.0, 0.03)),
             environment=any_of(("counting", "counting", "simulated", "not_counting")),
             journal_survives=any_of(("process_crash", "process_crash", "power_cut")),

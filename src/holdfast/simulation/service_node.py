@@ -119,15 +119,15 @@ class ServiceNode:
 
     # -- what it does ----------------------------------------------------------------------------
 
-    def receive(self, boot: int, call: int, payload: bytes) -> None:
-        """Take a request that was sent to the process of this boot."""
+    def receive(self, boot: int, call: int, payload: bytes, owner: str | None) -> None:
+        """Take a request that was sent to the process of this boot, with a certificate if any."""
         if boot != self.boot or not self.up:
             return
         if self.stopped:
-            self._deferred.append((self.receive, (boot, call, payload)))
+            self._deferred.append((self.receive, (boot, call, payload, owner)))
             return
         assert self.machine is not None
-        self._carry_out(self.machine.receive(call, payload, self._clock.now()))
+        self._carry_out(self.machine.receive(call, payload, self._clock.now(), owner))
 
     def _carry_out(self, effects: list[Effect]) -> None:
         machine = self.machine

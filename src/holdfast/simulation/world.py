@@ -24,7 +24,7 @@ from holdfast.simulation.disk import Disk
 from holdfast.simulation.memory import RememberedJobs, RememberingPlanner
 from holdfast.simulation.network import Network
 from holdfast.simulation.other_robots import OtherRobots
-from holdfast.simulation.robot_node import RobotNode, Task
+from holdfast.simulation.robot_node import SESSION, RobotNode, Task
 from holdfast.simulation.schedule import (
     LOCAL_SERVICE,
     NUM_TRIALS,
@@ -468,6 +468,8 @@ class _World:
         for number in range(fault.robots):
             self._crowds += 1
             payload = self._others.first_request(self._crowds, number % NUM_TRIALS)
+            if self._run.certificates and number == 0:
+                payload = self._others.impostors_request(SESSION, self._crowds % NUM_TRIALS)
             self._network.call_of_another(service, payload)
 
     def _crowd_takes_longer(self, service: ServiceNode, seconds: float) -> None:
