@@ -47,6 +47,7 @@ _START_S = 60.0
 _STEADY_S = 10.0
 """A process that ends earlier than this has failed at its start, and is started again later."""
 
+_END_S = 0.5
 _FIRST_DELAY_S, _LAST_DELAY_S = 0.1, 30.0
 _KEPT_S = 1.0
 """Connections are not kept waiting for a process that is started later than this."""
@@ -369,7 +370,10 @@ class Supervisor:
         self._changed()
 
     def _ended(self, index: int, child: _Child) -> None:
-        """Take note that a process has ended, or has closed its end, which is as bad."""
+        """Take note that a process has closed its end, as the system does when it ends."""
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            # The system closes what a process has open a moment before it says how that ended.
+            child.process.wait(_END_S)
         child.process.kill()
         code = self._bury(index, child)
         if code < 0:
