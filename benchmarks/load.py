@@ -2,19 +2,19 @@
 
 They play trials back that were run before, so they cost little themselves; but each has a session
 of its own and asks as a robot does: with what it has observed since the service last answered it,
-and with its whole state where the service says that it does not know it. Takes one JSON object and
-prints one, as child.py does.
+and with its whole state where the service says that it does not know it. One event loop has all their
+links, as little beside the service as it can be. Takes one JSON object and prints one, as child.py
+does.
 """
 
 from __future__ import annotations
 
+import asyncio
 import gc
-import heapq
 import json
 import os
 import sys
 import tempfile
-import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -114,7 +114,7 @@ class _Robot:
         self._link.send(self._call, payload)
 
     def replied(self, call: int, payload: bytes) -> None:
-        """Take a reply; on a thread of the transport."""
+        """Take a reply."""
         if call != self._call:
             return
         took_s = time.perf_counter() - self._sent_at
@@ -165,7 +165,7 @@ class _Link:
         self._transport = ZenohRobotTransport({_SERVICE: ServiceAddress(endpoint)})
         self._asked: dict[int, _Robot] = {}
         self._number = 0
-        self.appeared = threading.Event()
+        self.appeared = asyncio.Event()
         self._transport.start(self._deliver)
 
     def next_call(self, robot: _Robot) -> int:
@@ -176,8 +176,8 @@ class _Link:
     def send(self, call: int, payload: bytes) -> None:
         self._transport.call(_SERVICE, call, payload)
 
-    def close(self) -> None:
-        self._transport.close()
+    async def close(self) -> None:
+        await self._transport.close()
 
     def _deliver(self, event: TransportEvent) -> None:
         if isinstance(event, Replied):
@@ -199,9 +199,59 @@ def _percentiles(seconds: list[float]) -> dict[str, float]:
     }
 
 
-def load(
+class _Clock:
+    """Has robots ask in turn, each at its rate, and counts for some time."""
+
+    def __init__(
+        self, fleet: _Fleet, robots: list[_Robot], period_s: float, process_ids: list[int]
+    ) -> None:
+        self._fleet = fleet
+        self._robots = robots
+        self._period_s = period_s
+        self._process_ids = process_ids
+        self._loop = asyncio.get_running_loop()
+        self.late_s: list[float] = []
+        self._until = float("inf")
+
+    async def run(self, warm_up_s: float, seconds: float) -> dict[str, float]:
+        """Let the robots ask; return what the service and this process have used meanwhile."""
+        begin = self._loop.time() + 0.05
+        self._until = begin + warm_up_s + seconds
+        for index, robot in enumerate(self._robots):
+            at = begin + self._period_s * index / len(self._robots)
+            self._loop.call_at(at, self._turn, robot, at)
+        await asyncio.sleep(begin + warm_up_s - self._loop.time())
+        self._fleet.counting = True
+        before, own_before, counted_at = self._cpu_s(), os.times(), time.perf_counter()
+        await asyncio.sleep(self._until - self._loop.time())
+        wall_s = time.perf_counter() - counted_at
+        after, own_after = self._cpu_s(), os.times()
+        own_s = sum(own_after[:2]) - sum(own_before[:2])
+        return {
+            "wall_s": wall_s,
+            "service_cores": (after - before) / wall_s,
+            "own_cores": own_s / wall_s,
+        }
+
+    def _turn(self, robot: _Robot, at: float) -> None:
+        fleet = self._fleet
+        if at >= self._until:
+            return
+        self._loop.call_at(at + self._period_s, self._turn, robot, at + self._period_s)
+        if robot.waiting:
+            fleet.skipped += fleet.counting
+            return
+        if fleet.counting:
+            self.late_s.append(self._loop.time() - at)
+        robot.ask()
+
+    def _cpu_s(self) -> float:
+        return sum(usage_of(process_id).cpu_s for process_id in self._process_ids)
+
+
+async def load(
     endpoint: str,
-    process_id: int,
+    process_ids: list[int],
     num_robots: int,
     num_links: int,
     rate_hz: float,
@@ -214,7 +264,7 @@ def load(
     Parameters
     ----------
     endpoint : str
-    process_id : int
+    process_ids : list of int
         Of the service, to see what it uses.
     num_robots, num_links : int
         Robots, and links that they share.
@@ -233,55 +283,29 @@ def load(
     fleet = _Fleet(trials, opening_of(configuration))
     links = [_Link(fleet, endpoint) for _ in range(num_links)]
     for link in links:
-        if not link.appeared.wait(_PATIENCE_S):
-            raise RuntimeError(f"no service at {endpoint}")
+        try:
+            await asyncio.wait_for(link.appeared.wait(), _PATIENCE_S)
+        except TimeoutError:
+            raise RuntimeError(f"no service at {endpoint}") from None
     robots = [_Robot(fleet, index, links[index % num_links]) for index in range(num_robots)]
     gc.collect()
     gc.disable()
-
-    period_s = 1.0 / rate_hz
-    begin = time.perf_counter() + 0.05
-    counted_from, until = begin + warm_up_s, begin + warm_up_s + seconds
-    due = [(begin + period_s * index / num_robots, index) for index in range(num_robots)]
-    heapq.heapify(due)
-    late_s = []
-    before = own_before = None
-    while due[0][0] < until:
-        at, index = due[0]
-        now = time.perf_counter()
-        if now < at:
-            time.sleep(at - now)
-            continue
-        if not fleet.counting and at >= counted_from:
-            fleet.counting = True
-            before, own_before, counted_at = usage_of(process_id), os.times(), now
-        heapq.heapreplace(due, (at + period_s, index))
-        if robots[index].waiting:
-            fleet.skipped += fleet.counting
-            continue
-        if fleet.counting:
-            late_s.append(now - at)
-        robots[index].ask()
-    wall_s = time.perf_counter() - counted_at
-    after, own_after = usage_of(process_id), os.times()
-    assert before is not None and own_before is not None
+    clock = _Clock(fleet, robots, 1.0 / rate_hz, process_ids)
+    used = await clock.run(warm_up_s, seconds)
     # What is on its way still counts.
     drained_at = time.perf_counter() + _DRAIN_S
     while any(robot.waiting for robot in robots) and time.perf_counter() < drained_at:
-        time.sleep(0.01)
+        await asyncio.sleep(0.01)
     unanswered = sum(robot.waiting for robot in robots)
-    for link in links:
-        link.close()
-    own_s = sum(own_after[:2]) - sum(own_before[:2])
+    resident_bytes = sum(usage_of(process_id).resident_bytes for process_id in process_ids)
+    await asyncio.gather(*(link.close() for link in links))
     return {
         "task": _percentiles(fleet.task_s),
         "sensing": _percentiles(fleet.sensing_s),
-        "late": _percentiles(late_s),
-        "wall_s": wall_s,
-        "service_cores": (after.cpu_s - before.cpu_s) / wall_s,
-        "service_resident_bytes": after.resident_bytes,
-        "own_cores": own_s / wall_s,
+        "late": _percentiles(clock.late_s),
+        "service_resident_bytes": resident_bytes,
         "unanswered": unanswered,
+        **used,
         **{
             name: getattr(fleet, name)
             for name in (
@@ -299,4 +323,4 @@ def load(
 
 
 if __name__ == "__main__":
-    print(json.dumps(load(**json.loads(sys.argv[1]))))
+    print(json.dumps(asyncio.run(load(**json.loads(sys.argv[1])))))

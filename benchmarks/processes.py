@@ -137,6 +137,13 @@ class ServiceProcess:
         assert self._process is not None
         return self._process.pid
 
+    @property
+    def process_ids(self) -> list[int]:
+        """Of it and of the processes that it has started."""
+        own = self.process_id
+        children = Path(f"/proc/{own}/task/{own}/children").read_text()
+        return [own, *map(int, children.split())]
+
     def start(self) -> None:
         """Start it; returns at once."""
         command = [sys.executable, "-m", "holdfast", "serve", "--listen", self.endpoint]

@@ -11,7 +11,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -49,6 +49,7 @@ IDLE_BAR_PERCENT = 2.0
 RESIDENT_BAR_MB = 80.0
 FLEET_BAR_MS = 30.0
 FLEET = 100
+LARGE_FLEET = 800
 FLEET_RATE_HZ = 10.0
 
 THESIS_MORE_MS = 6.0
@@ -99,9 +100,7 @@ def offload(context: Context) -> Result:
                     alone_s = time.perf_counter() - start
                     bare = stranger.ask(state, turn.sensing_digest, checkpoint=checkpoint)
                     again = stranger.ask(state, turn.sensing_digest)
-                    start = time.perf_counter()
-                    ((echoed_at, _),) = wire_alone.call(bytes(_REQUEST_BYTES))
-                    echo_s = echoed_at - start
+                    ((echo_s, _),) = wire_alone.call(bytes(_REQUEST_BYTES))
                     start = time.perf_counter()
                     decided_in_process(problem, settings, turn)
                     whole_s = time.perf_counter() - start
@@ -434,10 +433,9 @@ def wire(context: Context) -> Result:
             context.progress((done + 1) / (len(sizes) + 1))
         with CountingProxy(service.port) as proxy:
             configuration = configuration_for(Path(directory), num_trials=1)
-            with Asker(proxy.endpoint, opening_of(configuration), b"only looks on..."):
-                time.sleep(0.5)  # declarations
+            with Asker(proxy.endpoint, opening_of(configuration), b"only looks on...") as asker:
                 before = proxy.total
-                time.sleep(idle_s)
+                asker.pause(idle_s)
                 keep_alive = (proxy.total - before) / idle_s
     return Result(
         [
@@ -505,9 +503,10 @@ def serve(context: Context) -> Result:
     rows = []
     idle: dict[str, tuple[float, float]] = {}
 
-    def watch(what: str) -> None:
+    def watch(what: str, pause: Callable[[float], None]) -> None:
+        pause(1.5)
         before = usage_of(service.process_id)
-        time.sleep(idle_s)
+        pause(idle_s)
         after = usage_of(service.process_id)
         percent = 100.0 * (after.cpu_s - before.cpu_s) / idle_s
         idle[what] = (percent, after.resident_bytes / _MB)
@@ -517,15 +516,12 @@ def serve(context: Context) -> Result:
 
     with tempfile.TemporaryDirectory() as directory, ServiceProcess() as service:
         configuration = configuration_for(Path(directory), num_trials=1)
-        time.sleep(1.5)
-        watch("nobody there")
+        watch("nobody there", time.sleep)
         with Asker(service.endpoint, opening_of(configuration), b"looks on, silent") as asker:
-            time.sleep(1.5)
-            watch("one robot there, silent")
+            watch("one robot there, silent", asker.pause)
             for turn in recorded_turns(configuration.problem, configuration.planning, 0):
                 asker.ask(turn.state, turn.digest, turn.observations[-1:])
-            time.sleep(1.5)
-            watch("the same, after a trial")
+            watch("the same, after a trial", asker.pause)
         context.progress(1.0)
     median, rare = _quantiles(ready_s)
     return Result(
@@ -552,26 +548,33 @@ def capacity(context: Context) -> Result:
     """Let one service decide for many robots, for as many as it holds and for four times that."""
     warm_up_s, seconds = (1.0, 2.0) if context.quick else (3.0, 15.0)
 
-    def measured(**arguments: Any) -> dict[str, Any]:
-        with ServiceProcess() as service:
+    def measured(processes: int, **arguments: Any) -> dict[str, Any]:
+        with ServiceProcess("--processes", str(processes)) as service:
             return _load(service, warm_up_s=warm_up_s, seconds=seconds, **arguments)
 
     rows, bars = [], []
     fleets = (FLEET, 4 * FLEET) if context.quick else tuple(FLEET * k for k in (1, 2, 3, 4))
     cases = [
-        *((count, 8, FLEET_RATE_HZ / 9.0) for count in fleets),
-        *((count, interval, FLEET_RATE_HZ) for interval in (0, 8) for count in fleets),
+        *((1, count, 8, FLEET_RATE_HZ / 9.0) for count in (*fleets, LARGE_FLEET)),
+        (2, LARGE_FLEET, 8, FLEET_RATE_HZ / 9.0),
+        *((1, count, interval, FLEET_RATE_HZ) for interval in (0, 8) for count in fleets),
     ]
+    barred = {(1, FLEET, 0), (1, FLEET, 8), (2, LARGE_FLEET, 8)}
     wrong = 0
-    for done, (count, interval, rate_hz) in enumerate(cases):
+    for done, (processes, count, interval, rate_hz) in enumerate(cases):
         found = measured(
-            num_robots=count, num_links=count, rate_hz=rate_hz, sensing_interval=interval
+            processes,
+            num_robots=count,
+            num_links=count,
+            rate_hz=rate_hz,
+            sensing_interval=interval,
         )
         wrong += found["wrong"]
         asked = max(1, found["sent"])
         rows.append(
             [
                 f"{count} x {rate_hz:.3g} turns of {interval + 1} + 1",
+                str(processes),
                 f"{found['complete'] / found['wall_s']:.0f}",
                 f"{found['busy'] / asked:.1%}",
                 *(_both(found[part]) for part in ("task", "sensing")),
@@ -582,11 +585,12 @@ def capacity(context: Context) -> Result:
                 f"{found['skipped'] / (asked + found['skipped']):.1%}",
             ]
         )
-        if count == FLEET:
+        if (processes, count, interval) in barred:
             bars.append(
                 Bar(
                     f"{count} robots, each {rate_hz:.3g} turns a second, of {interval + 1} task "
-                    f"action{'s' if interval else ''} and 1 sensing action: 99 % of whole answers",
+                    f"action{'s' if interval else ''} and 1 sensing action, "
+                    f"{processes} process{'es' if processes > 1 else ''}: 99 % of whole answers",
                     1e3 * found["sensing"]["percentile_99"],
                     FLEET_BAR_MS,
                     "ms",
@@ -613,6 +617,7 @@ def capacity(context: Context) -> Result:
             Table(
                 (
                     "robots",
+                    "processes",
                     "answered/s",
                     "busy",
                     "task actions",
@@ -641,7 +646,7 @@ def _load(service: ServiceProcess, **arguments: Any) -> dict[str, Any]:
 
 
 def _loaded(service: ServiceProcess, **arguments: Any) -> subprocess.Popen[str]:
-    request = {"endpoint": service.endpoint, "process_id": service.process_id, **arguments}
+    request = {"endpoint": service.endpoint, "process_ids": service.process_ids, **arguments}
     return subprocess.Popen(
         [sys.executable, str(_LOAD), json.dumps(request)],
         stdout=subprocess.PIPE,

@@ -7,8 +7,7 @@ a service uses but none of its code; so whatever a service answers can be held a
 
 from __future__ import annotations
 
-import sys
-from queue import SimpleQueue
+import asyncio
 from time import perf_counter
 from typing import NamedTuple, Self
 
@@ -48,7 +47,6 @@ from holdfast.transport.endpoints import ServiceAddress
 __all__ = ["Asked", "Asker", "Caller", "Turn", "decided_in_process", "recorded_turns"]
 
 _PATIENCE_S = 30.0
-_SWITCH_INTERVAL_S = 0.0005
 
 
 class Turn(NamedTuple):
@@ -182,39 +180,62 @@ class Asked(NamedTuple):
 class Caller:
     """The robot's own end of the wire to one service, for one call at a time.
 
+    Its event loop runs as long as one of its methods does, so a link is kept alive over a pause by
+    :meth:`pause` alone.
+
     Parameters
     ----------
     endpoint : str
     """
 
     def __init__(self, endpoint: str) -> None:
-        self._events: SimpleQueue[TransportEvent] = SimpleQueue()
-        self._transport = ZenohRobotTransport({endpoint: ServiceAddress(endpoint)})
+        self._transport = StreamRobotTransport({endpoint: ServiceAddress(endpoint)})
         self._endpoint = endpoint
         self._number = 0
-        self._switch_interval_s = sys.getswitchinterval()
+        self._replies: list[tuple[float, Reply]] = []
+        self._runner = asyncio.Runner()
 
     def __enter__(self) -> Self:
-        sys.setswitchinterval(_SWITCH_INTERVAL_S)  # as a robot's process does
-        self._transport.start(self._events.put)
-        while not isinstance(self._events.get(timeout=_PATIENCE_S), Appeared):
-            pass
+        self._runner.run(self._connect())
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._transport.close()
-        sys.setswitchinterval(self._switch_interval_s)
+        self._runner.run(self._transport.close())
+        self._runner.close()
 
-    def call(self, payload: bytes) -> list[tuple[float, Reply]]:
-        """Send a request; return its replies and when each was decoded, once the call has ended."""
+    def call(self, request: Request | bytes) -> list[tuple[float, Reply]]:
+        """Send a request; return its replies, once the call has ended.
+
+        Before each of them stand the seconds from before the request was encoded until the reply
+        was decoded.
+        """
+        return self._runner.run(self._call(request))
+
+    def pause(self, seconds: float) -> None:
+        """Do nothing, but keep the link."""
+        self._runner.run(asyncio.sleep(seconds))
+
+    async def _connect(self) -> None:
+        self._changed = asyncio.Event()
+        self._transport.start(self._deliver)
+        await asyncio.wait_for(self._changed.wait(), _PATIENCE_S)
+
+    async def _call(self, request: Request | bytes) -> list[tuple[float, Reply]]:
+        self._changed.clear()
+        self._replies = []
         self._number += 1
+        self._sent_at = perf_counter()
+        payload = request if isinstance(request, bytes) else encode(request)
         self._transport.call(self._endpoint, self._number, payload)
-        replies = []
-        while not isinstance(event := self._events.get(timeout=_PATIENCE_S), Ended):
-            if isinstance(event, Replied):
-                reply = decode_reply(event.payload)
-                replies.append((perf_counter(), reply))
-        return replies
+        await asyncio.wait_for(self._changed.wait(), _PATIENCE_S)
+        return self._replies
+
+    def _deliver(self, event: TransportEvent) -> None:
+        if isinstance(event, Replied):
+            reply = decode_reply(event.payload)
+            self._replies.append((perf_counter() - self._sent_at, reply))
+        elif isinstance(event, Appeared | Ended):
+            self._changed.set()
 
 
 class Asker(Caller):
@@ -241,7 +262,6 @@ class Asker(Caller):
         checkpoint: bytes | None = None,
     ) -> Asked:
         """Ask, and wait for the end of the call."""
-        start = perf_counter()
         request = Request(
             PROTOCOL_VERSION,
             self._session,
@@ -256,10 +276,10 @@ class Asker(Caller):
             checkpoint,
         )
         asked = Asked(None, None, 0.0, 0.0)
-        for at, reply in self.call(encode(request)):
+        for seconds, reply in self.call(request):
             if isinstance(reply, TaskAnswer):
-                asked = asked._replace(task=reply, task_s=at - start)
+                asked = asked._replace(task=reply, task_s=seconds)
             elif isinstance(reply, SensingAnswer):
-                asked = asked._replace(sensing=reply, sensing_s=at - start)
+                asked = asked._replace(sensing=reply, sensing_s=seconds)
         self._opening = None
         return asked

@@ -1,0 +1,225 @@
+"""Health and metrics over HTTP, answered by the event loop that the service itself runs on.
+
+Whatever watches a service asks with a plain GET: ``/livez`` says that the loop moves, which the
+answer itself proves; ``/readyz`` that robots are welcome; ``/metrics`` what has been counted. That
+is little enough to need no web server: a request's head is read and everything after it ignored,
+one answer is sent, and the connection is closed. Heads, connections and time are bounded, so that
+whoever connects costs the robots nothing.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import re
+import socket
+from collections.abc import Awaitable, Callable, Mapping
+from typing import NamedTuple, TypeAlias
+
+from holdfast.errors import HoldfastError
+
+__all__ = ["HealthError", "HttpAddress", "HttpServer", "Page", "Pages", "parse_http_address"]
+
+_MAX_HEAD_BYTES = 8192
+_MAX_CONNECTIONS = 64
+_PATIENCE_S = 5.0
+"""For a connection, from its beginning to its end."""
+
+_REASONS = {
+    200: "OK",
+    400: "Bad Request",
+    404: "Not Found",
+    405: "Method Not Allowed",
+    431: "Request Header Fields Too Large",
+    503: "Service Unavailable",
+}
+_LOOPBACK = "127.0.0.1"
+
+
+class HealthError(HoldfastError):
+    """Health or metrics cannot be offered at an address."""
+
+
+class HttpAddress(NamedTuple):
+    """Where to answer. ``str`` gives ``HOST:PORT``.
+
+    Attributes
+    ----------
+    host : str
+        An IPv6 address without its brackets.
+    port : int
+        0 lets the system choose.
+    """
+
+    host: str
+    port: int
+
+    def __str__(self) -> str:
+        return f"[{self.host}]:{self.port}" if ":" in self.host else f"{self.host}:{self.port}"
+
+
+class Page(NamedTuple):
+    """An answer.
+
+    Attributes
+    ----------
+    status : int
+        200 or 503.
+    body : bytes
+    content_type : str
+    """
+
+    status: int
+    body: bytes
+    content_type: str = "text/plain; charset=utf-8"
+
+    @classmethod
+    def of(cls, trouble: str | None) -> Page:
+        """Return the page that says "ok", or with status 503 what the trouble is."""
+        return cls(200 if trouble is None else 503, f"{trouble or 'ok'}\n".encode())
+
+
+Pages: TypeAlias = Mapping[str, Callable[[], Awaitable[Page]]]
+"""What is called for each path."""
+
+
+def parse_http_address(text: str) -> HttpAddress:
+    """Read ``HOST:PORT``, an IPv6 address in brackets; or ``PORT`` alone, of this machine only.
+
+    Raises
+    ------
+    HealthError
+        If it is neither.
+    """
+    host, colon, port = text.rpartition(":")
+    if colon and host.startswith("[") and host.endswith("]"):
+        host = host[1:-1]
+    elif ":" in host or (colon and not host):
+        raise HealthError(
+            f"{text!r} is no HOST:PORT, as in 127.0.0.1:9090, 0.0.0.0:9090 or [::1]:9090"
+        )
+    if not re.fullmatch("[0-9]{1,5}", port) or int(port) > 65535:
+        raise HealthError(f"{text!r}: port {port!r} is not a whole number from 0 to 65535")
+    return HttpAddress(host or _LOOPBACK, int(port))
+
+
+class HttpServer:
+    """Answers GET and HEAD at one address.
+
+    Parameters
+    ----------
+    address : HttpAddress
+    pages : Pages
+        One that raises has a defect, and ends the connection without an answer.
+    """
+
+    def __init__(self, address: HttpAddress, pages: Pages) -> None:
+        self._address = address
+        self._pages = pages
+        self._server: asyncio.Server | None = None
+        # In the order of their beginning.
+        self._connections: dict[_Connection, None] = {}
+
+    async def start(self) -> HttpAddress:
+        """Listen, in the running loop; return where, with the port that was free instead of 0.
+
+        Raises
+        ------
+        HealthError
+            If it cannot listen there; the message names the address.
+        """
+        loop = asyncio.get_running_loop()
+        try:
+            # The first address alone, so that there is one port.
+            family, *_, where = socket.getaddrinfo(
+                *self._address, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+            )[0]
+            self._server = await loop.create_server(
+                lambda: _Connection(self), str(where[0]), self._address.port, family=family
+            )
+        except OSError as error:
+            taken = error.errno == errno.EADDRINUSE
+            reason = "another program listens there" if taken else error.strerror or str(error)
+            raise HealthError(f"health or metrics at {self._address}: {reason}") from error
+        return self._address._replace(port=self._server.sockets[0].getsockname()[1])
+
+    def close(self) -> None:
+        """Listen no more, and end all connections; may be repeated."""
+        if self._server is not None:
+            self._server.close()
+        for connection in list(self._connections):
+            connection.abort()
+
+    def begun(self, connection: _Connection) -> None:
+        """Take a connection in; where there are too many, the oldest has to go."""
+        if len(self._connections) >= _MAX_CONNECTIONS:
+            next(iter(self._connections)).abort()
+        self._connections[connection] = None
+
+    def ended(self, connection: _Connection) -> None:
+        """Forget a connection."""
+        self._connections.pop(connection, None)
+
+    async def page(self, method: bytes, target: bytes) -> Page:
+        """Return the answer to a request."""
+        if method not in (b"GET", b"HEAD"):
+            return Page(405, b"GET and HEAD are answered\n")
+        page = self._pages.get(target.partition(b"?")[0].decode("latin-1"))
+        if page is None:
+            return Page(404, f"there are {', '.join(sorted(self._pages))}\n".encode())
+        return await page()
+
+
+class _Connection(asyncio.Protocol):
+    """One request and its answer."""
+
+    def __init__(self, server: HttpServer) -> None:
+        self._server = server
+        self._head = bytearray()
+        self._answering: asyncio.Task[None] | None = None
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        assert isinstance(transport, asyncio.Transport)
+        self._transport = transport
+        self._give_up = asyncio.get_running_loop().call_later(_PATIENCE_S, self.abort)
+        self._server.begun(self)
+
+    def data_received(self, data: bytes) -> None:
+        if self._answering is not None:
+            return
+        self._head += data
+        whole = b"\r\n\r\n" in self._head or b"\n\n" in self._head
+        if whole or len(self._head) > _MAX_HEAD_BYTES:
+            self._transport.pause_reading()
+            self._answering = asyncio.get_running_loop().create_task(self._answer(whole=whole))
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        del exc
+        self._give_up.cancel()
+        self._server.ended(self)
+        if self._answering is not None:
+            self._answering.cancel()
+
+    def abort(self) -> None:
+        """End the connection now."""
+        self._server.ended(self)
+        self._transport.abort()
+
+    async def _answer(self, *, whole: bool) -> None:
+        words = bytes(self._head).splitlines()[0].split() if whole and self._head.strip() else []
+        if not whole:
+            page = Page(431, b"a request's head has at most 8192 bytes\n")
+        elif len(words) != 3 or not words[2].startswith(b"HTTP/1."):
+            page = Page(400, b"this is no request of HTTP/1\n")
+        else:
+            page = await self._server.page(words[0], words[1])
+        head = (
+            f"HTTP/1.1 {page.status} {_REASONS[page.status]}\r\n"
+            f"Content-Type: {page.content_type}\r\n"
+            f"Content-Length: {len(page.body)}\r\n"
+            "Cache-Control: no-store\r\n"
+            "Connection: close\r\n\r\n"
+        )
+        body = b"" if words[:1] == [b"HEAD"] else page.body
+        self._transport.write(head.encode() + body)
+        self._transport.close()

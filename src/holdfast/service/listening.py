@@ -1,0 +1,116 @@
+"""The sockets of a service of several processes, which outlive each of them.
+
+Each process has a listening socket of its own at the same TCP port, and the system spreads
+connections over them (``SO_REUSEPORT``). One more socket is bound there that never listens: it
+keeps the port while no process has one. A local socket is one file, so all processes share it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+from collections.abc import Sequence
+from pathlib import Path
+
+from holdfast.errors import TransportError
+from holdfast.runtime.endpoints import Endpoint
+
+__all__ = ["SharedEndpoints"]
+
+_BACKLOG = 1024
+
+
+class SharedEndpoints:
+    """Endpoints at which several processes listen.
+
+    Parameters
+    ----------
+    endpoints : sequence of Endpoint
+
+    Attributes
+    ----------
+    endpoints : tuple of Endpoint
+        With the ports that were free instead of 0.
+
+    Raises
+    ------
+    TransportError
+        If one of them is taken, or cannot be shared; the message names it.
+    """
+
+    def __init__(self, endpoints: Sequence[Endpoint]) -> None:
+        self._bound: list[socket.socket] = []
+        self._listening: dict[int, list[socket.socket]] = {}
+        bound = []
+        for endpoint in endpoints:
+            try:
+                bound.append(self._bind(endpoint))
+            except OSError as error:
+                self.close()
+                raise TransportError(f"cannot listen on {endpoint}: {error.strerror}") from error
+        self.endpoints = tuple(bound)
+
+    def of(self, index: int) -> Sequence[socket.socket]:
+        """Return the listening sockets of a process, one for each endpoint.
+
+        Raises
+        ------
+        OSError
+            If they had been given up, and the system allows no more sockets now.
+        """
+        if index not in self._listening:
+            listening = self._listening[index] = []
+            for endpoint, bound in zip(self.endpoints, self._bound, strict=True):
+                listening.append(
+                    bound if endpoint.is_local_socket else _listen(bound.family, bound)
+                )
+        return self._listening[index]
+
+    def give_up(self, index: int) -> None:
+        """Refuse what waits at a process's own sockets, and what would."""
+        for listening in self._listening.pop(index, ()):
+            if listening not in self._bound:
+                listening.close()
+
+    def close(self) -> None:
+        """Give up all sockets and addresses; may be repeated."""
+        for index in list(self._listening):
+            self.give_up(index)
+        for bound in self._bound:
+            if bound.family == socket.AF_UNIX and bound.fileno() >= 0:
+                with contextlib.suppress(OSError):
+                    Path(bound.getsockname()).unlink()
+            bound.close()
+
+    def _bind(self, endpoint: Endpoint) -> Endpoint:
+        if endpoint.is_local_socket:
+            bound = socket.socket(socket.AF_UNIX)
+            self._bound.append(bound)
+            bound.bind(endpoint.host)
+            bound.listen(_BACKLOG)
+            return endpoint
+        family, *_, where = socket.getaddrinfo(
+            endpoint.host, endpoint.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+        )[0]
+        bound = socket.socket(family)
+        self._bound.append(bound)
+        bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        # The port must be ours alone; only then is it shared, with our own processes.
+        bound.bind(where)
+        bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 0)
+        bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
+        return endpoint.with_port(bound.getsockname()[1])
+
+
+def _listen(family: int, bound: socket.socket) -> socket.socket:
+    """Return another socket that listens where one is bound."""
+    listening = socket.socket(family)
+    try:
+        listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
+        listening.bind(bound.getsockname())
+        listening.listen(_BACKLOG)
+    except OSError:
+        listening.close()
+        raise
+    return listening

@@ -1,0 +1,280 @@
+"""How a service is doing, for Prometheus: counted by the service, written when somebody asks.
+
+The service's machine counts what it does anyway, and two additions for each decision keep the
+distributions of times. A :class:`Report` holds all of that. Reports of several processes are added
+up, and so is what a process had counted that has ended: a counter never goes backwards.
+"""
+
+from __future__ import annotations
+
+import os
+from bisect import bisect_left
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import TYPE_CHECKING, Literal, TypeAlias
+
+import msgspec
+
+from holdfast import __version__
+from holdfast.errors import HoldfastError
+from holdfast.session.messages import PROTOCOL_VERSION
+from holdfast.session.service_limits import ServiceStatistics
+
+if TYPE_CHECKING:
+    from prometheus_client.core import Metric
+
+__all__ = [
+    "BUCKETS_S",
+    "CONTENT_TYPE",
+    "DecisionKind",
+    "DecisionTimes",
+    "Durations",
+    "Exposition",
+    "MetricsError",
+    "Report",
+    "added",
+]
+
+DecisionKind: TypeAlias = Literal["task", "sensing"]
+
+BUCKETS_S = (
+    *(50e-6, 100e-6, 250e-6, 500e-6),
+    *(1e-3, 2.5e-3, 5e-3, 10e-3, 25e-3, 50e-3, 100e-3, 250e-3, 500e-3),
+    *(1.0, 2.5, 5.0, 10.0, 30.0, 60.0),
+)
+"""Upper ends of the histograms' buckets: from a task action's arithmetic to a hopeless wait."""
+
+CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
+"""Of what :class:`Exposition` writes."""
+
+_COUNTERS = (
+    ("restores", "States taken from a robot's checkpoint."),
+    ("state_requests", "Requests answered with the wish for the state."),
+    ("busy", "Requests turned away for want of capacity."),
+    ("cache_hits", "Requests answered from what was computed before."),
+    ("attached", "Requests that joined one already in work."),
+    ("superseded", "Requests dropped for a newer one of the same robot."),
+    ("sessions_opened", "Sessions opened."),
+    ("sessions_taken_over", "Sessions that a restarted robot went on with."),
+    ("sessions_evicted", "Sessions forgotten for want of room."),
+)
+_GAUGES = (
+    ("sessions", "sessions", "Sessions held."),
+    ("state_bytes", "state_bytes", "Size of all states held."),
+    ("waiting", "waiting_requests", "Requests that wait for their turn."),
+    ("running", "running_jobs", "Decisions being computed."),
+    ("calls", "open_calls", "Calls that have not ended."),
+)
+
+
+class MetricsError(HoldfastError):
+    """Metrics cannot be offered: a package is missing."""
+
+
+class Durations(msgspec.Struct):
+    """A histogram of durations.
+
+    Attributes
+    ----------
+    counts : list of int
+        Those in each bucket of :data:`BUCKETS_S`, and last those beyond.
+    sum_s : float
+    """
+
+    counts: list[int] = msgspec.field(default_factory=lambda: [0] * (len(BUCKETS_S) + 1))
+    sum_s: float = 0.0
+
+    def add(self, seconds: float) -> None:
+        """Note a duration."""
+        self.counts[bisect_left(BUCKETS_S, seconds)] += 1
+        self.sum_s += seconds
+
+    def cumulative(self) -> list[tuple[str, float]]:
+        """Return the buckets as Prometheus counts them: all up to each upper end."""
+        buckets, count = [], 0
+        for end, own in zip((*map(str, BUCKETS_S), "+Inf"), self.counts, strict=True):
+            count += own
+            buckets.append((end, float(count)))
+        return buckets
+
+
+class DecisionTimes(msgspec.Struct):
+    """For how long decisions were computed, and for how long they had waited before."""
+
+    task: Durations = msgspec.field(default_factory=Durations)
+    sensing: Durations = msgspec.field(default_factory=Durations)
+    waited: Durations = msgspec.field(default_factory=Durations)
+
+    def add(self, kind: DecisionKind, computed_s: float, waited_s: float) -> None:
+        """Note the times of a decision that was computed."""
+        (self.task if kind == "task" else self.sensing).add(computed_s)
+        self.waited.add(waited_s)
+
+
+class Report(msgspec.Struct):
+    """What one process of a service has counted, or several together.
+
+    Attributes
+    ----------
+    statistics : ServiceStatistics
+    times : DecisionTimes
+    """
+
+    statistics: ServiceStatistics = msgspec.field(default_factory=ServiceStatistics)
+    times: DecisionTimes = msgspec.field(default_factory=DecisionTimes)
+
+    def without_gauges(self) -> Report:
+        """Return what is left of a process that has ended: it holds nothing any more."""
+        nothing_held = {field: 0 for field, _, _ in _GAUGES}
+        return Report(msgspec.structs.replace(self.statistics, **nothing_held), self.times)
+
+
+def added(reports: Iterable[Report]) -> Report:
+    """Return the sum of reports, which share nothing with it."""
+    total = Report()
+    for report in reports:
+        mine, theirs = total.statistics, report.statistics
+        for field in theirs.__struct_fields__:
+            value = getattr(theirs, field)
+            if isinstance(value, dict):
+                counts = getattr(mine, field)
+                for key, count in value.items():
+                    counts[key] = counts.get(key, 0) + count
+            else:
+                setattr(mine, field, getattr(mine, field) + value)
+        for field in total.times.__struct_fields__:
+            sums, summands = getattr(total.times, field), getattr(report.times, field)
+            sums.counts = [a + b for a, b in zip(sums.counts, summands.counts, strict=True)]
+            sums.sum_s += summands.sum_s
+    return total
+
+
+class Exposition:
+    """Writes a report in Prometheus's text format.
+
+    Parameters
+    ----------
+    name : str
+        Of the service.
+    processes : callable, optional
+        Returns the numbers of the processes whose memory and time are told as one, the first of
+        them the one that answers.
+
+    Raises
+    ------
+    MetricsError
+        If ``prometheus_client`` is not installed.
+    """
+
+    def __init__(
+        self, name: str, processes: Callable[[], Sequence[int]] = lambda: (os.getpid(),)
+    ) -> None:
+        try:
+            import prometheus_client
+        except ImportError as error:
+            raise MetricsError(
+                'metrics need the package prometheus-client: pip install "holdfast[service]"'
+            ) from error
+        del prometheus_client
+        self._name = name
+        self._processes = processes
+
+    def text(self, report: Report, restarts: int = 0) -> bytes:
+        """Return the metrics.
+
+        Parameters
+        ----------
+        report : Report
+        restarts : int, optional
+            Processes of the service that were started again.
+        """
+        from prometheus_client import CollectorRegistry, generate_latest
+
+        families = [*self._families(report, restarts), *self._process_families()]
+        registry = CollectorRegistry(auto_describe=False)
+        registry.register(_Collected(families))
+        return generate_latest(registry)
+
+    def _families(self, report: Report, restarts: int) -> Iterator[Metric]:
+        from prometheus_client.core import (
+            CounterMetricFamily,
+            GaugeMetricFamily,
+            HistogramMetricFamily,
+        )
+
+        now, times = report.statistics, report.times
+        build = GaugeMetricFamily(
+            "holdfast_build_info",
+            "Version of holdfast and of its protocol, and the service's name.",
+            labels=["version", "protocol", "service"],
+        )
+        build.add_metric([__version__, str(PROTOCOL_VERSION), self._name], 1)
+        yield build
+        decisions = CounterMetricFamily(
+            "holdfast_decisions", "Parts of answers computed.", labels=["kind"]
+        )
+        decisions.add_metric(["task"], now.task_parts)
+        decisions.add_metric(["sensing"], now.sensing_parts)
+        yield decisions
+        seconds = HistogramMetricFamily(
+            "holdfast_decision_seconds", "Time to compute a decision.", labels=["kind"]
+        )
+        seconds.add_metric(["task"], times.task.cumulative(), times.task.sum_s)
+        seconds.add_metric(["sensing"], times.sensing.cumulative(), times.sensing.sum_s)
+        yield seconds
+        yield HistogramMetricFamily(
+            "holdfast_wait_seconds",
+            "Time for which a decision waited for its turn.",
+            buckets=times.waited.cumulative(),
+            sum_value=times.waited.sum_s,
+        )
+        refusals = CounterMetricFamily(
+            "holdfast_refusals", "Requests refused, by code.", labels=["code"]
+        )
+        for code, count in sorted(now.refusals.items()):
+            refusals.add_metric([code], count)
+        yield refusals
+        for field, text in _COUNTERS:
+            yield CounterMetricFamily(f"holdfast_{field}", text, getattr(now, field))
+        for field, name, text in _GAUGES:
+            yield GaugeMetricFamily(f"holdfast_{name}", text, getattr(now, field))
+        yield CounterMetricFamily(
+            "holdfast_process_restarts", "Processes of the service started again.", restarts
+        )
+
+    def _process_families(self) -> Iterator[Metric]:
+        """Yield the standard metrics of a process, of all processes together.
+
+        Their number of descriptors allowed and the time of their start are the first one's. A
+        process that has been waited for counts as a child of the first one, so that the time
+        computed does not go backwards.
+        """
+        first, *others = map(_told_by_the_system, self._processes())
+        for family in first:
+            (sample,) = family.samples
+            value = sample.value
+            if family.name not in ("process_start_time_seconds", "process_max_fds"):
+                value += sum(
+                    other.samples[0].value
+                    for families in others
+                    for other in families
+                    if other.name == family.name
+                )
+            if family.name == "process_cpu_seconds":
+                ended = os.times()
+                value += ended.children_user + ended.children_system
+            family.samples = [sample._replace(value=value)]
+            yield family
+
+
+def _told_by_the_system(process: int) -> list[Metric]:
+    from prometheus_client import ProcessCollector
+
+    return list(ProcessCollector(pid=lambda: process, registry=None).collect())
+
+
+class _Collected:
+    def __init__(self, families: list[Metric]) -> None:
+        self._families = families
+
+    def collect(self) -> list[Metric]:
+        return self._families

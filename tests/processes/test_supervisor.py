@@ -1,0 +1,268 @@
+"""``serve --processes``: several processes behind one address, of which any may die at any time."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import urllib.error
+import urllib.request
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from prometheus_client.parser import text_string_to_metric_families
+from tests.ports import free_port
+from tests.processes.faults import (
+    PATIENT,
+    References,
+    Service,
+    Site,
+    World,
+    assert_identical,
+    document_of,
+    events_of,
+    in_order,
+    wait_for_end,
+    wait_until,
+)
+
+PATIENCE_S = 30.0
+PEG = "peg_in_hole_2d"
+
+# Its import ends the process if a file says so.
+MORTAL = """
+import os
+from pathlib import Path
+
+from holdfast.problems.capsule_robot import CapsuleRobot
+
+if Path("die").exists():
+    os._exit(3)
+
+
+class Mortal(CapsuleRobot):
+    name = "mortal"
+"""
+
+
+def several(site: Site, *options: str, processes: int = 2) -> Service:
+    """Return a service of several processes that tells how it is."""
+    address = f"127.0.0.1:{free_port()}"
+    return site.service(
+        *("--processes", str(processes), "--health", address, "--metrics", address), *options
+    ).start()
+
+
+def page(service: Service, path: str) -> tuple[int, str]:
+    (ready,) = service.process.matching("ready")
+    try:
+        with urllib.request.urlopen(
+            f"http://{ready['health']}{path}", timeout=PATIENCE_S
+        ) as answer:
+            return answer.status, answer.read().decode()
+    except urllib.error.HTTPError as error:
+        with error:
+            return error.code, error.read().decode()
+
+
+def metrics(service: Service) -> dict[str, float]:
+    """Return all counts, each kind of a metric by itself."""
+    status, text = page(service, "/metrics")
+    assert status == 200
+    return {
+        f"{sample.name}{sorted(sample.labels.items())}": sample.value
+        for family in text_string_to_metric_families(text)
+        if family.type in ("counter", "histogram")
+        for sample in family.samples
+    }
+
+
+def children(service: Service) -> list[int]:
+    pid = service.process.pid
+    return [int(each) for each in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+
+
+def started_again(service: Service, count: int) -> Callable[[], object]:
+    return lambda: service.process.wait_for("process_started", count)
+
+
+class TestRobots:
+    def test_processes_are_killed_under_them(self, site: Site, references: References) -> None:
+        """Their runs decide the same; nothing but time is lost, and nothing is forgotten."""
+        cloud = several(site)
+        document = document_of(PEG)
+        told: list[dict[str, float]] = []
+
+        def kill(index: int) -> None:
+            told.append(metrics(cloud))
+            os.kill(children(cloud)[index], signal.SIGKILL)
+            told.append(metrics(cloud))
+
+        worlds: list[World] = []
+        robots = []
+        for number in range(4):
+            world, file = site.world(
+                document, f"robot-{number}", offload=PATIENT, recovery={"launch": "never"}
+            )
+            worlds.append(world)
+            if number == 0:
+                world.on("perform", 20, in_order(lambda: kill(0), started_again(cloud, 1)))
+                world.on("sense", 36, in_order(lambda: kill(1), started_again(cloud, 2)))
+                world.on("perform", 50, in_order(lambda: kill(0), lambda: kill(-1)))
+            robots.append(site.run(file, services=[cloud], out=f"out-{number}"))
+        for robot, world in zip(robots, worlds, strict=True):
+            robot.finish()
+            world.check()
+            assert_identical(robot.out, references(document))
+            world.assert_each_once(references(document))
+            assert not [each for each in events_of(robot.out) if each["event"] == "launch"]
+        told.append(metrics(cloud))
+        for before, after in zip(told, told[1:], strict=False):
+            for name, value in before.items():
+                assert after[name] >= value, name
+        decisions = "holdfast_decisions_total[('kind', 'sensing')]"
+        assert told[-1][decisions] > 0
+        assert told[-1][decisions] == told[-1]["holdfast_decision_seconds_count[('kind', 'sensing')]"]
+        assert told[-1]["holdfast_process_restarts_total[]"] == 4
+        assert len(cloud.process.matching("process_ended")) == 4
+        assert len(cloud.process.matching("ready")) == 1
+
+    def test_robots_of_all_processes_are_counted(self, site: Site, references: References) -> None:
+        cloud = several(site)
+        document = document_of(PEG)
+        for number in range(6):
+            file = site.configure(document, f"robot-{number}", offload=PATIENT)
+            site.run(file, services=[cloud], out=f"out-{number}").finish()
+        assert metrics(cloud)["holdfast_sessions_opened_total[]"] == 6
+
+
+class TestEnding:
+    @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 0), (signal.SIGINT, 130)])
+    def test_in_order(self, site: Site, number: signal.Signals, code: int) -> None:
+        cloud = several(site)
+        pids = children(cloud)
+        assert len(pids) == 2
+        cloud.process.signal(number)
+        assert cloud.process.wait() == code, cloud.process.account()
+        for pid in pids:
+            wait_for_end(pid)
+        (stopping, *others) = cloud.process.matching("stopping")
+        assert stopping["reason"] == number.name
+        assert "Traceback" not in cloud.process.output
+        with socket.socket() as again:
+            host, _, port = cloud.endpoint.removeprefix("tcp/").rpartition(":")
+            again.bind((host, int(port)))
+
+    def test_processes_end_with_the_supervisor(self, site: Site) -> None:
+        cloud = several(site)
+        pids = children(cloud)
+        cloud.kill()
+        for pid in pids:
+            wait_for_end(pid)
+
+    def test_a_second_signal_ends_at_once(self, site: Site) -> None:
+        """A process that stands still cannot end in order, and would be waited for."""
+        cloud = several(site)
+        pids = children(cloud)
+        os.kill(pids[0], signal.SIGSTOP)
+        cloud.process.signal(signal.SIGTERM)
+        cloud.process.wait_for("stopping")
+        cloud.process.signal(signal.SIGTERM)
+        cloud.process.wait()
+        for pid in pids:
+            wait_for_end(pid)
+
+
+class TestHealth:
+    def test_ready_alive_and_counted(self, site: Site) -> None:
+        cloud = several(site)
+        assert page(cloud, "/livez") == (200, "ok\n")
+        assert page(cloud, "/readyz") == (200, "ok\n")
+
+    def test_a_process_that_cannot_be_started_again(self, site: Site) -> None:
+        """Each time it is started a little later; as soon as it can serve, it does."""
+        (site.directory / "mortal_problem.py").write_text(MORTAL)
+        options = ("--problem", "mortal_problem:Mortal", "--problem-directory", str(site.directory))
+        cloud = several(site, *options)
+        (site.directory / "die").touch()
+        first, second = children(cloud)
+        os.kill(first, signal.SIGKILL)
+        ended = cloud.process.wait_for("process_ended", 4)
+        assert ended["reason"] == "ended with exit code 3"
+        delays = [each["again_in_s"] for each in cloud.process.matching("process_ended")]
+        assert delays == sorted(delays)
+        assert delays[0] == 0.0 < delays[-1]
+        # The other one serves.
+        assert page(cloud, "/readyz") == (200, "ok\n")
+        os.kill(second, signal.SIGKILL)
+        cloud.process.wait_for("process_ended", 1, pid=second)
+        assert page(cloud, "/readyz") == (503, "starting\n")
+        assert page(cloud, "/livez") == (200, "ok\n")
+        (site.directory / "die").unlink()
+        cloud.process.wait_for("process_started", 2)
+        assert page(cloud, "/readyz") == (200, "ok\n")
+
+    def test_a_process_that_stands_still(self, site: Site) -> None:
+        cloud = several(site)
+        pid = children(cloud)[1]
+        os.kill(pid, signal.SIGSTOP)
+        wait_until(lambda: page(cloud, "/livez")[0] == 503, "the silence to be seen")
+        assert f"process {pid} has said nothing" in page(cloud, "/livez")[1]
+        assert page(cloud, "/readyz") == (200, "ok\n")
+        assert metrics(cloud)["holdfast_process_restarts_total[]"] == 0
+        os.kill(pid, signal.SIGCONT)
+        wait_until(lambda: page(cloud, "/livez")[0] == 200, "it to be heard again")
+
+
+class TestRefusing:
+    def refused(self, site: Site, *options: str) -> str:
+        """Return the one line with which a service of several processes is not started."""
+        ended = site.process(
+            *site.service().command, "serve", "--processes", "2", "--log", "json", *options
+        )
+        assert ended.wait() == 2, ended.account()
+        assert not ended.matching("ready")
+        (error,) = ended.events
+        assert error["event"] == "error"
+        return json.dumps(error)
+
+    def test_an_address_that_is_taken(self, site: Site) -> None:
+        with socket.socket() as taken:
+            taken.bind(("127.0.0.1", free_port()))
+            taken.listen()
+            endpoint = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
+            assert endpoint in self.refused(site, "--listen", endpoint)
+            address = endpoint.removeprefix("tcp/")
+            anywhere = ("--listen", f"tcp/127.0.0.1:{free_port()}")
+            assert address in self.refused(site, *anywhere, "--health", address)
+
+    def test_a_second_service_at_one_address(self, site: Site) -> None:
+        cloud = several(site)
+        assert cloud.endpoint in self.refused(site, "--listen", cloud.endpoint)
+
+    @pytest.mark.parametrize(
+        ("options", "text"),
+        [
+            (("--connect", "tcp/127.0.0.1:1"), "--connect"),
+            (("--until-stdin-closes",), "--until-stdin-closes"),
+            (("--problem", "nix"), "nix"),
+            (("--health", "here"), "here"),
+        ],
+    )
+    def test_what_does_not_go_together(
+        self, site: Site, options: tuple[str, ...], text: str
+    ) -> None:
+        assert text in self.refused(site, "--listen", f"tcp/127.0.0.1:{free_port()}", *options)
+
+
+def test_events_name_the_processes(site: Site) -> None:
+    cloud = several(site)
+    pid = children(cloud)[0]
+    os.kill(pid, signal.SIGKILL)
+    started = cloud.process.wait_for("process_started")
+    ended: dict[str, Any] = cloud.process.matching("process_ended")[0]
+    assert (ended["pid"], ended["reason"]) == (pid, "was ended by SIGKILL")
+    assert started["pid"] in children(cloud)

@@ -1,0 +1,101 @@
+"""The address of several processes: whose it is, and what a process's end costs it."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+from collections.abc import Iterator, Sequence
+
+import pytest
+from tests.ports import free_port
+
+from holdfast.errors import TransportError
+from holdfast.runtime.endpoints import Endpoint, parse_endpoint
+from holdfast.service.listening import SharedEndpoints
+
+PATIENCE_S = 30.0
+
+
+@contextlib.contextmanager
+def shared(*endpoints: str) -> Iterator[SharedEndpoints]:
+    sockets = SharedEndpoints([parse_endpoint(each) for each in endpoints])
+    try:
+        yield sockets
+    finally:
+        sockets.close()
+
+
+def connect(endpoint: Endpoint) -> socket.socket:
+    return socket.create_connection((endpoint.host, endpoint.port), timeout=PATIENCE_S)
+
+
+def accepted(listening: Sequence[socket.socket]) -> int:
+    (one,) = listening
+    one.setblocking(False)
+    number = 0
+    with contextlib.suppress(BlockingIOError):
+        while True:
+            one.accept()[0].close()
+            number += 1
+    return number
+
+
+def test_connections_are_spread_over_the_processes() -> None:
+    with shared("tcp/127.0.0.1:0") as sockets, contextlib.ExitStack() as stack:
+        (endpoint,) = sockets.endpoints
+        each = [sockets.of(index) for index in range(2)]
+        for _ in range(100):
+            stack.enter_context(connect(endpoint))
+        numbers = [accepted(one) for one in each]
+    assert sum(numbers) == 100
+    assert min(numbers) > 0  # all at one of two fair ones: once in 2**99
+
+
+def test_what_waits_for_a_process_is_there_for_the_next() -> None:
+    with shared("tcp/127.0.0.1:0") as sockets:
+        (endpoint,) = sockets.endpoints
+        sockets.of(0)
+        with connect(endpoint):
+            assert accepted(sockets.of(0)) == 1
+
+
+def test_a_port_stays_ours_while_no_process_listens() -> None:
+    with shared("tcp/127.0.0.1:0") as sockets:
+        (endpoint,) = sockets.endpoints
+        sockets.of(0)
+        with connect(endpoint) as waiting:
+            sockets.give_up(0)
+            with contextlib.suppress(ConnectionResetError):
+                assert waiting.recv(1) == b""
+        with pytest.raises(ConnectionRefusedError):
+            connect(endpoint)
+        with pytest.raises(TransportError, match=f"{endpoint}: Address already in use"):
+            SharedEndpoints([endpoint])
+        sockets.of(0)
+        with connect(endpoint):
+            assert accepted(sockets.of(0)) == 1
+
+
+@pytest.mark.parametrize("reuse", [False, True])
+def test_a_port_that_is_taken(*, reuse: bool) -> None:
+    """Even by a program that would share it: robots would meet strangers half of the time."""
+    with socket.socket() as other:
+        if reuse:
+            other.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
+        other.bind(("127.0.0.1", free_port()))
+        other.listen()
+        endpoint = f"tcp/127.0.0.1:{other.getsockname()[1]}"
+        with pytest.raises(TransportError, match=f"{endpoint}: Address already in use"):
+            SharedEndpoints([parse_endpoint(endpoint)])
+
+
+def test_closed_sockets_are_free_for_others() -> None:
+    with shared("tcp/127.0.0.1:0") as sockets:
+        (endpoint,) = sockets.endpoints
+        sockets.of(0)
+        with connect(endpoint):
+            # Our end is closed first, so the system remembers the connection for a while.
+            assert accepted(sockets.of(0)) == 1
+        sockets.of(1)
+    with shared(str(endpoint)) as again:
+        assert again.endpoints == (endpoint,)
