@@ -20,11 +20,11 @@ from holdfast.runtime.links import RECOVERY_SERVICE
 __all__ = ["kills"]
 
 # What was asked for.
-FOUND_BAR_MS = 50.0
+FOUND_BAR_MS = 5.0
 WARM_BAR_MS = 100.0
 COLD_BAR_MS = 450.0
-LAUNCH_BAR_MS = 250.0
-USED_AGAIN_BAR_MS = 250.0
+LAUNCH_BAR_MS = 130.0
+USED_AGAIN_BAR_MS = 30.0
 
 THESIS_LAUNCH_MS = 370.0
 THESIS_TIMEOUT_MS = 5000.0

@@ -200,17 +200,17 @@ class ServiceProcess:
 
 
 class EchoProcess:
-    """The wire alone: see echo.py.
+    """A bare echo: see echo.py.
 
     Attributes
     ----------
-    endpoint : str
+    port : int
     """
 
     def __init__(self) -> None:
-        self.endpoint = f"tcp/127.0.0.1:{free_tcp_port()}"
+        self.port = free_tcp_port()
         self._process = subprocess.Popen(
-            [sys.executable, str(_ECHO), self.endpoint],
+            [sys.executable, str(_ECHO), str(self.port)],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
         )

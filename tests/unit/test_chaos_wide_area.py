@@ -43,9 +43,13 @@ def test_the_same_machine_needs_no_path() -> None:
         assert path.emulated_by == "nothing"
         assert path.listen == path.connect
         assert path.robot_prefix == path.service_prefix == ()
+        assert path.carried_bytes is None
 
 
-@pytest.mark.parametrize(("transport", "way"), [("tcp", "tcp proxy"), ("quic", "datagram proxy")])
+@pytest.mark.parametrize(
+    ("transport", "way"),
+    [("tcp", "tcp proxy"), ("tls", "tcp proxy"), ("udp", "datagram proxy")],
+)
 def test_where_no_networks_can_be_had_there_is_a_proxy(transport: Any, way: str) -> None:
     with lay_path(transport, 20.0, 0.01, "seed", packets=False) as path:
         assert path.emulated_by == way
@@ -56,9 +60,9 @@ def test_where_no_networks_can_be_had_there_is_a_proxy(transport: Any, way: str)
 @pytest.mark.parametrize(
     ("transport", "round_trip_ms", "loss", "message"),
     [
-        ("udp", 20.0, 0.0, "transport 'udp': there are tcp, quic"),
+        ("quic", 20.0, 0.0, "transport 'quic': there are tcp, tls, udp"),
         ("tcp", -20.0, 0.0, "must be from 0 to 60"),
-        ("quic", 20.0, 1.01, r"loss 1.01: must be from 0 to 1"),
+        ("udp", 20.0, 1.01, r"loss 1.01: must be from 0 to 1"),
     ],
 )
 def test_what_is_out_of_bounds(
@@ -77,6 +81,8 @@ def test_a_stream_survives_delay_and_loss(loss: float) -> None:
     """The system's own TCP makes good what the line loses; and nothing is faster than the line."""
     with lay_path("tcp", 10.0, loss, "seed") as path:
         assert path.emulated_by == "packets"
+        assert path.carried_bytes is not None
+        before = path.carried_bytes()
         port = path.listen.rpartition(":")[2]
         with subprocess.Popen(
             [*path.service_prefix, sys.executable, "-c", SERVE, path.host, port],
@@ -93,6 +99,8 @@ def test_a_stream_survives_delay_and_loss(loss: float) -> None:
                 )
             finally:
                 service.kill()
+        # There and back, and what was lost was sent again.
+        assert path.carried_bytes() > before + 2 * 60_000
     assert asked.returncode == 0, asked.stderr
     took_s, same = asked.stdout.split()
     assert same == "True"

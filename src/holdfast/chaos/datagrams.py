@@ -7,7 +7,7 @@ numbers, a delay and a share of losses, and a packet that arrives is the packet 
 
 :class:`DelayLine` is one direction of such a line, without a clock or a socket of its own.
 :class:`Carrier` is the thread that keeps lines, and :class:`DatagramProxy` stands between a robot
-and a service that speak QUIC on one machine.
+and a service on one machine.
 """
 
 from __future__ import annotations

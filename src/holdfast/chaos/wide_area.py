@@ -2,8 +2,8 @@
 
 Where the machine permits it, each gets a network of its own, and between the two there is nothing
 but a line: whatever packet leaves one of them comes to this process, which hands it to the other
-half a round trip later, or never. Both ends are the system's own TCP and Zenoh's own QUIC, so what
-they do about packets that are late or lost is what they would do on a real line. (Linux has this
+half a round trip later, or never. Both ends are the system's own TCP and UDP, so what they do about
+packets that are late or lost is what they would do on a real line. (Linux has this
 ready-made, ``tc netem``, but not every kernel has that.)
 
 Where it is not permitted, a proxy stands between them: datagrams are delayed and dropped all the
@@ -19,7 +19,7 @@ import os
 import socket
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Literal, NamedTuple, TypeAlias, get_args
 
 from holdfast.chaos.datagrams import Carrier, DatagramProxy, DelayLine
@@ -30,7 +30,7 @@ from holdfast.errors import InvalidValueError
 
 __all__ = ["Emulation", "Path", "Transport", "lay_path", "why_no_wide_area"]
 
-Transport: TypeAlias = Literal["tcp", "quic"]
+Transport: TypeAlias = Literal["tcp", "tls", "udp"]
 
 Emulation: TypeAlias = Literal["nothing", "packets", "tcp proxy", "datagram proxy"]
 """What delays and drops: nothing (the robot and the service share a loopback), a line for packets
@@ -67,6 +67,9 @@ class Path(NamedTuple):
         By which the robot calls the service.
     emulated_by : str
         See :data:`Emulation`.
+    carried_bytes : callable or None
+        Returns the bytes of all packets that were sent so far, both ways, with their headers and
+        with those that were lost; None where no packets are seen.
     """
 
     robot_prefix: tuple[str, ...]
@@ -75,6 +78,7 @@ class Path(NamedTuple):
     connect: str
     host: str
     emulated_by: Emulation
+    carried_bytes: Callable[[], int] | None = None
 
 
 @contextlib.contextmanager
@@ -85,7 +89,7 @@ def lay_path(
 
     Parameters
     ----------
-    transport : {"tcp", "quic"}
+    transport : {"tcp", "tls", "udp"}
     round_trip_ms : float
         Half of it for each way. 0 without loss is the machine's own loopback.
     loss : float
@@ -120,20 +124,23 @@ def lay_path(
         DelayLine[bytes](0.5e-3 * round_trip_ms, loss, f"{seed} {way}") for way in ("up", "down")
     ]
     if packets and why_no_wide_area() is None:
-        with _two_networks(lines[0], lines[1]) as (robot, service):
+        with _two_networks(lines[0], lines[1]) as (robot, service, carried_bytes):
             far = f"{transport}/{_SERVICE}:{port}"
-            yield Path(robot, service, far, far, _SERVICE, "packets")
+            yield Path(robot, service, far, far, _SERVICE, "packets", carried_bytes)
         return
     entry = free_port()
     through = f"{transport}/127.0.0.1:{entry}"
     round_trip_s = 1e-3 * round_trip_ms
-    if transport == "quic":
-        with DatagramProxy(entry, port, round_trip_s=round_trip_s, loss=loss, seed=seed):
-            yield Path((), (), near, through, "127.0.0.1", "datagram proxy")
-        return
-    with Proxy(entry, port, seed) as proxy:
+    with contextlib.ExitStack() as stack:
+        proxy = stack.enter_context(Proxy(entry, port, seed))
         proxy.impair(Impairment(latency_s=0.5 * round_trip_s, loss=loss))
-        yield Path((), (), near, through, "127.0.0.1", "tcp proxy")
+        if transport == "udp":
+            # Beside its datagrams it has a stream, at the same port.
+            stack.enter_context(
+                DatagramProxy(entry, port, round_trip_s=round_trip_s, loss=loss, seed=seed)
+            )
+        way: Emulation = "datagram proxy" if transport == "udp" else "tcp proxy"
+        yield Path((), (), near, through, "127.0.0.1", way)
 
 
 @functools.cache
@@ -152,8 +159,11 @@ def why_no_wide_area() -> str | None:
 @contextlib.contextmanager
 def _two_networks(
     up: DelayLine[bytes], down: DelayLine[bytes]
-) -> Iterator[tuple[tuple[str, ...], tuple[str, ...]]]:
-    """Yield commands that become others, in the robot's network and in the service's."""
+) -> Iterator[tuple[tuple[str, ...], tuple[str, ...], Callable[[], int]]]:
+    """Yield commands that become others, in the robot's network and in the service's.
+
+    And what returns the bytes of all packets that were sent.
+    """
     with contextlib.ExitStack() as stack:
         robot = stack.enter_context(NetworkNamespace())
         service = stack.enter_context(NetworkNamespace())
@@ -164,7 +174,11 @@ def _two_networks(
         carrier.add(robot_end.descriptor, robot_end.receive, up, service_end.send)
         carrier.add(service_end.descriptor, service_end.receive, down, robot_end.send)
         carrier.start()
-        yield robot.prefix, service.prefix
+        yield (
+            robot.prefix,
+            service.prefix,
+            lambda: robot_end.received_bytes + service_end.received_bytes,
+        )
 
 
 class _Device:
@@ -172,6 +186,7 @@ class _Device:
 
     def __init__(self, network: NetworkNamespace, own: str, other: str) -> None:
         self._prefix = network.prefix
+        self.received_bytes = 0
         here, there = socket.socketpair()
         with here, there:
             here.settimeout(_PATIENCE_S)
@@ -200,7 +215,9 @@ class _Device:
         os.close(self.descriptor)
 
     def receive(self) -> bytes:
-        return os.read(self.descriptor, _LARGEST)
+        packet = os.read(self.descriptor, _LARGEST)
+        self.received_bytes += len(packet)
+        return packet
 
     def send(self, packet: bytes) -> None:
         os.write(self.descriptor, packet)

@@ -74,6 +74,7 @@ COLUMNS = (
     "emulated_by",
     "load",
     "rate_hz",
+    "carried_bytes",
 )
 """Of the table of such trials: a row for each decision, each kill and, if wanted, each task action.
 
@@ -85,7 +86,9 @@ before); ``away_ms``, from the kill until the ready line of the cloud that was s
 ``failback_ms``, from that line until the robot carries out a decision of it; and ``waited_ms``, the
 longest time that it stood still for a decision until then. ``load`` is how many processes wanted a
 core when the run began, over the minute before: times on a busy machine say little. ``rate_hz`` is
-at how many task actions a second the robot really ran.
+at how many task actions a second the robot really ran, ``carried_bytes`` the bytes of all packets
+that were sent between robot and cloud from the start of the robot to its end, where packets are
+seen.
 """
 
 _PROBLEM = "peg_in_hole_2d"
@@ -112,7 +115,7 @@ class CloudTrials(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     Attributes
     ----------
     particles : int
-    transport : {"tcp", "quic"}
+    transport : {"tcp", "tls", "udp"}
     round_trip_ms : float
         Of the emulated path; 0 is the machine's own loopback.
     loss : float
@@ -135,6 +138,8 @@ class CloudTrials(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
         Whether the path may be one for packets; see :mod:`holdfast.chaos.wide_area`.
     actions : bool
         Whether there is a row for each task action that was performed, too.
+    kills : bool
+        Whether the cloud is killed at all.
     """
 
     particles: int
@@ -154,6 +159,7 @@ class CloudTrials(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     num_cores: int = 8
     packets: bool = True
     actions: bool = False
+    kills: bool = True
 
 
 def run_cloud_trials(**trials: Any) -> Table:
@@ -201,6 +207,7 @@ def rows_of_run(
     emulated_by: str,
     load: float | None = None,
     rate_hz: float | None = None,
+    carried_bytes: int | None = None,
     performed: Iterable[Performance] = (),
 ) -> Table:
     """Return the rows of a run: its decisions, its kill, if there was one, and its actions.
@@ -220,6 +227,8 @@ def rows_of_run(
         Of the machine.
     rate_hz : float or None
         Of the robot.
+    carried_bytes : int or None
+        Between the robot and the cloud.
     performed : iterable of Performance
         Task actions to be listed.
     """
@@ -229,6 +238,7 @@ def rows_of_run(
         "emulated_by": emulated_by,
         "load": load,
         "rate_hz": rate_hz,
+        "carried_bytes": carried_bytes,
     }
     rows: list[dict[str, Cell]] = [
         {
@@ -329,6 +339,7 @@ class _Processes:
         self._robot_done = False
         with contextlib.closing(DecisionTable(directory / _DISTURBED / TIMINGS_NAME)) as table:
             rate_hz = self._wanted.rate_hz / self._slowness
+            carried_before = self._carried_bytes()
             robot = self._start_robot(directory, rate_hz)
             chance = random.Random(f"kill {self._wanted.seed} {run}")
             strikes: list[Strike] = []
@@ -363,6 +374,7 @@ class _Processes:
                 emulated_by=self._path.emulated_by,
                 load=round(load, 2),
                 rate_hz=round(rate_hz, 2),
+                carried_bytes=self._carried_bytes(since=carried_before),
                 performed=(
                     list(performances(directory / f"{_DISTURBED}.txt"))
                     if self._wanted.actions
@@ -382,6 +394,8 @@ class _Processes:
         steps_of_trials: list[int],
     ) -> _Script:
         """Say what is waited for next, and do what is due then."""
+        if not self._wanted.kills:
+            yield lambda: False
 
         def steps_done() -> int:
             if not table.rows:
@@ -410,6 +424,10 @@ class _Processes:
         strike.usable_at = self._cloud_ready_at
         yield lambda: False
 
+    def _carried_bytes(self, *, since: int | None = 0) -> int | None:
+        carried = self._path.carried_bytes
+        return None if carried is None or since is None else carried() - since
+
     # -- before --------------------------------------------------------------------------------
 
     def _run_twin(self, run: int, directory: Path) -> list[int]:
@@ -434,7 +452,7 @@ class _Processes:
     def _write_configuration(self, path: Path, run: int, num_trials: int) -> None:
         wanted = self._wanted
         offload: dict[str, Any] = {"services": [self._path.connect]}
-        if wanted.transport == "quic":
+        if wanted.transport != "tcp":
             offload["tls"] = str(self._credentials() / "robot")
         document = {
             "problem": _PROBLEM,
@@ -462,7 +480,7 @@ class _Processes:
         write_atomically(path, msgspec.json.encode(document) + b"\n")
 
     def _credentials(self) -> Path:
-        """Return the directory with keys for both ends: QUIC is always encrypted."""
+        """Return the directory with keys for both ends."""
         if self._keys is None:
             from holdfast.runtime.credentials import make_credentials
 
@@ -475,7 +493,7 @@ class _Processes:
     def _start_cloud(self) -> None:
         self._cloud_ready_at = None
         arguments = ["serve", "--listen", self._path.listen, "--log", "json"]
-        if self._wanted.transport == "quic":
+        if self._wanted.transport != "tcp":
             arguments += ["--tls", str(self._credentials() / "service")]
         elif self._path.service_prefix:
             arguments.append("--insecure")  # nobody else is in that network

@@ -80,11 +80,11 @@ _PICTURE_RATE_HZ = 30.0
 _QUICK: dict[NetworkPath, tuple[int, ...]] = {
     NEAR: (100, 500),
     FAR: (200, 300, 400),
-    NetworkPath("tcp", 20.0, 0.0): (300,),
-    NetworkPath("quic", 20.0, 0.0): (300,),
-    NetworkPath("quic", THESIS_CLOUD_ROUND_TRIP_MS, 0.0): (300,),
-    NetworkPath("tcp", THESIS_CLOUD_ROUND_TRIP_MS, 0.05): (300,),
-    NetworkPath("quic", THESIS_CLOUD_ROUND_TRIP_MS, 0.05): (300,),
+    NetworkPath("tls", 20.0, 0.0): (300,),
+    NetworkPath("udp", 20.0, 0.0): (300,),
+    NetworkPath("udp", THESIS_CLOUD_ROUND_TRIP_MS, 0.0): (300,),
+    NetworkPath("tls", THESIS_CLOUD_ROUND_TRIP_MS, 0.05): (300,),
+    NetworkPath("udp", THESIS_CLOUD_ROUND_TRIP_MS, 0.05): (300,),
 }
 
 
@@ -179,7 +179,7 @@ def _cloud_tasks(condition: _Condition, scale: Scale) -> list[Task]:
     for first in range(0, condition.runs, _RUNS_IN_EACH):
         trials = CloudTrials(
             particles=condition.particles,
-            transport="quic" if path.transport == "quic" else "tcp",
+            transport=path.transport,
             round_trip_ms=path.round_trip_ms,
             loss=path.loss,
             first_run=first,
@@ -205,7 +205,8 @@ def _picture_task(scale: Scale) -> Task:
     return _task_of(
         CloudTrials(
             particles=300,
-            round_trip_ms=THESIS_CLOUD_ROUND_TRIP_MS,
+            transport=FAR.transport,
+            round_trip_ms=FAR.round_trip_ms,
             seed=scale.seed,
             min_steps=200,
             rate_hz=_PICTURE_RATE_HZ,
@@ -560,7 +561,7 @@ _EMULATIONS = {
     "packets": (
         "as packets between two networks on one machine, each delayed by half the round trip and "
         "dropped at random each way (independently, in order, without jitter or a limit on "
-        "bandwidth), with the system's own TCP and Zenoh's own QUIC at both ends"
+        "bandwidth), with the system's own TCP and UDP at both ends"
     ),
     "tcp proxy": (
         "by a proxy where TCP ends; a lost packet is a piece that comes later by 200 ms, because a "

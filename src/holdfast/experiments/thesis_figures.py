@@ -222,7 +222,7 @@ def sensing_times(rows: MeasuredRows) -> Figure:
                     answered,
                     in_cloud & rows.where(path=path),
                 )
-                for path, look in _tcp_looks(rows).items()
+                for path, look in _stream_looks(rows).items()
             ),
         ):
             _of_particles(panels[2], rows, values, chosen, series, dots=False)
@@ -235,9 +235,9 @@ def sensing_times(rows: MeasuredRows) -> Figure:
     return _figure(panels)
 
 
-def _tcp_looks(rows: MeasuredRows) -> dict[NetworkPath, _Series]:
-    """Return how the paths without loss over TCP look."""
-    return {path: look for path, look in _path_looks(rows).items() if path.transport == "tcp"}
+def _stream_looks(rows: MeasuredRows) -> dict[NetworkPath, _Series]:
+    """Return how the paths without loss over streams look."""
+    return {path: look for path, look in _path_looks(rows).items() if path.transport != "udp"}
 
 
 def _of_particles(
@@ -319,9 +319,9 @@ def _path_looks(rows: MeasuredRows) -> dict[NetworkPath, _Series]:
             continue
         far = path.round_trip_ms > 0.0
         color = 0 if not far else 3 if path.round_trip_ms < THESIS_CLOUD_ROUND_TRIP_MS else 4
-        marker = "s" if not far else "^" if path.transport == "tcp" else "v"
-        offset = 9.0 if not far else -7.0 if path.transport == "tcp" else 7.0
-        filled = path.transport == "tcp"
+        marker = "s" if not far else "^" if path.transport != "udp" else "v"
+        offset = 9.0 if not far else -7.0 if path.transport != "udp" else 7.0
+        filled = path.transport != "udp"
         label = f"cloud, {path.label}" + (" set" if far else "")
         looks[path] = _Series(label, COLORS[color], marker, filled, offset)
     return looks
@@ -478,7 +478,7 @@ def failbacks(rows: MeasuredRows) -> Figure:
     kills = rows.where(what="kill") & ~np.isnan(rows.number("failback_ms"))
     times = rows.number("failback_ms")
     with mpl.rc_context(STYLE):
-        for path, look in _tcp_looks(rows).items():
+        for path, look in _stream_looks(rows).items():
             _of_particles(
                 panels[0],
                 rows,
@@ -489,7 +489,7 @@ def failbacks(rows: MeasuredRows) -> Figure:
                 median=lambda values, here: median_interval(values[here]),
             )
         _over_particles(panels[0])
-        panels[0].set_title("By particles, over tcp without loss", loc="left")
+        panels[0].set_title("By particles, over streams without loss", loc="left")
         _legend_below(_figure(panels), panels[0], 3)
         _over_paths(panels[1], rows, times, kills)
         panels[1].set_title(_with_count("By path", int(kills.sum())), loc="left")
@@ -507,8 +507,8 @@ def _over_paths(panel: Axes, rows: MeasuredRows, values: FloatArray, chosen: Boo
     paths = [path for path in rows.paths if (chosen & rows.where(path=path)).any()]
     for number, path in enumerate(paths):
         here = values[chosen & rows.where(path=path)]
-        quic = path.transport == "quic"
-        color = COLORS[4] if quic else COLORS[0]
+        datagrams = path.transport == "udp"
+        color = COLORS[4] if datagrams else COLORS[0]
         _dots(panel, number, here, color, 0.5, upright=False)
         interval = median_interval(here)
         panel.errorbar(
@@ -518,7 +518,7 @@ def _over_paths(panel: Axes, rows: MeasuredRows, values: FloatArray, chosen: Boo
                 [_length(interval.value - interval.low)],
                 [_length(interval.high - interval.value)],
             ],
-            fmt="v" if quic else "s",
+            fmt="v" if datagrams else "s",
             color=color,
             markeredgecolor="white",
             markeredgewidth=0.7,

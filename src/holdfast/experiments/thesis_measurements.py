@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from holdfast.chaos.wide_area import Transport
 from holdfast.experiments.medians import median_interval_of_groups
 from holdfast.experiments.statistics import Interval
 from holdfast.experiments.tables import Table
@@ -53,13 +54,13 @@ class NetworkPath(NamedTuple):
 
     Attributes
     ----------
-    transport : {"tcp", "quic"}
+    transport : {"tcp", "tls", "udp"}
     round_trip_ms : float
     loss : float
         Share of packets, each way.
     """
 
-    transport: str
+    transport: Transport
     round_trip_ms: float
     loss: float
 
@@ -73,14 +74,16 @@ class NetworkPath(NamedTuple):
 
 
 NEAR = NetworkPath("tcp", 0.0, 0.0)
-FAR = NetworkPath("tcp", THESIS_CLOUD_ROUND_TRIP_MS, 0.0)
+FAR = NetworkPath("tls", THESIS_CLOUD_ROUND_TRIP_MS, 0.0)
+
+_FAR_TRANSPORTS: tuple[Transport, ...] = ("tls", "udp")
 
 PATHS = (
     NEAR,
     *(
         NetworkPath(transport, round_trip_ms, loss)
         for round_trip_ms in (20.0, THESIS_CLOUD_ROUND_TRIP_MS)
-        for transport in ("tcp", "quic")
+        for transport in _FAR_TRANSPORTS
         for loss in (0.0, 0.01, 0.05)
     ),
 )
