@@ -25,7 +25,6 @@ from holdfast.planning import (
 )
 from holdfast.problems.problem import Problem
 from holdfast.runtime.environment import SimulatedEnvironment
-from holdfast.runtime.transport.zenoh_transport import ZenohRobotTransport
 from holdfast.session.events import Appeared, Ended, Replied, TransportEvent
 from holdfast.session.messages import (
     DIGEST_SIZE,

@@ -125,7 +125,9 @@ class TestRobots:
                 assert after[name] >= value, name
         decisions = "holdfast_decisions_total[('kind', 'sensing')]"
         assert told[-1][decisions] > 0
-        assert told[-1][decisions] == told[-1]["holdfast_decision_seconds_count[('kind', 'sensing')]"]
+        assert (
+            told[-1][decisions] == told[-1]["holdfast_decision_seconds_count[('kind', 'sensing')]"]
+        )
         assert told[-1]["holdfast_process_restarts_total[]"] == 4
         assert len(cloud.process.matching("process_ended")) == 4
         assert len(cloud.process.matching("ready")) == 1

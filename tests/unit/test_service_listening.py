@@ -10,8 +10,8 @@ import pytest
 from tests.ports import free_port
 
 from holdfast.errors import TransportError
-from holdfast.runtime.endpoints import Endpoint, parse_endpoint
 from holdfast.service.listening import SharedEndpoints
+from holdfast.transport.endpoints import Endpoint, parse_endpoint
 
 PATIENCE_S = 30.0
 

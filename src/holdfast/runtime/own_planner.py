@@ -7,7 +7,6 @@ service is this one. It cannot be lost, for its process is the robot's.
 from __future__ import annotations
 
 import asyncio
-from collections import deque
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from time import monotonic

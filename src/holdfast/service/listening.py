@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from holdfast.errors import TransportError
-from holdfast.runtime.endpoints import Endpoint
+from holdfast.transport.endpoints import Endpoint
 
 __all__ = ["SharedEndpoints"]
 
