@@ -1325,25 +1325,27 @@ class TestAnyOrder:
         assert content(bench.ask(robot.request())) == robot.right_answer()
 
 
+def runs_of(service: Service, call: int, request: Request, now: float) -> list[float]:
+    """Have a request answered; return how long each of its jobs was expected to take."""
+    expected = []
+    effects = service.receive(call, encode(request), now)
+    while runs := [effect for effect in effects if isinstance(effect, Run)]:
+        (run,) = runs
+        expected.append(run.expected_s)
+        service.begun(run.job, now)
+        now += 0.001
+        effects = service.finished(run.job, run.job.run(), now)
+    return expected
+
+
 def test_only_what_was_measured_of_a_robot_is_expected_to_be_brief() -> None:
     service = Service(make_problem, 1)
-
-    def runs_of(call: int, request: Request, now: float) -> list[float]:
-        """Have a request answered; return how long each of its jobs was expected to take."""
-        expected = []
-        effects = service.receive(call, encode(request), now)
-        while runs := [effect for effect in effects if isinstance(effect, Run)]:
-            (run,) = runs
-            expected.append(run.expected_s)
-            service.begun(run.job, now)
-            now += 0.001
-            effects = service.finished(run.job, run.job.run(), now)
-        return expected
-
     light = Robot(key=1)
     found = []
     for call in range(1, 5):
-        found.append(runs_of(call, light.request(since=max(0, len(light.observed) - 1)), call))
+        found.append(
+            runs_of(service, call, light.request(since=max(0, len(light.observed) - 1)), call)
+        )
         light.act_until_sensing()
         light.sense()
     assert found[0] == [math.inf]  # the problem is to be built
@@ -1351,9 +1353,30 @@ def test_only_what_was_measured_of_a_robot_is_expected_to_be_brief() -> None:
     assert all(expected_s == pytest.approx(0.001) for expected_s in found[3])
     # Another robot with the same problem may have other settings: nothing is known of it.
     heavy = Robot(key=2, planning=planning_of(particles=500))
-    assert runs_of(10, heavy.request(), 20.0) == [math.inf]
+    assert runs_of(service, 10, heavy.request(), 20.0) == [math.inf]
     # Neither of a request that takes more than one observation to answer, or a whole state.
     for _ in range(2):
         light.act_until_sensing()
         light.sense()
-    assert runs_of(11, light.request(since=len(light.observed) - 3), 21.0)[0] == math.inf
+    assert runs_of(service, 11, light.request(since=len(light.observed) - 3), 21.0)[0] == math.inf
+
+
+def test_other_peoples_code_is_not_expected_to_be_brief() -> None:
+    service, robot = Service(lambda _: CapsuleRobot(), 1), Robot()
+    robot.opening = msgspec.structs.replace(robot.opening, problem="own_problem:Mine")
+    for call in range(5):
+        request = robot.request(since=max(0, len(robot.observed) - 1))
+        assert set(runs_of(service, call, request, call)) == {math.inf}
+        robot.act_until_sensing()
+        robot.sense()
+
+
+def test_what_may_be_of_few_steps_or_many_is_not_expected_to_be_brief() -> None:
+    service, robot = Service(make_problem, 1), Robot(planning=planning_of(interval=33))
+    for call in range(5):
+        request = robot.request(since=max(0, len(robot.observed) - 1))
+        expected = runs_of(service, call, request, call)
+        assert expected[0] == math.inf
+        robot.act_until_sensing()
+        robot.sense()
+    assert expected[1] < math.inf  # the sensing part is of none

@@ -225,7 +225,8 @@ def _serve(options: argparse.Namespace) -> int:
 
     from holdfast.runtime.allocator import limit_arenas
     from holdfast.runtime.logs import EventLog
-    from holdfast.runtime.service_shell import KnownProblems, ServiceShell
+    from holdfast.runtime.service_shell import ServiceShell
+    from holdfast.service.known_problems import KnownProblems
     from holdfast.session.service import Service
     from holdfast.session.service_limits import ServiceLimits
 

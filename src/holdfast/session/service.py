@@ -31,7 +31,7 @@ from collections.abc import Callable
 import msgspec
 
 from holdfast.errors import InvalidValueError
-from holdfast.planning import needs_sensing
+from holdfast.planning import PlanningState, needs_sensing
 from holdfast.problems.problem import Problem
 from holdfast.session.messages import (
     MessageError,
@@ -59,6 +59,9 @@ __all__ = ["Service"]
 _NO_ROOM_RETRY_MS = 100.0
 """A robot for which there is no room is to come back no sooner than after this."""
 
+_USUAL_STEPS = 32
+"""Of a work whose time can be told from those of the works before."""
+
 _INERTIA_OF_ONE = 4.0
 _INERTIA_OF_ALL = 8.0
 """What is expected of all robots moves more slowly than what is expected of one."""
@@ -72,9 +75,24 @@ class _Fate(enum.Enum):
     TURNED_AWAY = enum.auto()
 
 
-def _is_next(request: Request) -> bool:
-    """Tell whether a request is as most are: one observation further than the one before."""
-    return request.checkpoint is None and len(request.observations) <= 1
+def _takes_the_usual_time(work: Work, state: PlanningState | None) -> bool:
+    """Tell whether a work is as most are, so that what those before took says what it will take.
+
+    It then comes one observation after the one before, and is of few steps, for a robot may choose
+    the number of steps anew with each request. It is of a problem of holdfast's own: other people's
+    code may take any time at any call.
+    """
+    request = work.request
+    if state is None or not work.session.built_in:
+        return False
+    if request is None:
+        return True
+    if request.checkpoint is not None or len(request.observations) > 1:
+        return False
+    num_steps = request.step - state.step
+    if not work.sensing:
+        num_steps += work.session.planning.sensing_interval
+    return num_steps <= _USUAL_STEPS
 
 
 class Service:
@@ -443,9 +461,9 @@ class Service:
             state,
         )
         self._lines.begin(work, job, now)
-        expected_s = session.times.known_s(task=not work.sensing)
-        if problem is None or (request is not None and not _is_next(request)):
-            expected_s = math.inf
+        expected_s = math.inf
+        if problem is not None and _takes_the_usual_time(work, state):
+            expected_s = session.times.known_s(task=not work.sensing)
         self._effects.append(Run(job, expected_s))
 
     # -- outcomes --------------------------------------------------------------------------------

@@ -34,7 +34,8 @@ class Run(NamedTuple):
     job : Job
     expected_s : float
         How long it may take, by what such jobs of the same robot took before; infinite if there
-        was none, if the problem is still to be built, or if the request is out of the ordinary.
+        was none, if the problem is still to be built or is not one of holdfast's own, or if the
+        request is out of the ordinary.
     """
 
     job: Job

@@ -21,6 +21,7 @@ from typing import NamedTuple
 import msgspec
 
 from holdfast.planning import PlanningState
+from holdfast.problems.registry import BUILT_IN
 from holdfast.session.messages import Opening, Request, pack_opening
 from holdfast.session.service_limits import ServiceLimits
 from holdfast.settings import PlanningSettings
@@ -206,6 +207,7 @@ class Session:
         "ahead_digest",
         "answers",
         "built",
+        "built_in",
         "closed",
         "epoch",
         "held",
@@ -237,6 +239,7 @@ class Session:
         named = (opening.problem, opening.core_version, opening.problem_digest)
         self.problem_key = _key_of((named, opening.model, opening.state_space_planner))
         self.built = False
+        self.built_in = opening.problem in BUILT_IN
         # The number of threads changes no result, so the service may choose it.
         most = min(opening.planning.active_sensing.num_cores, max_threads)
         self.planning = _with_cores(opening.planning, most)
