@@ -2,7 +2,7 @@
 
 A robot that offloads nothing runs the same loop, with the same journal, as one that does; its only
 service is this one, on that loop. What takes long is computed on a thread, so that the next sensing
-action is computed while the robot moves here too. It cannot be lost, for its process is the robot's.
+action is computed while the robot moves here too. It cannot be lost: its process is the robot's.
 """
 
 from __future__ import annotations
