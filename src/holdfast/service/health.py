@@ -18,7 +18,15 @@ from typing import NamedTuple, TypeAlias
 
 from holdfast.errors import HoldfastError
 
-__all__ = ["HealthError", "HttpAddress", "HttpServer", "Page", "Pages", "parse_http_address"]
+__all__ = [
+    "HealthError",
+    "HttpAddress",
+    "HttpServer",
+    "Page",
+    "Pages",
+    "parse_http_address",
+    "start_servers",
+]
 
 _MAX_HEAD_BYTES = 8192
 _MAX_CONNECTIONS = 64
@@ -168,6 +176,44 @@ class HttpServer:
         if page is None:
             return Page(404, f"there are {', '.join(sorted(self._pages))}\n".encode())
         return await page()
+
+
+async def start_servers(
+    pages_at: Mapping[str, tuple[HttpAddress | None, Pages]],
+) -> dict[str, tuple[HttpServer, HttpAddress]]:
+    """Answer at several addresses; where two are the same, one server has the pages of both.
+
+    Parameters
+    ----------
+    pages_at : mapping
+        An address and pages, of each purpose; one without an address is left out.
+
+    Returns
+    -------
+    dict
+        Of each purpose, the server and where it listens.
+
+    Raises
+    ------
+    HealthError
+        If one cannot listen; the message names the address.
+    """
+    servers: dict[HttpAddress, tuple[HttpServer, HttpAddress]] = {}
+    try:
+        for address in dict.fromkeys(address for address, _ in pages_at.values()):
+            if address is not None:
+                at_it = [pages for where, pages in pages_at.values() if where == address]
+                server = HttpServer(address, {path: page for pages in at_it for path, page in pages.items()})
+                servers[address] = server, await server.start()
+    except HealthError:
+        for server, _ in servers.values():
+            server.close()
+        raise
+    return {
+        purpose: servers[address]
+        for purpose, (address, _) in pages_at.items()
+        if address is not None
+    }
 
 
 class _Connection(asyncio.Protocol):

@@ -34,7 +34,7 @@ from holdfast.errors import HoldfastError
 from holdfast.runtime.logs import EventSink
 from holdfast.service.metrics import Report, added
 
-__all__ = ["ListeningSockets", "ServiceProcessError", "Supervised", "Supervisor"]
+__all__ = ["ListeningSockets", "ServiceProcessError", "Supervised", "Supervisor", "supervise"]
 
 _REPORT_EVERY_S = 1.0
 _FRESH_WITHIN_S = 1.0
@@ -105,6 +105,11 @@ class Supervised:
         self._socket.set_inheritable(False)
         self._ready = False
         self._timer: asyncio.TimerHandle | None = None
+
+    @property
+    def has_served(self) -> bool:
+        """Whether this process has said that it serves."""
+        return self._timer is not None
 
     def start(self, report: Callable[[], Report], lost: Callable[[], None]) -> None:
         """Say in the running loop that this process serves, and report from then on.
@@ -189,13 +194,15 @@ class _Child:
 class Supervisor:
     """Starts a service's processes, watches them, starts again what dies, and ends them.
 
+    Belongs to the event loop that runs when it is made.
+
     Parameters
     ----------
     arguments : sequence of str
         Of ``holdfast serve``, for every process.
     processes : int
     listening : ListeningSockets
-        Is closed by :meth:`run`.
+        Closed when the processes are to end.
     events : EventSink
 
     Attributes
@@ -221,7 +228,8 @@ class Supervisor:
         self._past = Report()
         self._asked = 0
         self._stopping = False
-        self._change: asyncio.Future[None]
+        self._loop = asyncio.get_running_loop()
+        self._change: asyncio.Future[None] = self._loop.create_future()
         self._failure: str | None = None
         self._has_served = False
         self.restarts = 0
@@ -234,8 +242,6 @@ class Supervisor:
         ServiceProcessError
             If one has ended before; the message says why.
         """
-        self._loop = asyncio.get_running_loop()
-        self._change = self._loop.create_future()
         for index in range(len(self._children)):
             self._start(index)
         await self._until(
@@ -286,6 +292,7 @@ class Supervisor:
         for index, dead in enumerate(self._children):
             if dead is not None:
                 self._bury(index, dead)
+        self._changed()
 
     def process_ids(self) -> list[int]:
         """Return this process's number, then those of the processes."""
@@ -329,7 +336,7 @@ class Supervisor:
                 process = subprocess.Popen(
                     [
                         *self._command,
-                        f"--supervised={os.getpid()}:{theirs.fileno()}",
+                        f"--supervised={os.getpid()},{theirs.fileno()}",
                         f"--sockets={','.join(map(str, descriptors))}",
                     ],
                     stdin=subprocess.DEVNULL,
@@ -421,3 +428,58 @@ class Supervisor:
             if left_s is not None and left_s <= 0.0:
                 return
             await asyncio.wait({self._change}, timeout=left_s)
+
+
+async def supervise(
+    supervisor: Supervisor,
+    events: EventSink,
+    drain_s: float,
+    ready: Callable[[], None],
+) -> int:
+    """Run a service's processes until a signal says that they are to end.
+
+    Parameters
+    ----------
+    supervisor : Supervisor
+    events : EventSink
+    drain_s : float
+        How long the processes may take to end in order. A second signal ends them at once.
+    ready : callable
+        Is called once, when all of them serve.
+
+    Returns
+    -------
+    int
+        The signal.
+
+    Raises
+    ------
+    ServiceProcessError
+        If a process cannot serve.
+    """
+    loop = asyncio.get_running_loop()
+    stopping: asyncio.Future[int] = loop.create_future()
+
+    def stop(number: int) -> None:
+        if stopping.done():
+            supervisor.kill()
+        else:
+            stopping.set_result(number)
+
+    for number in (signal.SIGTERM, signal.SIGINT):
+        if signal.getsignal(number) is not signal.SIG_IGN:
+            loop.add_signal_handler(number, stop, number)
+    loop.add_signal_handler(signal.SIGHUP, supervisor.reload)
+    starting = loop.create_task(supervisor.start())
+    try:
+        await asyncio.wait({starting, stopping}, return_when=asyncio.FIRST_COMPLETED)
+        if starting.done():
+            starting.result()
+            ready()
+        reason = await stopping
+        events.event("stopping", reason=signal.Signals(reason).name)
+        await supervisor.stop(drain_s)
+        return reason
+    finally:
+        starting.cancel()
+        supervisor.kill()
