@@ -54,10 +54,6 @@ _MAX_UNDECODED_BYTES = 128 << 20
 _UNREAD_BUSY = [encode(Busy(0, retry_after_ms)) for retry_after_ms in range(100, 126)]
 """Used in turn, so that robots that were turned away together do not come back together."""
 
-_RARELY_LOGGED = frozenset(
-    {"busy", "refused", "session_opened", "session_taken_over", "restored", "evicted"}
-)
-
 
 class ServiceBrokenError(HoldfastError):
     """The service's own code failed: a defect. A new process is better than half a service."""
@@ -173,6 +169,16 @@ class ServiceShell:
         """Whether a thread is at work, which nobody waits for."""
         return self._jobs.num_open + self._decoder.num_open > 0
 
+    def note(self, event: str, /, **fields: object) -> None:
+        """Log an event; of each kind only so often, with the number of those left out.
+
+        What another machine can bring about, it can bring about a thousand times a second.
+        """
+        omitted = self._rates.admit(event, event, fields, self._loop.time())
+        if omitted is not None:
+            self._log(CountedEvent(event, fields, omitted))
+        self._set_timer()
+
     def statistics(self) -> ServiceStatistics:
         """Return a copy of what the machine counts."""
         statistics = self._service.statistics
@@ -227,8 +233,7 @@ class ServiceShell:
         self._unread += 1
         call.reply(_UNREAD_BUSY[self._unread % len(_UNREAD_BUSY)])
         call.end()
-        self._log(Noted("busy", {"turned_away_unread": self._unread}))
-        self._set_timer()
+        self.note("busy", turned_away_unread=self._unread)
 
     def _large_one_decoded(
         self, call: IncomingCall, size: int, request: Request | MessageError
@@ -265,7 +270,7 @@ class ServiceShell:
         self._timer = None
         now = self._loop.time()
         for event in self._rates.due(now):
-            self._log_one(event)
+            self._log(event)
         self._carry_out(self._service.tick(now))
 
     # -- what comes of it ------------------------------------------------------------------------
@@ -279,7 +284,7 @@ class ServiceShell:
             elif isinstance(effect, Run):
                 self._run(effect)
             elif isinstance(effect, Noted):
-                self._log(effect)
+                self.note(effect.event, **effect.fields)
             elif self._on_decision is not None:
                 self._on_decision(effect.kind, effect.computed_s, effect.waited_s)
         self._set_timer()
@@ -309,17 +314,7 @@ class ServiceShell:
             self._timer.cancel()
         self._timer = self._loop.call_at(due, self._guarded, self._tick)
 
-    def _log(self, note: Noted) -> None:
-        """Log an event; the frequent ones only so often, with the number of those left out."""
-        if note.event not in _RARELY_LOGGED:
-            self._events.event(note.event, **note.fields)
-            return
-        now = self._loop.time()
-        omitted = self._rates.admit(note.event, note.event, note.fields, now)
-        if omitted is not None:
-            self._log_one(CountedEvent(note.event, note.fields, omitted))
-
-    def _log_one(self, event: CountedEvent) -> None:
+    def _log(self, event: CountedEvent) -> None:
         self._events.event(event.name, **event.told())
 
 
