@@ -24,8 +24,8 @@ __all__ = [
     "HttpServer",
     "Page",
     "Pages",
+    "Watched",
     "parse_http_address",
-    "start_servers",
 ]
 
 _MAX_HEAD_BYTES = 8192
@@ -178,42 +178,38 @@ class HttpServer:
         return await page()
 
 
-async def start_servers(
-    pages_at: Mapping[str, tuple[HttpAddress | None, Pages]],
-) -> dict[str, tuple[HttpServer, HttpAddress]]:
-    """Answer at several addresses; where two are the same, one server has the pages of both.
+class Watched:
+    """Pages at several addresses; where two are the same, one server has the pages of both."""
 
-    Parameters
-    ----------
-    pages_at : mapping
-        An address and pages, of each purpose; one without an address is left out.
+    def __init__(self) -> None:
+        self._wanted: dict[str, HttpAddress] = {}
+        self._pages: dict[HttpAddress, dict[str, Callable[[], Awaitable[Page]]]] = {}
+        self._servers: list[HttpServer] = []
 
-    Returns
-    -------
-    dict
-        Of each purpose, the server and where it listens.
+    def add(self, purpose: str, address: HttpAddress, pages: Pages) -> None:
+        """Want pages at an address."""
+        self._wanted[purpose] = address
+        self._pages.setdefault(address, {}).update(pages)
 
-    Raises
-    ------
-    HealthError
-        If one cannot listen; the message names the address.
-    """
-    servers: dict[HttpAddress, tuple[HttpServer, HttpAddress]] = {}
-    try:
-        for address in dict.fromkeys(address for address, _ in pages_at.values()):
-            if address is not None:
-                at_it = [pages for where, pages in pages_at.values() if where == address]
-                server = HttpServer(address, {path: page for pages in at_it for path, page in pages.items()})
-                servers[address] = server, await server.start()
-    except HealthError:
-        for server, _ in servers.values():
+    async def start(self) -> dict[str, str]:
+        """Answer; return where, as ``HOST:PORT`` for each purpose.
+
+        Raises
+        ------
+        HealthError
+            If it cannot listen at an address; the message names it.
+        """
+        found = {}
+        for address, pages in self._pages.items():
+            server = HttpServer(address, pages)
+            found[address] = str(await server.start())
+            self._servers.append(server)
+        return {purpose: found[address] for purpose, address in self._wanted.items()}
+
+    def close(self) -> None:
+        """Answer no more; may be repeated."""
+        for server in self._servers:
             server.close()
-        raise
-    return {
-        purpose: servers[address]
-        for purpose, (address, _) in pages_at.items()
-        if address is not None
-    }
 
 
 class _Connection(asyncio.Protocol):

@@ -26,7 +26,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from time import monotonic
-from typing import Protocol
+from typing import Any, Protocol
 
 import msgspec
 
@@ -204,11 +204,6 @@ class Supervisor:
     listening : ListeningSockets
         Closed when the processes are to end.
     events : EventSink
-
-    Attributes
-    ----------
-    restarts : int
-        Processes started again.
     """
 
     def __init__(
@@ -232,7 +227,7 @@ class Supervisor:
         self._change: asyncio.Future[None] = self._loop.create_future()
         self._failure: str | None = None
         self._has_served = False
-        self.restarts = 0
+        self._restarts = 0
 
     async def start(self) -> None:
         """Start all processes; return when all of them serve.
@@ -263,11 +258,13 @@ class Supervisor:
             else:
                 child.reload = True  # it may have read the old ones a moment ago
 
-    async def stop(self, timeout_s: float) -> None:
-        """Have all processes finish what they owe, all at once, and end; kill what does not.
+    async def stop(self, number: int, timeout_s: float) -> None:
+        """Have all processes end, at the same time; kill those that do not.
 
         Parameters
         ----------
+        number : int
+            The signal that they get: at SIGTERM they finish what they owe.
         timeout_s : float
             How long they may take.
         """
@@ -277,7 +274,7 @@ class Supervisor:
         # As long as this end is open, the system would go on accepting for nobody.
         self._listening.close()
         for child in self._living():
-            child.process.terminate()
+            child.process.send_signal(number)
         await self._until(lambda: not self._living(), timeout_s)
         self.kill()
 
@@ -321,7 +318,9 @@ class Supervisor:
             _FRESH_WITHIN_S,
         )
         reports = (child.report for child in self._living())
-        return added([self._past, *(report for report in reports if report is not None)])
+        total = added([self._past, *(report for report in reports if report is not None)])
+        total.restarts = self._restarts
+        return total
 
     def _living(self) -> list[_Child]:
         return [child for child in self._children if child is not None]
@@ -413,7 +412,7 @@ class Supervisor:
         self._events.event("process_ended", reason=reason, **fields, again_in_s=delay_s)
         if delay_s > _KEPT_S:
             self._listening.give_up(index)
-        self.restarts += 1
+        self._restarts += 1
         self._delayed[index] = self._loop.call_later(delay_s, self._start, index)
 
     def _changed(self) -> None:
@@ -466,20 +465,21 @@ async def supervise(
         else:
             stopping.set_result(number)
 
-    for number in (signal.SIGTERM, signal.SIGINT):
-        if signal.getsignal(number) is not signal.SIG_IGN:
-            loop.add_signal_handler(number, stop, number)
+    for ending in (signal.SIGTERM, signal.SIGINT):
+        if signal.getsignal(ending) is not signal.SIG_IGN:
+            loop.add_signal_handler(ending, stop, ending)
     loop.add_signal_handler(signal.SIGHUP, supervisor.reload)
     starting = loop.create_task(supervisor.start())
     try:
-        await asyncio.wait({starting, stopping}, return_when=asyncio.FIRST_COMPLETED)
+        awaited: set[asyncio.Future[Any]] = {starting, stopping}
+        await asyncio.wait(awaited, return_when=asyncio.FIRST_COMPLETED)
         if starting.done():
             starting.result()
             ready()
-        reason = await stopping
-        events.event("stopping", reason=signal.Signals(reason).name)
-        await supervisor.stop(drain_s)
-        return reason
+        number = await stopping
+        events.event("stopping", reason=signal.Signals(number).name)
+        await supervisor.stop(number, drain_s)
+        return number
     finally:
         starting.cancel()
         supervisor.kill()

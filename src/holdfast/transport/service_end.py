@@ -151,7 +151,7 @@ class StreamServiceTransport:
         self._connect = [check_endpoint(text, listens=False) for text in connect]
         for endpoint in (*self._listen, *self._connect):
             check_credentials(endpoint, tls)
-        self._listening = listening or [None] * len(listen)
+        self._listening: Sequence[socket.socket | None] = listening or [None] * len(listen)
         self._boot = boot
         self._tls = tls
         self._context = None if tls is None else server_context(tls, boot)
