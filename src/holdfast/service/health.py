@@ -18,7 +18,15 @@ from typing import NamedTuple, TypeAlias
 
 from holdfast.errors import HoldfastError
 
-__all__ = ["HealthError", "HttpAddress", "HttpServer", "Page", "Pages", "parse_http_address"]
+__all__ = [
+    "HealthError",
+    "HttpAddress",
+    "HttpServer",
+    "Page",
+    "Pages",
+    "Watched",
+    "parse_http_address",
+]
 
 _MAX_HEAD_BYTES = 8192
 _MAX_CONNECTIONS = 64
@@ -168,6 +176,40 @@ class HttpServer:
         if page is None:
             return Page(404, f"there are {', '.join(sorted(self._pages))}\n".encode())
         return await page()
+
+
+class Watched:
+    """Pages at several addresses; where two are the same, one server has the pages of both."""
+
+    def __init__(self) -> None:
+        self._wanted: dict[str, HttpAddress] = {}
+        self._pages: dict[HttpAddress, dict[str, Callable[[], Awaitable[Page]]]] = {}
+        self._servers: list[HttpServer] = []
+
+    def add(self, purpose: str, address: HttpAddress, pages: Pages) -> None:
+        """Want pages at an address."""
+        self._wanted[purpose] = address
+        self._pages.setdefault(address, {}).update(pages)
+
+    async def start(self) -> dict[str, str]:
+        """Answer; return where, as ``HOST:PORT`` for each purpose.
+
+        Raises
+        ------
+        HealthError
+            If it cannot listen at an address; the message names it.
+        """
+        found = {}
+        for address, pages in self._pages.items():
+            server = HttpServer(address, pages)
+            found[address] = str(await server.start())
+            self._servers.append(server)
+        return {purpose: found[address] for purpose, address in self._wanted.items()}
+
+    def close(self) -> None:
+        """Answer no more; may be repeated."""
+        for server in self._servers:
+            server.close()
 
 
 class _Connection(asyncio.Protocol):

@@ -14,10 +14,9 @@ from pathlib import Path
 
 from holdfast.errors import TransportError
 from holdfast.transport.endpoints import Endpoint
+from holdfast.transport.listener import BACKLOG, listen
 
 __all__ = ["SharedEndpoints"]
-
-_BACKLOG = 1024
 
 
 class SharedEndpoints:
@@ -84,10 +83,7 @@ class SharedEndpoints:
 
     def _bind(self, endpoint: Endpoint) -> Endpoint:
         if endpoint.is_local_socket:
-            bound = socket.socket(socket.AF_UNIX)
-            self._bound.append(bound)
-            bound.bind(endpoint.host)
-            bound.listen(_BACKLOG)
+            self._bound.append(listen(endpoint))
             return endpoint
         family, *_, where = socket.getaddrinfo(
             endpoint.host, endpoint.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
@@ -109,7 +105,7 @@ def _listen(family: int, bound: socket.socket) -> socket.socket:
         listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
         listening.bind(bound.getsockname())
-        listening.listen(_BACKLOG)
+        listening.listen(BACKLOG)
     except OSError:
         listening.close()
         raise

@@ -117,10 +117,13 @@ class Report(msgspec.Struct):
     ----------
     statistics : ServiceStatistics
     times : DecisionTimes
+    restarts : int
+        Processes that were started again.
     """
 
     statistics: ServiceStatistics = msgspec.field(default_factory=ServiceStatistics)
     times: DecisionTimes = msgspec.field(default_factory=DecisionTimes)
+    restarts: int = 0
 
     def without_gauges(self) -> Report:
         """Return what is left of a process that has ended: it holds nothing any more."""
@@ -132,6 +135,7 @@ def added(reports: Iterable[Report]) -> Report:
     """Return the sum of reports, which share nothing with it."""
     total = Report()
     for report in reports:
+        total.restarts += report.restarts
         mine, theirs = total.statistics, report.statistics
         for field in theirs.__struct_fields__:
             value = getattr(theirs, field)
@@ -178,23 +182,16 @@ class Exposition:
         self._name = name
         self._processes = processes
 
-    def text(self, report: Report, restarts: int = 0) -> bytes:
-        """Return the metrics.
-
-        Parameters
-        ----------
-        report : Report
-        restarts : int, optional
-            Processes of the service that were started again.
-        """
+    def text(self, report: Report) -> bytes:
+        """Return the metrics."""
         from prometheus_client import CollectorRegistry, generate_latest
 
-        families = [*self._families(report, restarts), *self._process_families()]
+        families = [*self._families(report), *self._process_families()]
         registry = CollectorRegistry(auto_describe=False)
         registry.register(_Collected(families))
         return generate_latest(registry)
 
-    def _families(self, report: Report, restarts: int) -> Iterator[Metric]:
+    def _families(self, report: Report) -> Iterator[Metric]:
         from prometheus_client.core import (
             CounterMetricFamily,
             GaugeMetricFamily,
@@ -238,7 +235,7 @@ class Exposition:
         for field, name, text in _GAUGES:
             yield GaugeMetricFamily(f"holdfast_{name}", text, getattr(now, field))
         yield CounterMetricFamily(
-            "holdfast_process_restarts", "Processes of the service started again.", restarts
+            "holdfast_process_restarts", "Processes of the service started again.", report.restarts
         )
 
     def _process_families(self) -> Iterator[Metric]:

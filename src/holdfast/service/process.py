@@ -12,16 +12,25 @@ import contextlib
 import gc
 import os
 import signal
+import socket
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Awaitable, Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
-from holdfast.errors import InvalidValueError, TransportError
+from holdfast.errors import HoldfastError, InvalidValueError, TransportError
 from holdfast.printable import printable
 
 if TYPE_CHECKING:
+    import asyncio
+
+    from holdfast.runtime.logs import EventLog
+    from holdfast.service.health import HttpAddress, Watched
+    from holdfast.service.metrics import DecisionTimes, Report
+    from holdfast.service.shell import ServiceShell
+    from holdfast.service.supervisor import Supervised
     from holdfast.transport.endpoints import Endpoint, TlsFiles
+    from holdfast.transport.service_end import StreamServiceTransport
 
 __all__ = ["DEFAULT_NAME", "main"]
 
@@ -60,6 +69,10 @@ def main(arguments: Sequence[str]) -> int:
     gc.disable()
     # NumPy's BLAS would start threads that nothing here has work for.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    if options.processes > 1:
+        return _serve_with_several(options, arguments)
+    if options.supervised is not None:
+        return _serve_supervised(options)
     return _serve(options)
 
 
@@ -108,10 +121,25 @@ def _parser() -> _Parser:
         "can use the service and read along",
     )
     add(
+        "--processes",
+        type=_whole_number(1, 256),
+        default=1,
+        metavar="N",
+        help="processes behind the same address, watched by one more (default: 1)",
+    )
+    add(
+        "--health",
+        type=_http_address,
+        metavar="HOST:PORT",
+        help="answer http://HOST:PORT/livez and /readyz; a PORT alone is one of 127.0.0.1, 0 takes "
+        "a free one",
+    )
+    add(
         "--metrics",
-        type=_port,
-        metavar="PORT",
-        help="offer metrics for Prometheus at http://127.0.0.1:PORT/metrics; 0 takes a free port",
+        type=_http_address,
+        metavar="HOST:PORT",
+        help="offer metrics for Prometheus at http://HOST:PORT/metrics, which may be the address "
+        "of --health, too",
     )
     add(
         "--log",
@@ -123,7 +151,7 @@ def _parser() -> _Parser:
         "--workers",
         type=_whole_number(1, 256),
         metavar="N",
-        help="decisions computed at a time (default: one for each core)",
+        help="decisions that each process computes at a time (default: its share of the cores)",
     )
     add(
         "--lease-ms",
@@ -137,7 +165,15 @@ def _parser() -> _Parser:
         "--max-sessions",
         type=_whole_number(1, 1_000_000),
         metavar="N",
-        help="robots remembered; the one unused the longest is forgotten first (default: 1000)",
+        help="robots that each process remembers; the one unused the longest is forgotten first "
+        "(default: 1000)",
+    )
+    add(
+        "--drain-s",
+        type=_number(0.0, 3600.0),
+        default=5.0,
+        metavar="S",
+        help="after SIGTERM, time for the answers that are owed (default: 5)",
     )
     add(
         "--problem",
@@ -159,6 +195,9 @@ def _parser() -> _Parser:
         help="stop when standard input ends, as it does when the process that started this one "
         "dies",
     )
+    # For the processes that a supervisor starts: its number, and the descriptors that they inherit.
+    add("--supervised", type=_whole_numbers, help=argparse.SUPPRESS)
+    add("--sockets", type=_whole_numbers, default=[], help=argparse.SUPPRESS)
     return parser
 
 
@@ -188,45 +227,180 @@ def _directory(text: str) -> Path:
     return Path(text)
 
 
-def _port(text: str) -> int:
-    return _whole_number(0, 65535)(text)
+def _http_address(text: str) -> HttpAddress:
+    from holdfast.service.health import HealthError, parse_http_address
+
+    try:
+        return parse_http_address(text)
+    except HealthError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
 
 
-def _serve(options: argparse.Namespace) -> int:
+def _whole_numbers(text: str) -> list[int]:
+    return [int(word) for word in text.split(",")]
+
+
+def _serve_with_several(options: argparse.Namespace, arguments: Sequence[str]) -> int:
+    """Watch several processes that serve, each with the same options but for the supervisor's."""
+    for option, given in (
+        ("--connect", options.connect),
+        ("--until-stdin-closes", options.until_stdin_closes),
+    ):
+        if given:
+            raise InvalidValueError(f"{option}: goes with one process only, not with --processes")
+    listen, _ = _checked_endpoints(options, _credentials(options))
+
+    import asyncio
+
+    from holdfast.runtime.logs import EventLog
+    from holdfast.service.listening import SharedEndpoints
+    from holdfast.service.supervisor import Supervisor, supervise
+
+    own = _Parser(allow_abbrev=False, add_help=False)
+    for option in ("--listen", "--processes", "--health", "--metrics", "--workers"):
+        own.add_argument(option)
+    _, others = own.parse_known_args(arguments)
+    workers = options.workers or max(1, len(os.sched_getaffinity(0)) // options.processes)
+    shared = SharedEndpoints(listen)
+    events = EventLog(sys.stderr, format=options.log, component=options.name)
+    endpoints = [str(endpoint) for endpoint in shared.endpoints]
+
+    async def run() -> int:
+        supervisor = Supervisor(
+            [*others, f"--workers={workers}", *(f"--listen={each}" for each in endpoints)],
+            options.processes,
+            shared,
+            events,
+        )
+        watched = _watched(
+            options,
+            supervisor.why_not_alive,
+            supervisor.why_not_ready,
+            supervisor.report,
+            supervisor.process_ids,
+        )
+        where: dict[str, object] = {"listen": endpoints, "processes": options.processes}
+        try:
+            where.update(await watched.start())
+            return await supervise(
+                supervisor,
+                events,
+                options.drain_s + 2 * _CLOSE_TIMEOUT_S,
+                lambda: _say_ready(options, None, where),
+            )
+        finally:
+            watched.close()
+
+    try:
+        return _exit_status(signal.Signals(asyncio.run(run())).name)
+    finally:
+        shared.close()
+        events.close()
+
+
+def _serve_supervised(options: argparse.Namespace) -> int:
+    """Be one of several processes, and end with the one that watches them."""
+    from holdfast.runtime.leash import end_with_parent
+    from holdfast.service.supervisor import Supervised
+
+    parent, descriptor = options.supervised
+    end_with_parent(parent)
+    supervised = Supervised(descriptor)
+    try:
+        return _serve(options, supervised)
+    except HoldfastError as error:
+        if supervised.has_served:
+            raise
+        # The supervisor says it, once.
+        supervised.failed(str(error))
+        return 2
+
+
+def _credentials(options: argparse.Namespace) -> TlsFiles | None:
+    if options.tls is None:
+        return None
+    from holdfast.runtime.credentials import load_credentials
+
+    return load_credentials(options.tls, "service", warn=lambda text: _warn(options, text))
+
+
+def _checked_endpoints(
+    options: argparse.Namespace, tls: TlsFiles | None
+) -> tuple[list[Endpoint], list[Endpoint]]:
+    """Return where to listen and where to connect."""
+    from holdfast.transport.endpoints import parse_endpoint
+
+    if not options.listen and not options.connect:
+        options.listen = [f"{'tcp' if tls is None else 'tls'}/{_DEFAULT_PLACE}"]
+    listen, connect = (
+        [parse_endpoint(text) for text in texts] for texts in (options.listen, options.connect)
+    )
+    for endpoint in (*listen, *connect):
+        _check_safe(endpoint, tls, insecure=options.insecure)
+    return listen, connect
+
+
+def _watched(
+    options: argparse.Namespace,
+    why_not_alive: Callable[[], str | None],
+    why_not_ready: Callable[[], str | None],
+    report: Callable[[], Awaitable[Report]],
+    processes: Callable[[], Sequence[int]] = lambda: (os.getpid(),),
+) -> Watched:
+    """Return what --health and --metrics ask for."""
+    from holdfast.service.health import Page, Watched
+
+    async def alive() -> Page:
+        return Page.of(why_not_alive())
+
+    async def ready() -> Page:
+        return Page.of(why_not_ready())
+
+    watched = Watched()
+    if options.health is not None:
+        watched.add("health", options.health, {"/livez": alive, "/readyz": ready})
+    if options.metrics is not None:
+        from holdfast.service.metrics import CONTENT_TYPE, Exposition
+
+        exposition = Exposition(options.name, processes)
+
+        async def metrics() -> Page:
+            return Page(200, exposition.text(await report()), CONTENT_TYPE)
+
+        watched.add("metrics", options.metrics, {"/metrics": metrics})
+    return watched
+
+
+def _serve(options: argparse.Namespace, supervised: Supervised | None = None) -> int:
     if options.until_stdin_closes and sys.stdin is None:
         raise InvalidValueError("--until-stdin-closes: this process has no standard input")
     # In the order in which they are needed, so that a mistake in the options is told at once.
-    from holdfast.transport.endpoints import parse_endpoint
-
-    tls = None
-    if options.tls is not None:
-        from holdfast.runtime.credentials import load_credentials
-
-        tls = load_credentials(options.tls, "service", warn=lambda text: _warn(options, text))
-    listen, connect = options.listen, options.connect
-    if not listen and not connect:
-        listen = [f"{'tcp' if tls is None else 'tls'}/{_DEFAULT_PLACE}"]
-    for text in (*listen, *connect):
-        _check_safe(parse_endpoint(text), tls, insecure=options.insecure)
+    tls = _credentials(options)
+    _checked_endpoints(options, tls)
 
     from holdfast.runtime.descriptors import NEEDED, allow_descriptors
-    from holdfast.runtime.transport.zenoh_transport import MAX_ROBOTS, ZenohServiceTransport
+    from holdfast.transport.service_end import MAX_LINKS, StreamServiceTransport
 
-    allow_descriptors(NEEDED + MAX_ROBOTS)
+    allow_descriptors(NEEDED + MAX_LINKS)
     boot = os.urandom(8).hex()
-    transport = ZenohServiceTransport(
+    transport = StreamServiceTransport(
         options.name,
         boot=boot,
-        listen=listen,
-        connect=connect,
+        listen=options.listen,
+        connect=options.connect,
+        listening=[socket.socket(fileno=each) for each in options.sockets],
         lease_ms=options.lease_ms,
         tls=tls,
+        on_event=lambda event, **fields: shell.note(event, **fields),
     )
+
+    import asyncio
 
     from holdfast.runtime.allocator import limit_arenas
     from holdfast.runtime.logs import EventLog
-    from holdfast.runtime.service_shell import ServiceShell
     from holdfast.service.known_problems import KnownProblems
+    from holdfast.service.metrics import DecisionTimes
+    from holdfast.service.shell import ServiceShell
     from holdfast.session.service import Service
     from holdfast.session.service_limits import ServiceLimits
 
@@ -244,39 +418,115 @@ def _serve(options: argparse.Namespace) -> int:
 
     service = Service(problems, workers, limits, describe_error)
     events = EventLog(sys.stderr, format=options.log, component=options.name)
-    metrics = metrics_server = None
-    if options.metrics is not None:
-        from holdfast.runtime.metrics import ServiceMetrics
-
-        metrics = ServiceMetrics(lambda: shell.statistics(), name=options.name)
-    shell = ServiceShell(
-        service, transport, workers, events, None if metrics is None else metrics.on_decision
-    )
-    if metrics is not None:
-        # Not before: who asks at once is told what the shell counts.
-        metrics_server = metrics.start(options.metrics)
+    times = DecisionTimes()
+    shell = ServiceShell(service, transport, workers, events, times.add)
     sys.setswitchinterval(_SWITCH_INTERVAL_S)
-    with _signals_to(shell.wakeup_descriptor):
-        try:
-            shell.start()
-            # What was loaded stays; the collector need never look at it again.
-            gc.freeze()
-            gc.set_threshold(_BETWEEN_COLLECTIONS)
-            gc.enable()
-            where: dict[str, object] = {"listen": list(transport.endpoints)}
-            if connect:
-                where["connect"] = connect
-            if metrics_server is not None:
-                where["metrics_port"] = metrics_server.port
+    try:
+        status = asyncio.run(_run(options, boot, transport, shell, events, times, supervised))
+    finally:
+        events.close()
+    if shell.is_computing:
+        # A thread that comes back from foreign code while the interpreter goes down would abort
+        # the process.
+        _end_at_once(status)
+    return status
+
+
+async def _run(
+    options: argparse.Namespace,
+    boot: str,
+    transport: StreamServiceTransport,
+    shell: ServiceShell,
+    events: EventLog,
+    times: DecisionTimes,
+    supervised: Supervised | None,
+) -> int:
+    """Serve until there is a reason to stop; return the exit status."""
+    import asyncio
+
+    from holdfast.service.metrics import Report
+
+    loop = asyncio.get_running_loop()
+    is_serving = False
+
+    def why_not_ready() -> str | None:
+        return "draining" if shell.is_draining else None if is_serving else "starting"
+
+    async def report() -> Report:
+        return Report(shell.statistics(), times)
+
+    watched = _watched(options, lambda: None, why_not_ready, report)
+    try:
+        where: dict[str, object] = dict(await watched.start())
+        for number in _handled_signals():
+            loop.add_signal_handler(number, shell.stop, number.name)
+        await shell.start()
+        if options.until_stdin_closes:
+            _watch_stdin(loop, shell)
+        # What was loaded stays; the collector need never look at it again.
+        gc.freeze()
+        gc.set_threshold(_BETWEEN_COLLECTIONS)
+        gc.enable()
+        is_serving = True
+        if supervised is None:
+            where["listen"] = list(transport.endpoints)
+            if options.connect:
+                where["connect"] = options.connect
             _say_ready(options, boot, where)
-            number = shell.wait([_STDIN] if options.until_stdin_closes else [])
-            reason = signal.Signals(number).name if number else "standard input has ended"
+        else:
+            supervised.start(
+                lambda: Report(shell.statistics(), times),
+                lambda: shell.stop("the supervisor is gone"),
+            )
+        reason = await shell.wait()
+        if supervised is None:
             events.event("stopping", reason=reason)
-        finally:
-            shell.close(_CLOSE_TIMEOUT_S)
-            if metrics_server is not None:
-                metrics_server.close()
-    return 0 if number in (0, signal.SIGTERM) else 128 + number
+        else:
+            supervised.not_ready()
+        if reason == signal.SIGTERM.name:
+            draining = loop.create_task(shell.drain(options.drain_s))
+            for number in _handled_signals():
+                loop.add_signal_handler(number, draining.cancel)
+            await asyncio.wait((draining,))
+    finally:
+        await shell.close(_CLOSE_TIMEOUT_S)
+        watched.close()
+        if supervised is not None:
+            supervised.close()
+    return _exit_status(reason)
+
+
+def _exit_status(reason: str) -> int:
+    number = getattr(signal, reason, signal.SIGTERM)
+    return 0 if number == signal.SIGTERM else 128 + int(number)
+
+
+def _handled_signals() -> list[signal.Signals]:
+    """Return the signals that end a service; whoever started it may have them ignored."""
+    ending = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    return [number for number in ending if signal.getsignal(number) is not signal.SIG_IGN]
+
+
+def _watch_stdin(loop: asyncio.AbstractEventLoop, shell: ServiceShell) -> None:
+    """Stop the service when standard input ends; what is read from it is dropped."""
+
+    def read() -> None:
+        if not os.read(_STDIN, 4096):
+            loop.remove_reader(_STDIN)
+            shell.stop("standard input has ended")
+
+    try:
+        loop.add_reader(_STDIN, read)
+    except PermissionError:
+        # A file, or the null device: nobody will ever close it.
+        shell.stop("standard input has ended")
+
+
+def _end_at_once(status: int) -> NoReturn:
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(OSError, ValueError):
+            stream.flush()
+    os._exit(status)
 
 
 def _check_safe(endpoint: Endpoint, tls: TlsFiles | None, *, insecure: bool) -> None:
@@ -301,12 +551,16 @@ def _warn(options: argparse.Namespace, text: str) -> None:
         sys.stderr.write(f"holdfast serve: warning: {printable(text)}\n")
 
 
-def _say_ready(options: argparse.Namespace, boot: str, where: dict[str, object]) -> None:
+def _say_ready(options: argparse.Namespace, boot: str | None, where: dict[str, object]) -> None:
     if options.log == "json":
         from holdfast.runtime.logs import EventLog
 
         EventLog(sys.stdout, format="json", component=options.name).event(
-            "ready", service=options.name, boot=boot, pid=os.getpid(), **where
+            "ready",
+            service=options.name,
+            pid=os.getpid(),
+            **({} if boot is None else {"boot": boot}),
+            **where,
         )
         return
     parts = [
@@ -314,31 +568,10 @@ def _say_ready(options: argparse.Namespace, boot: str, where: dict[str, object])
         for verb, key in (("is listening on", "listen"), ("is connecting to", "connect"))
         if isinstance(places := where.get(key), list) and places
     ]
-    if "metrics_port" in where:
-        parts.append(f"offers metrics on port {where['metrics_port']}")
+    if "processes" in where:
+        parts[-1] += f" with {where['processes']} processes"
+    parts += [f"offers {what} at {where[what]}" for what in ("health", "metrics") if what in where]
     # Nobody may be reading: that is no reason not to serve.
     with contextlib.suppress(OSError, ValueError):
         sys.stdout.write(printable(f"{options.name} {', '.join(parts)}\n"))
         sys.stdout.flush()
-
-
-@contextlib.contextmanager
-def _signals_to(descriptor: int) -> Iterator[None]:
-    """Have the numbers of signals that end a process written to a descriptor instead."""
-
-    def note(number: int, frame: object) -> None:
-        """Do nothing: without a handler of Python's own the number would not be written."""
-
-    handled = [
-        number
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-        if signal.getsignal(number) is not signal.SIG_IGN
-    ]
-    saved = {number: signal.signal(number, note) for number in handled}
-    previous = signal.set_wakeup_fd(descriptor, warn_on_full_buffer=False)
-    try:
-        yield
-    finally:
-        signal.set_wakeup_fd(previous)
-        for number, handler in saved.items():
-            signal.signal(number, handler)

@@ -26,7 +26,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from time import monotonic
-from typing import Protocol
+from typing import Any, Protocol
 
 import msgspec
 
@@ -34,7 +34,7 @@ from holdfast.errors import HoldfastError
 from holdfast.runtime.logs import EventSink
 from holdfast.service.metrics import Report, added
 
-__all__ = ["ListeningSockets", "ServiceProcessError", "Supervised", "Supervisor"]
+__all__ = ["ListeningSockets", "ServiceProcessError", "Supervised", "Supervisor", "supervise"]
 
 _REPORT_EVERY_S = 1.0
 _FRESH_WITHIN_S = 1.0
@@ -105,6 +105,11 @@ class Supervised:
         self._socket.set_inheritable(False)
         self._ready = False
         self._timer: asyncio.TimerHandle | None = None
+
+    @property
+    def has_served(self) -> bool:
+        """Whether this process has said that it serves."""
+        return self._timer is not None
 
     def start(self, report: Callable[[], Report], lost: Callable[[], None]) -> None:
         """Say in the running loop that this process serves, and report from then on.
@@ -189,19 +194,16 @@ class _Child:
 class Supervisor:
     """Starts a service's processes, watches them, starts again what dies, and ends them.
 
+    Belongs to the event loop that runs when it is made.
+
     Parameters
     ----------
     arguments : sequence of str
         Of ``holdfast serve``, for every process.
     processes : int
     listening : ListeningSockets
-        Is closed by :meth:`run`.
+        Closed when the processes are to end.
     events : EventSink
-
-    Attributes
-    ----------
-    restarts : int
-        Processes started again.
     """
 
     def __init__(
@@ -221,10 +223,11 @@ class Supervisor:
         self._past = Report()
         self._asked = 0
         self._stopping = False
-        self._change: asyncio.Future[None]
+        self._loop = asyncio.get_running_loop()
+        self._change: asyncio.Future[None] = self._loop.create_future()
         self._failure: str | None = None
         self._has_served = False
-        self.restarts = 0
+        self._restarts = 0
 
     async def start(self) -> None:
         """Start all processes; return when all of them serve.
@@ -234,8 +237,6 @@ class Supervisor:
         ServiceProcessError
             If one has ended before; the message says why.
         """
-        self._loop = asyncio.get_running_loop()
-        self._change = self._loop.create_future()
         for index in range(len(self._children)):
             self._start(index)
         await self._until(
@@ -257,11 +258,13 @@ class Supervisor:
             else:
                 child.reload = True  # it may have read the old ones a moment ago
 
-    async def stop(self, timeout_s: float) -> None:
-        """Have all processes finish what they owe, all at once, and end; kill what does not.
+    async def stop(self, number: int, timeout_s: float) -> None:
+        """Have all processes end, at the same time; kill those that do not.
 
         Parameters
         ----------
+        number : int
+            The signal that they get: at SIGTERM they finish what they owe.
         timeout_s : float
             How long they may take.
         """
@@ -271,7 +274,7 @@ class Supervisor:
         # As long as this end is open, the system would go on accepting for nobody.
         self._listening.close()
         for child in self._living():
-            child.process.terminate()
+            child.process.send_signal(number)
         await self._until(lambda: not self._living(), timeout_s)
         self.kill()
 
@@ -286,6 +289,7 @@ class Supervisor:
         for index, dead in enumerate(self._children):
             if dead is not None:
                 self._bury(index, dead)
+        self._changed()
 
     def process_ids(self) -> list[int]:
         """Return this process's number, then those of the processes."""
@@ -314,7 +318,9 @@ class Supervisor:
             _FRESH_WITHIN_S,
         )
         reports = (child.report for child in self._living())
-        return added([self._past, *(report for report in reports if report is not None)])
+        total = added([self._past, *(report for report in reports if report is not None)])
+        total.restarts = self._restarts
+        return total
 
     def _living(self) -> list[_Child]:
         return [child for child in self._children if child is not None]
@@ -329,7 +335,7 @@ class Supervisor:
                 process = subprocess.Popen(
                     [
                         *self._command,
-                        f"--supervised={os.getpid()}:{theirs.fileno()}",
+                        f"--supervised={os.getpid()},{theirs.fileno()}",
                         f"--sockets={','.join(map(str, descriptors))}",
                     ],
                     stdin=subprocess.DEVNULL,
@@ -406,7 +412,7 @@ class Supervisor:
         self._events.event("process_ended", reason=reason, **fields, again_in_s=delay_s)
         if delay_s > _KEPT_S:
             self._listening.give_up(index)
-        self.restarts += 1
+        self._restarts += 1
         self._delayed[index] = self._loop.call_later(delay_s, self._start, index)
 
     def _changed(self) -> None:
@@ -421,3 +427,59 @@ class Supervisor:
             if left_s is not None and left_s <= 0.0:
                 return
             await asyncio.wait({self._change}, timeout=left_s)
+
+
+async def supervise(
+    supervisor: Supervisor,
+    events: EventSink,
+    drain_s: float,
+    ready: Callable[[], None],
+) -> int:
+    """Run a service's processes until a signal says that they are to end.
+
+    Parameters
+    ----------
+    supervisor : Supervisor
+    events : EventSink
+    drain_s : float
+        How long the processes may take to end in order. A second signal ends them at once.
+    ready : callable
+        Is called once, when all of them serve.
+
+    Returns
+    -------
+    int
+        The signal.
+
+    Raises
+    ------
+    ServiceProcessError
+        If a process cannot serve.
+    """
+    loop = asyncio.get_running_loop()
+    stopping: asyncio.Future[int] = loop.create_future()
+
+    def stop(number: int) -> None:
+        if stopping.done():
+            supervisor.kill()
+        else:
+            stopping.set_result(number)
+
+    for ending in (signal.SIGTERM, signal.SIGINT):
+        if signal.getsignal(ending) is not signal.SIG_IGN:
+            loop.add_signal_handler(ending, stop, ending)
+    loop.add_signal_handler(signal.SIGHUP, supervisor.reload)
+    starting = loop.create_task(supervisor.start())
+    try:
+        awaited: set[asyncio.Future[Any]] = {starting, stopping}
+        await asyncio.wait(awaited, return_when=asyncio.FIRST_COMPLETED)
+        if starting.done():
+            starting.result()
+            ready()
+        number = await stopping
+        events.event("stopping", reason=signal.Signals(number).name)
+        await supervisor.stop(number, drain_s)
+        return number
+    finally:
+        starting.cancel()
+        supervisor.kill()

@@ -21,9 +21,11 @@ from holdfast.errors import TransportError
 from holdfast.transport.endpoints import Endpoint
 from holdfast.transport.links import OPENING_TIMEOUT_S
 
-__all__ = ["Listener"]
+__all__ = ["BACKLOG", "Listener", "listen"]
 
-_BACKLOG: Final = 1024
+BACKLOG: Final = 1024
+"""Connections that wait to be accepted."""
+
 _ACCEPTED_AT_ONCE: Final = 32
 """Before links that stand are heard again."""
 
@@ -45,6 +47,8 @@ class Listener:
         Gets the socket of such a connection.
     speaks_first : bool
         Whether it is this end that has to speak first: then connections are handed over at once.
+    listening : socket or None
+        One that listens there already, for the process that made it as well.
 
     Attributes
     ----------
@@ -63,17 +67,21 @@ class Listener:
         accepted: Callable[[socket.socket], None],
         *,
         speaks_first: bool = False,
+        listening: socket.socket | None = None,
     ) -> None:
         self._accepted = accepted
         self._speaks_first = speaks_first
         self._loop = asyncio.get_running_loop()
         try:
-            self._socket = _listening(endpoint)
+            self._socket = listen(endpoint) if listening is None else listening
+            self._socket.setblocking(False)
         except OSError as error:
             reason = error.strerror or str(error)
             raise TransportError(f"cannot listen on {endpoint}: {reason}") from error
         self._socket_file: os.stat_result | None = None
-        if endpoint.is_local_socket:
+        if endpoint.is_local_socket and listening is not None:
+            self.endpoint = endpoint
+        elif endpoint.is_local_socket:
             self._socket_file = Path(endpoint.host).stat()
             self.endpoint = endpoint
         else:
@@ -144,8 +152,14 @@ class Listener:
         self._loop.remove_reader(connection)
 
 
-def _listening(endpoint: Endpoint) -> socket.socket:
-    """Return a socket that listens at an endpoint."""
+def listen(endpoint: Endpoint) -> socket.socket:
+    """Return a socket that listens at an endpoint.
+
+    Raises
+    ------
+    OSError, TransportError
+        If it cannot.
+    """
     if endpoint.is_local_socket:
         _remove_stale_socket(endpoint)
         family, address = socket.AF_UNIX, endpoint.host
@@ -159,9 +173,8 @@ def _listening(endpoint: Endpoint) -> socket.socket:
         # A service that is started again may have the port of the one that died.
         made.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
-        made.setblocking(False)
         made.bind(address)
-        made.listen(_BACKLOG)
+        made.listen(BACKLOG)
     except BaseException:
         made.close()
         raise

@@ -108,6 +108,9 @@ class StreamServiceTransport:
         Of this process; no other one may ever have had it.
     listen, connect : sequence of str
         Endpoints at which robots connect, and of robots that listen.
+    listening : sequence of socket
+        If given, a socket for each of ``listen`` that listens there already, for the process that
+        made it as well.
     lease_ms : float
         Robots give this service up when nothing comes from it for this long; it lets itself be
         heard more often. How long a robot may be silent, the robot says.
@@ -132,6 +135,7 @@ class StreamServiceTransport:
         boot: str,
         listen: Sequence[str] = (),
         connect: Sequence[str] = (),
+        listening: Sequence[socket.socket] = (),
         lease_ms: float = 400.0,
         max_message_bytes: int = DEFAULT_MAX_MESSAGE_BYTES,
         tls: TlsFiles | None = None,
@@ -147,6 +151,7 @@ class StreamServiceTransport:
         self._connect = [check_endpoint(text, listens=False) for text in connect]
         for endpoint in (*self._listen, *self._connect):
             check_credentials(endpoint, tls)
+        self._listening: Sequence[socket.socket | None] = listening or [None] * len(listen)
         self._boot = boot
         self._tls = tls
         self._context = None if tls is None else server_context(tls, boot)
@@ -184,8 +189,9 @@ class StreamServiceTransport:
         self._started = True
         self._deliver = deliver
         try:
-            for endpoint in self._listen:
-                self._listeners.append(Listener(endpoint, partial(self._accepted, endpoint)))
+            for endpoint, listening in zip(self._listen, self._listening, strict=True):
+                accepted = partial(self._accepted, endpoint)
+                self._listeners.append(Listener(endpoint, accepted, listening=listening))
         except TransportError:
             self.stop_listening()
             raise
