@@ -82,17 +82,21 @@ class Dialer:
         self._connected_at = float("-inf")
         self._next = self._loop.call_later(_REFUSED_PAUSE_S if refused else 0.0, self._attempt)
 
-    def stop(self, winner: Link | None = None) -> None:
+    def won(self, winner: Link) -> None:
         """Connect no more, and end all links that were made but this one."""
+        self.stop()
+        for link in list(self._links):
+            if link is not winner:
+                link.end("was not needed: another connection was first", goodbye="")
+        self._links.clear()
+
+    def stop(self) -> None:
+        """Connect no more; the links that were made go on."""
         if self._next is not None:
             self._next.cancel()
             self._next = None
         for attempt in self._attempts:
             attempt.cancel()
-        for link in list(self._links):
-            if link is not winner:
-                link.end("was not needed: another connection was first", goodbye="")
-        self._links.clear()
 
     def succeeded(self) -> None:
         """Take note that somebody is there who is what was looked for."""

@@ -51,7 +51,7 @@ WIRE_VERSION: Final = 1
 MAGIC: Final = b"holdfast"
 """The first bytes of either end."""
 
-HELLO: Final = 1  # who speaks; the first frame, and no other
+HELLO: Final = 1  # who speaks; the first frame, unless that is a goodbye, and no other
 CALL: Final = 2  # a request
 REPLY: Final = 3  # one of the replies to a call
 END: Final = 4  # no more replies to a call
@@ -177,9 +177,15 @@ class FrameDecoder:
     ----------
     max_message_bytes : int
         A larger request or reply is passed over.
+
+    Attributes
+    ----------
+    error : FrameError or None
+        What came after the last frame and is none of ours. Nothing may be fed after that.
     """
 
     def __init__(self, max_message_bytes: int) -> None:
+        self.error: FrameError | None = None
         self._buffer = bytearray()
         self._passing_over = 0
         self._has_magic = False
@@ -199,13 +205,15 @@ class FrameDecoder:
         return len(self._buffer)
 
     def feed(self, data: bytes) -> list[Frame]:
-        """Take bytes and return the frames that are complete with them.
+        """Take bytes and return the frames that are complete with them."""
+        frames: list[Frame] = []
+        try:
+            self._feed(data, frames)
+        except FrameError as error:
+            self.error = error
+        return frames
 
-        Raises
-        ------
-        FrameError
-            If they are no frames of ours. Nothing may be fed after that.
-        """
+    def _feed(self, data: bytes, frames: list[Frame]) -> None:
         buffer = self._buffer
         source: bytes | bytearray = data
         if buffer:
@@ -219,7 +227,6 @@ class FrameDecoder:
             if end >= len(MAGIC):
                 self._has_magic = True
                 at = len(MAGIC)
-        frames: list[Frame] = []
         while self._has_magic:
             if self._passing_over:
                 passed = min(self._passing_over, end - at)
@@ -246,11 +253,10 @@ class FrameDecoder:
             del buffer[:at]
         elif at < end:
             buffer += memoryview(data)[at:]
-        return frames
 
     def _bound(self, kind: int) -> int:
         if not self._greeted:
-            if kind != HELLO:
+            if kind not in (HELLO, GOODBYE):
                 raise FrameError(f"begins with a frame of kind {kind} instead of a hello")
             return MAX_HELLO_BYTES
         bound = self._bounds.get(kind)

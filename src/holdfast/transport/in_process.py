@@ -103,7 +103,8 @@ class InProcessRobotTransport:
         self.calls.open(deliver)
         self._network._robots.append(self)
         for service in self._network._services:
-            self.appeared(service)
+            if service.listens:
+                self.appeared(service)
 
     def call(self, service: str, call: int, payload: bytes) -> None:
         """Send a request."""
@@ -164,6 +165,7 @@ class InProcessServiceTransport:
         self.boot = boot
         self.robot = robot
         self.max_message_bytes = max_message_bytes
+        self.listens = True
         self.open_calls: set[_InProcessCall] = set()
 
     @property
@@ -189,8 +191,7 @@ class InProcessServiceTransport:
 
     def stop_listening(self) -> None:
         """Be seen by no more robots than those that see it."""
-        if self in self._network._services:
-            self._network._services.remove(self)
+        self.listens = False
 
     async def close(self, timeout_s: float = 1.0) -> None:
         """Be seen no more, and end all calls. May be repeated."""
@@ -198,7 +199,7 @@ class InProcessServiceTransport:
         deliver, self._deliver = self._deliver, None
         if deliver is None:
             return
-        self.stop_listening()
+        self._network._services.remove(self)
         for robot in self._network._robots:
             robot.vanished(self)
         for call in list(self.open_calls):

@@ -20,6 +20,7 @@ from typing import Final, NamedTuple, Protocol
 from holdfast.transport.frames import (
     GOODBYE,
     HELLO,
+    MAGIC,
     PING,
     Frame,
     FrameDecoder,
@@ -32,7 +33,7 @@ from holdfast.transport.frames import (
 )
 from holdfast.transport.tls import PeerCertificate, TlsStream
 
-__all__ = ["HalfReceived", "Link", "LinkOwner", "LinkRefusedError", "LinkSettings"]
+__all__ = ["HalfReceived", "Link", "LinkOwner", "LinkSettings"]
 
 OPENING_TIMEOUT_S: Final = 5.0
 """For a connection to become a link: the handshake and the other end's hello."""
@@ -49,10 +50,6 @@ _UNSENT_IN_SYSTEM_BYTES: Final = 128 * 1024
 _PINGS_IN_LEASE: Final = 3
 _CLOSE_TIMEOUT_S: Final = 1.0
 _PING: Final = encode_frame(PING)
-
-
-class LinkRefusedError(Exception):
-    """The link is not wanted by this end; the text completes a sentence about the other end."""
 
 
 class HalfReceived:
@@ -109,8 +106,12 @@ class LinkOwner(Protocol):
         """Hear that the TLS handshake is complete at this end; not called without TLS."""
         ...
 
+    def refusal(self, hello: Hello) -> str | None:
+        """Return why the other end is not wanted, as the rest of a sentence about it."""
+        ...
+
     def greeted(self, link: Link, hello: Hello) -> None:
-        """Hear who the other end is; raise LinkRefusedError to refuse it."""
+        """Hear who the other end is; now frames of calls may be sent."""
         ...
 
     def received(self, link: Link, frame: Frame) -> None:
@@ -173,6 +174,7 @@ class Link(asyncio.Protocol):
         self._silent_at = now + OPENING_TIMEOUT_S
         self._patience_s = 0.0
         self._moved_at = now
+        self._said_hello = False
         self._spoke = False
         self._handed_over_bytes = self._moved_bytes = 0
         self._timer = self._loop.call_at(self._silent_at, self._tick)
@@ -241,7 +243,9 @@ class Link(asyncio.Protocol):
         if self._ended:
             return
         if goodbye is not None:
-            self.send(encode_goodbye(goodbye))
+            self.send(
+                encode_goodbye(goodbye) if self._said_hello else MAGIC + encode_goodbye(goodbye)
+            )
             if self.ended:  # it does not read
                 return
         self._ended = True
@@ -280,7 +284,7 @@ class Link(asyncio.Protocol):
                 )
         if self.tls is None:
             if self._speaks_first:
-                self.send(self._settings.hello)
+                self._say_hello()
         elif self._speaks_first:
             self.tls.begin()
             transport.write(self.tls.take())
@@ -303,6 +307,8 @@ class Link(asyncio.Protocol):
                 if self.ended:
                     return
                 self._take(frame)
+            if self._decoder.error is not None:
+                raise self._decoder.error
             if tls is not None and tls.ended:
                 self.end("")
         except FrameError as error:
@@ -310,8 +316,6 @@ class Link(asyncio.Protocol):
             self.end(
                 str(error), goodbye=str(error) if self.hello is not None else None, refused=True
             )
-        except LinkRefusedError as error:
-            self.end(str(error), goodbye=str(error), refused=True)
 
     def eof_received(self) -> None:
         """Let asyncio close this end, as the other one has."""
@@ -339,12 +343,14 @@ class Link(asyncio.Protocol):
             self._transport.write(tls.take())  # it is told, in an alert
             self.end(_what_is_wrong(error), refused=True)
             return b""
-        if tls.established and not was_established:
+        if was_established:
+            return data
+        assert self._transport is not None
+        self._transport.write(tls.take())
+        if tls.established:
             self.peer = tls.peer()
-            assert self._transport is not None
-            self._transport.write(tls.take())
             if self._speaks_first:
-                self.send(self._settings.hello)
+                self._say_hello()
             self._owner.established(self)
         return data
 
@@ -353,23 +359,31 @@ class Link(asyncio.Protocol):
         if kind == PING:
             return
         if kind == HELLO:
-            if not self._speaks_first:
-                self.send(self._settings.hello)
             try:
                 hello = decode_hello(frame.payload)
+                refusal = self._owner.refusal(hello)
             except FrameError as error:
-                raise LinkRefusedError(str(error)) from None
-            self._owner.greeted(self, hello)
+                refusal = str(error)
+            if refusal is not None:
+                self.end(refusal, goodbye=refusal, refused=True)
+                return
+            if not self._speaks_first:
+                self._say_hello()
             self.hello = hello
             self._patience_s = 1e-3 * hello.lease_ms
             self._silent_at = self._loop.time() + self._patience_s
             self._timer.cancel()
             self._tick()
+            self._owner.greeted(self, hello)
         elif kind == GOODBYE:
             reason = read_goodbye(frame.payload)
             self.end(f"refuses this end, which {reason}" if reason else "", refused=reason != "")
         else:
             self._owner.received(self, frame)
+
+    def _say_hello(self) -> None:
+        self._said_hello = True
+        self.send(self._settings.hello)
 
     def _tell(self) -> None:
         if not self._told:
@@ -425,4 +439,4 @@ def _what_is_wrong(error: ssl.SSLError) -> str:
     if "PEER_DID_NOT_RETURN_A_CERTIFICATE" in reason:
         return "shows no certificate"
     text = reason.lower().replace("_", " ") if reason else str(error.args[-1])
-    return text if text.startswith("does ") else f"does not speak TLS 1.3 as expected: {text}"
+    return f"does not speak TLS 1.3 as expected: {text}"

@@ -38,7 +38,7 @@ from holdfast.transport.frames import (
     encode_frame,
     encode_hello,
 )
-from holdfast.transport.links import HalfReceived, Link, LinkRefusedError, LinkSettings
+from holdfast.transport.links import HalfReceived, Link, LinkSettings
 from holdfast.transport.listener import Listener
 from holdfast.transport.tls import TlsStream, client_context
 
@@ -274,15 +274,17 @@ class _Service:
         # What the process is called is not known yet: whatever it is, it is another one.
         self._appeared(link, self._boot if same else f"not-named-yet-{next(self._early)}")
 
-    def greeted(self, link: Link, hello: Hello) -> None:
-        """Take note of what the other end says of itself."""
+    def refusal(self, hello: Hello) -> str | None:
+        """Refuse whoever is not the service that is looked for."""
         if hello.role != "service":
-            raise LinkRefusedError("is a robot, and a service was expected")
+            return "is a robot, and a service was expected"
         wanted = self._address.name
         if wanted is not None and hello.name != wanted:
-            raise LinkRefusedError(f"is the service {hello.name}, and {wanted} was expected")
-        if self._stopped:
-            return
+            return f"is the service {hello.name}, and {wanted} was expected"
+        return None
+
+    def greeted(self, link: Link, hello: Hello) -> None:
+        """Take note of what the other end says of itself."""
         boot = self._links.get(link)
         if boot is None:
             boot = self._boot if hello.incarnation == self._incarnation else hello.incarnation
@@ -298,7 +300,7 @@ class _Service:
         self._links[link] = boot
         self._calls[link] = {}
         if self._dialer is not None:
-            self._dialer.stop(link)
+            self._dialer.won(link)
         self._robot.calls.appeared(self._name, boot)
 
     def received(self, link: Link, frame: Frame) -> None:

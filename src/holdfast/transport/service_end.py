@@ -34,7 +34,7 @@ from holdfast.transport.frames import (
     encode_frame,
     encode_hello,
 )
-from holdfast.transport.links import HalfReceived, Link, LinkRefusedError, LinkSettings
+from holdfast.transport.links import HalfReceived, Link, LinkSettings
 from holdfast.transport.listener import Listener
 from holdfast.transport.tls import PeerCertificate, TlsStream, server_context
 
@@ -283,20 +283,22 @@ class StreamServiceTransport:
     def established(self, link: Link) -> None:
         """Nothing: a robot says who it is next."""
 
+    def refusal(self, hello: Hello) -> str | None:
+        """Refuse what is no robot, and more robots than there is room for."""
+        if hello.role != "robot":
+            return "is a service, and a robot was expected"
+        if len(self._links) >= MAX_LINKS:
+            return f"is one too many: {MAX_LINKS} robots are connected"
+        return None
+
     def greeted(self, link: Link, hello: Hello) -> None:
         """Take note of a robot."""
-        if hello.role != "robot":
-            raise LinkRefusedError("is a service, and a robot was expected")
-        if len(self._links) >= MAX_LINKS:
-            raise LinkRefusedError(f"is one too many: {MAX_LINKS} robots are connected")
-        if self._deliver is None:
-            return
         self._ungreeted.pop(link, None)
         self._links[link] = set()
         dialer = self._dialled.get(link)
         if dialer is not None:
             dialer.succeeded()
-            dialer.stop(link)
+            dialer.won(link)
         self._tell("robot_connected", robot=_name(link, hello))
 
     def received(self, link: Link, frame: Frame) -> None:

@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 
 from holdfast.errors import TransportError
 from holdfast.transport.endpoints import TlsFiles
+from holdfast.transport.frames import FrameError
 
 __all__ = ["PeerCertificate", "TlsStream", "client_context", "server_context"]
 
@@ -145,12 +146,14 @@ class TlsStream:
         Raises
         ------
         ssl.SSLError
-            If the other end does not speak TLS, or does not prove who it is.
+            If the handshake fails, or the other end says that it did.
+        FrameError
+            If the other end does not speak TLS at all.
         """
         if not self._has_first_byte:
             self._has_first_byte = True
             if self._is_server and data[:1] != b"\x16":
-                raise ssl.SSLError("does not speak TLS at an endpoint that does")
+                raise FrameError("does not speak TLS at an endpoint that does")
         self._incoming.write(data)
         if not self.established:
             self._shake_hands()
