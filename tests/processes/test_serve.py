@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import json
 import os
@@ -11,9 +12,9 @@ import socket
 import struct
 import subprocess
 import sys
-import time
+import threading
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
@@ -23,7 +24,6 @@ import pytest
 from tests.processes.faults import PATIENT
 from tests.unit.test_session_service import Robot, content, planning_of
 
-from holdfast.runtime.transport.zenoh_transport import ZenohRobotTransport
 from holdfast.session.events import Appeared, Ended, Replied, TransportEvent, Vanished
 from holdfast.session.messages import (
     PROTOCOL_VERSION,
@@ -37,6 +37,7 @@ from holdfast.session.messages import (
     sealed,
 )
 from holdfast.transport.endpoints import PrivateSocket, ServiceAddress, TlsFiles
+from holdfast.transport.robot_end import StreamRobotTransport
 
 PATIENCE_S = 30.0
 COMMAND = [sys.executable, "-m", "holdfast", "serve"]
@@ -145,7 +146,7 @@ def listening_sockets(pid: int) -> set[tuple[str, int]]:
 
 
 class End:
-    """A robot's end of the wire."""
+    """A robot's end of the wire, on an event loop that has a thread of its own."""
 
     def __init__(
         self,
@@ -156,12 +157,31 @@ class End:
         name: str | None = None,
     ) -> None:
         self.events: SimpleQueue[TransportEvent] = SimpleQueue()
+        self.loop = asyncio.new_event_loop()
         address = ServiceAddress(endpoint, listens=listens, name=name)
-        self.transport = ZenohRobotTransport(
+        self.transport = StreamRobotTransport(
             {"service": address}, lease_ms=PATIENT["lease_ms"], tls=tls
         )
-        self.transport.start(self.events.put)
+        self.thread = threading.Thread(target=self.loop.run_forever, daemon=True)
+        self.thread.start()
+        self.on_loop(self.transport.start, self.events.put)
         self.calls = 0
+
+    def on_loop(self, function: Callable[..., None], *arguments: object) -> None:
+        """Call a function on the loop's thread, and wait until it has returned."""
+
+        async def run() -> None:
+            function(*arguments)
+
+        asyncio.run_coroutine_threadsafe(run(), self.loop).result(PATIENCE_S)
+
+    def close(self) -> None:
+        try:
+            asyncio.run_coroutine_threadsafe(self.transport.close(), self.loop).result(PATIENCE_S)
+        finally:
+            self.loop.call_soon_threadsafe(self.loop.stop)
+            self.thread.join(PATIENCE_S)
+            self.loop.close()
 
     def appeared(self) -> str:
         event = self.events.get(timeout=PATIENCE_S)
@@ -170,7 +190,7 @@ class End:
 
     def send(self, payload: bytes) -> int:
         self.calls += 1
-        self.transport.call("service", self.calls, payload)
+        self.on_loop(self.transport.call, "service", self.calls, payload)
         return self.calls
 
     def ask(self, payload: bytes) -> list[Reply]:
@@ -194,7 +214,7 @@ def robots_end(endpoint: str, **options: Any) -> Iterator[End]:
     try:
         yield end
     finally:
-        end.transport.close()
+        end.close()
 
 
 def run_turns(end: End, robot: Robot, turns: int) -> None:
@@ -449,7 +469,7 @@ class TestRefusing:
     @pytest.mark.parametrize(
         ("arguments", "text"),
         [
-            (["--listen", "udp/127.0.0.1:0"], "udp"),
+            (["--listen", "quic/127.0.0.1:0"], "quic"),
             (["--listen", "tcp/127.0.0.1"], "no port"),
             (["--lease-ms", "1"], "from 50 to 60000"),
             (["--lease-ms", "nan"], "from 50 to 60000"),
@@ -479,15 +499,12 @@ class TestRefusing:
 
 
 class TestTls:
-    @pytest.mark.parametrize("protocol", ["tls", "quic"])
-    def test_robot_with_and_without_credentials(self, tmp_path: Path, protocol: str) -> None:
+    def test_robot_with_credentials(self, tmp_path: Path) -> None:
         credentials = pytest.importorskip("holdfast.runtime.credentials")
         pytest.importorskip("cryptography")
         credentials.make_credentials(tmp_path)
         tls = credentials.load_credentials(tmp_path / "robot", "robot")
-        with served(
-            "--listen", f"{protocol}/127.0.0.1:0", "--tls", str(tmp_path / "service")
-        ) as service:
+        with served("--listen", "tls/127.0.0.1:0", "--tls", str(tmp_path / "service")) as service:
             with robots_end(service.endpoint, tls=tls) as end:
                 end.appeared()
                 run_turns(end, Robot(), 2)
@@ -561,25 +578,6 @@ class TestTelling:
         assert done.returncode == 0
         for option in ("--listen", "--connect", "--tls", "--insecure", "--until-stdin-closes"):
             assert option in done.stdout
-
-
-@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="Linux tells the threads' names")
-def test_zenoh_has_the_threads_that_were_asked_for() -> None:
-    """What it is asked with is no part of its interface: a later version may call it otherwise.
-
-    A thread names itself when it first runs, which on a busy machine can be later than the
-    ready line: they are read again until one has.
-    """
-    with served(*ANYWHERE) as service, robots_end(service.endpoint) as end:
-        end.appeared()
-        end.ask(encode(Robot().request()))
-        end_of_patience = time.monotonic() + PATIENCE_S
-        pools: set[str] = set()
-        while "app" not in pools and time.monotonic() < end_of_patience:
-            tasks = Path(f"/proc/{service.process.pid}/task").iterdir()
-            pools = {(task / "comm").read_text().strip().rpartition("-")[0] for task in tasks}
-    assert "app" in pools
-    assert not pools & {"rx", "net", "acc"}
 
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="where there are such arenas")
