@@ -208,6 +208,16 @@ class End:
         return replies
 
 
+def in_work(end: End, robot: Robot) -> TransportEvent:
+    """Have a request worked on; return the sign of progress that tells so."""
+    end.appeared()
+    end.send(encode(robot.request()))
+    event = end.events.get(timeout=PATIENCE_S)
+    assert isinstance(event, Replied)
+    assert isinstance(decode_reply(event.payload), Progress)
+    return event
+
+
 @contextlib.contextmanager
 def robots_end(endpoint: str, **options: Any) -> Iterator[End]:
     end = End(endpoint, **options)
@@ -318,20 +328,56 @@ class TestServing:
         directory = tmp_path / "elsewhere"
         directory.mkdir()
         with (
-            served(*ANYWHERE, *arguments, directory=directory) as service,
+            served(*ANYWHERE, *arguments, "--drain-s", "0.1", directory=directory) as service,
             robots_end(service.endpoint) as end,
         ):
-            end.appeared()
-            end.send(encode(robot.request()))
-            event = end.events.get(timeout=PATIENCE_S)  # a sign: it is in work
-            assert isinstance(event, Replied)
-            assert isinstance(decode_reply(event.payload), Progress)
+            event = in_work(end, robot)
             code, log = service.end()
             assert code == 0, log
             assert "Fatal" not in log
             while isinstance(event, Replied):
                 event = end.events.get(timeout=PATIENCE_S)
             assert isinstance(event, Ended | Vanished)
+
+    def test_terminated_it_answers_what_it_owes_and_takes_nothing_new(self, tmp_path: Path) -> None:
+        arguments = ["--problem", "busy_problem:Busy", "--drain-s", "3600"]
+        robot = robot_of_busy(tmp_path)
+        with (
+            served(*ANYWHERE, *arguments, directory=tmp_path) as service,
+            robots_end(service.endpoint) as end,
+            robots_end(service.endpoint) as other,
+        ):
+            in_work(end, robot)
+            boot = other.appeared()
+            service.process.terminate()
+            assert service.process.stderr is not None
+            while "stopping" not in service.process.stderr.readline():
+                pass
+            # It is known to be about to end when a question is not answered.
+            while other.ask(encode(Robot(key=2).request())):
+                pass
+            host, _, port = service.endpoint.removeprefix("tcp/").rpartition(":")
+            with pytest.raises(ConnectionRefusedError):
+                socket.create_connection((host, int(port)), PATIENCE_S)
+            (tmp_path / "let_go").touch()
+            (reply,) = end.collect()
+            assert isinstance(reply, SensingAnswer)
+            assert other.events.get(timeout=PATIENCE_S) == Vanished("service", boot)
+            assert service.process.wait(PATIENCE_S) == 0
+
+    def test_a_second_signal_ends_it_at_once(self, tmp_path: Path) -> None:
+        arguments = ["--problem", "busy_problem:Busy", "--drain-s", "3600"]
+        with (
+            served(*ANYWHERE, *arguments, directory=tmp_path) as service,
+            robots_end(service.endpoint) as end,
+        ):
+            in_work(end, robot_of_busy(tmp_path))
+            service.process.terminate()
+            assert service.process.stderr is not None
+            while "stopping" not in service.process.stderr.readline():
+                pass
+            code, log = service.end()
+            assert code == 0, log
 
     def test_own_problem_that_was_not_named(self) -> None:
         robot = Robot()
@@ -545,7 +591,7 @@ class TestTelling:
                 end.appeared()
                 run_turns(end, Robot(), 3)
                 end.ask(sealed(b"rubbish"))
-            url = f"http://127.0.0.1:{ready['metrics_port']}/metrics"
+            url = f"http://{ready['metrics']}/metrics"
             with urllib.request.urlopen(url, timeout=PATIENCE_S) as response:
                 lines = response.read().decode().splitlines()
             assert service.end()[0] == 0
@@ -558,9 +604,11 @@ class TestTelling:
     def test_what_is_not_said_to_be_reachable_listens_for_this_machine_alone(self) -> None:
         """The sockets themselves are looked at, those of the metrics as well."""
         pytest.importorskip("prometheus_client")
-        with served(*ANYWHERE, "--log", "json", "--metrics", "0") as service:
+        watched = ["--metrics", "0", "--health", "0"]
+        with served(*ANYWHERE, "--log", "json", *watched) as service:
             ready = json.loads(service.ready_line)
-            ports = {int(ready["listen"][0].rpartition(":")[2]), ready["metrics_port"]}
+            ports = {int(ready[key].rpartition(":")[2]) for key in ("metrics", "health")}
+            ports.add(int(ready["listen"][0].rpartition(":")[2]))
             assert listening_sockets(service.process.pid) == {("127.0.0.1", p) for p in ports}
 
     def test_metrics_port_that_is_taken(self) -> None:
@@ -583,9 +631,13 @@ class TestTelling:
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="where there are such arenas")
 def test_the_threads_share_arenas() -> None:
     """Each keeps as much as its threads ever held at the same time (runtime/allocator.py)."""
-    with served(*ANYWHERE) as service, robots_end(service.endpoint) as end:
-        end.appeared()
-        end.ask(encode(Robot().request()))
+    with served(*ANYWHERE, "--workers", "8") as service, contextlib.ExitStack() as stack:
+        ends = [stack.enter_context(robots_end(service.endpoint)) for _ in range(8)]
+        for key, end in enumerate(ends, 1):
+            end.appeared()
+            end.send(encode(Robot(key=key).request()))
+        for end in ends:
+            end.collect()
         process = Path(f"/proc/{service.process.pid}")
         threads = len(list((process / "task").iterdir()))
         heaps = _heaps((process / "maps").read_text())
@@ -634,7 +686,7 @@ sys.exit(service_process.main(["--listen", "tcp/127.0.0.1:0", "--until-stdin-clo
     modules = set(json.loads(done.stdout.splitlines()[1]))
     assert "numpy" in modules
     for heavy in (
-        "asyncio", "cryptography", "holdfast.configuration", "holdfast.user_code",
+        "cryptography", "holdfast.configuration", "holdfast.user_code",
         "importlib.metadata", "matplotlib", "multiprocessing", "prometheus_client", "rich",
         "scipy", "sqlite3", "ssl", "typer", "yaml",
     ):  # fmt: skip

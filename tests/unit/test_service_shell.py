@@ -396,7 +396,7 @@ class Script(Service):
         self.times: list[float] = []
 
     def receive_request(self, call: int, *arguments: Any) -> list[Effect]:
-        self.trace.append(f"call {call}")
+        self.trace.append(f"call {call} of {arguments[-1]}")
         runs, self.runs = self.runs, []
         return [Answer(call, b"first"), *runs]
 
@@ -422,7 +422,7 @@ class Call:
     """A call that notes what it is told."""
 
     payload = b""
-    robot = None
+    robot = "a robot"
 
     def __init__(self, trace: list[str]) -> None:
         self._trace = trace
@@ -464,8 +464,8 @@ async def test_what_has_arrived_is_heard_before_the_next_brief_job() -> None:
         asyncio.get_running_loop().remove_reader(here)
         await both.close()
     assert machine.trace[:9] == [
-        *("call 1", "reply first", "delivered", "begun one", "finished one"),
-        *("call 2", "reply first", "begun two", "finished two"),
+        *("call 1 of a robot", "reply first", "delivered", "begun one", "finished one"),
+        *("call 2 of a robot", "reply first", "begun two", "finished two"),
     ]
     assert set(threads) == {threading.current_thread()}
 

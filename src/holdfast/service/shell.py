@@ -246,7 +246,7 @@ class ServiceShell:
         number = next(self._numbers)
         self._calls[number] = call
         now = self._loop.time()
-        self._carry_out(self._service.receive_request(number, request, size, now))
+        self._carry_out(self._service.receive_request(number, request, size, now, call.robot))
 
     def _run_brief_job(self) -> None:
         job = self._brief_jobs.popleft()
