@@ -367,11 +367,12 @@ class TestServing:
 
     def test_a_second_signal_ends_it_at_once(self, tmp_path: Path) -> None:
         arguments = ["--problem", "busy_problem:Busy", "--drain-s", "3600"]
+        robot = robot_of_busy(tmp_path)
         with (
             served(*ANYWHERE, *arguments, directory=tmp_path) as service,
             robots_end(service.endpoint) as end,
         ):
-            in_work(end, robot_of_busy(tmp_path))
+            in_work(end, robot)
             service.process.terminate()
             assert service.process.stderr is not None
             while "stopping" not in service.process.stderr.readline():

@@ -10,11 +10,12 @@ import asyncio
 import threading
 from collections.abc import Callable
 from queue import SimpleQueue
-from typing import Any, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 __all__ = ["ThreadPool"]
 
 _Result = TypeVar("_Result")
+_Task: TypeAlias = tuple[asyncio.AbstractEventLoop, Callable[[], Any], Callable[[Any], None]]
 
 
 class ThreadPool:
@@ -28,7 +29,6 @@ class ThreadPool:
         At most; they are started as they are needed.
     name : str
         Of the threads.
-    loop : asyncio.AbstractEventLoop
     failed : callable
         Is called on the loop with an error that a function has raised.
 
@@ -42,28 +42,25 @@ class ThreadPool:
         self,
         num_threads: int,
         name: str,
-        loop: asyncio.AbstractEventLoop,
         failed: Callable[[BaseException], None],
     ) -> None:
         self._num_threads = num_threads
         self._name = name
-        self._loop = loop
         self._failed = failed
-        self._queue: SimpleQueue[tuple[Callable[[], Any], Callable[[Any], None]] | None] = (
-            SimpleQueue()
-        )
+        self._queue: SimpleQueue[_Task | None] = SimpleQueue()
         self._threads: list[threading.Thread] = []
         self.num_open = 0
 
     def submit(self, function: Callable[[], _Result], done: Callable[[_Result], None]) -> None:
-        """Run a function on a thread, then ``done`` with its result on the loop."""
+        """Run a function on a thread, then ``done`` with its result on the running loop."""
+        loop = asyncio.get_running_loop()
         self.num_open += 1
         if len(self._threads) < min(self.num_open, self._num_threads):
             name = f"{self._name}-{len(self._threads)}"
             thread = threading.Thread(target=self._work, name=name, daemon=True)
             self._threads.append(thread)
             thread.start()
-        self._queue.put((function, done))
+        self._queue.put((loop, function, done))
 
     def close(self) -> None:
         """Let the threads end; one that computes is not waited for."""
@@ -72,13 +69,13 @@ class ThreadPool:
 
     def _work(self) -> None:
         while (task := self._queue.get()) is not None:
-            function, done = task
+            loop, function, done = task
             try:
                 result = function()
             except BaseException as error:  # noqa: BLE001 - the loop's side must hear of any
                 function, done, result = _nothing, self._failed, error
             try:
-                self._loop.call_soon_threadsafe(self._hand_over, done, result)
+                loop.call_soon_threadsafe(self._hand_over, done, result)
             except RuntimeError:
                 return  # the loop is closed: nobody waits for it any more
             # Nothing of it is held while the thread waits for the next.

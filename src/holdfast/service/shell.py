@@ -96,7 +96,8 @@ class ServiceShell:
     ) -> None:
         self._service = service
         self._transport = transport
-        self._workers = workers
+        self._jobs = ThreadPool(workers, "holdfast-worker", self._broke)
+        self._decoder = ThreadPool(1, "holdfast-decoder", self._broke)
         self._events = events or NullEventLog()
         self._on_decision = on_decision
         self._max_undecoded = max_undecoded
@@ -123,8 +124,6 @@ class ServiceShell:
         """
         self._loop = asyncio.get_running_loop()
         self._stopped: asyncio.Future[str] = self._loop.create_future()
-        self._jobs = ThreadPool(self._workers, "holdfast-worker", self._loop, self._broke)
-        self._decoder = ThreadPool(1, "holdfast-decoder", self._loop, self._broke)
         await self._transport.start(self.deliver)
 
     async def wait(self) -> str:
