@@ -891,6 +891,25 @@ class TestStreams:
         assert greeting.kind == frames.HELLO
         assert last == (frames.LAST, 5, b"question", 0)
 
+    @pytest.mark.parametrize("robot_listens", [False, True])
+    async def test_nothing_waits_for_more_to_be_sent_with_it(
+        self, socket_directory: Path, robot_listens: bool, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        made: list[links.Link] = []
+        begin = links.Link.connection_made
+
+        def connection_made(link: links.Link, transport: asyncio.BaseTransport) -> None:
+            begin(link, transport)
+            stream = transport.get_extra_info("socket")
+            assert stream.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
+            made.append(link)
+
+        monkeypatch.setattr(links.Link, "connection_made", connection_made)
+        wire = StreamWire("tcp", socket_directory, robot_listens=robot_listens)
+        await connected(wire)
+        assert len(made) == 2
+        await wire.close_on_loop()
+
     async def test_a_taken_port_is_an_error_that_names_it(self, tcp: StreamWire) -> None:
         await tcp.service("cloud", "b1").start(echo)
         endpoint = tcp.endpoint("cloud")

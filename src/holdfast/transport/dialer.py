@@ -10,11 +10,12 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import errno
 import ipaddress
 import socket
 import threading
 from collections.abc import Callable
-from typing import Final, TypeAlias
+from typing import Any, Final, TypeAlias
 
 from holdfast.transport.endpoints import Endpoint
 from holdfast.transport.links import Link
@@ -36,7 +37,7 @@ _REFUSED_PAUSE_S: Final = 1.0
 
 _RESOLVE_AGAIN_S: Final = 5.0
 
-_Address: TypeAlias = tuple[socket.AddressFamily, object]
+_Address: TypeAlias = str | tuple[Any, ...]
 
 
 class Dialer:
@@ -53,14 +54,14 @@ class Dialer:
         self._endpoint = endpoint
         self._make_link = make_link
         self._loop = asyncio.get_running_loop()
-        self._attempts: set[asyncio.Task[None]] = set()
+        self._attempts: dict[socket.socket, asyncio.TimerHandle] = {}
         self._links: set[Link] = set()
         self._next: asyncio.TimerHandle | None = None
         self._absent_since: float | None = None
         self._connected_at = float("-inf")
         self._turn = 0
         self._resolved_at = float("-inf")
-        self._addresses: list[_Address] = []
+        self._addresses: list[tuple[socket.AddressFamily, _Address]] = []
         if endpoint.is_local_socket:
             self._addresses = [(socket.AF_UNIX, endpoint.host)]
         else:
@@ -95,8 +96,8 @@ class Dialer:
         if self._next is not None:
             self._next.cancel()
             self._next = None
-        for attempt in self._attempts:
-            attempt.cancel()
+        for stream in list(self._attempts):
+            self._give_up(stream)
 
     def succeeded(self) -> None:
         """Take note that somebody is there who is what was looked for."""
@@ -124,32 +125,54 @@ class Dialer:
             return
         family, address = self._addresses[self._turn % len(self._addresses)]
         self._turn += 1
-        attempt = self._loop.create_task(self._connect(family, address))
-        self._attempts.add(attempt)
-        attempt.add_done_callback(self._attempts.discard)
+        self._connect(family, address)
 
-    async def _connect(self, family: socket.AddressFamily, address: object) -> None:
+    # Without tasks: one that is begun while the loop ends would be complained of.
+
+    def _connect(self, family: socket.AddressFamily, address: _Address) -> None:
         try:
             stream = socket.socket(family, socket.SOCK_STREAM)
         except OSError:
             return  # no descriptor is free
+        stream.setblocking(False)
         try:
-            stream.setblocking(False)
-            async with asyncio.timeout(_CONNECT_TIMEOUT_S):
-                await self._loop.sock_connect(stream, address)  # type: ignore[arg-type]
-            now = self._loop.time()
-            if now < self._connected_at + _NEXT_LINK_S:
-                stream.close()
-                return
-            self._connected_at = now
-            link = self._make_link()
-            self._links.add(link)
-            await link.connect(stream)
-        except OSError:  # a timeout is one, too
+            stream.connect(address)
+        except BlockingIOError as error:
+            if error.errno == errno.EINPROGRESS:
+                timeout = self._loop.call_later(_CONNECT_TIMEOUT_S, self._give_up, stream)
+                self._attempts[stream] = timeout
+                self._loop.add_writer(stream, self._look, stream)
+            else:
+                stream.close()  # the queue of a local socket is full
+        except OSError:
             stream.close()
-        except asyncio.CancelledError:
+        else:
+            self._connected(stream)
+
+    def _look(self, stream: socket.socket) -> None:
+        self._forget(stream)
+        if stream.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR):
             stream.close()
-            raise
+        else:
+            self._connected(stream)
+
+    def _connected(self, stream: socket.socket) -> None:
+        now = self._loop.time()
+        if now < self._connected_at + _NEXT_LINK_S:
+            stream.close()
+            return
+        self._connected_at = now
+        link = self._make_link()
+        self._links.add(link)
+        link.connecting = self._loop.create_task(link.connect(stream))
+
+    def _give_up(self, stream: socket.socket) -> None:
+        self._forget(stream)
+        stream.close()
+
+    def _forget(self, stream: socket.socket) -> None:
+        self._attempts.pop(stream).cancel()
+        self._loop.remove_writer(stream)
 
     def _resolve(self) -> None:
         """Look up the host's addresses; on a thread of its own."""
@@ -158,7 +181,9 @@ class Dialer:
             found = socket.getaddrinfo(endpoint.host, endpoint.port, type=socket.SOCK_STREAM)
         except (OSError, UnicodeError):
             return  # those of before may still be right
-        addresses: list[_Address] = [(entry[0], entry[4]) for entry in found]
+        addresses: list[tuple[socket.AddressFamily, _Address]] = [
+            (entry[0], entry[4]) for entry in found
+        ]
 
         def take() -> None:
             self._addresses = addresses

@@ -207,6 +207,13 @@ class FrameDecoder:
     def feed(self, data: bytes) -> list[Frame]:
         """Take bytes and return the frames that are complete with them."""
         frames: list[Frame] = []
+        if self._greeted and not self._buffer and not self._passing_over:
+            # Nearly always it is one frame, and the whole of it.
+            start = _HEADER.size
+            if len(data) >= start:
+                size, kind, call = _HEADER.unpack_from(data)
+                if start + size == len(data) and size <= self._bounds.get(kind, -1):
+                    return [Frame(kind, call, data[start:])]
         try:
             self._feed(data, frames)
         except FrameError as error:

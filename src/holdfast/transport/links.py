@@ -47,9 +47,15 @@ _UNSENT_BYTES_AT_LEAST: Final = 4 << 20
 _UNSENT_IN_SYSTEM_BYTES: Final = 128 * 1024
 """May wait in the system: then even a slow link is seen to move every few seconds."""
 
+_RECEIVED_AT_ONCE_BYTES: Final = 256 * 1024
 _PINGS_IN_LEASE: Final = 3
 _CLOSE_TIMEOUT_S: Final = 1.0
 _PING: Final = encode_frame(PING)
+
+
+# What a link receives is copied out of it before anything else happens, so all share one: to
+# allocate as much each time takes longer than all else that is done about a small message.
+_received = memoryview(bytearray(_RECEIVED_AT_ONCE_BYTES))
 
 
 class HalfReceived:
@@ -123,7 +129,7 @@ class LinkOwner(Protocol):
         ...
 
 
-class Link(asyncio.Protocol):
+class Link(asyncio.BufferedProtocol):
     """One stream; a protocol for asyncio, to be connected by it.
 
     Parameters
@@ -175,6 +181,7 @@ class Link(asyncio.Protocol):
         self._patience_s = 0.0
         self._moved_at = now
         self._said_hello = False
+        self._holds = False
         self._spoke = False
         self._handed_over_bytes = self._moved_bytes = 0
         self._timer = self._loop.call_at(self._silent_at, self._tick)
@@ -279,6 +286,8 @@ class Link(asyncio.Protocol):
         stream = transport.get_extra_info("socket")
         if stream is not None and stream.family != socket.AF_UNIX:
             with contextlib.suppress(OSError):
+                # What is sent is meant to arrive now, although more may follow.
+                stream.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
                 stream.setsockopt(
                     socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, _UNSENT_IN_SYSTEM_BYTES
                 )
@@ -289,10 +298,16 @@ class Link(asyncio.Protocol):
             self.tls.begin()
             transport.write(self.tls.take())
 
-    def data_received(self, data: bytes) -> None:
+    def get_buffer(self, sizehint: int) -> memoryview:
+        """Return where asyncio puts what comes next."""
+        del sizehint
+        return _received
+
+    def buffer_updated(self, nbytes: int) -> None:
         """Take what has come."""
         if self._ended:
             return
+        data = bytes(_received[:nbytes])
         if self.hello is not None:
             self._silent_at = self._loop.time() + self._patience_s
         try:
@@ -302,7 +317,10 @@ class Link(asyncio.Protocol):
                 if self.ended:
                     return
             frames = self._decoder.feed(data)
-            self._settings.half_received.note(self, self._decoder.held_bytes)
+            held_bytes = self._decoder.held_bytes
+            if held_bytes or self._holds:
+                self._holds = held_bytes > 0
+                self._settings.half_received.note(self, held_bytes)
             for frame in frames:
                 if self.ended:
                     return

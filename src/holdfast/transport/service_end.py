@@ -50,7 +50,17 @@ _MAX_UNGREETED: Final = 256
 class _StreamCall:
     """A request as the service sees it; see :class:`~holdfast.transport.contract.IncomingCall`."""
 
-    __slots__ = ("_calls", "_link", "_loop", "_number", "_open", "_reply", "payload", "robot")
+    __slots__ = (
+        "_calls",
+        "_link",
+        "_loop",
+        "_number",
+        "_open",
+        "_reply",
+        "is_being_delivered",
+        "payload",
+        "robot",
+    )
 
     def __init__(
         self,
@@ -66,6 +76,7 @@ class _StreamCall:
         self._loop = loop
         self._reply: bytes | None = None
         self._open = True
+        self.is_being_delivered = False
         self.payload = payload
         self.robot = None if link.peer is None else link.peer.name
 
@@ -73,10 +84,10 @@ class _StreamCall:
         """Send a reply. A robot that is gone is no error."""
         if not self._open or len(payload) > self._link.max_message_bytes:
             return
-        if self._reply is None:
-            self._loop.call_soon(self._flush)
-        else:
-            self._flush()
+        if self._reply is not None:
+            self.flush()
+        elif not self.is_being_delivered:
+            self._loop.call_soon(self.flush)
         self._reply = payload
 
     def end(self) -> None:
@@ -91,7 +102,8 @@ class _StreamCall:
         else:
             self._link.send(encode_frame(LAST, self._number, reply))
 
-    def _flush(self) -> None:
+    def flush(self) -> None:
+        """Send a reply that waits for the end."""
         reply, self._reply = self._reply, None
         if reply is not None:
             self._link.send(encode_frame(REPLY, self._number, reply))
@@ -318,7 +330,10 @@ class StreamServiceTransport:
             return
         call = _StreamCall(link, frame.call, frame.payload, calls, asyncio.get_running_loop())
         calls.add(call)
+        call.is_being_delivered = True
         deliver(call)
+        call.is_being_delivered = False
+        call.flush()
 
     def lost(self, link: Link) -> None:
         """Take note that a link has ended."""
