@@ -13,8 +13,10 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import math
 import socket
 import ssl
+import time
 from typing import Final, NamedTuple, Protocol
 
 from holdfast.transport.frames import (
@@ -51,6 +53,8 @@ _RECEIVED_AT_ONCE_BYTES: Final = 256 * 1024
 _PINGS_IN_LEASE: Final = 3
 _CLOSE_TIMEOUT_S: Final = 1.0
 _PING: Final = encode_frame(PING)
+
+_EXPIRED: Final = "has a certificate that has expired"
 
 
 # What a link receives is copied out of it before anything else happens, so all share one: to
@@ -112,7 +116,7 @@ class LinkOwner(Protocol):
         """Hear that the TLS handshake is complete at this end; not called without TLS."""
         ...
 
-    def refusal(self, hello: Hello) -> str | None:
+    def refusal(self, link: Link, hello: Hello) -> str | None:
         """Return why the other end is not wanted, as the rest of a sentence about it."""
         ...
 
@@ -379,7 +383,7 @@ class Link(asyncio.BufferedProtocol):
         if kind == HELLO:
             try:
                 hello = decode_hello(frame.payload)
-                refusal = self._owner.refusal(hello)
+                refusal = self._owner.refusal(self, hello)
             except FrameError as error:
                 refusal = str(error)
             if refusal is not None:
@@ -417,6 +421,10 @@ class Link(asyncio.BufferedProtocol):
             # If it is this process that stood still, what came meanwhile is still to be read.
             self._loop.call_soon(self._loop.call_soon, self._give_up_if_silent)
             return
+        valid_s = math.inf if self.peer is None else self.peer.expires_at - time.time()
+        if valid_s <= 0.0:
+            self.end(_EXPIRED, goodbye=_EXPIRED, refused=True)
+            return
         transport = self._transport
         if self.hello is not None and transport is not None:
             if not self._spoke:
@@ -432,7 +440,7 @@ class Link(asyncio.BufferedProtocol):
                 return
         due = self._silent_at
         if self.hello is not None:
-            due = min(due, now + self._ping_interval_s)
+            due = min(due, now + self._ping_interval_s, now + valid_s)
         self._timer = self._loop.call_at(due, self._tick)
 
     def _give_up_if_silent(self) -> None:
