@@ -1,178 +1,343 @@
-"""A client of an honest service that would like to be the service.
+"""A client of an honest service that means harm, with all that a stolen robot has.
 
-It has what a stolen robot has: the service's address and, where there are any, a robot's
-certificate. All else it learns from the service, as every robot does. It speaks plain Zenoh, in
-whichever mode, so nothing of holdfast's own ends keeps it from saying what it likes.
+It has the service's address, a valid certificate of another robot, the honest robot's problem and
+settings, so all questions that it will ask, and even its session. It says each message at each
+moment of a link, over plain sockets (:mod:`tests.wire`), and notes whatever it is told that it
+should not be.
 """
 
 from __future__ import annotations
 
-import json
-import time
-from collections.abc import Callable
-from functools import partial
-from typing import Literal, Self, TypeAlias, TypeVar
+import contextlib
+import itertools
+import random
+import socket
+import ssl
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
 
-import zenoh
+import msgspec
+from tests.wire import (
+    CALL,
+    END,
+    GOODBYE,
+    HELLO,
+    LAST,
+    MAGIC,
+    PING,
+    REPLY,
+    Frame,
+    RawLink,
+    frame_of,
+    hello_of,
+)
 
-from holdfast.runtime.transport.zenoh_transport import KEY_VERSION
-from holdfast.transport.endpoints import TlsFiles
+from holdfast.session.messages import (
+    MessageError,
+    NeedState,
+    Progress,
+    Refused,
+    Reply,
+    Request,
+    SensingAnswer,
+    TaskAnswer,
+    decode_reply,
+    encode,
+    numbers_to,
+)
 
-Mode: TypeAlias = Literal["client", "peer", "router"]
+__all__ = ["MOMENTS", "Impostor", "Intruder", "Message", "messages", "wrong_actions"]
 
-MODES: tuple[Mode, ...] = ("client", "peer", "router")
+_PROBE = 0x7FFF_0001
+"""Number of the call with which the intruder finds out that all before it was read."""
 
-FORGED_BOOT = "forged"
-"""A service that nobody is."""
+_OTHERS_CALLS = 40
+"""Calls of robots are counted from 1 on: so many of them are aimed at."""
 
-_PREFIX = f"holdfast/{KEY_VERSION}"
-_PATIENCE_S = 30.0
+_ACTION_SIZE = 3
+_LAST_EPOCH = 2**32 - 1
 
-Answer = TypeVar("Answer")
+
+class Message(NamedTuple):
+    """Something to be said.
+
+    Attributes
+    ----------
+    name : str
+    data : bytes
+    is_whole : bool
+        Whether it is made of whole frames, so that what comes after it is read.
+    """
+
+    name: str
+    data: bytes
+    is_whole: bool = True
+
+
+def wrong_actions(number: int) -> bytes:
+    """Return moves that are nearly eighty times as long as the problem's longest."""
+    return encode(TaskAnswer(number, 9, numbers_to([7.77] * (_ACTION_SIZE * 9)), 1))
+
+
+def _stale(number: int) -> bytes:
+    """Return what stops a robot: that another process has taken its run over."""
+    return encode(Refused(number, "stale_epoch", "epoch 1: epoch 2 is there"))
+
+
+def messages(questions: Sequence[Request], service: str, incarnation: str) -> list[Message]:
+    """Return all that can be said.
+
+    Parameters
+    ----------
+    questions : sequence of Request
+        What the honest robot asks, with its session, its epoch and its numbers.
+    service, incarnation : str
+        As what the service is known.
+    """
+    chance = random.Random(7)
+    garbage = chance.randbytes(80)
+    found = [
+        Message("nothing", b""),
+        Message("random bytes", garbage, is_whole=False),
+        Message("an HTTP request", b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n", is_whole=False),
+        Message("a TLS greeting", b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03", is_whole=False),
+        Message("the beginning again", hello_of()),
+        Message("a service's beginning", hello_of("service", service, incarnation), is_whole=False),
+    ]
+    for role in ("robot", "service", "router", ""):
+        said = hello_of(role, service, incarnation).removeprefix(MAGIC)
+        found.append(Message(f"a hello as {role or 'nobody'}", said))
+    for kind in (*range(10), 255):
+        for call in (0, 1, 2, _LAST_EPOCH):
+            found.append(Message(f"kind {kind} of call {call}, empty", frame_of(kind, call)))
+            found.append(
+                Message(f"kind {kind} of call {call}, garbage", frame_of(kind, call, garbage))
+            )
+        too_long = (2**32 - 1).to_bytes(4, "little") + bytes([kind]) + bytes(4)
+        found.append(Message(f"kind {kind}, four gigabytes", too_long, is_whole=False))
+        found.append(Message(f"kind {kind}, half", frame_of(kind, 1, garbage)[:-9], is_whole=False))
+    calls = range(1, _OTHERS_CALLS + 1)
+    for name, kind, forge in (
+        ("wrong actions", REPLY, wrong_actions),
+        ("wrong actions, the last", LAST, wrong_actions),
+        ("a stale epoch", LAST, _stale),
+        ("an end", END, lambda _: b""),
+    ):
+        forged = b"".join(frame_of(kind, call, forge(call)) for call in calls)
+        found.append(Message(f"{name} for the calls of others", forged))
+    found.append(Message("goodbye", frame_of(GOODBYE, 0, b"the service ends"), is_whole=False))
+    for what, changes in (
+        ("as it is", {}),
+        ("of a later process", {"epoch": 2}),
+        ("of the last process of all", {"epoch": _LAST_EPOCH}),
+        ("of an earlier process", {"epoch": 0}),
+        ("with other numbers", {"number": 2**31}),
+    ):
+        asked = [
+            encode(msgspec.structs.replace(question, opening=None, checkpoint=None, **changes))
+            for question in questions
+        ]
+        said = b"".join(
+            frame_of(CALL, 1000 + number, payload) for number, payload in enumerate(asked)
+        )
+        found.append(Message(f"all questions of the robot, {what}", said))
+    return found
+
+
+MOMENTS = (
+    "before the handshake",
+    "instead of the beginning",
+    "before the hello",
+    "after the hello",
+    "in the middle of a call",
+    "in the middle of a frame",
+)
 
 
 class Intruder:
-    """Says that it is the service, and notes what it is told.
-
-    Once it is made, all that it says has reached the service: it has asked the service after that,
-    on the same link.
+    """Says each message at each moment, a link for each, and notes what it should not be told.
 
     Parameters
     ----------
     endpoint : str
-        The service's.
-    mode : {"client", "peer", "router"}
-        As what it connects.
-    answer : callable
-        Makes the forged reply to a request.
-    tls : TlsFiles or None
-        Its certificate.
+    keys : Path or None
+        Directory of its certificate.
+    questions : sequence of Request
+        What the honest robot asks.
+    own : Request
+        A question of its own, which it may ask.
 
     Attributes
     ----------
-    boots : list of tuple of str
-        Names and boots of the services that it has seen.
-    received : list of bytes
-        Requests that were not meant for it.
-    overheard : list of str
-        Keys of what others published.
+    links : int
+        How many it has had.
+    told : list of str
+        What it should not have been told.
+    answered : int
+        Calls of its own that came to an end.
     """
 
     def __init__(
-        self,
-        endpoint: str,
-        mode: Mode,
-        answer: Callable[[bytes], bytes] = bytes,
-        *,
-        tls: TlsFiles | None = None,
+        self, endpoint: str, keys: Path | None, questions: Sequence[Request], own: Request
     ) -> None:
-        self._answer = answer
-        self.received: list[bytes] = []
-        self.overheard: list[str] = []
-        self.session = open_session(endpoint, mode, tls=tls)
+        self._endpoint = endpoint
+        self._keys = keys
+        self._own = encode(own)
+        self._own_number = own.number
+        self.links = 0
+        self.told: list[str] = []
+        self.answered = 0
+        with RawLink(endpoint, keys) as link:
+            link.say(hello_of())
+            frame = link.receive()
+            assert frame is not None and frame.kind == HELLO, "the intruder was not let in"
+            hello = msgspec.msgpack.decode(frame.payload)
+        self._messages = messages(questions, hello["name"], hello["incarnation"])
+
+    def run(self) -> None:
+        """Say all messages at all moments, once."""
+        for moment, message in itertools.product(MOMENTS, self._messages):
+            if moment == "before the handshake" and self._keys is None:
+                continue
+            self._say(moment, message)
+
+    def _say(self, moment: str, message: Message) -> None:
+        """Have a link, bring it to a moment, say something and note all that comes."""
+        self.links += 1
+        calls: set[int] = set()
+        # Whatever the service does to a link, at whatever moment, is its right.
+        with contextlib.suppress(OSError, ssl.SSLError):
+            shakes = moment != "before the handshake"
+            with RawLink(self._endpoint, self._keys, shakes_hands=shakes) as link:
+                try:
+                    greeted = self._bring(link, moment, calls)
+                    link.say(message.data)
+                    calls.update(_calls_in(message))
+                    if greeted and message.is_whole:
+                        calls.add(_PROBE)
+                        link.send(CALL, _PROBE, b"junk")
+                    else:
+                        # Past TLS, for which a half-closed stream is none.
+                        socket.socket.shutdown(link.socket, socket.SHUT_WR)
+                finally:
+                    self._listen(link, f"{message.name}, {moment}", calls)
+
+    def _bring(self, link: RawLink, moment: str, calls: set[int]) -> bool:
+        """Bring a link to a moment; return whether it is one on which calls are answered."""
+        if moment in ("before the handshake", "instead of the beginning"):
+            return False
+        if moment == "before the hello":
+            link.say(MAGIC)
+            return False
+        link.say(hello_of(incarnation=f"intruder-{self.links}"))
+        if moment == "in the middle of a call":
+            calls.add(1)
+            link.send(CALL, 1, self._own)
+        if moment == "in the middle of a frame":
+            link.say(frame_of(CALL, 1, self._own)[:40])
+            return False
+        return True
+
+    def _listen(self, link: RawLink, when: str, calls: set[int]) -> None:
+        for frame in _until_the_end(link):
+            if frame.kind in (HELLO, PING, GOODBYE):
+                continue
+            if frame.kind not in (REPLY, LAST, END) or frame.call not in calls:
+                self.told.append(f"{when}: kind {frame.kind} of call {frame.call}")
+                continue
+            if frame.kind != END:
+                self._judge(when, frame)
+            if frame.kind != REPLY:
+                self.answered += 1
+                if frame.call == _PROBE:
+                    return
+
+    def _judge(self, when: str, frame: Frame) -> None:
+        """Note a reply that holds anything of somebody else's."""
+        reply: Reply
         try:
-            self.boots = self._look()
-            self._pretend()
-            self._wait_until_heard()
-        except BaseException:
-            self.session.close()
-            raise
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.session.close()
-
-    def _look(self) -> list[tuple[str, str]]:
-        """Learn the service's name and boot, as robots do."""
-
-        def look() -> list[list[str]]:
-            replies = self.session.liveliness().get(f"{_PREFIX}/*/*/alive", timeout=_PATIENCE_S)
-            return [str(reply.ok.key_expr).split("/") for reply in replies if reply.ok is not None]
-
-        return [(key[2], key[3]) for key in _in_time(look)]
-
-    def _pretend(self) -> None:
-        liveliness = self.session.liveliness()
-        self._declared: list[object] = []
-        for name, boot in (*self.boots, *((name, FORGED_BOOT) for name, _ in self.boots)):
-            prefix = f"{_PREFIX}/{name}/{boot}"
-            self._declared += [
-                self._queryable(f"{prefix}/decide"),
-                liveliness.declare_token(f"{prefix}/alive"),
-            ]
-        self._declared += [
-            self._queryable(f"{_PREFIX}/**"),
-            self._queryable("**"),
-            self.session.declare_subscriber(
-                "**",
-                zenoh.handlers.Callback(self._overhear, indirect=False),
-                allowed_origin=zenoh.Locality.REMOTE,
-            ),
-        ]
-
-    def _queryable(self, key: str) -> object:
-        return self.session.declare_queryable(
-            key, zenoh.handlers.Callback(self._take, indirect=False), complete=True
-        )
-
-    def _take(self, query: zenoh.Query) -> None:
-        with query:
-            payload = b"" if query.payload is None else query.payload.to_bytes()
-            self.received.append(payload)
-            query.reply(query.key_expr, self._answer(payload))
-
-    def _overhear(self, sample: zenoh.Sample) -> None:
-        self.overheard.append(str(sample.key_expr))
-
-    def ask(self, key: str) -> list[bytes]:
-        """Return what others than the intruder itself reply to a question."""
-        replies = self.session.get(
-            key,
-            payload=b"question",
-            target=zenoh.QueryTarget.ALL,
-            allowed_destination=zenoh.Locality.REMOTE,
-            consolidation=zenoh.ConsolidationMode.NONE,
-            timeout=_PATIENCE_S,
-        )
-        return [reply.ok.payload.to_bytes() for reply in replies if reply.ok is not None]
-
-    def _wait_until_heard(self) -> None:
-        """Ask the service, and have it answer: what was said before has arrived."""
-        for name, boot in self.boots:
-            # It may be seen a moment before it can be asked.
-            _in_time(partial(self.ask, f"{_PREFIX}/{name}/{boot}/decide"))
-        self.received.clear()
+            reply = decode_reply(frame.payload)
+        except MessageError as error:
+            self.told.append(f"{when}: {error}")
+            return
+        if isinstance(reply, NeedState | Progress):
+            return  # of the session it knows nothing
+        if isinstance(reply, Refused) and reply.code != "stale_epoch":
+            return
+        own = isinstance(reply, TaskAnswer | SensingAnswer) and reply.number == self._own_number
+        if not (own and frame.call == 1):
+            self.told.append(f"{when}: {reply}")
 
 
-def _in_time(ask: Callable[[], list[Answer]]) -> list[Answer]:
-    """Ask until there is an answer."""
-    deadline_s = time.monotonic() + _PATIENCE_S
-    while time.monotonic() < deadline_s:
-        if answers := ask():
-            return answers
-        time.sleep(0.02)
-    raise AssertionError("the intruder was not let in, so this shows nothing")
+def _calls_in(message: Message) -> Iterator[int]:
+    """Yield the calls that a message makes."""
+    at = 0
+    if not message.is_whole:
+        return
+    data = message.data.removeprefix(MAGIC)
+    while at < len(data):
+        if data[at + 4] == CALL:
+            yield int.from_bytes(data[at + 5 : at + 9], "little")
+        at += 9 + int.from_bytes(data[at : at + 4], "little")
 
 
-def open_session(endpoint: str, mode: Mode, *, tls: TlsFiles | None = None) -> zenoh.Session:
-    """Open a plain session that is connected to one endpoint."""
-    settings: dict[str, object] = {
-        "mode": mode,
-        "scouting": {"multicast": {"enabled": False}},
-        "listen": {"endpoints": []},
-        "connect": {"endpoints": [endpoint]},
-    }
-    if tls is not None:
-        settings["transport"] = {
-            "link": {
-                "tls": {
-                    "root_ca_certificate": str(tls.authority),
-                    "connect_private_key": str(tls.key),
-                    "connect_certificate": str(tls.certificate),
-                    "enable_mtls": True,
-                }
-            }
-        }
-    return zenoh.open(zenoh.Config.from_json5(json.dumps(settings)))
+def _until_the_end(link: RawLink) -> Iterator[Frame]:
+    """Yield frames until the other end hangs up, or says what is no frame (TLS's own alerts)."""
+    with contextlib.suppress(OSError, AssertionError):
+        yield from link.until_the_end()
+
+
+class Impostor:
+    """Listens as the service that it is not, with a robot's certificate.
+
+    Attributes
+    ----------
+    endpoint : str
+    received : list of bytes
+        Requests that it was asked.
+    knocked : int
+        Connections that were made.
+    """
+
+    def __init__(
+        self, port: int, keys: Path, answer: Callable[[int], bytes] = wrong_actions
+    ) -> None:
+        self.endpoint = f"tls/127.0.0.1:{port}"
+        self.received: list[bytes] = []
+        self.knocked = 0
+        self._answer = answer
+        self._context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+        self._context.load_cert_chain(keys / "certificate.pem", keys / "key.pem")
+        self._context.load_verify_locations(keys / "authority.pem")
+        self._context.set_alpn_protocols(["holdfast"])
+        self._listener = socket.create_server(("127.0.0.1", port))
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Hang up."""
+        self._listener.shutdown(socket.SHUT_RDWR)
+        self._listener.close()
+        self._thread.join()
+
+    def _run(self) -> None:
+        while True:
+            try:
+                connection, _ = self._listener.accept()
+            except OSError:
+                return
+            self.knocked += 1
+            with contextlib.suppress(OSError, ssl.SSLError, AssertionError), connection:
+                connection.settimeout(10.0)
+                with self._context.wrap_socket(connection, server_side=True) as secured:
+                    self._serve(RawLink.over(secured))
+
+    def _serve(self, link: RawLink) -> None:
+        for frame in link.until_the_end(10.0):
+            if frame.kind == HELLO:
+                link.say(hello_of("service", "cloud", "impostor"))
+            elif frame.kind == CALL:
+                self.received.append(frame.payload)
+                link.send(LAST, frame.call, self._answer(1))

@@ -28,6 +28,7 @@ __all__ = [
     "create_directory_atomically",
     "read_bounded",
     "remove_unfinished",
+    "replace_directory",
     "write_atomically",
 ]
 
@@ -211,6 +212,28 @@ def create_directory_atomically(path: Path, files: Mapping[str, NewFile]) -> Non
             reason = "it exists already" if path.exists() else error.strerror
             raise OutputError(f"{path}: cannot be created: {reason}") from error
         raise
+
+
+def replace_directory(path: Path, files: Mapping[str, NewFile]) -> None:
+    """Put a new directory in the place of one that is there, which is removed.
+
+    No reader ever sees files of both. A process that is killed on the way may leave none there.
+
+    Raises
+    ------
+    OutputError
+        If it cannot be written.
+    """
+    new, old = path.with_name(f".{path.name}.new"), path.with_name(f".{path.name}.old")
+    for left in (new, old):
+        shutil.rmtree(left, ignore_errors=True)
+    create_directory_atomically(new, files)
+    try:
+        path.rename(old)
+        new.rename(path)
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be replaced: {error.strerror}") from error
+    shutil.rmtree(old, ignore_errors=True)
 
 
 def claim_directory(out: Path | None, parent: Path, name: str) -> Path:

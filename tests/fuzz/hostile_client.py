@@ -1,4 +1,4 @@
-"""A client that means harm: it speaks Zenoh, and says whatever it likes.
+"""A client that means harm: it speaks the wire, and says whatever it likes.
 
     python -m tests.fuzz.hostile_client ENDPOINT --messages 10000 --seed 1
 
@@ -13,18 +13,17 @@ import collections
 import contextlib
 import itertools
 import json
-import os
 import random
-import struct
+import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import msgspec
-import zenoh
 from tests.fuzz import corpus
 from tests.fuzz.mutations import Mutator
+from tests.wire import CALL, END, LAST, REPLY, Frame, RawClient, frame_of, hello_of
 
 from holdfast.session.messages import (
     MAX_OBSERVATIONS,
@@ -42,22 +41,18 @@ __all__ = ["HostileMessages", "Message", "main"]
 
 _OWN_SESSIONS = 60
 _COSTLY_SHARE = 0.0002
+_FRAMES_SHARE = 0.01
 _PATIENCE_S = 30.0
 _TIMEOUT_S = 10.0
-_PART_BYTES = 36_000
-_PART = struct.Struct("<16sQII")
-"""As the transport describes a part: request, its size, number of this part, number of parts."""
-
 _WORDS = (0, 1, 2, 3, 7, 64, 2**16, 2**31, 2**32 - 1)
 
 
 class Message(NamedTuple):
-    """A payload, an attachment if it is a part, and whether the call is given up at once."""
+    """A request, or other bytes that are no call but go the same way."""
 
     kind: str
     payload: bytes
-    attachment: bytes | None = None
-    abandoned: bool = False
+    is_call: bool = True
 
 
 class HostileMessages:
@@ -87,17 +82,17 @@ class HostileMessages:
         chance = self._chance
         while True:
             draw = chance.random()
-            if draw < 0.05:
-                yield from self._upload()
-            elif draw < 0.05 + _COSTLY_SHARE:
+            if draw < _FRAMES_SHARE:
+                yield Message("frames", self._frames(), is_call=False)
+            elif draw < _FRAMES_SHARE + _COSTLY_SHARE:
                 yield Message("costly", self._costly())
-            elif draw < 0.051:
+            elif draw < _FRAMES_SHARE + 0.001:
                 yield Message("large", chance.randbytes(chance.choice((50_000, 300_000))))
             else:
                 _, kind, way = chance.choices(self._ways, self._weights)[0]
                 payload = way()
                 self._sent.append(payload)
-                yield Message(kind, payload, None, chance.random() < 0.05)
+                yield Message(kind, payload)
 
     def _random(self) -> bytes:
         return self._sealed(
@@ -190,27 +185,21 @@ class HostileMessages:
         changes = {"opening": opening, "checkpoint": None, "observations": ()}
         return encode(msgspec.structs.replace(request, **changes))
 
-    def _upload(self) -> Iterator[Message]:
-        """Yield parts of a large request: some, all, spoilt, or of none at all."""
+    def _frames(self) -> bytes:
+        """Return frames that no robot sends; most of them end the link."""
         chance = self._chance
-        name = chance.randbytes(16)
-        size = chance.choice((1000, 1000, 4000, _PART_BYTES))
-        count = chance.randint(2, 8)
-        payload = self._mutator.spoilt().ljust(size * count - size // 2, b"\0")
-        for index in range(count):
-            if chance.random() < 0.15:
-                continue  # it never comes
-            lies = chance.random() < 0.1
-            attachment = _PART.pack(
-                name,
-                chance.choice((0, 2**26, 2**63)) if lies else len(payload),
-                chance.choice(_WORDS) if lies else index,
-                chance.choice(_WORDS) if lies else count,
-            )
-            if chance.random() < 0.02:
-                attachment = chance.randbytes(chance.choice((0, 1, 31, 33)))
-            part = b"" if chance.random() < 0.2 else payload[index * size : (index + 1) * size]
-            yield Message("part", part, attachment, chance.random() < 0.05)
+        kind, call = chance.choice((*range(10), 255)), chance.choice((*_WORDS, *range(8)))
+        content = chance.choice((b"", chance.randbytes(40), self._spoilt()))
+        match chance.choice(("frame", "frame", "hello", "length", "bytes")):
+            case "frame":
+                return frame_of(kind, call, content)
+            case "hello":
+                return hello_of(chance.choice(("robot", "service")), "cloud")
+            case "length":
+                size = chance.choice((*_WORDS, len(content) + 1))
+                return size.to_bytes(4, "little") + frame_of(kind, call, content)[4:]
+            case _:
+                return chance.randbytes(chance.choice((1, 9, 500)))
 
 
 class _Client:
@@ -223,110 +212,105 @@ class _Client:
         Calls that may be open at a time.
     deaf_s : float
         Now and then nothing is read for this long.
+    seed : int
     """
 
     def __init__(self, endpoint: str, outstanding: int, deaf_s: float, seed: int) -> None:
-        self._room = threading.Semaphore(outstanding)
         self._outstanding = outstanding
         self._endpoint = endpoint
         self._deaf_s = deaf_s
         self._chance = random.Random(seed)
+        self._link: RawClient | None = None
+        self._open: set[int] = set()
+        self._changed = threading.Condition()
+        self._numbers = itertools.count(1)
         self.kinds: collections.Counter[str] = collections.Counter()
         self.replies: collections.Counter[str] = collections.Counter()
         self.ended = 0
         self.links = 0
-        self._lock = threading.Lock()
-        self._session: zenoh.Session | None = None
-        self._key = ""
 
     def connect(self) -> None:
-        """Connect, as often as it takes, and find out how the service is called now."""
-        deadline = time.monotonic() + _PATIENCE_S
+        """Connect, as often as it takes."""
         self.close()
-        configuration = zenoh.Config.from_json5(
-            json.dumps(
-                {
-                    "mode": "client",
-                    "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
-                    "connect": {"endpoints": [self._endpoint], "timeout_ms": 5000},
-                    "transport": {"shared_memory": {"enabled": False}},
-                }
-            )
-        )
+        deadline = time.monotonic() + _PATIENCE_S
         while True:
             try:
-                self._session = zenoh.open(configuration)
-                self.links += 1
-                for reply in self._session.liveliness().get("holdfast/1/**/alive", timeout=5.0):
-                    if reply.ok is not None:
-                        self._key = str(reply.ok.key_expr).removesuffix("alive") + "decide"
-                        return
-            except zenoh.ZError:
-                pass
-            assert time.monotonic() < deadline, "no service is there"
-            self.close()
-            time.sleep(0.05)
+                link = RawClient(self._endpoint)
+                break
+            except (OSError, AssertionError):
+                assert time.monotonic() < deadline, "no service is there"
+                time.sleep(0.05)
+        self.links += 1
+        with self._changed:
+            self._link = link
+            self._open = set()
+        threading.Thread(target=self._read, args=(link, self._open), daemon=True).start()
 
     def close(self) -> None:
-        session, self._session = self._session, None
-        if session is not None:
-            with contextlib.suppress(zenoh.ZError):
-                session.close()
+        """Hang up; what was asked stays without an answer."""
+        with self._changed:
+            link, self._link = self._link, None
+        if link is not None:
+            with contextlib.suppress(OSError):
+                link.socket.shutdown(socket.SHUT_RDWR)
+            link.close()
 
     def send(self, message: Message) -> None:
-        self._room.acquire()
-        self.kinds[message.kind] += 1
-        token = zenoh.CancellationToken() if message.abandoned else None
-        try:
-            assert self._session is not None
-            self._session.get(
-                self._key,
-                zenoh.handlers.Callback(self._replied, self._ended, indirect=False),
-                payload=message.payload,
-                attachment=message.attachment,
-                consolidation=zenoh.ConsolidationMode.NONE,
-                timeout=_TIMEOUT_S,
-                express=False,
-                cancellation_token=token,
+        """Send a message, once there is room for its call."""
+        with self._changed:
+            self._changed.wait_for(
+                lambda: self._link is None or len(self._open) < self._outstanding, _TIMEOUT_S
             )
-        except zenoh.ZError:
-            self._room.release()
+            lost = self._link is None
+        if lost:
             self.replies["link lost"] += 1
             self.connect()
-            return
-        if token is not None:
-            token.cancel()
+        self.kinds[message.kind] += 1
+        link = self._link
+        if link is None:
+            return  # it was lost at once, and the next message finds out
+        try:
+            if message.is_call:
+                number = next(self._numbers) % 2**32
+                with self._changed:
+                    self._open.add(number)
+                link.send(CALL, number, message.payload)
+            else:
+                link.say(message.payload)
+        except OSError:
+            self.close()
 
     def wait(self) -> None:
         """Wait for the calls that are open."""
-        deadline = time.monotonic() + _TIMEOUT_S + 5.0
-        for _ in range(self._outstanding):
-            self._room.acquire(timeout=max(0.0, deadline - time.monotonic()))
+        with self._changed:
+            self._changed.wait_for(lambda: self._link is None or not self._open, _TIMEOUT_S + 5.0)
 
-    def _replied(self, reply: zenoh.Reply) -> None:
-        sample = reply.ok
-        if sample is None:
-            what = "timeout"
-        else:
-            payload = sample.payload.to_bytes()
-            what = "acknowledged"
-            if payload:
-                try:
-                    decoded = decode_reply(payload)
-                    what = type(decoded).__name__
-                    if isinstance(decoded, Refused):
-                        what = f"Refused {decoded.code}"
-                except MessageError:
-                    what = "MALFORMED REPLY"
-        with self._lock:
+    def _read(self, link: RawClient, calls: set[int]) -> None:
+        with contextlib.suppress(OSError, ValueError):
+            for frame in link.until_the_end(3600.0):
+                self._take(frame, calls)
+                if self._deaf_s and self._chance.random() < 0.01:
+                    time.sleep(self._deaf_s)
+        with self._changed:
+            if self._link is link:
+                self._link = None
+            self._changed.notify_all()
+
+    def _take(self, frame: Frame, calls: set[int]) -> None:
+        if frame.kind in (REPLY, LAST):
+            try:
+                decoded = decode_reply(frame.payload)
+                what = type(decoded).__name__
+                if isinstance(decoded, Refused):
+                    what = f"Refused {decoded.code}"
+            except MessageError:
+                what = "MALFORMED REPLY"
             self.replies[what] += 1
-        if self._deaf_s and self._chance.random() < 0.01:
-            time.sleep(self._deaf_s)  # on the thread that reads
-
-    def _ended(self) -> None:
-        with self._lock:
+        if frame.kind in (LAST, END):
             self.ended += 1
-        self._room.release()
+            with self._changed:
+                calls.discard(frame.call)
+                self._changed.notify_all()
 
 
 def main() -> None:
@@ -338,12 +322,6 @@ def main() -> None:
     parser.add_argument("--outstanding", type=int, default=48)
     parser.add_argument("--deaf", type=float, default=0.0, metavar="SECONDS")
     options = parser.parse_args()
-    if options.deaf:
-        # One thread that sees and reads, so that all of the link goes unread.
-        os.environ["ZENOH_RUNTIME"] = (
-            "(acc: (handover: app), net: (handover: app), rx: (handover: app), "
-            "app: (worker_threads: 1))"
-        )
     client = _Client(options.endpoint, options.outstanding, options.deaf, options.seed)
     began = time.monotonic()
     client.connect()
@@ -366,8 +344,6 @@ def main() -> None:
         "replies": dict(client.replies.most_common()),
     }
     print(json.dumps(report), flush=True)
-    # Zenoh's threads may be in a callback yet.
-    os._exit(0)
 
 
 if __name__ == "__main__":

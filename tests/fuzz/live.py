@@ -1,4 +1,4 @@
-"""A service under fire: hostile clients, bytes that are no Zenoh, and honest robots among them.
+"""A service under fire: hostile clients, bytes that are no frames, and honest robots among them.
 
     python -m tests.fuzz.live --messages 1000000 --seed 1
 
@@ -13,7 +13,6 @@ import argparse
 import collections
 import csv
 import json
-import os
 import signal
 import statistics
 import sys
@@ -388,7 +387,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    code = main()
-    sys.stdout.flush()
-    # Zenoh's threads may be in a callback yet.
-    os._exit(code)
+    sys.exit(main())

@@ -1,59 +1,40 @@
-"""Bytes at a service's port that are no Zenoh, or only the beginning of it."""
+"""Bytes at a service's port that are not ours, or only the beginning of it: scanners and worse."""
 
 from __future__ import annotations
 
 import contextlib
-import json
 import random
 import socket
 import struct
 import threading
 
-import zenoh
+from tests.wire import CALL, frame_of, hello_of
 
-__all__ = ["RawConnections", "captured_greeting"]
+__all__ = ["RawConnections"]
 
 _MAX_OPEN = 40
 _PAUSE_S = 0.01
 
-
-def captured_greeting() -> bytes:
-    """Return what a client of Zenoh says first, as it said it to a listener of ours."""
-    listener = socket.create_server(("127.0.0.1", 0))
-    listener.settimeout(10.0)
-    port = listener.getsockname()[1]
-
-    def open_session() -> None:
-        configuration = zenoh.Config.from_json5(
-            json.dumps(
-                {
-                    "mode": "client",
-                    "scouting": {"multicast": {"enabled": False}},
-                    "connect": {"endpoints": [f"tcp/127.0.0.1:{port}"], "timeout_ms": 500},
-                }
-            )
-        )
-        with contextlib.suppress(zenoh.ZError):
-            zenoh.open(configuration).close()
-
-    thread = threading.Thread(target=open_session)
-    thread.start()
-    with listener:
-        connection, _ = listener.accept()
-        with connection:
-            connection.settimeout(10.0)
-            greeting = connection.recv(65_536)
-    thread.join(10.0)
-    return greeting
+_HTTP = b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n"
+_TLS = b"\x16\x03\x01\x00\xf4\x01\x00\x00\xf0\x03\x03" + bytes(244)
+_RESET = struct.pack("ii", 1, 0)
 
 
 class RawConnections:
     """Connects, says something that it should not, and hangs up, in order or not, or keeps silent.
 
+    Some send what they have byte by byte. Of those that stay open, the oldest are left first.
+
+    Parameters
+    ----------
+    port : int
+        Of loopback.
+    seed : int
+
     Attributes
     ----------
     made, held : int
-        Connections that were made, and those of them that said the first half of a greeting and
+        Connections that were made, and those of them that said the first half of something and
         were left open.
     bytes_sent : int
     """
@@ -61,8 +42,9 @@ class RawConnections:
     def __init__(self, port: int, seed: int) -> None:
         self._port = port
         self._chance = random.Random(seed)
-        self._greeting = captured_greeting()
+        self._greeting = hello_of() + frame_of(CALL, 1, b"no request")
         self._open: list[socket.socket] = []
+        self._dripping: list[tuple[socket.socket, bytearray]] = []
         self._stopped = threading.Event()
         self.made = self.held = self.bytes_sent = 0
         self._thread = threading.Thread(target=self._run, daemon=True)
@@ -72,22 +54,38 @@ class RawConnections:
         """Hang up."""
         self._stopped.set()
         self._thread.join()
-        for connection in self._open:
+        for connection in (*self._open, *(each for each, _ in self._dripping)):
             connection.close()
 
     def _run(self) -> None:
         while not self._stopped.wait(_PAUSE_S * self._chance.random()):
             with contextlib.suppress(OSError):
                 self._connect()
+            self._drip()
             while len(self._open) > _MAX_OPEN:
                 self._open.pop(self._chance.randrange(len(self._open))).close()
+
+    def _drip(self) -> None:
+        """Send one more byte of each that is slow."""
+        for each in list(self._dripping):
+            connection, left = each
+            try:
+                connection.sendall(bytes([left.pop(0)]))
+            except OSError:
+                left.clear()
+            self.bytes_sent += 1
+            if not left or len(self._dripping) > _MAX_OPEN:
+                self._dripping.remove(each)
+                connection.close()
 
     def _connect(self) -> None:
         chance = self._chance
         connection = socket.create_connection(("127.0.0.1", self._port), timeout=5.0)
         self.made += 1
         greeting = self._greeting
-        match chance.choice(("random", "half", "spoilt", "whole", "length", "nothing")):
+        match chance.choice(
+            ("random", "half", "spoilt", "whole", "length", "other", "slow", "nothing")
+        ):
             case "random":
                 said = chance.randbytes(chance.choice((1, 2, 100, 70_000)))
             case "half":
@@ -103,9 +101,16 @@ class RawConnections:
                 self.held += 1
             case "length":
                 # What follows has so many bytes, it says; then hardly any come.
-                said = struct.pack("<H", chance.choice((0, 1, 40_000, 65_535)))
+                size = chance.choice((0, 1, 40_000, 2**26, 2**32 - 1))
+                said = hello_of() + struct.pack("<IBI", size, chance.randrange(9), 1)
                 said += chance.randbytes(chance.choice((0, 5)))
                 self.held += 1
+            case "other":
+                said = chance.choice((_HTTP, _TLS))
+            case "slow":
+                self._dripping.append((connection, bytearray(greeting)))
+                self.held += 1
+                return
             case _:
                 said = b""
         self.bytes_sent += len(said)
@@ -116,7 +121,7 @@ class RawConnections:
                 return
             if chance.random() < 0.5:
                 # With a reset instead of an orderly end.
-                connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+                connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET)
         except OSError:
             pass
         connection.close()

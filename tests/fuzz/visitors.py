@@ -11,33 +11,22 @@ from __future__ import annotations
 import argparse
 import collections
 import json
-import os
 import random
+import sys
 import time
-from queue import Empty, SimpleQueue
 from typing import Any
 
 from tests.fuzz import corpus
-from tests.processes.faults import PATIENT
 from tests.questions import request_of
 from tests.unit.test_session_service import Robot as ReferenceRobot
 from tests.unit.test_session_service import content
+from tests.wire import RawClient
 
 from holdfast.planning import encode_checkpoint
-from holdfast.runtime.transport.zenoh_transport import ZenohRobotTransport
-from holdfast.session.events import Appeared, Ended, Replied, TransportEvent
-from holdfast.session.messages import (
-    NeedState,
-    Reply,
-    Request,
-    decode_reply,
-    encode,
-)
-from holdfast.transport.endpoints import ServiceAddress
+from holdfast.session.messages import NeedState, encode
 
 __all__ = ["main"]
 
-_PATIENCE_S = 30.0
 _ROBOTS_OF_A_LINK = 40
 _PROBLEMS = (corpus.PROBLEM, "peg_in_hole_2d")
 
@@ -54,35 +43,6 @@ def _right_answers() -> dict[str, list[list[tuple[Any, ...]]]]:
     return found
 
 
-class _Link:
-    """A robot's end of the wire."""
-
-    def __init__(self, endpoint: str) -> None:
-        self.events: SimpleQueue[TransportEvent] = SimpleQueue()
-        # Long, for a machine that stands still for a moment; the service is asked to be as patient.
-        address = ServiceAddress(endpoint)
-        self.transport = ZenohRobotTransport({"cloud": address}, lease_ms=PATIENT["lease_ms"])
-        self.transport.start(self.events.put)
-        self._calls = 0
-        while not isinstance(self.events.get(timeout=_PATIENCE_S), Appeared):
-            pass
-
-    def send(self, request: Request) -> int:
-        self._calls += 1
-        self.transport.call("cloud", self._calls, encode(request))
-        return self._calls
-
-    def ask(self, request: Request) -> list[Reply]:
-        call = self.send(request)
-        replies = []
-        while True:
-            event = self.events.get(timeout=_PATIENCE_S)
-            if isinstance(event, Replied) and event.call == call:
-                replies.append(decode_reply(event.payload))
-            elif isinstance(event, Ended) and event.call == call:
-                return replies
-
-
 def main() -> None:
     """Come and go for so long."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
@@ -96,11 +56,11 @@ def main() -> None:
     counts: collections.Counter[str] = collections.Counter()
     wrong: list[str] = []
     until = time.monotonic() + options.seconds
-    link = _Link(options.endpoint)
+    link = RawClient(options.endpoint)
     while time.monotonic() < until and not wrong:
         if counts["robots"] % _ROBOTS_OF_A_LINK == _ROBOTS_OF_A_LINK - 1:
-            link.transport.close()
-            link = _Link(options.endpoint)
+            link.close()
+            link = RawClient(options.endpoint)
             counts["links"] += 1
         counts["robots"] += 1
         time.sleep(options.pause * 2 * chance.random())
@@ -122,15 +82,16 @@ def main() -> None:
             )
             if leaves and number == last - 1:
                 # It was killed in the middle of its call.
-                call = link.send(request)
-                if chance.random() < 0.5:
-                    link.transport.abandon(call)
+                link.send_call(encode(request))
+                if chance.random() < 0.1:
+                    link.close()
+                    link = RawClient(options.endpoint)
                 counts["left"] += 1
                 break
             try:
                 replies = link.ask(request)
-            except Empty:
-                wrong.append(f"no answer within {_PATIENCE_S} s")
+            except OSError as error:
+                wrong.append(f"no answer: {error!r}")
                 break
             told = content(replies)
             expected = right[name][number]
@@ -144,8 +105,7 @@ def main() -> None:
                 if told and not isinstance(told[0][0], NeedState):
                     break  # it is busy
     print(json.dumps({"seed": options.seed, **counts, "wrong": wrong}), flush=True)
-    # Zenoh's threads may be in a callback yet.
-    os._exit(0 if not wrong else 1)
+    sys.exit(1 if wrong else 0)
 
 
 if __name__ == "__main__":

@@ -20,7 +20,16 @@ from pathlib import Path
 import pytest
 
 from holdfast.chaos.processes import marked_processes
-from holdfast.chaos.schedule import NEEDS_NAMESPACE, Fault, FaultKind, Schedule, draw_schedule
+from holdfast.chaos.schedule import (
+    NEEDS_NAMESPACE,
+    WIRES,
+    Fault,
+    FaultKind,
+    Schedule,
+    Wire,
+    draw_schedule,
+    kinds_over,
+)
 from holdfast.chaos.trial import Pace, TrialOutcome, run_chaos_trial
 from holdfast.chaos.twin import keep_undisturbed
 from holdfast.chaos.world import performances
@@ -31,11 +40,14 @@ COMMAND = (sys.executable, "-m", "holdfast", "chaos")
 BRIEF = Pace(min_steps=60, rate_hz=60.0)
 
 
-def schedule_of(*faults: Fault, kind: FaultKind, num_clouds: int = 1) -> Schedule:
+def schedule_of(
+    *faults: Fault, kind: FaultKind, num_clouds: int = 1, wire: Wire = "tcp"
+) -> Schedule:
     return Schedule(
         seed=0,
         trial=0,
         kind=kind,
+        wire=wire,
         world_seed=11,
         num_particles=30,
         num_clouds=num_clouds,
@@ -49,12 +61,14 @@ def run(schedule: Schedule, directory: Path, pace: Pace = BRIEF) -> TrialOutcome
     return run_chaos_trial(schedule, directory, pace, threading.Event())
 
 
-def test_a_cloud_and_a_robot_are_killed(tmp_path: Path) -> None:
+@pytest.mark.parametrize("wire", WIRES)
+def test_a_cloud_and_a_robot_are_killed(tmp_path: Path, wire: Wire) -> None:
     """Both in one run; the robot goes on in a new process, and nothing is done twice."""
     schedule = schedule_of(
         Fault(kind=FaultKind.CLOUD_KILLED, at=0.1, duration_s=0.3),
         Fault(kind=FaultKind.ROBOT_KILLED, at=0.3, duration_s=0.0),
         kind=FaultKind.COMBINATION,
+        wire=wire,
     )
     outcome = run(schedule, tmp_path)
     assert outcome.verdict == "identical", outcome.reason
@@ -203,8 +217,11 @@ def only(kinds: Sequence[FaultKind]) -> list[str]:
 
 
 @pytest.mark.slow
-def test_every_kind_of_fault(tmp_path: Path, started: list[Chaos]) -> None:
-    chaos = Chaos(tmp_path, "--trials", str(len(FaultKind)), "--seed", "3", "--jobs", "2")
+@pytest.mark.parametrize("wire", WIRES)
+def test_every_kind_of_fault(tmp_path: Path, started: list[Chaos], wire: Wire) -> None:
+    possible = set(kinds_over(wire, tuple(FaultKind)))
+    trials = str(len(possible))
+    chaos = Chaos(tmp_path, *("--trials", trials, "--seed", "3", "--jobs", "2", "--wire", wire))
     started.append(chaos)
     output, errors = chaos.end()
     assert chaos.process.returncode == 0, output + errors
@@ -221,16 +238,17 @@ def test_every_kind_of_fault(tmp_path: Path, started: list[Chaos]) -> None:
         "trials.jsonl",
     ]
     summary = json.loads((chaos.out / "summary.json").read_text())
-    assert summary["identical"] == summary["finished"] == len(FaultKind)
+    assert summary["identical"] == summary["finished"] == len(possible)
     left_out = set(summary["left_out"])
     assert left_out in (set(), set(NEEDS_NAMESPACE))
-    assert {row["kind"] for row in summary["kinds"]} == {*FaultKind} - left_out
+    assert {row["kind"] for row in summary["kinds"]} == possible - left_out
+    assert summary["wires"] == {wire: len(possible)}
     for kind in left_out:
         assert kind in errors  # and why
     with (chaos.out / "chaos.csv").open() as file:
         rows = list(csv.DictReader(file))
     struck = {row["kind"] for row in rows}
-    assert struck >= {*FaultKind} - left_out - {"combination"}
+    assert struck >= possible - left_out - {"combination"}
     for row in rows:
         if row["kind"] in ("cloud_killed", "link_cut") and row["trial_kind"] == row["kind"]:
             assert float(row["detection_ms"]) > 0.0
@@ -259,7 +277,7 @@ main()
     started.append(chaos)
     output, _ = chaos.end()
     assert chaos.process.returncode == 1
-    assert "trial 0 (link_cut): diverged: different: an invention" in output
+    assert "trial 0 (link_cut over tcp): diverged: different: an invention" in output
     assert "1 of 1 trial went wrong (1 diverged" in output
     kept = chaos.out / "trial-00000"
     assert f"its files: {kept}" in output
@@ -268,10 +286,11 @@ main()
     assert again is not None
     options = shlex.split(again[1])[2:]
     assert options == [
-        *("--trials", "1", "--first", "0", "--seed", "0", "--only", "link_cut", "--keep")
+        *("--trials", "1", "--first", "0", "--seed", "0", "--only", "link_cut"),
+        *("--wire", "tcp", "--keep"),
     ]
     schedule = json.loads((kept / "schedule.json").read_text())
-    drawn = draw_schedule(0, 0, FaultKind.LINK_CUT, tuple(FaultKind))
+    drawn = draw_schedule(0, 0, FaultKind.LINK_CUT, "tcp", tuple(FaultKind))
     assert schedule["world_seed"] == drawn.world_seed
 
 
@@ -394,6 +413,7 @@ def test_events_instead_of_a_bar(tmp_path: Path, started: list[Chaos]) -> None:
     [
         (("--only", "earthquake"), "--only is 'earthquake'; allowed are cloud_killed, "),
         (("--only", "link-slient"), "--only is 'link-slient' (did you mean link_silent?); allowed"),
+        (("--wire", "token_ring"), f"--wire is 'token_ring'; allowed are {', '.join(WIRES)}"),
         (("--kinds", "cloud_killed"), "No such option: --kinds (Possible options: --kind"),
     ],
 )

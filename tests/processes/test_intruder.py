@@ -1,92 +1,163 @@
-"""Whoever may ask a service cannot steer the robots that it decides for.
+"""A stolen robot can ask for itself and do nothing else to the robots beside it.
 
-An intruder with the certificate of a stolen robot says in every mode that it is the service, and
-has a wrong answer ready at once (``tests/intruder.py``). Nothing reaches it, and the run is the
-same as undisturbed, bit for bit.
+It has a certificate of the same authority, knows the other robot's session and all that this one
+asks, and says each message at each moment of a link (``tests/intruder.py``) while the honest robot
+runs. Nothing of the other session reaches it, and the honest run is the same as undisturbed, bit
+for bit.
 """
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Callable
+import os
+import threading
+from collections.abc import Iterator
 from pathlib import Path
 
+import msgspec
 import pytest
-from tests.intruder import MODES, Intruder
-from tests.processes.faults import References, Site, Story, document_of
+from tests.intruder import Impostor, Intruder
+from tests.ports import free_port
+from tests.processes.faults import PATIENCE_S, References, Service, Site, Story, document_of
 from tests.processes.test_tls import secure
+from tests.questions import questions_of
+from tests.wire import GOODBYE, HELLO, RawLink, hello_of
 
-from holdfast.session.messages import (
-    MessageError,
-    Refused,
-    Request,
-    TaskAnswer,
-    decode_request,
-    encode,
-    numbers_to,
-)
-from holdfast.transport.endpoints import TlsFiles
+from holdfast.configuration import load
+from holdfast.recording.journal import Journal
+from holdfast.runtime.robot_process import opening_of
 
 DOCUMENT = document_of("peg_in_hole_2d")
-INTERVAL = DOCUMENT["simulator"]["sensing_intervals"] + 1
-ACTION_SIZE = 3
 
 
-def wrong_actions(request: Request) -> bytes:
-    """Return moves that are nearly eighty times as long as the problem's longest."""
-    count = INTERVAL - request.step % INTERVAL
-    return encode(TaskAnswer(request.number, count, numbers_to([7.77] * (ACTION_SIZE * count)), 1))
+@pytest.fixture(scope="session")
+def stolen(keys: Path) -> Path:
+    """Return the directory of the certificate of another robot, of the same authority."""
+    with Site(keys) as site:
+        made = site.holdfast("keys", keys / "ours", "--robot", "stolen")
+        assert made.process.returncode == 0, made.account()
+    return keys / "ours" / "stolen"
 
 
-def stale_epoch(request: Request) -> bytes:
-    """Return what stops a robot: that another process has taken its run over."""
-    return encode(Refused(request.number, "stale_epoch", "epoch 1: epoch 2 is there"))
+@pytest.fixture(params=["tcp", "tls"])
+def protocol(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
 
 
-def forging(forge: Callable[[Request], bytes]) -> Callable[[bytes], bytes]:
-    def answer(payload: bytes) -> bytes:
+@pytest.fixture
+def cloud(protocol: str, keys: Path, site: Site) -> Service:
+    return (site.service() if protocol == "tcp" else secure(site, keys, protocol)).start()
+
+
+@pytest.fixture
+def options(protocol: str, keys: Path) -> tuple[str, ...]:
+    """Return what the honest robot needs."""
+    return () if protocol == "tcp" else ("--tls", str(keys / "ours" / "robot"))
+
+
+class Raid:
+    """An intruder that goes through all that it can say, again and again, while a robot runs."""
+
+    def __init__(self, cloud: Service, keys: Path | None, story: Story) -> None:
+        self._cloud = cloud
+        self._keys = keys
+        self._story = story
+        self._stopped = threading.Event()
+        self._round = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._failure: BaseException | None = None
+        self.intruder: Intruder | None = None
+
+    def begin(self) -> None:
+        """Begin, once the robot has asked something."""
+        with Journal.read(self._story.running.out / "journal.sqlite") as journal:
+            session = journal.session()
+        if self._keys is None:
+            # Without certificates the session is the only secret, and nobody tells it.
+            session = os.urandom(16)
+        configuration = load(self._story.file)
+        asked = questions_of(configuration, session)
+        own = msgspec.structs.replace(
+            asked[0], session=os.urandom(16), opening=opening_of(configuration)
+        )
+        self.intruder = Intruder(self._cloud.endpoint, self._keys, asked, own)
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def finish_a_round(self) -> None:
+        """Wait until all was said once."""
+        assert self._round.wait(5 * PATIENCE_S)
+
+    def end(self) -> Intruder:
+        """End; return the intruder."""
+        self._stopped.set()
+        assert self._thread is not None and self.intruder is not None
+        self._thread.join()
+        if self._failure is not None:
+            raise self._failure
+        return self.intruder
+
+    def _run(self) -> None:
+        assert self.intruder is not None
         try:
-            return forge(decode_request(payload))
-        except MessageError:
-            return b""  # the other intruders' questions
+            while not self._stopped.is_set():
+                self.intruder.run()
+                self._round.set()
+        except BaseException as error:  # noqa: BLE001 - raised where it is waited for
+            self._failure = error
+        finally:
+            self._round.set()
 
-    return answer
 
-
-@pytest.mark.parametrize("forge", [wrong_actions, stale_epoch])
-@pytest.mark.parametrize("protocol", ["tcp", "tls", "quic"])
-def test_an_intruder_changes_nothing(
+def test_each_message_at_each_moment_changes_nothing(
     protocol: str,
-    forge: Callable[[Request], bytes],
-    keys: Path,
+    cloud: Service,
+    options: tuple[str, ...],
+    stolen: Path,
     site: Site,
     references: References,
 ) -> None:
-    stolen: TlsFiles | None = None
-    options: tuple[str, ...] = ()
-    if protocol == "tcp":
-        cloud = site.service().start()
-    else:
-        cloud = secure(site, keys, protocol).start()
-        robot_keys = keys / "ours" / "robot"
-        options = ("--tls", str(robot_keys))
-        stolen = TlsFiles(
-            *(robot_keys / name for name in ("authority.pem", "certificate.pem", "key.pem"))
-        )
     story = Story(site, references, DOCUMENT)
-    with contextlib.ExitStack() as stack:
-
-        def come() -> list[Intruder]:
-            return [
-                stack.enter_context(Intruder(cloud.endpoint, mode, forging(forge), tls=stolen))
-                for mode in MODES
-            ]
-
-        intruders = come()
-        # Others come when the robot is there already.
-        story.at("perform", 20, lambda: intruders.extend(come()))
-        robot = story.run(cloud, options=options)
-        assert [intruder.received for intruder in intruders] == [[]] * 6
+    raid = Raid(cloud, None if protocol == "tcp" else stolen, story)
+    # It goes on while the robot asks; and it has said everything before the robot is through.
+    story.at("perform", 10, raid.begin)
+    story.at("perform", 70, raid.finish_a_round)
+    robot = story.run(cloud, options=options)
+    intruder = raid.end()
+    assert intruder.told == []
+    assert intruder.links > 500
+    assert intruder.answered > 100
     assert robot.statuses() == []
     assert len(robot.matching("service_appeared", service=cloud.endpoint)) == 1
-    assert not robot.matching("disagreement")
+    for name in ("service_vanished", "service_suspected", "disagreement", "refused", "restore"):
+        assert not robot.matching(name), name
+    assert cloud.process.process.poll() is None
+    assert "Traceback" not in cloud.process.output
+
+
+def test_who_says_that_it_is_a_service_is_sent_away(
+    protocol: str, cloud: Service, stolen: Path
+) -> None:
+    with RawLink(cloud.endpoint, None if protocol == "tcp" else stolen) as link:
+        link.say(hello_of("service", "cloud", "another"))
+        kinds = [frame.kind for frame in link.until_the_end() if frame.kind != HELLO]
+    assert kinds == [GOODBYE]
+
+
+@pytest.fixture
+def impostor(stolen: Path) -> Iterator[Impostor]:
+    impostor = Impostor(free_port(), stolen)
+    yield impostor
+    impostor.close()
+
+
+def test_a_robots_certificate_is_not_a_services(
+    impostor: Impostor, keys: Path, site: Site, references: References
+) -> None:
+    """It listens where the robot looks for a service, and is never asked."""
+    cloud = secure(site, keys, "tls").start()
+    story = Story(site, references, DOCUMENT)
+    robot = story.run(impostor.endpoint, cloud, options=("--tls", str(keys / "ours" / "robot")))
+    assert impostor.knocked
+    assert not impostor.received
+    assert not robot.matching("service_appeared", service=impostor.endpoint)
+    assert robot.matching("service_appeared", service=cloud.endpoint)

@@ -7,6 +7,7 @@ between robot and service stands a relay that keeps what both say first.
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import socket
 import subprocess
@@ -139,5 +140,5 @@ def test_the_local_service_is_told_the_robots_lease() -> None:
         command = links.launcher(lambda _: None)._command
         assert command[command.index("--lease-ms") + 1] == str(ROBOT_MS)
     finally:
-        links.transport.close()
+        asyncio.run(links.transport.close())
         links.close()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
-from queue import SimpleQueue
 from typing import Any
 
 import msgspec
@@ -25,66 +24,33 @@ from tests.processes.faults import (
     in_order,
 )
 from tests.questions import request_of
+from tests.wire import RawClient
 
 from holdfast.configuration import Configuration, load
 from holdfast.planning import initial_state
 from holdfast.runtime.robot_process import opening_of
-from holdfast.runtime.transport.calls import DEFAULT_MAX_MESSAGE_BYTES
-from holdfast.runtime.transport.zenoh_transport import ZenohRobotTransport
-from holdfast.session.events import Appeared, Ended, Replied, TransportEvent
 from holdfast.session.messages import (
     PROTOCOL_VERSION,
     Progress,
     Refused,
-    Reply,
     Request,
     SensingAnswer,
-    decode_reply,
     encode,
     sealed,
 )
-from holdfast.transport.endpoints import ServiceAddress
+from holdfast.transport.contract import DEFAULT_MAX_MESSAGE_BYTES
 
 PEG = "peg_in_hole_2d"
 
 
-class Client:
+class Client(RawClient):
     """A robot's end of the wire, in the test's own hands."""
-
-    def __init__(self, service: Service) -> None:
-        self._events: SimpleQueue[TransportEvent] = SimpleQueue()
-        self._transport = ZenohRobotTransport(
-            {"cloud": ServiceAddress(service.endpoint)},
-            # Where cores are taken away for a while, it is not to be given up.
-            lease_ms=PATIENT["lease_ms"],
-            # It is the service that is to refuse.
-            max_message_bytes=8 * DEFAULT_MAX_MESSAGE_BYTES,
-        )
-        self._transport.start(self._events.put)
-        self._calls = 0
-        while not isinstance(self._events.get(timeout=PATIENCE_S), Appeared):
-            pass
-
-    def ask(self, payload: bytes) -> list[Reply]:
-        """Return all replies to a request."""
-        self._calls += 1
-        self._transport.call("cloud", self._calls, payload)
-        replies = []
-        while True:
-            event = self._events.get(timeout=PATIENCE_S)
-            if isinstance(event, Replied) and event.call == self._calls:
-                replies.append(decode_reply(event.payload))
-            elif isinstance(event, Ended) and event.call == self._calls:
-                return replies
 
     def refused(self, payload: bytes) -> Refused:
         # A sign of life may come before, if it takes its time to find out why.
         (reply,) = (each for each in self.ask(payload) if not isinstance(each, Progress))
         assert isinstance(reply, Refused), reply
         return reply
-
-    def close(self) -> None:
-        self._transport.close()
 
 
 @pytest.fixture
@@ -94,7 +60,7 @@ def cloud(site: Site) -> Service:
 
 @pytest.fixture
 def client(cloud: Service) -> Iterator[Client]:
-    client = Client(cloud)
+    client = Client(cloud.endpoint)
     yield client
     client.close()
 

@@ -2,21 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
-import os
-import socket
-import threading
-import time
-from collections.abc import Iterator
-
 import pytest
-from tests.ports import free_port
 
-from holdfast.chaos.datagrams import DatagramProxy, DelayLine
-from holdfast.chaos.processes import CannotStartError
+from holdfast.chaos.datagrams import DelayLine
 from holdfast.errors import InvalidValueError
-
-PATIENCE_S = 20.0
 
 
 class TestDelayLine:
@@ -75,105 +64,3 @@ class TestDelayLine:
     def test_what_is_out_of_bounds(self, delay_s: float, loss: float, message: str) -> None:
         with pytest.raises(InvalidValueError, match=message):
             DelayLine(delay_s, loss, "seed")
-
-
-class Echo:
-    """A service that sends datagrams back to whoever sent them."""
-
-    def __init__(self) -> None:
-        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._socket.bind(("127.0.0.1", 0))
-        self.port: int = self._socket.getsockname()[1]
-        self._thread = threading.Thread(target=self._serve)
-        self._thread.start()
-
-    def _serve(self) -> None:
-        while True:
-            content, address = self._socket.recvfrom(65_536)
-            if not content:
-                return
-            self._socket.sendto(content, address)
-
-    def close(self) -> None:
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as last:
-            last.sendto(b"", ("127.0.0.1", self.port))
-        self._thread.join(PATIENCE_S)
-        self._socket.close()
-
-
-@pytest.fixture
-def echo() -> Iterator[Echo]:
-    with contextlib.closing(Echo()) as echo:
-        yield echo
-
-
-def client_of(port: int) -> socket.socket:
-    client = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    client.connect(("127.0.0.1", port))
-    client.settimeout(PATIENCE_S)
-    return client
-
-
-class TestDatagramProxy:
-    def test_it_changes_nothing_and_confuses_nobody(self, echo: Echo) -> None:
-        port = free_port()
-        with (
-            DatagramProxy(port, echo.port, round_trip_s=0.01, loss=0.0, seed="s"),
-            client_of(port) as first,
-            client_of(port) as second,
-        ):
-            for size in (1, 1200, 60_000):
-                contents = [os.urandom(size), os.urandom(size)]
-                for client, content in zip((first, second), contents, strict=True):
-                    client.send(content)
-                assert [first.recv(65_536), second.recv(65_536)] == contents
-
-    def test_it_is_never_early(self, echo: Echo) -> None:
-        port = free_port()
-        with (
-            DatagramProxy(port, echo.port, round_trip_s=0.05, loss=0.0, seed="s"),
-            client_of(port) as client,
-        ):
-            began = time.monotonic()
-            client.send(b"question")
-            assert client.recv(100) == b"question"
-            # Late it may be on any machine; that nothing overtakes the delay is no matter of speed.
-            assert time.monotonic() - began >= 0.05
-
-    def test_what_is_lost_is_lost_whole(self, echo: Echo) -> None:
-        port = free_port()
-        sent = [number.to_bytes(2, "big") * 300 for number in range(200)]
-        with (
-            DatagramProxy(port, echo.port, round_trip_s=0.0, loss=0.3, seed="s"),
-            client_of(port) as client,
-        ):
-            for content in sent:
-                client.send(content)
-                time.sleep(0.0005)  # no buffer of the system overflows
-            client.settimeout(0.5)
-            arrived = []
-            with contextlib.suppress(TimeoutError):
-                while True:
-                    arrived.append(client.recv(65_536))
-        # 98 expected, standard deviation 7.
-        assert 50 < len(arrived) < 150
-        assert set(arrived) <= set(sent)
-        assert arrived == sorted(arrived)
-
-    def test_nobody_behind_it(self) -> None:
-        port, nobody = free_port(), free_port()
-        with (
-            DatagramProxy(port, nobody, round_trip_s=0.0, loss=0.0, seed="s") as proxy,
-            client_of(port) as client,
-        ):
-            client.send(b"one")
-            client.send(b"two")
-            client.settimeout(0.1)
-            with pytest.raises(TimeoutError):
-                client.recv(100)
-            proxy.close()
-            proxy.close()
-
-    def test_its_port_is_taken(self, echo: Echo) -> None:
-        with pytest.raises(CannotStartError, match=rf"127.0.0.1:{echo.port} \(UDP\): "):
-            DatagramProxy(echo.port, 1, round_trip_s=0.0, loss=0.0, seed="s")

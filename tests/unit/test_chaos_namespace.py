@@ -39,7 +39,9 @@ def test_rules_come_and_go() -> None:
         heal_the_other = namespace.drop(7447, "both", 0.25)
         rules = inside(namespace, "nft", "list", "ruleset")
         assert "tcp dport 7447 drop" in rules
-        assert rules.count("numgen random mod 1000 < 250 drop") == 2
+        assert "udp dport 7447 drop" in rules
+        # Of streams and of datagrams, each way.
+        assert rules.count("numgen random mod 1000 < 250 drop") == 4
         heal()
         rules = inside(namespace, "nft", "list", "ruleset")
         assert "dport 7447 drop" not in rules

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import socket
 import threading
+import time
 from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -233,3 +237,166 @@ def test_it_closes_with_everything_open(echo: Echo) -> None:
 def test_a_port_that_is_taken(echo: Echo) -> None:
     with pytest.raises(CannotStartError, match=rf"cannot listen on 127.0.0.1:{echo.port}"):
         Proxy(echo.port, free_port(), "seed")
+
+
+class DatagramEcho:
+    """A service that sends datagrams back to whoever sent them."""
+
+    def __init__(self) -> None:
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.bind(("127.0.0.1", 0))
+        self.port: int = self._socket.getsockname()[1]
+        self._thread = threading.Thread(target=self._serve)
+        self._thread.start()
+
+    def _serve(self) -> None:
+        while True:
+            content, address = self._socket.recvfrom(65_536)
+            if not content:
+                return
+            self._socket.sendto(content, address)
+
+    def close(self) -> None:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as last:
+            last.sendto(b"", ("127.0.0.1", self.port))
+        self._thread.join(PATIENCE_S)
+        self._socket.close()
+
+
+@pytest.fixture
+def datagram_echo() -> Iterator[DatagramEcho]:
+    with contextlib.closing(DatagramEcho()) as echo:
+        yield echo
+
+
+def client_of(port: int) -> socket.socket:
+    client = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    client.connect(("127.0.0.1", port))
+    client.settimeout(PATIENCE_S)
+    return client
+
+
+@contextlib.contextmanager
+def datagram_line(port: int, target: int, latency_s: float, loss: float) -> Iterator[Proxy]:
+    with Proxy(port, target, "seed", datagrams=True) as proxy:
+        proxy.impair(Impairment(latency_s=latency_s, loss=loss))
+        yield proxy
+
+
+class TestDatagrams:
+    def test_it_changes_nothing_and_confuses_nobody(self, datagram_echo: DatagramEcho) -> None:
+        port = free_port()
+        with (
+            datagram_line(port, datagram_echo.port, 0.005, 0.0),
+            client_of(port) as first,
+            client_of(port) as second,
+        ):
+            for size in (1, 1200, 60_000):
+                contents = [os.urandom(size), os.urandom(size)]
+                for client, content in zip((first, second), contents, strict=True):
+                    client.send(content)
+                assert [first.recv(65_536), second.recv(65_536)] == contents
+
+    def test_it_is_never_early(self, datagram_echo: DatagramEcho) -> None:
+        port = free_port()
+        with (
+            datagram_line(port, datagram_echo.port, 0.025, 0.0),
+            client_of(port) as client,
+        ):
+            began = time.monotonic()
+            client.send(b"question")
+            assert client.recv(100) == b"question"
+            # Late it may be on any machine; that nothing overtakes the delay is no matter of speed.
+            assert time.monotonic() - began >= 0.05
+
+    def test_what_is_lost_is_lost_whole(self, datagram_echo: DatagramEcho) -> None:
+        port = free_port()
+        sent = [number.to_bytes(2, "big") * 300 for number in range(200)]
+        with (
+            datagram_line(port, datagram_echo.port, 0, 0.3),
+            client_of(port) as client,
+        ):
+            for content in sent:
+                client.send(content)
+                time.sleep(0.0005)  # no buffer of the system overflows
+            client.settimeout(0.5)
+            arrived = []
+            with contextlib.suppress(TimeoutError):
+                while True:
+                    arrived.append(client.recv(65_536))
+        # 98 expected, standard deviation 7.
+        assert 50 < len(arrived) < 150
+        assert set(arrived) <= set(sent)
+        assert arrived == sorted(arrived)
+
+    def test_nobody_behind_it(self) -> None:
+        port, nobody = free_port(), free_port()
+        with (
+            datagram_line(port, nobody, 0, 0.0) as proxy,
+            client_of(port) as client,
+        ):
+            client.send(b"one")
+            client.send(b"two")
+            client.settimeout(0.1)
+            with pytest.raises(TimeoutError):
+                client.recv(100)
+            proxy.close()
+            proxy.close()
+
+    def test_its_port_is_taken(self, datagram_echo: DatagramEcho) -> None:
+        with pytest.raises(CannotStartError, match=rf"127.0.0.1:{datagram_echo.port}: "):
+            Proxy(datagram_echo.port, 1, "seed", datagrams=True)
+
+    @pytest.mark.parametrize("direction", ["both", "to_service", "to_robot"])
+    def test_silence_swallows_them(self, datagram_echo: DatagramEcho, direction: Any) -> None:
+        port = free_port()
+        with (
+            datagram_line(port, datagram_echo.port, 0.0, 0.0) as proxy,
+            client_of(port) as client,
+        ):
+            heal = proxy.impair(Impairment(silent=True, direction=direction))
+            client.send(b"lost")
+            assert not comes_briefly(client)
+            heal()
+            client.send(b"heard")
+            assert client.recv(100) == b"heard"
+
+    def test_a_cut_refuses_them(self, datagram_echo: DatagramEcho) -> None:
+        port = free_port()
+        with (
+            datagram_line(port, datagram_echo.port, 0.0, 0.0) as proxy,
+            client_of(port) as client,
+        ):
+            client.send(b"one")
+            assert client.recv(100) == b"one"
+            heal = proxy.impair(Impairment(cut=True))
+            client.send(b"lost")
+            with pytest.raises(ConnectionRefusedError):
+                client.recv(100)
+            heal()
+            client.send(b"two")
+            assert client.recv(100) == b"two"
+
+
+def test_a_local_socket_has_such_a_line_as_well(tmp_path: Path) -> None:
+    place, target = tmp_path / "line", tmp_path / "service"
+    with socket.socket(socket.AF_UNIX) as listener:
+        listener.bind(str(target))
+        listener.listen()
+        with Proxy(place, target, "seed") as proxy, socket.socket(socket.AF_UNIX) as robot:
+            robot.settimeout(PATIENCE_S)
+            robot.connect(str(place))
+            service, _ = listener.accept()
+            service.settimeout(PATIENCE_S)
+            with service:
+                robot.sendall(b"question")
+                assert received(service, 8) == b"question"
+                service.sendall(b"answer")
+                assert received(robot, 6) == b"answer"
+                heal = proxy.impair(Impairment(cut=True))
+                assert received(robot, 1) == received(service, 1) == b""
+            with socket.socket(socket.AF_UNIX) as late:
+                with pytest.raises(ConnectionRefusedError):
+                    late.connect(str(place))
+                heal()
+                late.connect(str(place))

@@ -20,6 +20,7 @@ from holdfast.files import OutputError
 PLAN = SeriesPlan(
     seed=4,
     first=0,
+    wires=("tcp", "udp"),
     kinds=(FaultKind.CLOUD_KILLED, FaultKind.COMBINATION),
     possible=tuple(FaultKind),
     commit="abc1234",
@@ -51,6 +52,7 @@ def outcome(
     return TrialOutcome(
         trial=trial,
         kind=kind,
+        wire="tcp",
         verdict=verdict,
         reason="" if verdict == "identical" else "for a reason",
         launch="on_failure",

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import Counter
+
 import msgspec
 import pytest
 
@@ -9,30 +11,33 @@ from holdfast.chaos.schedule import (
     DESCRIPTIONS,
     NEEDS_NAMESPACE,
     NEEDS_PROXY,
+    WIRES,
     FaultKind,
     Schedule,
     draw_schedule,
+    kinds_over,
 )
+from holdfast.chaos.series import SeriesPlan
 
 ALL = tuple(FaultKind)
 WITHOUT_NFTABLES = tuple(kind for kind in FaultKind if kind not in NEEDS_NAMESPACE)
 
 
 def drawn(kind: FaultKind, number: int = 40) -> list[Schedule]:
-    return [draw_schedule(7, trial, kind, ALL) for trial in range(number)]
+    return [draw_schedule(7, trial, kind, "tcp", ALL) for trial in range(number)]
 
 
 @pytest.mark.parametrize("kind", ALL)
 def test_it_is_a_function_of_seed_trial_and_kind(kind: FaultKind) -> None:
-    first = draw_schedule(3, 5, kind, ALL)
-    assert first == draw_schedule(3, 5, kind, ALL)
-    assert first != draw_schedule(3, 6, kind, ALL)
-    assert first != draw_schedule(4, 5, kind, ALL)
+    first = draw_schedule(3, 5, kind, "tcp", ALL)
+    assert first == draw_schedule(3, 5, kind, "tcp", ALL)
+    assert first != draw_schedule(3, 6, kind, "tcp", ALL)
+    assert first != draw_schedule(4, 5, kind, "tcp", ALL)
     assert msgspec.json.decode(msgspec.json.encode(first), type=Schedule) == first
 
 
 def test_it_is_the_same_on_every_machine() -> None:
-    schedule = draw_schedule(0, 0, FaultKind.CLOUD_KILLED, ALL)
+    schedule = draw_schedule(0, 0, FaultKind.CLOUD_KILLED, "tls", ALL)
     assert [(fault.at, fault.duration_s) for fault in schedule.faults] == [
         (0.0796, 0.525),
         (0.4941, 0.337),
@@ -94,8 +99,26 @@ class TestCombination:
 
     def test_of_what_can_be_done_here(self) -> None:
         for trial in range(100):
-            schedule = draw_schedule(7, trial, FaultKind.COMBINATION, WITHOUT_NFTABLES)
+            schedule = draw_schedule(7, trial, FaultKind.COMBINATION, "udp", WITHOUT_NFTABLES)
             assert not schedule.needs_namespace
+
+    def test_a_local_socket_has_no_packets(self) -> None:
+        schedules = [
+            draw_schedule(7, trial, FaultKind.COMBINATION, "unix", ALL) for trial in range(200)
+        ]
+        assert not any(schedule.needs_namespace for schedule in schedules)
+        assert any(schedule.needs_proxy for schedule in schedules)
+
+
+def test_all_wires_have_as_many_trials_and_all_their_kinds() -> None:
+    plan = SeriesPlan(seed=0, first=0, wires=WIRES, kinds=ALL, possible=ALL, commit="")
+    drawn = [plan.of(trial) for trial in range(len(WIRES) * len(ALL))]
+    assert Counter(wire for wire, _ in drawn) == dict.fromkeys(WIRES, len(ALL))
+    for wire in WIRES:
+        assert {kind for each, kind in drawn if each == wire} == set(kinds_over(wire, ALL))
+    assert NEEDS_NAMESPACE.isdisjoint(kinds_over("unix", ALL))
+    # The default of twenty trials has most of the kinds.
+    assert len({kind for _, kind in drawn[:20]}) > 10
 
 
 def test_every_kind_is_described() -> None:

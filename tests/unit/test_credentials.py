@@ -76,6 +76,7 @@ class TestWhatIsMade:
         assert {path.name for path in (home / "authority").iterdir()} == {
             "authority.pem",
             "authority.key",
+            "issued.csv",
         }
         for name in ("service", "robot"):
             assert {path.name for path in (home / name).iterdir()} == FILES
@@ -148,6 +149,8 @@ class TestWhatIsMade:
         assert not ring.authority_is_new
         assert [made.name for made in ring.made] == ["cloud-2.lab", "left", "right"]
         after = contents_of(tmp_path)
+        record = before.pop("authority/issued.csv")
+        assert after["authority/issued.csv"].startswith(record)
         assert {name: after[name] for name in before} == before
         authority = certificate_of(tmp_path / "authority", "authority.pem")
         for name in ("left", "right", "cloud-2.lab"):
@@ -228,7 +231,8 @@ class TestRenewal:
         ring = make_credentials(tmp_path, services=["service"], hosts=["cloud.lan"], renew=True)
         after = contents_of(tmp_path)
         assert {name for name in after if after[name] != before[name]} == {
-            "service/certificate.pem"
+            "service/certificate.pem",
+            "authority/issued.csv",
         }
         assert ring.made[0].renewed
         assert {"10.0.0.7", "cloud.lan", "localhost"} <= set(ring.made[0].hosts)

@@ -393,6 +393,7 @@ class Script(Service):
         super().__init__(KnownProblems(), 2)
         self.runs = list(runs)
         self.trace: list[str] = []
+        self.times: list[float] = []
 
     def receive_request(self, call: int, *arguments: Any) -> list[Effect]:
         self.trace.append(f"call {call}")
@@ -401,9 +402,11 @@ class Script(Service):
 
     def begun(self, job: Job, now: float) -> None:
         self.trace.append(f"begun {job.kind}")
+        self.times.append(now)
 
     def finished(self, job: Job, outcome: Outcome, now: float) -> list[Effect]:
         self.trace.append(f"finished {job.kind}")
+        self.times.append(now)
         return []
 
 
@@ -476,10 +479,42 @@ async def test_long_jobs_run_beside_each_other_and_beside_the_loop() -> None:
     while meeting.n_waiting < 2:
         await asyncio.sleep(0)
     meeting.wait()
-    while len(machine.trace) < 4:
+    while len(machine.trace) < 6:
         await asyncio.sleep(0.001)
-    assert sorted(machine.trace[2:]) == ["finished one", "finished two"]
+    assert sorted(machine.trace[2:]) == ["begun one", "begun two", "finished one", "finished two"]
     await both.close()
+
+
+@on_a_loop
+async def test_the_way_to_a_thread_and_back_is_no_part_of_a_jobs_time() -> None:
+    """Else a brief job that was once sent to a thread would be sent there for ever."""
+    loop, here = asyncio.get_running_loop(), threading.current_thread()
+    computed_s = 0.0
+
+    def compute() -> None:
+        nonlocal computed_s
+        computed_s = 1.0
+
+    machine, both = scripted(("one", math.inf, compute))
+    await both.start()
+    clock = Clock(loop, lambda: 100.0 if threading.current_thread() is here else computed_s)
+    both._loop = cast(asyncio.AbstractEventLoop, clock)
+    both.deliver(Call(machine.trace))
+    while "finished one" not in machine.trace:
+        await asyncio.sleep(0.001)
+    assert machine.times == [99.0, 100.0]
+    await both.close()
+
+
+class Clock:
+    """A loop with a clock of a test's own."""
+
+    def __init__(self, loop: asyncio.AbstractEventLoop, time: Callable[[], float]) -> None:
+        self._loop = loop
+        self.time = time
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._loop, name)
 
 
 def broken(*_: object) -> None:

@@ -5,9 +5,8 @@ of the way, and some never do. What becomes of that (retransmissions, smaller wi
 the business of the protocols at its ends, which are the real ones. So what is emulated here is two
 numbers, a delay and a share of losses, and a packet that arrives is the packet that was sent.
 
-:class:`DelayLine` is one direction of such a line, without a clock or a socket of its own.
-:class:`Carrier` is the thread that keeps lines, and :class:`DatagramProxy` stands between a robot
-and a service on one machine.
+:class:`DelayLine` is one direction of such a line, without a clock or a socket of its own, and
+:class:`Carrier` is the thread that keeps lines.
 """
 
 from __future__ import annotations
@@ -16,24 +15,20 @@ import contextlib
 import os
 import random
 import select
-import socket
 import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from types import TracebackType
-from typing import Any, Generic, NamedTuple, Self, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
-from holdfast.chaos.processes import CannotStartError
 from holdfast.errors import InvalidValueError
 
-__all__ = ["Carrier", "DatagramProxy", "DelayLine"]
+__all__ = ["Carrier", "DelayLine"]
 
 _LARGEST = 65_536
 _CAPACITY = 4096
 """Packets on the way in one direction: 6 MB of the usual size, as a router may hold."""
 
-_MOST_CLIENTS = 64
 _LONGEST_DELAY_S = 60.0
 _IDLE_S = 1.0
 
@@ -208,111 +203,3 @@ class Carrier:
             except OSError:
                 return  # nobody listened where the last one went
             way.line.put(packet, time.monotonic())
-
-
-class _Client(NamedTuple):
-    """Who has sent something, and the socket through which that reaches the service."""
-
-    address: Any
-    upstream: socket.socket
-
-
-class DatagramProxy:
-    """A line to a service on this machine that speaks over UDP; to be used in a ``with`` statement.
-
-    Parameters
-    ----------
-    port : int
-        Where it listens, on 127.0.0.1.
-    target : int
-        The port of the service.
-    round_trip_s : float
-        Half of it is added to each way.
-    loss : float
-        Share of datagrams that are dropped, each way.
-    seed : str
-        Of the losses.
-
-    Raises
-    ------
-    CannotStartError
-        If it cannot listen.
-    """
-
-    def __init__(
-        self, port: int, target: int, *, round_trip_s: float, loss: float, seed: str
-    ) -> None:
-        self._target = target
-        self._delay_s = 0.5 * round_trip_s
-        self._loss = loss
-        self._seed = seed
-        self._clients: dict[Any, _Client] = {}
-        self._number = 0
-        to_service: DelayLine[tuple[bytes, Any]] = DelayLine(
-            self._delay_s, loss, f"{seed} to the service"
-        )
-        self._listener = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        try:
-            self._listener.bind(("127.0.0.1", port))
-        except OSError as error:
-            self._listener.close()
-            raise CannotStartError(
-                f"the proxy cannot listen on 127.0.0.1:{port} (UDP): {error.strerror}"
-            ) from error
-        self._listener.setblocking(False)
-        self._carrier = Carrier(f"datagrams-{port}")
-        self._carrier.add(
-            self._listener.fileno(),
-            lambda: self._listener.recvfrom(_LARGEST),
-            to_service,
-            self._to_service,
-        )
-        self._carrier.start()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """Carry no more; may be repeated."""
-        self._carrier.close()
-        for client in self._clients.values():
-            client.upstream.close()
-        self._clients.clear()
-        self._listener.close()
-
-    # -- on the carrier's thread ---------------------------------------------------------------
-
-    def _to_service(self, packet: tuple[bytes, Any]) -> None:
-        content, address = packet
-        client = self._clients.pop(address, None) or self._new_client(address)
-        self._clients[address] = client  # now the last of all
-        client.upstream.send(content)
-
-    def _new_client(self, address: Any) -> _Client:
-        """Give a client a socket of its own, so that the service's answers find it."""
-        while len(self._clients) >= _MOST_CLIENTS:
-            oldest = self._clients.pop(next(iter(self._clients)))
-            self._carrier.remove(oldest.upstream.fileno())
-            oldest.upstream.close()
-        upstream = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        upstream.connect(("127.0.0.1", self._target))
-        upstream.setblocking(False)
-        self._number += 1
-        line: DelayLine[bytes] = DelayLine(
-            self._delay_s, self._loss, f"{self._seed} to robot {self._number}"
-        )
-        self._carrier.add(
-            upstream.fileno(),
-            lambda: upstream.recv(_LARGEST),
-            line,
-            lambda content: self._listener.sendto(content, address),
-        )
-        return _Client(address, upstream)

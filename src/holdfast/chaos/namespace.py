@@ -27,6 +27,7 @@ _TOOLS = {"unshare": "util-linux", "nsenter": "util-linux", "ip": "iproute2", "n
 _PATIENCE_S = 10.0
 _TABLE = "inet holdfast_chaos"
 _LOSS_STEPS = 1000
+_PROTOCOLS = ("tcp", "udp")
 
 
 class NetworkNamespace:
@@ -121,9 +122,9 @@ class NetworkNamespace:
             chosen = f"numgen random mod {_LOSS_STEPS} < {below} "
         rules = [f"add chain {chain} {{ type filter hook input priority 0; policy accept; }}"]
         if direction in ("both", "to_service"):
-            rules.append(f"add rule {chain} tcp dport {port} {chosen}drop")
+            rules += [f"add rule {chain} {each} dport {port} {chosen}drop" for each in _PROTOCOLS]
         if direction in ("both", "to_robot"):
-            rules.append(f"add rule {chain} tcp sport {port} {chosen}drop")
+            rules += [f"add rule {chain} {each} sport {port} {chosen}drop" for each in _PROTOCOLS]
         self._nft("\n".join(rules))
         return lambda: self._nft(f"delete chain {chain}")
 

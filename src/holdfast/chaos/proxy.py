@@ -1,4 +1,4 @@
-"""A bad line on demand: a TCP proxy that delays, loses, falls silent and cuts.
+"""A bad line on demand: a proxy that delays, loses, falls silent and cuts.
 
 It stands between one robot and one service, and whatever it does, it never changes, reorders or
 drops a byte of a stream that lives on, for neither does TCP. A packet that is lost on a real line
@@ -6,6 +6,9 @@ is sent again after a timeout, and everything behind it waits; so loss is a late
 that swallows everything is one on which all pieces are late until it is healed, and no end of a
 connection gets through either. Only a cut breaks connections: both ends are reset, and new ones are
 refused.
+
+It may carry datagrams beside streams, at the same port. Those are really lost where they are lost
+or the line is silent, and jitter lets one overtake another.
 
 Several impairments may be on at the same time; a piece suffers from all of them. What waits is
 bounded: if it is more, the sender is no longer read from, as with a full window.
@@ -22,14 +25,18 @@ import threading
 from collections.abc import Callable, Coroutine
 from concurrent.futures import Future
 from dataclasses import dataclass
+from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, Self, TypeAlias
 
 from holdfast.chaos.processes import CannotStartError
 
-__all__ = ["Direction", "Impairment", "Proxy"]
+__all__ = ["Direction", "Impairment", "Place", "Proxy"]
 
 Direction: TypeAlias = Literal["both", "to_service", "to_robot"]
+
+Place: TypeAlias = int | Path
+"""A port of 127.0.0.1, or the path of a local socket."""
 
 _PIECE_BYTES = 65_536
 _PIECES_WAITING = 64
@@ -39,6 +46,8 @@ _RETRANSMISSION_S = 0.2
 
 _RESET_ON_CLOSE = struct.pack("ii", 1, 0)
 _BACKLOG = 16
+_LARGEST_DATAGRAM = 65_536
+_MOST_CLIENTS = 64
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,7 +61,8 @@ class Impairment:
     latency_s, jitter_s : float
         Each piece comes later by the latency and by up to the jitter.
     loss : float
-        Share of pieces that come later by the time after which TCP sends again.
+        Share of pieces that come later by the time after which TCP sends again, and of datagrams
+        that never come.
     silent : bool
         Nothing comes through.
     cut : bool
@@ -72,12 +82,14 @@ class Proxy:
 
     Parameters
     ----------
-    port : int
-        Where it listens, on 127.0.0.1.
-    target : int
-        The port of the service. If nothing listens there, connections are closed at once.
+    place : int or Path
+        Where it listens.
+    target : int or Path
+        Where the service does. If nothing listens there, connections are closed at once.
     seed : str
         Of the jitter and the losses.
+    datagrams : bool
+        Whether it carries datagrams between the same ports, too.
 
     Raises
     ------
@@ -85,25 +97,29 @@ class Proxy:
         If it cannot listen.
     """
 
-    def __init__(self, port: int, target: int, seed: str) -> None:
-        self._port = port
+    def __init__(self, place: Place, target: Place, seed: str, *, datagrams: bool = False) -> None:
+        self._place = place
         self._target = target
         self._chance = random.Random(seed)
         self._impairments: dict[int, Impairment] = {}
         self._numbers = 0
         self._listener: socket.socket | None = None
+        self._datagrams: socket.socket | None = None
+        self._carries_datagrams = datagrams
+        self._clients: dict[Any, socket.socket] = {}
         self._connections: set[asyncio.Task[None]] = set()
         self._sockets: set[socket.socket] = set()
         self._loop = asyncio.new_event_loop()
         self._changed = asyncio.Event()
-        self._thread = threading.Thread(target=self._run, name=f"proxy-{port}", daemon=True)
+        self._thread = threading.Thread(target=self._run, name=f"proxy-{place}", daemon=True)
         self._thread.start()
         try:
             self._call(self._listen())
         except OSError as error:
             self.close()
+            named = place if isinstance(place, Path) else f"127.0.0.1:{place}"
             raise CannotStartError(
-                f"the proxy cannot listen on 127.0.0.1:{port}: {error.strerror}"
+                f"the proxy cannot listen on {named}: {error.strerror}"
             ) from error
 
     def __enter__(self) -> Self:
@@ -155,21 +171,26 @@ class Proxy:
     async def _listen(self) -> None:
         self._listener = self._bound()
         self._open(self._listener)
+        self._open_datagrams()
 
     def _open(self, listener: socket.socket) -> None:
         listener.listen(_BACKLOG)
         self._loop.add_reader(listener, self._accept, listener)
 
-    def _bound(self) -> socket.socket:
-        listener = socket.socket()
+    def _bound(self, kind: socket.SocketKind = socket.SOCK_STREAM) -> socket.socket:
+        place = self._place
+        if isinstance(place, Path):
+            place.unlink(missing_ok=True)
+        bound = socket.socket(_family(place), kind)
         try:
-            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            listener.bind(("127.0.0.1", self._port))
-            listener.setblocking(False)
+            if kind == socket.SOCK_STREAM:
+                bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            bound.bind(_address(place))
+            bound.setblocking(False)
         except BaseException:
-            listener.close()
+            bound.close()
             raise
-        return listener
+        return bound
 
     async def _add(self, number: int, impairment: Impairment) -> None:
         was_cut = self._is_cut()
@@ -180,6 +201,10 @@ class Proxy:
             # Whoever knocks at a port that is bound, but not listened on, is refused; and nobody
             # else can have it.
             self._listener = self._bound()
+            if self._carries_datagrams:
+                # One that listens to itself alone: whoever else sends there is refused, too.
+                self._datagrams = self._bound(socket.SOCK_DGRAM)
+                self._datagrams.connect(_address(self._place))
 
     async def _remove(self, number: int) -> None:
         was_cut = self._is_cut()
@@ -188,6 +213,8 @@ class Proxy:
         if was_cut and not self._is_cut():
             assert self._listener is not None
             self._open(self._listener)
+            self._close_datagrams()
+            self._open_datagrams()
 
     async def _end(self) -> None:
         self._impairments.clear()
@@ -208,6 +235,7 @@ class Proxy:
         if self._listener is not None:
             self._listener.close()
             self._listener = None
+        self._close_datagrams()
 
     def _tell(self) -> None:
         """Wake those who wait for the line to be otherwise."""
@@ -223,14 +251,18 @@ class Proxy:
             for each in self._impairments.values()
         )
 
-    def _delay_s(self, direction: Direction) -> float:
-        delay_s = 0.0
+    def _fate(self, direction: Direction) -> tuple[float, int]:
+        """Return by how much something comes later, and how often it is lost."""
+        delay_s, losses = 0.0, 0
         for each in self._impairments.values():
             if each.direction in ("both", direction):
                 delay_s += each.latency_s + each.jitter_s * self._chance.random()
-                if each.loss and self._chance.random() < each.loss:
-                    delay_s += _RETRANSMISSION_S
-        return delay_s
+                losses += each.loss > 0.0 and self._chance.random() < each.loss
+        return delay_s, losses
+
+    def _delay_s(self, direction: Direction) -> float:
+        delay_s, losses = self._fate(direction)
+        return delay_s + losses * _RETRANSMISSION_S
 
     async def _until_heard(self, direction: Direction) -> None:
         while self._is_silent(direction):
@@ -248,20 +280,21 @@ class Proxy:
 
     def _take(self, each: socket.socket) -> None:
         each.setblocking(False)
-        each.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        # Until an end comes in order, whatever closes it resets it.
-        each.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET_ON_CLOSE)
+        if each.family != socket.AF_UNIX:
+            each.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            # Until an end comes in order, whatever closes it resets it.
+            each.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET_ON_CLOSE)
         self._sockets.add(each)
 
     async def _connect(self, robot: socket.socket) -> None:
         """Carry one connection from its beginning to its end."""
-        service = socket.socket()
+        service = socket.socket(_family(self._target))
         try:
             self._take(service)
             # On a silent line not even the first packet of a connection comes through.
             await self._until_heard("to_service")
             await self._until_heard("to_robot")
-            await self._loop.sock_connect(service, ("127.0.0.1", self._target))
+            await self._loop.sock_connect(service, _address(self._target))
             async with asyncio.TaskGroup() as group:
                 group.create_task(self._carry(robot, service, "to_service"))
                 group.create_task(self._carry(service, robot, "to_robot"))
@@ -309,3 +342,67 @@ class Proxy:
             await pieces.put((due, piece))
             if not piece:
                 return
+
+    # -- datagrams -------------------------------------------------------------------------------
+
+    def _open_datagrams(self) -> None:
+        if self._carries_datagrams:
+            self._datagrams = self._bound(socket.SOCK_DGRAM)
+            self._loop.add_reader(self._datagrams, self._questions_come, self._datagrams)
+
+    def _close_datagrams(self) -> None:
+        for each in (*self._clients.values(), *([self._datagrams] if self._datagrams else [])):
+            self._loop.remove_reader(each)
+            each.close()
+        self._clients.clear()
+        self._datagrams = None
+
+    def _questions_come(self, listener: socket.socket) -> None:
+        with contextlib.suppress(OSError):  # no more of them, or an earlier one went nowhere
+            while True:
+                content, address = listener.recvfrom(_LARGEST_DATAGRAM)
+                client = self._clients.pop(address, None) or self._new_client(address)
+                self._clients[address] = client  # now the last of all
+                self._carry_datagram(content, "to_service", client, None)
+
+    def _new_client(self, address: Any) -> socket.socket:
+        """Give a client a socket of its own, so that the service's answers find it."""
+        while len(self._clients) >= _MOST_CLIENTS:
+            oldest = self._clients.pop(next(iter(self._clients)))
+            self._loop.remove_reader(oldest)
+            oldest.close()
+        client = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        client.setblocking(False)
+        client.connect(_address(self._target))
+        self._loop.add_reader(client, self._answers_come, client, address)
+        return client
+
+    def _answers_come(self, client: socket.socket, address: Any) -> None:
+        with contextlib.suppress(OSError):
+            while True:
+                content = client.recv(_LARGEST_DATAGRAM)
+                if self._datagrams is not None:
+                    self._carry_datagram(content, "to_robot", self._datagrams, address)
+
+    def _carry_datagram(
+        self, content: bytes, direction: Direction, sender: socket.socket, address: Any
+    ) -> None:
+        delay_s, losses = self._fate(direction)
+        if not losses and not self._is_silent(direction):
+            self._loop.call_later(delay_s, self._send_datagram, content, sender, address)
+
+    @staticmethod
+    def _send_datagram(content: bytes, sender: socket.socket, address: Any) -> None:
+        with contextlib.suppress(OSError):  # no room, nobody there, or a line that was cut
+            if address is None:
+                sender.send(content)
+            else:
+                sender.sendto(content, address)
+
+
+def _family(place: Place) -> socket.AddressFamily:
+    return socket.AF_UNIX if isinstance(place, Path) else socket.AF_INET
+
+
+def _address(place: Place) -> Any:
+    return str(place) if isinstance(place, Path) else ("127.0.0.1", place)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import csv
 import io
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -33,7 +34,7 @@ __all__ = [
 FAULTS_NAME = "chaos.csv"
 SUMMARY_NAME = "summary.json"
 
-_TRIAL_COLUMNS = ("trial", "trial_kind", "verdict", "launch", "fault")
+_TRIAL_COLUMNS = ("trial", "trial_kind", "wire", "verdict", "launch", "fault")
 
 
 class KindRow(msgspec.Struct, frozen=True, kw_only=True):
@@ -82,6 +83,8 @@ class ChaosSummary(msgspec.Struct, frozen=True, kw_only=True):
     jobs : int
         Trials at a time.
     kinds : tuple of KindRow
+    wires : dict of str to int
+        Trials over each wire.
     left_out : dict of str to str
         Kinds that this machine cannot do, and why.
     holdfast_version, commit : str
@@ -105,6 +108,7 @@ class ChaosSummary(msgspec.Struct, frozen=True, kw_only=True):
     sensing_actions: int
     jobs: int
     kinds: tuple[KindRow, ...]
+    wires: dict[str, int]
     left_out: dict[str, str]
     holdfast_version: str
     commit: str
@@ -181,6 +185,7 @@ def summarise(
         sensing_actions=sum(outcome.sensing_actions for outcome in outcomes),
         jobs=jobs,
         kinds=kind_rows(outcomes),
+        wires=dict(Counter(outcome.wire for outcome in outcomes)),
         left_out={kind.value: reason for kind, reason in left_out.items()},
         holdfast_version=plan.holdfast_version,
         commit=plan.commit,
@@ -208,7 +213,13 @@ def _fault_table(outcomes: Sequence[TrialOutcome]) -> str:
     columns = FaultTimes.__struct_fields__
     writer.writerow((*_TRIAL_COLUMNS, *columns))
     for outcome in sorted(outcomes, key=lambda outcome: outcome.trial):
-        head = (outcome.trial, outcome.kind.value, outcome.verdict, outcome.launch)
+        head = (
+            outcome.trial,
+            outcome.kind.value,
+            outcome.wire,
+            outcome.verdict,
+            outcome.launch,
+        )
         for number, fault in enumerate(outcome.faults):
             values = (getattr(fault, column) for column in columns)
             writer.writerow(

@@ -1,9 +1,9 @@
 """What happens to a run, drawn from the seed and the number of the trial.
 
 A schedule is data: which faults, when, how hard, for how long, and what robot they strike. The same
-seed, trial and kind give the same schedule on every machine. When a fault strikes is said in steps
-of the robot and not in seconds, so that it strikes a run on a slow machine at the same place; how
-long it lasts is said in seconds, because that is what the timeouts of the robot are.
+seed, trial, kind and wire give the same schedule on every machine. When a fault strikes is said in
+steps of the robot and not in seconds, so that it strikes a run on a slow machine at the same place;
+how long it lasts is said in seconds, because that is what the timeouts of the robot are.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from __future__ import annotations
 import random
 from collections.abc import Sequence
 from enum import StrEnum
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, TypeAlias
 
 import msgspec
 
@@ -21,11 +21,21 @@ __all__ = [
     "DESCRIPTIONS",
     "NEEDS_NAMESPACE",
     "NEEDS_PROXY",
+    "WIRES",
     "Fault",
     "FaultKind",
     "Schedule",
+    "Wire",
     "draw_schedule",
+    "kinds_over",
 ]
+
+
+Wire: TypeAlias = Literal["tcp", "tls", "unix", "udp"]
+"""Over which robots reach their services."""
+
+WIRES: tuple[Wire, ...] = ("tcp", "tls")
+"""Of a series."""
 
 
 class FaultKind(StrEnum):
@@ -118,6 +128,7 @@ class Schedule(msgspec.Struct, frozen=True, kw_only=True):
     ----------
     seed, trial : int
     kind : FaultKind
+    wire : {"tcp", "tls", "unix", "udp"}
     world_seed : int
         Of the robot's run.
     num_particles : int
@@ -133,6 +144,7 @@ class Schedule(msgspec.Struct, frozen=True, kw_only=True):
     seed: int
     trial: int
     kind: FaultKind
+    wire: Wire
     world_seed: int
     num_particles: int
     num_clouds: int
@@ -189,8 +201,13 @@ _MOST_COMBINED = 5
 _FEWEST_COMBINED = 2
 
 
+def kinds_over(wire: Wire, kinds: Sequence[FaultKind]) -> tuple[FaultKind, ...]:
+    """Return those kinds of trial that there are over a wire: a local socket has no packets."""
+    return tuple(kind for kind in kinds if wire != "unix" or kind not in NEEDS_NAMESPACE)
+
+
 def draw_schedule(
-    seed: int, trial: int, kind: FaultKind, combinable: Sequence[FaultKind]
+    seed: int, trial: int, kind: FaultKind, wire: Wire, combinable: Sequence[FaultKind]
 ) -> Schedule:
     """Draw what happens in a trial.
 
@@ -198,6 +215,7 @@ def draw_schedule(
     ----------
     seed, trial : int
     kind : FaultKind
+    wire : {"tcp", "tls", "unix", "udp"}
     combinable : sequence of FaultKind
         All kinds that can be done on this machine: what a combination is made of.
 
@@ -210,7 +228,9 @@ def draw_schedule(
     if kind is FaultKind.COMBINATION:
         # A proxy stands in the machine's own network, and a namespace has no way there.
         others = chance.choice((NEEDS_NAMESPACE, NEEDS_PROXY))
-        singles = [each for each in combinable if each not in {*_NOT_COMBINED, *others}]
+        singles = [
+            each for each in kinds_over(wire, combinable) if each not in {*_NOT_COMBINED, *others}
+        ]
         for _ in range(chance.randint(_FEWEST_COMBINED, _MOST_COMBINED)):
             single = chance.choice(singles)
             at, duration_s = chance.uniform(*_COMBINED_STRIKES), _COMBINED_DURATION_S
@@ -233,6 +253,7 @@ def draw_schedule(
         seed=seed,
         trial=trial,
         kind=kind,
+        wire=wire,
         world_seed=chance.getrandbits(31),
         num_particles=chance.randint(30, 100),
         num_clouds=num_clouds,

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import msgspec
 
 from holdfast import __version__
-from holdfast.chaos.schedule import FaultKind, draw_schedule
+from holdfast.chaos.schedule import FaultKind, Wire, draw_schedule, kinds_over
 from holdfast.chaos.trial import CancelledTrialError, Pace, TrialOutcome, run_chaos_trial
 from holdfast.files import OutputError, write_atomically
 
@@ -38,8 +38,10 @@ class SeriesPlan(msgspec.Struct, frozen=True, kw_only=True):
     seed : int
     first : int
         Number of the first trial.
+    wires : tuple of str
+        Trial n is over wire n modulo their number.
     kinds : tuple of FaultKind
-        Trial n is of kind n modulo their number.
+        The trials over each wire are of one kind after another; each wire begins with another one.
     possible : tuple of FaultKind
         All that can be done on this machine; combinations are made of these.
     commit : str
@@ -49,10 +51,18 @@ class SeriesPlan(msgspec.Struct, frozen=True, kw_only=True):
 
     seed: int
     first: int
+    wires: tuple[Wire, ...]
     kinds: tuple[FaultKind, ...]
     possible: tuple[FaultKind, ...]
     commit: str
     holdfast_version: str = __version__
+
+    def of(self, trial: int) -> tuple[Wire, FaultKind]:
+        """Return over which wire a trial is, and of which kind."""
+        turn, place = divmod(trial, len(self.wires))
+        wire = self.wires[place]
+        kinds = kinds_over(wire, self.kinds)
+        return wire, kinds[(turn + place * len(kinds) // len(self.wires)) % len(kinds)]
 
 
 class _Started(NamedTuple):
@@ -184,20 +194,19 @@ class Series:
                 trial = missing.get_nowait()
             except Empty:
                 return
-            kinds = self._plan.kinds
-            kind = kinds[trial % len(kinds)]
-            said.put(_Started(trial, kind))
+            said.put(_Started(trial, self._plan.of(trial)[1]))
             try:
-                said.put(self._run_trial(trial, kind, cancelled))
+                said.put(self._run_trial(trial, cancelled))
             except CancelledTrialError:
                 return
             except BaseException as error:  # noqa: BLE001 - raised again where it is read
                 said.put(error)
                 return
 
-    def _run_trial(self, trial: int, kind: FaultKind, cancelled: threading.Event) -> TrialOutcome:
+    def _run_trial(self, trial: int, cancelled: threading.Event) -> TrialOutcome:
         directory = self.directory_of(trial)
-        schedule = draw_schedule(self._plan.seed, trial, kind, self._plan.possible)
+        wire, kind = self._plan.of(trial)
+        schedule = draw_schedule(self._plan.seed, trial, kind, wire, self._plan.possible)
         # One that was begun and not finished tells nothing.
         shutil.rmtree(directory, ignore_errors=True)
         try:

@@ -44,8 +44,8 @@ from holdfast.chaos.processes import (
     free_port,
     local_services_of,
 )
-from holdfast.chaos.proxy import Impairment, Proxy
-from holdfast.chaos.schedule import NEEDS_NAMESPACE, Fault, FaultKind, Schedule
+from holdfast.chaos.proxy import Impairment, Place, Proxy
+from holdfast.chaos.schedule import NEEDS_NAMESPACE, Fault, FaultKind, Schedule, Wire
 from holdfast.chaos.twin import keep_undisturbed, run_undisturbed
 from holdfast.chaos.world import WitnessedWorld, difference_of_performances
 from holdfast.configuration import load
@@ -114,6 +114,7 @@ class TrialOutcome(msgspec.Struct, frozen=True, kw_only=True):
     ----------
     trial : int
     kind : FaultKind
+    wire : str
     verdict : {"identical", "diverged", "failed", "timed_out"}
         ``identical``: every decision and every performed action is that of the twin. ``diverged``:
         one is not. ``failed``: a process ended that should not, or one was left. ``timed_out``: the
@@ -136,6 +137,7 @@ class TrialOutcome(msgspec.Struct, frozen=True, kw_only=True):
 
     trial: int
     kind: FaultKind
+    wire: Wire
     verdict: Verdict
     reason: str
     launch: str
@@ -196,6 +198,7 @@ def run_chaos_trial(
     return TrialOutcome(
         trial=schedule.trial,
         kind=schedule.kind,
+        wire=schedule.wire,
         verdict=verdict,
         reason=reason,
         launch=schedule.launch,
@@ -253,8 +256,9 @@ class _Trial:
         self._prefix: tuple[str, ...] = ()
         self._namespace: NetworkNamespace | None = None
         self._proxies: list[Proxy] = []
-        self._ports = [free_port() for _ in range(schedule.num_clouds)]
+        self._listens_at: list[Place] = []
         self._endpoints: list[str] = []
+        self._keys: Path | None = None
         self._clouds: dict[int, ChildProcess] = {}
         self._ready_at: dict[int, float] = {}
         self._robot: ChildProcess | None = None
@@ -333,13 +337,29 @@ class _Trial:
         if self._schedule.needs_namespace:
             self._namespace = self._stack.enter_context(NetworkNamespace())
             self._prefix = self._namespace.prefix
-        for number, port in enumerate(self._ports):
-            entry = port
+        wire = self._schedule.wire
+        if wire in ("tls", "udp"):
+            from holdfast.runtime.credentials import make_credentials
+
+            self._keys = Path(self._temporary) / "keys"
+            make_credentials(self._keys)
+        for number in range(self._schedule.num_clouds):
+            place = self._new_place(f"cloud-{number}")
+            entry = place
             if self._schedule.needs_proxy:
-                entry = free_port()
+                entry = self._new_place(f"line-{number}")
                 seed = f"{self._schedule.seed} {self._schedule.trial} {number}"
-                self._proxies.append(self._stack.enter_context(Proxy(entry, port, seed)))
-            self._endpoints.append(f"tcp/127.0.0.1:{entry}")
+                proxy = Proxy(entry, place, seed, datagrams=wire == "udp")
+                self._proxies.append(self._stack.enter_context(proxy))
+            self._listens_at.append(place)
+            self._endpoints.append(self._endpoint(entry))
+
+    def _new_place(self, name: str) -> Place:
+        return Path(self._temporary) / name if self._schedule.wire == "unix" else free_port()
+
+    def _endpoint(self, place: Place) -> str:
+        where = place if isinstance(place, Path) else f"127.0.0.1:{place}"
+        return f"{self._schedule.wire}/{where}"
 
     def _run_twin(self) -> None:
         """Run it without faults, and see how long it is."""
@@ -368,6 +388,8 @@ class _Trial:
     def _write_configuration(self, num_trials: int) -> None:
         schedule = self._schedule
         offload: dict[str, Any] = {"services": self._endpoints}
+        if self._keys is not None:
+            offload["tls"] = str(self._keys / "robot")
         if schedule.decision_deadline_ms is not None:
             offload["decision_deadline_ms"] = schedule.decision_deadline_ms
         document = {
@@ -427,9 +449,11 @@ class _Trial:
 
     def _start_cloud(self, number: int) -> None:
         self._ready_at.pop(number, None)
-        listen = f"tcp/127.0.0.1:{self._ports[number]}"
+        words = ["serve", "--listen", self._endpoint(self._listens_at[number]), "--log", "json"]
+        if self._keys is not None:
+            words += ["--tls", str(self._keys / "service")]
         self._clouds[number] = self._start(
-            ["serve", "--listen", listen, "--log", "json", "--until-stdin-closes"],
+            [*words, "--until-stdin-closes"],
             _CLOUD_LOG_NAME.format(number),
         )
 
@@ -611,7 +635,9 @@ class _Trial:
         if fault.kind in NEEDS_NAMESPACE:
             assert self._namespace is not None
             share = fault.loss if fault.kind is FaultKind.PACKETS_LOST else 1.0
-            heal = self._namespace.drop(self._ports[fault.cloud], fault.direction, share)
+            port = self._listens_at[fault.cloud]
+            assert isinstance(port, int)
+            heal = self._namespace.drop(port, fault.direction, share)
         else:
             heal = self._proxies[fault.cloud].impair(_impairment_of(fault))
         yield _after(fault.duration_s)

@@ -22,7 +22,7 @@ import sys
 from collections.abc import Callable, Iterator
 from typing import Literal, NamedTuple, TypeAlias, get_args
 
-from holdfast.chaos.datagrams import Carrier, DatagramProxy, DelayLine
+from holdfast.chaos.datagrams import Carrier, DelayLine
 from holdfast.chaos.namespace import NetworkNamespace, why_no_namespace
 from holdfast.chaos.processes import CannotStartError, free_port
 from holdfast.chaos.proxy import Impairment, Proxy
@@ -131,14 +131,8 @@ def lay_path(
     entry = free_port()
     through = f"{transport}/127.0.0.1:{entry}"
     round_trip_s = 1e-3 * round_trip_ms
-    with contextlib.ExitStack() as stack:
-        proxy = stack.enter_context(Proxy(entry, port, seed))
+    with Proxy(entry, port, seed, datagrams=transport == "udp") as proxy:
         proxy.impair(Impairment(latency_s=0.5 * round_trip_s, loss=loss))
-        if transport == "udp":
-            # Beside its datagrams it has a stream, at the same port.
-            stack.enter_context(
-                DatagramProxy(entry, port, round_trip_s=round_trip_s, loss=loss, seed=seed)
-            )
         way: Emulation = "datagram proxy" if transport == "udp" else "tcp proxy"
         yield Path((), (), near, through, "127.0.0.1", way)
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from holdfast.chaos.measures import Spread
     from holdfast.chaos.report import ChaosSummary
-    from holdfast.chaos.schedule import FaultKind
+    from holdfast.chaos.schedule import FaultKind, Wire
     from holdfast.chaos.series import Series, SeriesPlan
     from holdfast.chaos.trial import TrialOutcome
     from holdfast.cli.terminal import ProgressLine
@@ -91,6 +91,18 @@ def chaos(
             show_default=False,
         ),
     ] = None,
+    wire: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--wire",
+            metavar="WIRE",
+            help=(
+                "Only trials over this wire: tcp, tls, unix or udp; may be repeated (default: all "
+                "in turns)."
+            ),
+            show_default=False,
+        ),
+    ] = None,
     jobs: Annotated[
         int,
         typer.Option(
@@ -147,6 +159,7 @@ def chaos(
             seed=seed,
             out=out,
             only=only or [],
+            wires=_chosen_wires(wire or []),
             jobs=jobs,
             first=first,
             resume=resume,
@@ -202,12 +215,22 @@ def _chosen_kinds(
     return kinds, {kind: impossible[kind] for kind in wanted if kind in impossible}
 
 
+def _chosen_wires(names: Sequence[str]) -> tuple[Wire, ...]:
+    from holdfast.chaos.schedule import WIRES
+
+    for name in names:
+        if name not in WIRES:
+            raise InvalidValueError(f"--wire is {name!r}; allowed are {', '.join(WIRES)}")
+    return tuple(wire for wire in WIRES if not names or wire in names)
+
+
 def _run(
     *,
     trials: int,
     seed: int,
     out: Path | None,
     only: Sequence[str],
+    wires: tuple[Wire, ...],
     jobs: int,
     first: int,
     resume: bool,
@@ -215,7 +238,7 @@ def _run(
     as_json: bool,
 ) -> bool:
     from holdfast.chaos.report import summarise, write_tables
-    from holdfast.chaos.schedule import FaultKind
+    from holdfast.chaos.schedule import WIRES, FaultKind, kinds_over
     from holdfast.chaos.series import Series, SeriesPlan
     from holdfast.cli.terminal import progress_line
     from holdfast.files import claim_directory
@@ -223,12 +246,18 @@ def _run(
 
     impossible = _impossible_kinds()
     kinds, left_out = _chosen_kinds(only, impossible)
+    over = tuple(wire for wire in wires if kinds_over(wire, kinds))
+    if not over:
+        raise InvalidValueError(
+            f"--only {kinds[0].value} cannot be done over {wires[0]}: choose another --wire"
+        )
     if resume and out is None:
         raise InvalidValueError("--resume needs --out: which series is to go on")
     possible = tuple(kind for kind in FaultKind if kind not in impossible)
     plan = SeriesPlan(
         seed=seed,
         first=first,
+        wires=over,
         kinds=kinds,
         possible=possible,
         commit=commit().removeprefix("commit "),
@@ -239,6 +268,7 @@ def _run(
     show.start(directory, jobs, left_out)
     words = ["holdfast", "chaos", "--trials", str(trials), "--seed", str(seed)]
     words += [word for name in only for word in ("--only", name)]
+    words += [word for name in wires for word in ("--wire", name)] if wires != WIRES else []
     words += ["--first", str(first)] if first else []
     words += ["--jobs", str(jobs)] if jobs != 1 else []
     words += ["--keep"] if keep else []
@@ -334,6 +364,7 @@ class _Show:
                 "chaos_trial",
                 trial=outcome.trial,
                 kind=outcome.kind.value,
+                wire=outcome.wire,
                 verdict=outcome.verdict,
                 faults=len(outcome.faults),
                 took_s=outcome.took_s,
@@ -383,7 +414,8 @@ class _Show:
     def _account(self, outcome: TrialOutcome) -> str:
         """Say what went wrong, where its files are, and how to do it again."""
         return (
-            f"trial {outcome.trial} ({outcome.kind.value}): {outcome.verdict}: {outcome.reason}\n"
+            f"trial {outcome.trial} ({outcome.kind.value} over {outcome.wire}): "
+            f"{outcome.verdict}: {outcome.reason}\n"
             f"  its files: {self._series.directory_of(outcome.trial)}\n"
             f"  again: {self._command_of(outcome)}"
         )
@@ -391,7 +423,7 @@ class _Show:
     def _command_of(self, outcome: TrialOutcome) -> str:
         return (
             f"holdfast chaos --trials 1 --first {outcome.trial} --seed {self._plan.seed} "
-            f"--only {outcome.kind.value} --keep"
+            f"--only {outcome.kind.value} --wire {outcome.wire} --keep"
         )
 
     def _tell(self, event: str, text: str, **fields: object) -> None:
@@ -455,10 +487,14 @@ def _print_table(summary: ChaosSummary, console: Console) -> None:
         verdict = f"no divergence: {trials} with {counted(summary.faults, 'fault')}"
     units = "" if wide else "Times in milliseconds. "
     console.print(
-        f"\n{units}{verdict}; {summary.steps:,} task actions and {summary.sensing_actions:,} "
-        "sensing actions are those of the fault-free twins",
+        f"\n{units}{verdict}, over {_counted_wires(summary.wires)}; {summary.steps:,} task actions "
+        f"and {summary.sensing_actions:,} sensing actions are those of the fault-free twins",
         style="bold red" if bad else "",
     )
+
+
+def _counted_wires(wires: dict[str, int]) -> str:
+    return ", ".join(f"{wire} ({number})" for wire, number in sorted(wires.items())) or "no wire"
 
 
 def _cell(spread: Spread | None, *, wide: bool) -> str:

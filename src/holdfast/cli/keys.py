@@ -1,18 +1,20 @@
-"""``holdfast keys``: makes credentials, and says what goes where."""
+"""``holdfast keys``: makes and revokes credentials, and says what goes where."""
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from holdfast.cli.options import location, whole_number
+from holdfast.errors import InvalidValueError
 from holdfast.printable import printable
 
 if TYPE_CHECKING:
-    from holdfast.runtime.credentials import KeyRing
+    from holdfast.runtime.credentials import Issued, KeyRing, Revocation
 
 __all__ = ["keys"]
 
@@ -58,25 +60,103 @@ def keys(
         bool,
         typer.Option("--renew", help="New certificates for keys that are there already."),
     ] = False,
+    rotate: Annotated[
+        bool,
+        typer.Option("--rotate", help="New keys and certificates for those that have some."),
+    ] = False,
+    revoke: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME",
+            help="A robot or service whose certificates are valid no more; may be repeated.",
+        ),
+    ] = None,
+    revoke_serial: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="HEX",
+            help="The number of one certificate that is valid no more; may be repeated.",
+        ),
+    ] = None,
+    list_: Annotated[
+        bool,
+        typer.Option("--list", help="Say what was ever made, and what is revoked."),
+    ] = False,
 ) -> None:
-    """Make keys by which robots and services know each other.
+    """Make keys by which robots and services know each other, and revoke them.
 
     Without names: one robot and one service. Again with other names: more of the same authority.
-    What is there already stays as it is, unless --renew is said; then its certificate is replaced,
-    and its key stays.
-    """
-    from holdfast.runtime.credentials import make_credentials
+    What is there already stays as it is, unless --renew or --rotate is said; then its certificate
+    is replaced, and its key stays or is replaced, too.
 
-    ring = make_credentials(
-        directory,
-        robots=robot or (),
-        services=service or (),
-        hosts=host or (),
-        days=days,
-        renew=renew,
-        warn=lambda text: typer.echo(f"warning: {printable(text)}", err=True),
-    )
-    sys.stdout.write(_account(ring))
+    --revoke writes revoked.pem into each directory. Copied to a service it takes effect with the
+    signal SIGHUP, copied to a robot with its next run. Together with --rotate, what is revoked are
+    the certificates of before.
+    """
+    from holdfast.runtime.credentials import list_credentials, make_credentials, revoke_credentials
+
+    def warn(text: str) -> None:
+        typer.echo(f"warning: {printable(text)}", err=True)
+
+    revokes = bool(revoke or revoke_serial)
+    if revokes:
+        done = revoke_credentials(
+            directory, names=revoke or (), serials=_numbers(revoke_serial or ()), warn=warn
+        )
+        sys.stdout.write(_account_of_revocation(directory, done))
+    if robot or service or renew or rotate or not (revokes or list_):
+        ring = make_credentials(
+            directory,
+            robots=robot or (),
+            services=service or (),
+            hosts=host or (),
+            days=days,
+            renew=renew,
+            rotate=rotate,
+            warn=warn,
+        )
+        sys.stdout.write(_account(ring))
+    if list_:
+        sys.stdout.write("".join(f"{_line_of(each)}\n" for each in list_credentials(directory)))
+
+
+def _numbers(texts: Sequence[str]) -> list[int]:
+    numbers = []
+    for text in texts:
+        try:
+            numbers.append(int(text.replace(":", ""), 16))
+        except ValueError:
+            raise InvalidValueError(
+                f"--revoke-serial: {text!r} is no hexadecimal number; --list shows them"
+            ) from None
+    return numbers
+
+
+def _account_of_revocation(directory: Path, done: Revocation) -> str:
+    """Say what was revoked, and what is to be done with the list."""
+    lines = [f"revoked: {_line_of(each)}" for each in done.revoked]
+    if not lines:
+        return "All of these were revoked already; nothing was changed.\n"
+    lines += [
+        "",
+        f"Copy {directory / 'NAME' / 'revoked.pem'} to each service and robot, beside its "
+        "certificate.pem.",
+        "Then send each 'holdfast serve' the signal SIGHUP: links of what is revoked end at once, "
+        "others go on.",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _line_of(issued: Issued) -> str:
+    """Say what is known of a certificate, on one line."""
+    parts = [f"{issued.serial:040x}"]
+    if issued.role is not None:
+        parts.append(f"{issued.role} {issued.name!r}")
+    if issued.expires is not None:
+        parts.append(f"valid until {issued.expires:%Y-%m-%d}")
+    if issued.revoked is not None:
+        parts.append(f"revoked on {issued.revoked:%Y-%m-%d}")
+    return ", ".join(parts)
 
 
 def _account(ring: KeyRing) -> str:
@@ -90,7 +170,8 @@ def _account(ring: KeyRing) -> str:
     if any(made.renewed for made in ring.made):
         lines += [
             "",
-            "Copy each certificate.pem over the old one. Services read it when they start.",
+            "Copy each certificate.pem over the old one. Services read it when they start, and "
+            "with the signal SIGHUP.",
         ]
     examples = {made.role: made.directory for made in ring.made if not made.renewed}
     if examples:

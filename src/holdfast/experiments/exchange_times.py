@@ -8,15 +8,16 @@ processes woken, digests, the answer decoded. A path adds its round trip to that
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import os
 import queue
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import msgspec
 
@@ -29,8 +30,8 @@ from holdfast.experiments.trial_batches import problem_of
 from holdfast.planning import advance, choose_sensing_action, digest, initial_state, observe
 from holdfast.problems.registry import problem_class, problem_module
 from holdfast.runtime.leash import leash
+from holdfast.runtime.links import OnLoop
 from holdfast.runtime.own_planner import OWN_PLANNER, OwnPlanner
-from holdfast.runtime.transport.contract import RobotTransport
 from holdfast.runtime.transport.zenoh_transport import ZenohRobotTransport
 from holdfast.session.events import Appeared, Ended, Replied, TransportEvent
 from holdfast.session.messages import (
@@ -49,6 +50,7 @@ from holdfast.session.messages import (
 )
 from holdfast.settings import ParticleFilterSettings, PlanningSettings, SelectorSettings
 from holdfast.source_digest import core_version, problem_digest
+from holdfast.transport.contract import RobotTransport
 from holdfast.transport.endpoints import ServiceAddress
 
 __all__ = ["COLUMNS", "Exchange", "measure_exchange"]
@@ -121,7 +123,7 @@ def measure_exchange(**exchange: Any) -> Table:
         If the problem refuses it.
     """
     wanted = msgspec.convert(exchange, Exchange)
-    ways: dict[str, Callable[[Exchange], contextlib.AbstractContextManager[tuple[str, Any]]]] = {
+    ways: dict[str, Callable[[Exchange], _Service]] = {
         "tcp": _over_tcp,
         "in_process": _in_process,
     }
@@ -137,20 +139,28 @@ def measure_exchange(**exchange: Any) -> Table:
     )
     opening = Opening(wanted.problem, {}, {}, settings, wanted.seed, *code)
     turns = [turn for trial in range(wanted.num_trials) for turn in _turns(wanted, settings, trial)]
-    rows: list[tuple[Cell, ...]] = []
     switch_interval_s = sys.getswitchinterval()
     sys.setswitchinterval(_SWITCH_INTERVAL_S)  # as a robot's process does
     try:
-        with ways[wanted.way](wanted) as (service, transport):
-            asking = _Asking(service, transport)
-            for number, turn in enumerate(turns, 1):
-                row = asking.ask(number, turn, opening if number == 1 else None)
-                # The first one has the problem loaded.
-                if number > 1:
-                    rows.append((wanted.way, turn.trial, turn.step, *row))
+        rows = asyncio.run(_asked(ways[wanted.way](wanted), wanted.way, turns, opening))
     finally:
         sys.setswitchinterval(switch_interval_s)
     return Table.of_rows(COLUMNS, rows)
+
+
+async def _asked(
+    service: _Service, way: str, turns: list[_Turn], opening: Opening
+) -> list[tuple[Cell, ...]]:
+    """Return a row for each question but the first: for that, the problem is loaded."""
+    rows: list[tuple[Cell, ...]] = []
+    async with service as (name, transport):
+        asking = _Asking(name, transport)
+        await asking.start()
+        for number, turn in enumerate(turns, 1):
+            row = await asking.ask(number, turn, opening if number == 1 else None)
+            if number > 1:
+                rows.append((way, turn.trial, turn.step, *row))
+    return rows
 
 
 def _turns(wanted: Exchange, settings: PlanningSettings, trial: int) -> Iterator[_Turn]:
@@ -177,19 +187,25 @@ def _turns(wanted: Exchange, settings: PlanningSettings, trial: int) -> Iterator
         asked = state
 
 
+_Service: TypeAlias = contextlib.AbstractAsyncContextManager[tuple[str, RobotTransport]]
+
+
 class _Asking:
     """Puts one question at a time, as one robot."""
 
     def __init__(self, service: str, transport: RobotTransport) -> None:
         self._service = service
         self._transport = transport
-        self._events: queue.SimpleQueue[TransportEvent] = queue.SimpleQueue()
+        self._events: asyncio.Queue[TransportEvent] = asyncio.Queue()
         self._session = os.urandom(16)
-        transport.start(self._events.put)
-        while not isinstance(self._next(), Appeared):
+
+    async def start(self) -> None:
+        """Wait until the service is there."""
+        self._transport.start(self._events.put_nowait)
+        while not isinstance(await self._next(), Appeared):
             pass
 
-    def ask(self, number: int, turn: _Turn, opening: Opening | None) -> tuple[Cell, ...]:
+    async def ask(self, number: int, turn: _Turn, opening: Opening | None) -> tuple[Cell, ...]:
         """Return the times of an answer."""
         start = time.perf_counter()
         request = Request(
@@ -209,7 +225,7 @@ class _Asking:
         answer: SensingAnswer | None = None
         said: list[Reply] = []
         computed_ms = sensing_ms = 0.0
-        while not isinstance(event := self._next(), Ended):
+        while not isinstance(event := await self._next(), Ended):
             if not isinstance(event, Replied):
                 continue
             reply = decode_reply(event.payload)
@@ -229,24 +245,25 @@ class _Asking:
             )
         return task_ms, task_computed_ms, sensing_ms, computed_ms
 
-    def _next(self) -> TransportEvent:
+    async def _next(self) -> TransportEvent:
         try:
-            return self._events.get(timeout=_PATIENCE_S)
-        except queue.Empty:
+            async with asyncio.timeout(_PATIENCE_S):
+                return await self._events.get()
+        except TimeoutError:
             raise TaskError(f"the service has not answered for {_PATIENCE_S:g} s") from None
 
 
-@contextlib.contextmanager
-def _in_process(wanted: Exchange) -> Iterator[tuple[str, RobotTransport]]:
+@contextlib.asynccontextmanager
+async def _in_process(wanted: Exchange) -> AsyncIterator[tuple[str, RobotTransport]]:
     planner = OwnPlanner(problem_of(wanted.problem, {}, {}))
     try:
         yield OWN_PLANNER, planner
     finally:
-        planner.close()
+        await planner.close()
 
 
-@contextlib.contextmanager
-def _over_tcp(wanted: Exchange) -> Iterator[tuple[str, RobotTransport]]:
+@contextlib.asynccontextmanager
+async def _over_tcp(wanted: Exchange) -> AsyncIterator[tuple[str, RobotTransport]]:
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     happened: queue.SimpleQueue[Written | ProcessEnded] = queue.SimpleQueue()
     with tempfile.TemporaryDirectory(prefix="holdfast-") as directory:
@@ -262,13 +279,13 @@ def _over_tcp(wanted: Exchange) -> Iterator[tuple[str, RobotTransport]]:
         )
         try:
             _await_ready(child, happened)
-            transport = ZenohRobotTransport(
-                {endpoint: ServiceAddress(endpoint)}, lease_ms=_LEASE_MS
+            transport = OnLoop(
+                ZenohRobotTransport({endpoint: ServiceAddress(endpoint)}, lease_ms=_LEASE_MS)
             )
             try:
                 yield endpoint, transport
             finally:
-                transport.close()
+                await transport.close()
         finally:
             child.terminate()
             child.close(_END_S)

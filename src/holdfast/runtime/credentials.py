@@ -4,7 +4,9 @@ Both ends of a link show a certificate, and each accepts only those that its aut
 The authority is one key file, made here, which stays at home; whoever holds it decides who belongs.
 A certificate also says what its owner is: a robot's is good for asking only and a service's for
 answering only (the field that X.509 calls the extended key usage), so a stolen robot cannot pretend
-to be a service to the others.
+to be a service to the others. A certificate whose key is lost or stolen is revoked: its number goes
+into a list that the authority signs and that lies beside everybody's credentials. What was ever
+signed is written down, so that no older certificate of a name is forgotten then.
 
 :func:`make_credentials` makes them, with the package ``cryptography``. :func:`load_credentials`
 finds out before a link is opened whether they will work, because a TLS library later only says
@@ -14,17 +16,25 @@ of the standard library, which is there on every robot and imports in a fraction
 
 from __future__ import annotations
 
+import contextlib
+import csv
 import re
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from datetime import UTC, datetime, timedelta
 from ipaddress import ip_address
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias
 
-from holdfast.errors import HoldfastError
-from holdfast.files import NewFile, create_directory_atomically, write_atomically
+from holdfast.errors import HoldfastError, TransportError
+from holdfast.files import (
+    NewFile,
+    create_directory_atomically,
+    replace_directory,
+    write_atomically,
+)
 from holdfast.transport.endpoints import TlsFiles
+from holdfast.transport.revocation import REVOKED_FILE, refuse_revoked
 
 if TYPE_CHECKING:
     import ssl
@@ -40,11 +50,15 @@ __all__ = [
     "DEFAULT_DAYS",
     "CredentialsError",
     "CredentialsWarning",
+    "Issued",
     "KeyRing",
     "MadeCredentials",
+    "Revocation",
     "Role",
+    "list_credentials",
     "load_credentials",
     "make_credentials",
+    "revoke_credentials",
 ]
 
 Role: TypeAlias = Literal["robot", "service"]
@@ -66,6 +80,9 @@ _AUTHORITY_CERTIFICATE = "authority.pem"
 _AUTHORITY_KEY = "authority.key"
 _CERTIFICATE = "certificate.pem"
 _KEY = "key.pem"
+_ISSUED = "issued.csv"
+_ISSUED_FIELDS = ("serial", "name", "role", "expires")
+_MAX_SERIAL = 2**159
 
 # A robot whose clock is a little behind would refuse a certificate that begins now.
 _BACKDATED = timedelta(days=1)
@@ -111,6 +128,45 @@ class MadeCredentials(NamedTuple):
     renewed: bool
 
 
+class Issued(NamedTuple):
+    """A certificate that the authority has signed.
+
+    Attributes
+    ----------
+    serial : int
+    name : str
+        Empty if only the number is known.
+    role : {"robot", "service"} or None
+    expires : datetime or None
+    revoked : datetime or None
+        When; None if it is not.
+    """
+
+    serial: int
+    name: str
+    role: Role | None
+    expires: datetime | None
+    revoked: datetime | None = None
+
+
+class Revocation(NamedTuple):
+    """What :func:`revoke_credentials` did.
+
+    Attributes
+    ----------
+    revoked : tuple of Issued
+        What was not revoked before.
+    before : int
+        How many were.
+    copies : tuple of Path
+        The list in each directory of credentials.
+    """
+
+    revoked: tuple[Issued, ...]
+    before: int
+    copies: tuple[Path, ...]
+
+
 class KeyRing(NamedTuple):
     """What :func:`make_credentials` did.
 
@@ -137,6 +193,7 @@ def make_credentials(
     hosts: Sequence[str] = (),
     days: int = DEFAULT_DAYS,
     renew: bool = False,
+    rotate: bool = False,
     now: datetime | None = None,
     warn: Callable[[str], None] | None = None,
 ) -> KeyRing:
@@ -144,8 +201,9 @@ def make_credentials(
 
     Each gets a directory of its name with ``authority.pem``, ``certificate.pem`` and ``key.pem``,
     which appears whole or not at all. Another call adds keys of the same authority. Nothing that
-    exists is changed, unless ``renew`` is set: then a new certificate replaces the old one, for the
-    same key and at least the same hosts.
+    exists is changed, unless ``renew`` or ``rotate`` is set: then a new certificate replaces the
+    old one, for the same key or a new one, and for at least the same hosts. The old one stays valid
+    until its time is up or it is revoked (:func:`revoke_credentials`).
 
     Parameters
     ----------
@@ -153,13 +211,15 @@ def make_credentials(
         Where all of them go; it is made if it is not there.
     robots, services : sequence of str
         Their names; none at all means one robot ``robot`` and one service ``service``, or with
-        ``renew`` all that are there.
+        ``renew`` or ``rotate`` all that are there.
     hosts : sequence of str
         Names and addresses under which robots call the services, besides those of this machine.
     days : int
         For which the certificates are valid; never longer than the authority.
     renew : bool
-        Whether certificates that are there already are replaced.
+        Whether certificates that are there already are replaced. One that is revoked is not.
+    rotate : bool
+        Whether certificates and keys that are there already are replaced.
     now : datetime or None
         The time from which they are valid, with its time zone; None takes the clock's.
     warn : callable or None
@@ -182,14 +242,20 @@ def make_credentials(
     # Certificates have whole seconds.
     now = (now or datetime.now(UTC)).replace(microsecond=0)
     if not robots and not services:
-        robots, services = _present(directory) if renew else (("robot",), ("service",))
+        robots, services = _present(directory) if renew or rotate else (("robot",), ("service",))
     _check_arguments(robots, services, hosts, days)
+    if renew and rotate:
+        raise CredentialsError(
+            "renew (--renew) keeps the keys and rotate (--rotate) makes new ones: choose one"
+        )
 
     home = directory / _AUTHORITY
     authority_is_new = not home.exists()
     authority = _new_authority(now) if authority_is_new else _read_authority(home, now, warn)
 
     # All that can be refused is refused before the first file is written.
+    revoked = () if authority_is_new else _read_revoked(home, authority.certificate)
+    numbers = frozenset(entry.serial_number for entry in revoked)
     end = min(now + timedelta(days=days), authority.certificate.not_valid_after_utc)
     roles: list[tuple[str, Role]] = [(name, "service") for name in services]
     roles += [(name, "robot") for name in robots]
@@ -199,12 +265,19 @@ def make_credentials(
         occupied = _first_file_of(place)
         if occupied is None:
             parties.append(_new_party(name, role, hosts, authority, now, end))
-        elif renew:
-            parties.append(_renewed_party(place, role, hosts, authority, now, end))
+        elif renew or rotate:
+            old = _old_certificate(place, role, authority)
+            if renew and old.serial_number in numbers:
+                raise CredentialsError(
+                    f"{place / _CERTIFICATE}: is revoked, so its key gets no new certificate; "
+                    f"make a new key (--rotate)"
+                )
+            parties.append(_renewed_party(place, old, role, hosts, authority, now, end, rotate))
         else:
             raise CredentialsError(
                 f"{occupied}: exists already, and nothing was changed; choose another name, or "
-                f"renew it (--renew) to get a new certificate for the same key"
+                f"renew it (--renew) to get a new certificate for the same key, or rotate it "
+                f"(--rotate) to get a new key as well"
             )
 
     try:
@@ -219,20 +292,24 @@ def make_credentials(
                 _AUTHORITY_KEY: NewFile(_key_pem(authority.key), _PRIVATE_FILE),
             },
         )
+    # Before any of them is there: what was not written down could not be revoked by its name.
+    issued = _read_issued(directory, authority.certificate)
+    _write_issued(home, [*issued, *(_issued(each.certificate) for each in parties)])
     made = []
     for party in parties:
         place = directory / party.name
         if party.key is None:
             write_atomically(place / _CERTIFICATE, _pem(party.certificate))
         else:
-            create_directory_atomically(
-                place,
-                {
-                    _AUTHORITY_CERTIFICATE: NewFile(_pem(authority.certificate), _PUBLIC_FILE),
-                    _CERTIFICATE: NewFile(_pem(party.certificate), _PUBLIC_FILE),
-                    _KEY: NewFile(_key_pem(party.key), _PRIVATE_FILE),
-                },
-            )
+            files = {
+                _AUTHORITY_CERTIFICATE: NewFile(_pem(authority.certificate), _PUBLIC_FILE),
+                _CERTIFICATE: NewFile(_pem(party.certificate), _PUBLIC_FILE),
+                _KEY: NewFile(_key_pem(party.key), _PRIVATE_FILE),
+            }
+            if (home / REVOKED_FILE).exists():
+                files[REVOKED_FILE] = NewFile(_read(home / REVOKED_FILE), _PUBLIC_FILE)
+            put = replace_directory if place.exists() else create_directory_atomically
+            put(place, files)
         made.append(
             MadeCredentials(party.name, party.role, place, party.hosts, end, party.key is None)
         )
@@ -242,6 +319,93 @@ def make_credentials(
         authority.certificate.not_valid_after_utc,
         tuple(made),
     )
+
+
+def revoke_credentials(
+    directory: Path,
+    *,
+    names: Sequence[str] = (),
+    serials: Sequence[int] = (),
+    now: datetime | None = None,
+    warn: Callable[[str], None] | None = None,
+) -> Revocation:
+    """Revoke certificates: no service and no robot that has the new list accepts them any more.
+
+    The list is written to the authority and beside each party's credentials. What is revoked
+    already stays so, and nothing is ever taken off the list.
+
+    Parameters
+    ----------
+    directory : Path
+        As for :func:`make_credentials`.
+    names : sequence of str
+        Of robots and services: all certificates that they ever had.
+    serials : sequence of int
+        Numbers of single certificates.
+    now : datetime or None
+        When, with its time zone; None takes the clock's.
+    warn : callable or None
+        As for :func:`make_credentials`.
+
+    Raises
+    ------
+    CredentialsError
+        If a name never had a certificate, a number cannot be one, a file is missing or malformed,
+        or ``cryptography`` is not installed.
+    OutputError
+        If a file cannot be written.
+    """
+    _require_cryptography()
+    now = (now or datetime.now(UTC)).replace(microsecond=0)
+    home = directory / _AUTHORITY
+    authority = _read_authority(home, now, warn or _give_to_warnings)
+    issued = _read_issued(directory, authority.certificate)
+    wanted: dict[int, Issued] = {}
+    for name in names:
+        theirs = [each for each in issued if each.name == name]
+        if not theirs:
+            raise CredentialsError(f"name {name!r}: has no certificate of {home}")
+        wanted |= {each.serial: each for each in theirs}
+    for serial in serials:
+        if not 0 < serial < _MAX_SERIAL:
+            raise CredentialsError(f"serial number {serial:x}: is not between 1 and 2^159")
+        known = next((each for each in issued if each.serial == serial), None)
+        wanted[serial] = known or Issued(serial, "", None, None)
+    listed = _read_revoked(home, authority.certificate)
+    numbers = {entry.serial_number for entry in listed}
+    new = [each._replace(revoked=now) for each in wanted.values() if each.serial not in numbers]
+    if new:
+        content = _sign_revoked(home, listed, new, authority, now)
+        write_atomically(home / REVOKED_FILE, content)
+    copies = []
+    if new or listed:
+        content = _read(home / REVOKED_FILE)
+        for certificate in _certificates_in(directory):
+            # Also if nothing is new: who wrote it may have been killed before the copies.
+            copies.append(certificate.with_name(REVOKED_FILE))
+            write_atomically(copies[-1], content)
+    return Revocation(tuple(new), len(listed), tuple(copies))
+
+
+def list_credentials(directory: Path) -> tuple[Issued, ...]:
+    """Return all certificates that an authority has signed, and what is revoked.
+
+    Raises
+    ------
+    CredentialsError
+        If there is no authority, a file is malformed, or ``cryptography`` is not installed.
+    """
+    _require_cryptography()
+    home = directory / _AUTHORITY
+    certificate = _read_certificate(home / _AUTHORITY_CERTIFICATE)
+    listed = {
+        entry.serial_number: entry.revocation_date_utc for entry in _read_revoked(home, certificate)
+    }
+    issued = [
+        each._replace(revoked=listed.pop(each.serial, None))
+        for each in _read_issued(directory, certificate)
+    ]
+    return (*issued, *(Issued(serial, "", None, None, at) for serial, at in listed.items()))
 
 
 def load_credentials(
@@ -326,6 +490,10 @@ def _rehearse(authority: Path, certificate: Path, key: Path, role: Role) -> floa
         theirs.load_verify_locations(cafile=authority)
     except ssl.SSLError as error:
         raise CredentialsError(f"{authority}: is no certificate in PEM form") from error
+    try:
+        refuse_revoked(theirs, authority.parent)
+    except TransportError as error:
+        raise CredentialsError(str(error)) from error
     # A server needs a certificate of its own; nobody looks at it here.
     for context in (ours,) if serving else (ours, theirs):
         try:
@@ -346,6 +514,9 @@ def _rehearse(authority: Path, certificate: Path, key: Path, role: Role) -> floa
                     continue
         shown = far.getpeercert()
     except ssl.SSLCertVerificationError as error:
+        if error.verify_code in _LIST_IS_WRONG:
+            reason = _LIST_IS_WRONG[error.verify_code]
+            raise CredentialsError(f"{authority.with_name(REVOKED_FILE)}: {reason}") from error
         reason = _refusal(certificate, role, error)
         raise CredentialsError(f"{certificate}: {reason}") from error
     except (ssl.SSLError, ValueError) as error:
@@ -365,6 +536,15 @@ def _unusable_pair(certificate: Path, key: Path, error: ssl.SSLError) -> str:
     return f"{certificate} and {key} cannot be used: {error.reason or error}"
 
 
+_LIST_IS_WRONG = {
+    3: f"is not of the authority beside it, {_AUTHORITY_CERTIFICATE}",
+    8: f"was not signed by the authority beside it, {_AUTHORITY_CERTIFICATE}",
+    11: "is not valid yet; is this machine's clock right?",
+    12: "has expired",
+}
+"""By OpenSSL's numbers: what can be wrong with a revocation list."""
+
+
 def _refusal(certificate: Path, role: Role, error: ssl.SSLCertVerificationError) -> str:
     """Say why the other end refuses the certificate, by OpenSSL's number of the reason."""
     other: Role = "robot" if role == "service" else "service"
@@ -373,6 +553,8 @@ def _refusal(certificate: Path, role: Role, error: ssl.SSLCertVerificationError)
             return f"is not valid yet{_validity(certificate)}; is this machine's clock right?"
         case 10:
             return f"has expired{_validity(certificate)}"
+        case 23:
+            return "has been revoked; 'holdfast keys DIR --rotate' makes new ones"
         case 26:
             return f"is not for a {role} but for a {other}"
         case 7 | 18 | 19 | 20 | 21:
@@ -473,11 +655,9 @@ def _present(directory: Path) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return the names of all robots and services that have a certificate here."""
     robots: list[str] = []
     services: list[str] = []
-    for certificate in sorted(directory.glob(f"*/{_CERTIFICATE}")):
-        name = certificate.parent.name
-        if _NAME.fullmatch(name):
-            role = _role_of(_read_certificate(certificate))
-            (services if role == "service" else robots).append(name)
+    for certificate in _certificates_in(directory):
+        role = _role_of(_read_certificate(certificate))
+        (services if role == "service" else robots).append(certificate.parent.name)
     if not robots and not services:
         raise CredentialsError(f"{directory}: has no certificates to renew")
     return tuple(robots), tuple(services)
@@ -548,30 +728,41 @@ def _new_party(
     return _Party(name, role, reached_at, certificate, key)
 
 
-def _renewed_party(
-    place: Path,
-    role: Role,
-    hosts: Sequence[str],
-    authority: _Authority,
-    now: datetime,
-    end: datetime,
-) -> _Party:
+def _old_certificate(place: Path, role: Role, authority: _Authority) -> x509.Certificate:
+    """Return the certificate that is to be replaced, if it is one of ours."""
     from cryptography.exceptions import InvalidSignature
     from cryptography.hazmat.primitives.asymmetric import ec
 
     path = place / _CERTIFICATE
     old = _read_certificate(path)
-    public_key = old.public_key()
     try:
         old.verify_directly_issued_by(authority.certificate)
     except (ValueError, TypeError, InvalidSignature) as error:
         raise CredentialsError(f"{path}: is not of the authority in {place.parent}") from error
-    if _role_of(old) != role or not isinstance(public_key, ec.EllipticCurvePublicKey):
+    if _role_of(old) != role or not isinstance(old.public_key(), ec.EllipticCurvePublicKey):
         raise CredentialsError(f"{path}: is not a {role}'s certificate, so it is left alone")
+    return old
+
+
+def _renewed_party(
+    place: Path,
+    old: x509.Certificate,
+    role: Role,
+    hosts: Sequence[str],
+    authority: _Authority,
+    now: datetime,
+    end: datetime,
+    rotate: bool,
+) -> _Party:
+    from cryptography.hazmat.primitives.asymmetric import ec
+
+    key = ec.generate_private_key(ec.SECP256R1()) if rotate else None
+    public_key = old.public_key() if key is None else key.public_key()
+    assert isinstance(public_key, ec.EllipticCurvePublicKey)
     reached_at = tuple(dict.fromkeys((*_hosts_of(old), *map(_normal, hosts))))
     reached_at = reached_at if role == "service" else ()
     certificate = _sign(place.name, role, reached_at, public_key, authority, now, end)
-    return _Party(place.name, role, reached_at, certificate, None)
+    return _Party(place.name, role, reached_at, certificate, key)
 
 
 def _sign(
@@ -608,6 +799,128 @@ def _sign(
         names = [_general_name(host) for host in hosts]
         builder = builder.add_extension(x509.SubjectAlternativeName(names), critical=False)
     return builder.sign(authority.key, hashes.SHA256())
+
+
+# What was signed, and what is revoked
+
+
+def _issued(certificate: x509.Certificate) -> Issued:
+    from cryptography.x509.oid import NameOID
+
+    names = certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
+    return Issued(
+        certificate.serial_number,
+        str(names[0].value) if names else "",
+        _role_of(certificate),
+        certificate.not_valid_after_utc,
+    )
+
+
+def _read_issued(directory: Path, authority: x509.Certificate) -> list[Issued]:
+    """Return what was signed: what is written down, and what is there besides."""
+    from cryptography.exceptions import InvalidSignature
+
+    path = directory / _AUTHORITY / _ISSUED
+    issued: dict[int, Issued] = {}
+    if path.exists():
+        try:
+            for serial, name, role, expires in _rows_of(_read(path).decode()):
+                known: Role = "service" if role == "service" else "robot"
+                end = datetime.fromisoformat(expires)
+                issued[int(serial, 16)] = Issued(int(serial, 16), name, known, end)
+        except ValueError as error:
+            raise CredentialsError(f"{path}: is no record of certificates: {error}") from error
+    for place in _certificates_in(directory):
+        # Anything may lie here; what our authority has not signed is no certificate of ours.
+        with contextlib.suppress(CredentialsError, ValueError, TypeError, InvalidSignature):
+            certificate = _read_certificate(place)
+            certificate.verify_directly_issued_by(authority)
+            issued.setdefault(certificate.serial_number, _issued(certificate))
+    return list(issued.values())
+
+
+def _rows_of(text: str) -> list[list[str]]:
+    """Return the rows below the header."""
+    rows = list(csv.reader(text.splitlines()))
+    if not rows or tuple(rows[0]) != _ISSUED_FIELDS:
+        raise ValueError(f"its first line is not {','.join(_ISSUED_FIELDS)}")
+    return rows[1:]
+
+
+def _certificates_in(directory: Path) -> list[Path]:
+    """Return the certificates of all parties that have a directory here."""
+    found = sorted(directory.glob(f"*/{_CERTIFICATE}"))
+    return [path for path in found if _NAME.fullmatch(path.parent.name)]
+
+
+def _write_issued(home: Path, issued: Iterable[Issued]) -> None:
+    rows = [
+        (f"{each.serial:x}", each.name, each.role or "", each.expires.isoformat())
+        for each in issued
+        if each.expires is not None
+    ]
+    text = "".join(",".join(row) + "\n" for row in (_ISSUED_FIELDS, *rows))
+    write_atomically(home / _ISSUED, text)
+
+
+def _read_revoked(home: Path, authority: x509.Certificate) -> tuple[x509.RevokedCertificate, ...]:
+    """Return the entries of the authority's list; none if there is none yet."""
+    revoked = _load_revoked(home, authority)
+    return () if revoked is None else tuple(revoked)
+
+
+def _load_revoked(home: Path, authority: x509.Certificate) -> x509.CertificateRevocationList | None:
+    from cryptography import x509
+    from cryptography.hazmat.primitives.asymmetric import ec
+
+    path = home / REVOKED_FILE
+    if not path.exists():
+        return None
+    try:
+        revoked = x509.load_pem_x509_crl(_read(path))
+    except ValueError as error:
+        raise CredentialsError(f"{path}: is no revocation list in PEM form") from error
+    key = authority.public_key()
+    assert isinstance(key, ec.EllipticCurvePublicKey)
+    if not revoked.is_signature_valid(key):
+        raise CredentialsError(f"{path}: was not signed by {home / _AUTHORITY_CERTIFICATE}")
+    return revoked
+
+
+def _sign_revoked(
+    home: Path,
+    listed: Iterable[x509.RevokedCertificate],
+    new: Iterable[Issued],
+    authority: _Authority,
+    now: datetime,
+) -> bytes:
+    """Return the next list, in PEM."""
+    from cryptography import x509
+    from cryptography.hazmat.primitives import hashes
+    from cryptography.hazmat.primitives.serialization import Encoding
+
+    before = _load_revoked(home, authority.certificate)
+    number = 1
+    if before is not None:
+        number += before.extensions.get_extension_for_class(x509.CRLNumber).value.crl_number
+    builder = (
+        x509.CertificateRevocationListBuilder()
+        .issuer_name(authority.certificate.subject)
+        .last_update(max(now - _BACKDATED, authority.certificate.not_valid_before_utc))
+        # A list that expires would lock everybody out.
+        .next_update(authority.certificate.not_valid_after_utc)
+        .add_extension(x509.CRLNumber(number), critical=False)
+        .add_extension(
+            x509.AuthorityKeyIdentifier.from_issuer_public_key(authority.key.public_key()),
+            critical=False,
+        )
+    )
+    for entry in listed:
+        builder = builder.add_revoked_certificate(entry)
+    for each in new:
+        entry = x509.RevokedCertificateBuilder(each.serial, now).build()
+        builder = builder.add_revoked_certificate(entry)
+    return builder.sign(authority.key, hashes.SHA256()).public_bytes(Encoding.PEM)
 
 
 def _hosts_of_this_machine(hosts: Sequence[str]) -> tuple[str, ...]:

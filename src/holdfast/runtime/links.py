@@ -25,7 +25,7 @@ from holdfast.settings import OffloadSettings
 from holdfast.transport.contract import RobotTransport
 from holdfast.user_code import describe_problem_error
 
-__all__ = ["RECOVERY_SERVICE", "Links", "make_links"]
+__all__ = ["RECOVERY_SERVICE", "Links", "OnLoop", "make_links"]
 
 _FOR_EVER_MS = 3_600_000.0  # the largest that the settings allow
 
@@ -155,10 +155,10 @@ def _zenoh_links(configuration: Configuration, log_path: Path | None, events: Ev
     except BaseException:
         close()
         raise
-    return Links(_OnLoop(transport), offload.services, recovery, launcher, offload, close)
+    return Links(OnLoop(transport), offload.services, recovery, launcher, offload, close)
 
 
-class _OnLoop:
+class OnLoop:
     """A transport that delivers on threads of its own, as one that delivers on the loop."""
 
     def __init__(self, transport: ThreadedRobotTransport) -> None:
@@ -167,10 +167,12 @@ class _OnLoop:
         self.abandon = transport.abandon
 
     def start(self, deliver: Callable[[TransportEvent], None]) -> None:
+        """Begin to deliver."""
         loop = asyncio.get_running_loop()
         self._transport.start(lambda event: _hand_in(loop, deliver, event))
 
     async def close(self, timeout_s: float = 1.0) -> None:
+        """Close the transport."""
         self._transport.close(timeout_s)
 
 

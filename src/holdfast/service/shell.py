@@ -252,8 +252,7 @@ class ServiceShell:
         job = self._brief_jobs.popleft()
         if self._brief_jobs:
             self._run_brief_job_soon()
-        self._service.begun(job, self._loop.time())
-        self._finished(job, job.run())
+        self._finished(job, *self._computed(job))
 
     def _run_brief_job_soon(self) -> None:
         """Have the next brief job run once all that has arrived by then was handled.
@@ -262,8 +261,18 @@ class ServiceShell:
         """
         self._loop.call_at(self._loop.time(), self._guarded, self._run_brief_job)
 
-    def _finished(self, job: Job, outcome: Outcome) -> None:
-        self._carry_out(self._service.finished(job, outcome, self._loop.time()))
+    def _computed(self, job: Job) -> tuple[Outcome, float]:
+        """Return what a job comes to, and how long it took; on any thread."""
+        began = self._loop.time()
+        outcome = job.run()
+        return outcome, self._loop.time() - began
+
+    def _finished(self, job: Job, outcome: Outcome, computed_s: float) -> None:
+        now = self._loop.time()
+        # Without the ways to a thread and back: else a brief job that was once sent there never
+        # counts as brief again.
+        self._service.begun(job, now - computed_s)
+        self._carry_out(self._service.finished(job, outcome, now))
 
     def _tick(self) -> None:
         """Let the machine take note of the time, and log what was left out before."""
@@ -295,8 +304,10 @@ class ServiceShell:
     def _run(self, run: Run) -> None:
         job = run.job
         if run.expected_s > _BRIEF_S:
-            done = functools.partial(self._guarded, self._finished, job)
-            self._jobs.submit(job.run, done)
+            self._jobs.submit(
+                functools.partial(self._computed, job),
+                lambda computed: self._guarded(self._finished, job, *computed),
+            )
             return
         self._brief_jobs.append(job)
         if len(self._brief_jobs) == 1:

@@ -1,0 +1,507 @@
+"""Both ends over a network of numbers: a virtual clock, delays, losses drawn by seed."""
+
+import heapq
+import itertools
+import math
+import random
+from collections.abc import Callable
+from typing import NamedTuple
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from holdfast.transport.exchanges import (
+    KEEP_ALIVE_S,
+    MAX_ANSWERS,
+    MAX_DATAGRAM_BYTES,
+    MAX_PAYLOAD_BYTES,
+    Answers,
+    Part,
+    Questions,
+    RoundTrips,
+    Ways,
+)
+from holdfast.transport.sealing import OVERHEAD, ReplayWindow
+
+
+class Sent(NamedTuple):
+    at: float
+    kind: int
+    size: int
+    datagram: bool
+
+
+class Network:
+    """A robot and a service, and two ways between them.
+
+    The service answers ``parts`` parts, each after ``work_s``, and then ends the call.
+    """
+
+    def __init__(
+        self,
+        *,
+        delay_s: float = 0.04,
+        loss: float = 0.0,
+        twice: float = 0.0,
+        jitter_s: float = 0.0,
+        work_s: float = 0.0,
+        parts: int = 2,
+        answer: bytes = bytes(150),
+        seed: int = 0,
+        datagrams: bool = True,
+    ) -> None:
+        self.now = 0.0
+        self.delay_s, self.loss, self.twice, self.jitter_s = delay_s, loss, twice, jitter_s
+        self.work_s, self.parts, self.answer = work_s, parts, answer
+        self.datagrams = datagrams
+        self.stream = True
+        self._chance = random.Random(seed)
+        self._queue: list[tuple[float, int, Callable[[], None]]] = []
+        self._order = itertools.count()
+        self.sent: dict[str, list[Sent]] = {"robot": [], "service": []}
+        self.asked: list[bytes] = []
+        self.parts_of: dict[int, list[Part]] = {}
+        self.done_at: dict[int, float] = {}
+        self.drop: Callable[[str, int], bool] = lambda _who, _kind: False
+        self._windows = {"robot": ReplayWindow(), "service": ReplayWindow()}
+        self._counters = {"robot": itertools.count(), "service": itertools.count()}
+        self.questions = Questions(self._ways("robot"))
+        self.answers = Answers(self._ways("service"))
+
+    def _ways(self, who: str) -> Ways:
+        return Ways(
+            lambda message: self._datagram(who, message),
+            lambda _number, message: self._on_stream(who, message),
+            lambda: self._windows[who].lost,
+        )
+
+    def _datagram(self, who: str, message: bytes) -> None:
+        assert len(message) + OVERHEAD <= MAX_DATAGRAM_BYTES
+        self.sent[who].append(Sent(self.now, message[0], len(message) + OVERHEAD, True))
+        other = "service" if who == "robot" else "robot"
+        counter = next(self._counters[who])
+        lost = self._chance.random() < self.loss or self.drop(who, message[0])
+        if not self.datagrams or lost:
+            return
+        for _ in range(1 + (self._chance.random() < self.twice)):
+            due = self.now + self.delay_s + self.jitter_s * self._chance.random()
+            self._at(due, lambda: self._arrive(other, message, counter))
+
+    def _arrive(self, who: str, message: bytes, counter: int) -> None:
+        if self._windows[who].is_fresh(counter):
+            self._windows[who].note(counter)
+            self._take(who, message, datagram=True)
+
+    def _on_stream(self, who: str, message: bytes) -> None:
+        self.sent[who].append(Sent(self.now, message[0], len(message), False))
+        other = "service" if who == "robot" else "robot"
+        if self.stream:
+            self._at(self.now + self.delay_s, lambda: self._take(other, message, datagram=False))
+
+    def _take(self, who: str, message: bytes, *, datagram: bool) -> None:
+        if who == "robot":
+            for part in self.questions.received(message, self.now, datagram=datagram):
+                self.parts_of.setdefault(part.call, []).append(part)
+                if part.last:
+                    self.done_at[part.call] = self.now
+        else:
+            arrived = self.answers.received(message, datagram=datagram)
+            if arrived is not None:
+                self.asked.append(arrived.payload)
+                self._work(arrived.number, 0)
+
+    def _work(self, number: int, part: int) -> None:
+        last = part == self.parts
+        payload = None if last else self.answer + b"%d" % part
+
+        def answer() -> None:
+            self.answers.reply(number, payload, self.now, last=last)
+            if not last:
+                self._work(number, part + 1)
+
+        self._at(self.now + (0.0 if last else self.work_s), answer)
+
+    def _at(self, when: float, what: Callable[[], None]) -> None:
+        heapq.heappush(self._queue, (when, next(self._order), what))
+
+    def run(self, until: Callable[[], bool], limit_s: float = 60.0) -> None:
+        """Let time pass until something is so."""
+        end = self.now + limit_s
+        while not until():
+            due = min(
+                self._queue[0][0] if self._queue else math.inf,
+                self.questions.due,
+                self.answers.due,
+            )
+            assert due <= end, f"nothing in {limit_s} s of its time"
+            self.now = max(self.now, due)
+            if self._queue and self._queue[0][0] <= self.now:
+                heapq.heappop(self._queue)[2]()
+            else:
+                self.questions.expire(self.now)
+                self.answers.expire(self.now)
+
+    def wait(self, seconds: float) -> None:
+        done: list[bool] = []
+        self._at(self.now + seconds, lambda: done.append(True))
+        self.run(lambda: bool(done), seconds + 1.0)
+
+    def is_open(self) -> bool:
+        return self.questions.open
+
+    def begin(self) -> None:
+        self.questions.begin(self.now)
+        if self.datagrams:
+            self.run(self.is_open)
+
+    def ask(self, call: int, payload: bytes = bytes(75)) -> float:
+        """Ask, wait for the answer, and return how long it took."""
+        began = self.now
+        self.questions.ask(call, payload, self.now)
+        self.run(lambda: call in self.done_at)
+        return self.done_at[call] - began
+
+    def expected(self, call: int) -> list[Part]:
+        replies = [Part(call, self.answer + b"%d" % k, False) for k in range(self.parts)]
+        return [*replies, Part(call, None, True)]
+
+    def datagrams_of(self, who: str) -> list[Sent]:
+        return [sent for sent in self.sent[who] if sent.datagram]
+
+
+class TestWithoutLoss:
+    def test_an_answer_takes_one_round_trip(self) -> None:
+        network = Network(delay_s=0.04)
+        network.begin()
+        for call in range(100):
+            assert network.ask(call) == pytest.approx(0.08)
+            assert network.parts_of[call] == network.expected(call)
+
+    def test_nothing_is_sent_twice(self) -> None:
+        network = Network(delay_s=0.04)
+        network.begin()
+        before = {who: len(sent) for who, sent in network.sent.items()}
+        for call in range(300):
+            network.ask(call)
+            network.wait(0.02)
+        assert len(network.sent["robot"]) - before["robot"] == 300
+        assert len(network.sent["service"]) - before["service"] == 3 * 300
+        assert all(sent.datagram for who in network.sent for sent in network.sent[who])
+        assert len(network.asked) == 300
+
+    def test_an_answer_that_takes_its_time_is_asked_for_ever_more_rarely(self) -> None:
+        network = Network(delay_s=0.04, work_s=5.0, parts=1)
+        network.begin()
+        assert network.ask(1) == pytest.approx(5.08)
+        assert network.parts_of[1] == network.expected(1)
+        assert len(network.asked) == 1
+        times = [sent.at for sent in network.sent["robot"][1:]]
+        pauses = [b - a for a, b in itertools.pairwise(times)]
+        assert len(pauses) < 10
+        assert max(pauses) <= 1.1
+
+    def test_a_service_that_shows_that_it_works_is_asked_no_more(self) -> None:
+        network = Network(delay_s=0.04, work_s=0.05, parts=20, answer=b"working")
+        network.begin()
+        before = len(network.sent["robot"])
+        network.ask(1)
+        assert network.parts_of[1] == network.expected(1)
+        # Once in the beginning: that the first sign takes longer than the way is not known.
+        assert len(network.sent["robot"]) - before <= 2
+
+    def test_it_is_asked_now_and_then_whether_the_way_is_open(self) -> None:
+        network = Network()
+        network.begin()
+        network.wait(10.5 * KEEP_ALIVE_S)
+        probes = [sent.at for sent in network.sent["robot"]]
+        assert len(probes) == 11
+        assert min(b - a for a, b in itertools.pairwise(probes)) >= KEEP_ALIVE_S
+        assert network.is_open()
+
+
+class TestLoss:
+    @pytest.mark.parametrize("seed", range(3))
+    def test_five_per_cent_each_way(self, seed: int) -> None:
+        network = Network(delay_s=0.0435, loss=0.05, seed=seed)
+        network.begin()
+        times = sorted(network.ask(call) for call in range(1000))
+        for call in range(1000):
+            assert network.parts_of[call] == network.expected(call)
+        assert times[500] == pytest.approx(0.087)
+        assert times[949] <= 0.105
+        plain = Network(delay_s=0.0435)
+        plain.begin()
+        for call in range(1000):
+            plain.ask(call)
+        for who in network.sent:
+            sizes = [sum(s.size + 28 for s in n.datagrams_of(who)) for n in (network, plain)]
+            assert sizes[0] <= 3 * sizes[1]
+        # Before any loss is known, two in a row may be taken for silence.
+        assert sum(not sent.datagram for sent in network.sent["robot"]) <= 10
+
+    def test_only_the_direction_that_loses_is_doubled(self) -> None:
+        network = Network(delay_s=0.04)
+        chance = random.Random(1)
+        network.drop = lambda who, _kind: who == "service" and chance.random() < 0.1
+        network.begin()
+        for call in range(500):
+            network.ask(call)
+        assert len(network.sent["service"]) > 1.8 * 3 * 500
+        asked_again = len(network.sent["robot"]) - 501
+        assert asked_again < 100
+
+    def test_nothing_is_doubled_any_more_when_the_way_is_good_again(self) -> None:
+        network = Network(delay_s=0.04, loss=0.1, seed=3)
+        network.begin()
+        for call in range(200):
+            network.ask(call)
+        network.loss = 0.0
+        for call in range(200, 400):
+            network.ask(call)
+        before = len(network.sent["robot"])
+        for call in range(400, 500):
+            network.ask(call)
+        assert len(network.sent["robot"]) - before == 100
+
+    @pytest.mark.parametrize("lost_kind", [1, 2])
+    def test_the_first_of_all_is_lost(self, lost_kind: int) -> None:
+        network = Network(delay_s=0.04)
+        network.begin()
+        network.ask(1)
+        lost: list[int] = []
+
+        def drop(who: str, kind: int) -> bool:
+            if kind == lost_kind and not lost:
+                lost.append(kind)
+                return True
+            return False
+
+        network.drop = drop
+        # One more round trip, and the patience beyond the first.
+        assert network.ask(2) <= 0.08 + 0.08 + 0.03 + 4 * 0.04
+        assert lost
+        assert network.parts_of[2] == network.expected(2)
+
+    @given(
+        loss=st.floats(0.0, 0.5),
+        twice=st.floats(0.0, 0.5),
+        jitter_s=st.floats(0.0, 0.2),
+        delay_s=st.sampled_from([0.0001, 0.01, 0.1]),
+        work_s=st.sampled_from([0.0, 0.001, 0.2]),
+        parts=st.integers(0, 4),
+        seed=st.integers(0, 1000),
+    )
+    @settings(max_examples=60, deadline=None)
+    def test_each_part_comes_once_in_order_whatever_is_lost(
+        self,
+        loss: float,
+        twice: float,
+        jitter_s: float,
+        delay_s: float,
+        work_s: float,
+        parts: int,
+        seed: int,
+    ) -> None:
+        network = Network(
+            delay_s=delay_s,
+            loss=loss,
+            twice=twice,
+            jitter_s=jitter_s,
+            work_s=work_s,
+            parts=parts,
+            seed=seed,
+        )
+        network.questions.begin(0.0)
+        calls = range(30)
+        for call in calls:
+            size = 2 * MAX_PAYLOAD_BYTES if call % 7 == 3 else 75
+            network.questions.ask(call, bytes([call]) * size, network.now)
+            network.wait(0.01)
+        network.run(lambda: len(network.done_at) == len(calls), 600.0)
+        for call in calls:
+            assert network.parts_of[call] == network.expected(call)
+        assert sorted(payload[0] for payload in network.asked) == list(calls)
+        assert network.questions.calls == []
+
+
+class TestBudget:
+    def test_a_way_that_loses_nearly_all_is_given_no_more_than_three_times_the_load(self) -> None:
+        network = Network(delay_s=0.04)
+        network.begin()
+        network.stream = True
+        for call in range(50):
+            network.ask(call)
+        network.loss = 0.6
+        before = len(network.sent["robot"]), len(network.sent["service"])
+        for call in range(50, 550):
+            network.ask(call)
+        for who, start in zip(("robot", "service"), before, strict=True):
+            sent = [each for each in network.sent[who][start:] if each.datagram]
+            first = 500 * (75 + 10 + 2 + OVERHEAD + 28) if who == "robot" else 0
+            if who == "service":
+                first = 500 * (2 * (151 + 8 + OVERHEAD + 28) + 8 + OVERHEAD + 28)
+            extra = sum(each.size + 28 for each in sent if each.kind in (1, 2))
+            assert extra <= 3 * first + 8192
+
+
+class TestTheStream:
+    def test_before_datagrams_are_known_to_get_through(self) -> None:
+        network = Network()
+        assert network.ask(1) == pytest.approx(0.08)
+        assert network.parts_of[1] == network.expected(1)
+        assert not any(sent.datagram for who in network.sent for sent in network.sent[who])
+
+    def test_where_no_datagram_gets_through(self) -> None:
+        network = Network(datagrams=False)
+        network.begin()
+        for call in range(10):
+            assert network.ask(call) == pytest.approx(0.08)
+            assert network.parts_of[call] == network.expected(call)
+        assert not network.is_open()
+        network.wait(60.0)
+        # It is asked every second whether that has changed.
+        assert 55 <= len(network.datagrams_of("robot")) <= 70
+        network.datagrams = True
+        network.wait(2.0)
+        assert network.is_open()
+
+    def test_what_is_large_goes_there_with_its_answer(self) -> None:
+        network = Network()
+        network.begin()
+        network.ask(1, bytes(MAX_PAYLOAD_BYTES))
+        network.ask(2, bytes(MAX_PAYLOAD_BYTES + 1))
+        assert [sent.datagram for sent in network.sent["robot"] if sent.kind == 1] == [True, False]
+        answers = [sent.datagram for sent in network.sent["service"] if sent.kind == 2]
+        assert answers == [True] * 3 + [False] * 3
+        assert network.parts_of[2] == network.expected(2)
+
+    def test_a_large_part_among_small_ones(self) -> None:
+        network = Network(parts=3)
+        network.answer = bytes(MAX_PAYLOAD_BYTES + 100)
+        network.begin()
+        network.ask(1)
+        assert network.parts_of[1] == network.expected(1)
+        answers = [sent.datagram for sent in network.sent["service"] if sent.kind == 2]
+        assert answers == [False, False, False, True]
+
+    @pytest.mark.parametrize("work_s", [0.0, 2.0])
+    def test_datagrams_stop_getting_through(self, work_s: float) -> None:
+        network = Network(work_s=work_s)
+        network.begin()
+        network.ask(1)
+        network.datagrams = False
+        assert network.ask(2) <= 1.0 + 2 * work_s
+        assert network.parts_of[2] == network.expected(2)
+        assert not network.is_open()
+        assert network.ask(3) == pytest.approx(0.08 + 2 * work_s)
+        network.datagrams = True
+        network.wait(2.0)
+        assert network.is_open()
+        assert network.asked == [bytes(75)] * 3  # none was taken for a new one
+
+    def test_answers_that_are_on_their_way_when_datagrams_stop(self) -> None:
+        network = Network(work_s=0.5, parts=4)
+        network.begin()
+        network.questions.ask(1, bytes(75), network.now)
+        network.wait(0.7)
+        network.datagrams = False
+        network.run(lambda: 1 in network.done_at)
+        assert network.parts_of[1] == network.expected(1)
+
+    def test_silence_is_noticed_though_nothing_is_asked(self) -> None:
+        network = Network()
+        network.begin()
+        network.datagrams = False
+        network.wait(3.0 * KEEP_ALIVE_S)
+        assert not network.is_open()
+
+    def test_a_service_that_ends_sends_there_what_the_robot_may_lack(self) -> None:
+        network = Network()
+        network.begin()
+        network.drop = lambda who, _kind: who == "service"
+        network.questions.ask(1, bytes(75), network.now)
+        network.wait(0.06)
+        network.answers.flush()
+        network.run(lambda: 1 in network.done_at)
+        assert network.parts_of[1] == network.expected(1)
+        assert network.done_at[1] <= 0.3
+
+    def test_what_was_passed_over_because_it_is_too_large(self) -> None:
+        network = Network()
+        network.questions.ask(5, bytes(75), 0.0)
+        assert network.questions.passed_over(1) == [Part(5, None, True)]
+        assert network.questions.passed_over(1) == []
+        assert network.answers.passed_over(1)
+        assert not network.answers.passed_over(1)
+        network.questions.ask(6, bytes(75), 0.0)
+        network.answers.passed_over(2)
+        network.answers.reply(2, b"too large", 0.0, last=True)
+        network.run(lambda: 6 in network.done_at)
+        assert network.parts_of[6] == [Part(6, b"too large", True)]
+
+
+class TestBounds:
+    def test_a_call_that_is_forgotten_is_heard_of_no_more(self) -> None:
+        network = Network(work_s=1.0)
+        network.begin()
+        network.questions.ask(1, bytes(75), network.now)
+        network.wait(0.2)
+        network.questions.forget(1)
+        assert network.ask(2) > 0
+        assert 1 not in network.parts_of
+        before = len(network.sent["robot"])
+        network.wait(4.0)
+        assert len(network.sent["robot"]) == before
+
+    def test_answers_are_kept_until_the_robot_has_them(self) -> None:
+        network = Network()
+        network.begin()
+        for call in range(5 * MAX_ANSWERS):
+            network.ask(call)
+        # All but the last are settled, so a late copy of an old question is no new one.
+        late = b"\1\0" + b"\0\0\0\1" * 2 + b"\0\0" + bytes(75)
+        assert network.answers.received(late, datagram=True) is None
+        assert len(network.asked) == 5 * MAX_ANSWERS
+
+    def test_no_more_answers_are_kept_than_the_bound(self) -> None:
+        answers = Answers(Ways(lambda _: None, lambda _n, _m: None, lambda: 0))
+        for number in range(1, 3 * MAX_ANSWERS):
+            question = b"\1\0" + number.to_bytes(4, "big") + b"\0\0\0\1\0\0x"
+            assert answers.received(question, datagram=True) is not None
+            answers.reply(number, b"answer", 0.0, last=True)
+        assert len(answers._answers) == MAX_ANSWERS
+
+    @given(st.binary(max_size=60), st.booleans())
+    def test_arbitrary_messages_do_no_harm(self, message: bytes, datagram: bool) -> None:
+        network = Network()
+        network.begin()
+        network.questions.ask(1, bytes(75), network.now)
+        network.questions.received(message, network.now, datagram=datagram)
+        network.answers.received(message, datagram=datagram)
+        for kind in range(7):
+            network.questions.received(bytes((kind, 0)) + message, network.now, datagram=datagram)
+            network.answers.received(bytes((kind, 0)) + message, datagram=datagram)
+
+
+class TestRoundTrips:
+    def test_as_in_the_standard(self) -> None:
+        trips = RoundTrips()
+        assert trips.patience_s == 0.2
+        trips.add(0.1)
+        assert trips.patience_s == pytest.approx(0.1 + 4 * 0.05)
+        trips.add(0.1)
+        assert trips.patience_s == pytest.approx(0.1 + 4 * 0.0375)
+        trips.add(0.2)
+        assert trips.smoothed_s == pytest.approx(0.1125)
+        assert trips.patience_s == pytest.approx(0.1125 + 4 * (0.75 * 0.0375 + 0.25 * 0.1))
+
+    def test_the_margin_is_never_less_than_ten_milliseconds_nor_the_sum_more_than_a_second(
+        self,
+    ) -> None:
+        trips = RoundTrips()
+        for _ in range(200):
+            trips.add(0.0002)
+        assert trips.patience_s == pytest.approx(0.0102, abs=1e-6)
+        trips.add(30.0)
+        assert trips.patience_s == 1.0
