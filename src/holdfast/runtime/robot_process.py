@@ -378,8 +378,7 @@ class RobotProcess:
                 before, now = now, monotonic()
                 self._was_deaf(now - before)
         if self._ended:
-            self._on_loop().stop()
-            return
+            return  # the loop was stopped, or closes the links by now
         self._listens_since = now
         self._wake_at = wake_at = self._robot.next_wakeup()
         # One that wakes the loop too early does no harm.
