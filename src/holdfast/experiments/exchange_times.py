@@ -30,9 +30,7 @@ from holdfast.experiments.trial_batches import problem_of
 from holdfast.planning import advance, choose_sensing_action, digest, initial_state, observe
 from holdfast.problems.registry import problem_class, problem_module
 from holdfast.runtime.leash import leash
-from holdfast.runtime.links import OnLoop
 from holdfast.runtime.own_planner import OWN_PLANNER, OwnPlanner
-from holdfast.runtime.transport.zenoh_transport import ZenohRobotTransport
 from holdfast.session.events import Appeared, Ended, Replied, TransportEvent
 from holdfast.session.messages import (
     DIGEST_SIZE,
@@ -52,6 +50,7 @@ from holdfast.settings import ParticleFilterSettings, PlanningSettings, Selector
 from holdfast.source_digest import core_version, problem_digest
 from holdfast.transport.contract import RobotTransport
 from holdfast.transport.endpoints import ServiceAddress
+from holdfast.transport.robot_end import StreamRobotTransport
 
 __all__ = ["COLUMNS", "Exchange", "measure_exchange"]
 
@@ -279,9 +278,8 @@ async def _over_tcp(wanted: Exchange) -> AsyncIterator[tuple[str, RobotTransport
         )
         try:
             _await_ready(child, happened)
-            transport = OnLoop(
-                ZenohRobotTransport({endpoint: ServiceAddress(endpoint)}, lease_ms=_LEASE_MS)
-            )
+            addresses = {endpoint: ServiceAddress(endpoint)}
+            transport = StreamRobotTransport(addresses, lease_ms=_LEASE_MS)
             try:
                 yield endpoint, transport
             finally:

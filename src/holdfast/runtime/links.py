@@ -6,9 +6,8 @@ launched, finds the robot. With none named the planner is in the robot's own pro
 
 from __future__ import annotations
 
-import asyncio
-import contextlib
 import functools
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -19,13 +18,11 @@ from holdfast.configuration import Configuration
 from holdfast.runtime.logs import EventSink
 from holdfast.runtime.own_planner import OWN_PLANNER, OwnPlanner
 from holdfast.runtime.recovery_launcher import RecoveryExited, RecoveryLauncher
-from holdfast.runtime.transport.contract import RobotTransport as ThreadedRobotTransport
-from holdfast.session.events import TransportEvent
 from holdfast.settings import OffloadSettings
 from holdfast.transport.contract import RobotTransport
 from holdfast.user_code import describe_problem_error
 
-__all__ = ["RECOVERY_SERVICE", "Links", "OnLoop", "make_links"]
+__all__ = ["RECOVERY_SERVICE", "Links", "make_links"]
 
 _FOR_EVER_MS = 3_600_000.0  # the largest that the settings allow
 
@@ -92,19 +89,19 @@ def make_links(configuration: Configuration, log_path: Path | None, events: Even
             functools.partial(describe_problem_error, configuration.problem_name),
         )
         return Links(planner, (OWN_PLANNER,), None, None, patient, _nothing)
-    return _zenoh_links(configuration, log_path, events)
+    return _streams(configuration, log_path, events)
 
 
-def _zenoh_links(configuration: Configuration, log_path: Path | None, events: EventSink) -> Links:
+def _streams(configuration: Configuration, log_path: Path | None, events: EventSink) -> Links:
     # Only a robot that has services needs these.
     from holdfast.runtime.credentials import load_credentials
-    from holdfast.runtime.transport.zenoh_transport import ZenohRobotTransport
     from holdfast.transport.endpoints import (
         PrivateSocket,
         ServiceAddress,
         check_credentials,
         parse_endpoint,
     )
+    from holdfast.transport.robot_end import StreamRobotTransport
 
     offload = configuration.offload
     tls = None
@@ -120,7 +117,7 @@ def _zenoh_links(configuration: Configuration, log_path: Path | None, events: Ev
                 "insecure",
                 service=service,
                 reason="whoever is on the way can read along and decide in its place; "
-                "use tls/... or quic/... with --tls",
+                "use tls/... or udp/... with --tls",
             )
     addresses = {service: ServiceAddress(service) for service in offload.services}
     recovery = None
@@ -146,44 +143,19 @@ def _zenoh_links(configuration: Configuration, log_path: Path | None, events: Ev
             return RecoveryLauncher(arguments, deliver, log_path)
 
     try:
-        transport = ZenohRobotTransport(
+        transport = StreamRobotTransport(
             addresses,
+            incarnation=os.urandom(8).hex(),
             lease_ms=offload.lease_ms,
             tls=tls,
-            decision_timeout_ms=offload.decision_timeout_ms,
+            on_refused=lambda service, reason: events.event(
+                "link_refused", service=service, reason=reason
+            ),
         )
     except BaseException:
         close()
         raise
-    return Links(OnLoop(transport), offload.services, recovery, launcher, offload, close)
-
-
-class OnLoop:
-    """A transport that delivers on threads of its own, as one that delivers on the loop."""
-
-    def __init__(self, transport: ThreadedRobotTransport) -> None:
-        self._transport = transport
-        self.call = transport.call
-        self.abandon = transport.abandon
-
-    def start(self, deliver: Callable[[TransportEvent], None]) -> None:
-        """Begin to deliver."""
-        loop = asyncio.get_running_loop()
-        self._transport.start(lambda event: _hand_in(loop, deliver, event))
-
-    async def close(self, timeout_s: float = 1.0) -> None:
-        """Close the transport."""
-        self._transport.close(timeout_s)
-
-
-def _hand_in(
-    loop: asyncio.AbstractEventLoop,
-    deliver: Callable[[TransportEvent], None],
-    event: TransportEvent,
-) -> None:
-    # The loop is closed if it is too late for events.
-    with contextlib.suppress(RuntimeError):
-        loop.call_soon_threadsafe(deliver, event)
+    return Links(transport, offload.services, recovery, launcher, offload, close)
 
 
 def _problem_arguments(configuration: Configuration) -> list[str]:
