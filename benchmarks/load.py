@@ -27,7 +27,7 @@ from benchmarks.processes import usage_of
 from benchmarks.robots import configuration_for
 from benchmarks.turns import Turn, recorded_turns
 from holdfast.runtime.robot_process import opening_of
-from holdfast.runtime.transport.zenoh_transport import ZenohRobotTransport
+from holdfast.transport.robot_end import StreamRobotTransport
 from holdfast.session.events import Appeared, Ended, Replied, TransportEvent, Vanished
 from holdfast.session.messages import (
     PROTOCOL_VERSION,
@@ -162,7 +162,7 @@ class _Link:
 
     def __init__(self, fleet: _Fleet, endpoint: str) -> None:
         self._fleet = fleet
-        self._transport = ZenohRobotTransport({_SERVICE: ServiceAddress(endpoint)})
+        self._transport = StreamRobotTransport({_SERVICE: ServiceAddress(endpoint)})
         self._asked: dict[int, _Robot] = {}
         self._number = 0
         self.appeared = asyncio.Event()

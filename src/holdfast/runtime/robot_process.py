@@ -230,6 +230,7 @@ class RobotProcess:
         self._numbers = iter(range(configuration.simulator.num_trials))
         self._verifying = False
         self._ended = False
+        self._closing = False
         self._interrupted: int | None = None
         problem = configuration.problem
         simulator = configuration.simulator
@@ -312,7 +313,7 @@ class RobotProcess:
             raise TrialError(text) from error
         finally:
             sys.setswitchinterval(before)
-            self._ended = True
+            self._ended = self._closing = True
             if self._performer is not None:
                 self._performer.close()
             loop.run_until_complete(self._transport.close())
@@ -378,7 +379,7 @@ class RobotProcess:
                 before, now = now, monotonic()
                 self._was_deaf(now - before)
         if self._ended:
-            self._on_loop().stop()
+            self._stop_loop()
             return
         self._listens_since = now
         self._wake_at = wake_at = self._robot.next_wakeup()
@@ -415,7 +416,11 @@ class RobotProcess:
 
     def _end(self) -> None:
         self._ended = True
-        self._on_loop().stop()
+        self._stop_loop()
+
+    def _stop_loop(self) -> None:
+        if not self._closing:  # else the loop runs to close the links
+            self._on_loop().stop()
 
     def _loop_failed(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
         """Take an error of what else runs on the loop: nobody would wait for what it owes."""
