@@ -272,12 +272,10 @@ class Intruder:
 
 
 def _calls_in(message: Message) -> Iterator[int]:
-    """Yield the calls that a message makes."""
+    """Yield the calls that a message makes, or begins to make."""
     at = 0
-    if not message.is_whole:
-        return
     data = message.data.removeprefix(MAGIC)
-    while at < len(data):
+    while at + 9 <= len(data):
         if data[at + 4] == CALL:
             yield int.from_bytes(data[at + 5 : at + 9], "little")
         at += 9 + int.from_bytes(data[at : at + 4], "little")

@@ -1,0 +1,178 @@
+"""Bad neighbours of a robot: whatever else may come to a service's port, one kind at a time.
+
+    python -m tests.fuzz.neighbours scanner tcp/127.0.0.1:7447 --seconds 5
+
+It prints a line when it has begun, and how often it did what it does when it ends.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import itertools
+import select
+import socket
+import struct
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import msgspec
+from tests.fuzz import corpus
+from tests.wire import CALL, RawLink, frame_of, hello_of
+
+from holdfast.session.messages import encode
+
+__all__ = ["KINDS", "main"]
+
+_RESET = struct.pack("ii", 1, 0)
+_HTTP = b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n"
+_TLS = b"\x16\x03\x01\x00\xf4\x01\x00\x00\xf0\x03\x03" + bytes(244)
+_OPEN = 200
+
+
+class _Visit:
+    """What a neighbour knows: where to go, with which certificate, and until when."""
+
+    def __init__(self, endpoint: str, keys: Path | None, seconds: float) -> None:
+        self.endpoint = endpoint
+        self.keys = keys
+        self._until = time.monotonic() + seconds
+        self.done = 0
+
+    @property
+    def goes_on(self) -> bool:
+        return time.monotonic() < self._until
+
+    def connect(self) -> socket.socket:
+        """Return a connection on which nothing was said."""
+        protocol, _, place = self.endpoint.partition("/")
+        assert protocol in ("tcp", "tls")
+        host, _, port = place.rpartition(":")
+        return socket.create_connection((host, int(port)), 10.0)
+
+    def pause(self, often_hz: float, began: float) -> None:
+        """Wait until it is time to do it again."""
+        due = began + self.done / often_hz
+        time.sleep(max(0.0, due - time.monotonic()))
+
+
+def _deaf(visit: _Visit) -> None:
+    """Two clients that ask, and never read what they are sent."""
+    request = msgspec.structs.replace(corpus.requests()[1], session=b"never reads it..")
+    numbers = itertools.count(1)
+    links: list[RawLink | None] = [None, None]
+    while visit.goes_on:
+        for place, link in enumerate(links):
+            try:
+                if link is None:
+                    links[place] = link = RawLink(visit.endpoint, visit.keys)
+                    link.say(hello_of(incarnation=f"deaf-{place}"))
+                number = next(numbers)
+                asked = msgspec.structs.replace(request, number=number)
+                # Never more than the service takes: it would be this end that waits.
+                if select.select([], [link.socket], [], 0.001)[1]:
+                    link.say(frame_of(CALL, number, encode(asked)))
+                    visit.done += 1
+            except OSError:
+                links[place] = None
+        time.sleep(0.0005)
+
+
+def _slow(visit: _Visit) -> None:
+    """Connections that say a byte now and then, and never come to an end."""
+    greeting = hello_of()
+    connections: list[tuple[socket.socket, bytearray]] = []
+    while visit.goes_on:
+        while len(connections) < _OPEN:
+            connections.append((visit.connect(), bytearray(greeting)))
+        for each in list(connections):
+            connection, left = each
+            try:
+                connection.sendall(bytes([left.pop(0)]))
+                visit.done += 1
+            except OSError:
+                left.clear()
+            if not left:
+                connections.remove(each)
+                connection.close()
+        time.sleep(0.1)
+
+
+def _scanner(visit: _Visit) -> None:
+    """Connections that are closed, or reset, as soon as they are there: 500 a second."""
+    began = time.monotonic()
+    while visit.goes_on:
+        with visit.connect() as connection:
+            if visit.done % 2:
+                connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET)
+        visit.done += 1
+        visit.pause(500.0, began)
+
+
+def _greetings(visit: _Visit) -> None:
+    """Browsers, and clients of TLS, at a port where neither belongs: 200 a second."""
+    began = time.monotonic()
+    while visit.goes_on:
+        with contextlib.suppress(OSError), visit.connect() as connection:
+            connection.sendall(_HTTP if visit.done % 2 else _TLS)
+            connection.recv(1000)
+        visit.done += 1
+        visit.pause(200.0, began)
+
+
+def _hasty(visit: _Visit) -> None:
+    """2,000 connections, as fast as they come about, closed before their handshake."""
+    while visit.done < 2000:
+        visit.connect().close()
+        visit.done += 1
+
+
+def _trickle(visit: _Visit) -> None:
+    """50 connections a second, closed before their handshake."""
+    began = time.monotonic()
+    while visit.goes_on:
+        visit.connect().close()
+        visit.done += 1
+        visit.pause(50.0, began)
+
+
+def _silent(visit: _Visit) -> None:
+    """2,000 connections that are held, and on which nothing is ever said."""
+    held: list[socket.socket] = []
+    while visit.goes_on:
+        if len(held) == 2000:
+            held.pop(0).close()
+        held.append(visit.connect())
+        visit.done += 1
+        time.sleep(0.0005)
+
+
+KINDS: dict[str, Callable[[_Visit], None]] = {
+    "deaf": _deaf,
+    "slow": _slow,
+    "scanner": _scanner,
+    "greetings": _greetings,
+    "silent": _silent,
+    "hasty": _hasty,
+    "trickle": _trickle,
+}
+
+
+def main() -> None:
+    """Be a bad neighbour for so long."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("kind", choices=KINDS)
+    parser.add_argument("endpoint")
+    parser.add_argument("--tls", type=Path, help="directory of a robot's credentials")
+    parser.add_argument("--seconds", type=float, default=5.0)
+    options = parser.parse_args()
+    corpus.requests()
+    visit = _Visit(options.endpoint, options.tls, options.seconds)
+    print("begins", flush=True)
+    KINDS[options.kind](visit)
+    print(visit.done, flush=True)
+
+
+if __name__ == "__main__":
+    main()
