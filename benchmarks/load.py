@@ -27,7 +27,6 @@ from benchmarks.processes import usage_of
 from benchmarks.robots import configuration_for
 from benchmarks.turns import Turn, recorded_turns
 from holdfast.runtime.robot_process import opening_of
-from holdfast.transport.robot_end import StreamRobotTransport
 from holdfast.session.events import Appeared, Ended, Replied, TransportEvent, Vanished
 from holdfast.session.messages import (
     PROTOCOL_VERSION,
@@ -42,6 +41,7 @@ from holdfast.session.messages import (
     encode,
 )
 from holdfast.transport.endpoints import ServiceAddress
+from holdfast.transport.robot_end import StreamRobotTransport
 
 _SERVICE = "cloud"
 _NUM_TRIALS = 12
