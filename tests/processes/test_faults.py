@@ -173,7 +173,9 @@ class TestCloud:
         robot = story.run(cloud)
         assert robot.statuses() == [LOST, RESTORED]
 
-    @pytest.mark.parametrize("holds_at", [0, 4, 21])
+    @pytest.mark.parametrize(
+        "holds_at", [0, *(pytest.param(n, marks=pytest.mark.slow) for n in (4, 21))]
+    )
     def test_killed_during_a_computation(
         self, holds_at: int, site: Site, references: References
     ) -> None:

@@ -276,9 +276,10 @@ class TestEndedInOrder:
     @pytest.mark.parametrize(
         ("number", "said"),
         [
-            (signal.SIGINT, "Interrupted"),
+            # The others come from a terminal, below.
+            pytest.param(signal.SIGINT, "Interrupted", marks=pytest.mark.slow),
             (signal.SIGTERM, "Ended by SIGTERM"),
-            (signal.SIGHUP, "Ended by SIGHUP"),
+            pytest.param(signal.SIGHUP, "Ended by SIGHUP", marks=pytest.mark.slow),
         ],
     )
     def test_by_a_signal(
