@@ -378,6 +378,8 @@ def _serve(options: argparse.Namespace, supervised: Supervised | None = None) ->
     tls = _credentials(options)
     _checked_endpoints(options, tls)
 
+    _import_asyncio(with_ssl=tls is not None)
+
     from holdfast.runtime.descriptors import NEEDED, allow_descriptors
     from holdfast.transport.service_end import MAX_LINKS, StreamServiceTransport
 
@@ -430,6 +432,17 @@ def _serve(options: argparse.Namespace, supervised: Supervised | None = None) ->
         # the process.
         _end_at_once(status)
     return status
+
+
+def _import_asyncio(*, with_ssl: bool) -> None:
+    """Load asyncio, which loads OpenSSL if it can, and takes a third longer for it."""
+    if with_ssl or "ssl" in sys.modules:
+        return
+    sys.modules["ssl"] = None  # type: ignore[assignment]  # as it is where there is none
+    try:
+        import asyncio  # noqa: F401
+    finally:
+        del sys.modules["ssl"]
 
 
 async def _run(
