@@ -12,7 +12,6 @@ import errno
 import os
 import re
 import select
-import shutil
 import stat
 import time
 from collections.abc import Iterable, Mapping
@@ -206,7 +205,7 @@ def create_directory_atomically(path: Path, files: Mapping[str, NewFile]) -> Non
                 os.fsync(file.fileno())
         temporary.rename(path)
     except BaseException as error:
-        shutil.rmtree(temporary, ignore_errors=True)
+        _remove_tree(temporary)
         if isinstance(error, OSError):
             # A rename onto a directory that has files fails with one of several reasons.
             reason = "it exists already" if path.exists() else error.strerror
@@ -226,14 +225,14 @@ def replace_directory(path: Path, files: Mapping[str, NewFile]) -> None:
     """
     new, old = path.with_name(f".{path.name}.new"), path.with_name(f".{path.name}.old")
     for left in (new, old):
-        shutil.rmtree(left, ignore_errors=True)
+        _remove_tree(left)
     create_directory_atomically(new, files)
     try:
         path.rename(old)
         new.rename(path)
     except OSError as error:
         raise OutputError(f"{path}: cannot be replaced: {error.strerror}") from error
-    shutil.rmtree(old, ignore_errors=True)
+    _remove_tree(old)
 
 
 def claim_directory(out: Path | None, parent: Path, name: str) -> Path:
@@ -269,3 +268,9 @@ def claim_directory(out: Path | None, parent: Path, name: str) -> Path:
     except OSError as error:
         raise OutputError(f"{out or parent}: cannot be made: {error.strerror}") from error
     raise OutputError(f"{parent}: more than {_MAX_DEFAULT_DIRECTORIES} of {name}; give --out")
+
+
+def _remove_tree(directory: Path) -> None:
+    import shutil  # which few processes need, and which takes long to load
+
+    shutil.rmtree(directory, ignore_errors=True)

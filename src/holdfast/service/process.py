@@ -83,8 +83,17 @@ class _Parser(argparse.ArgumentParser):
         raise InvalidValueError(message.removeprefix("argument "))
 
 
+def _formatter(prog: str) -> argparse.HelpFormatter:
+    """Return what writes the help; it is told its width, and so need not load shutil for that."""
+    columns = 80
+    with contextlib.suppress(OSError):
+        columns = os.get_terminal_size().columns
+    return argparse.HelpFormatter(prog, width=columns - 2)
+
+
 def _parser() -> _Parser:
     parser = _Parser(
+        formatter_class=_formatter,
         prog="holdfast serve",
         description="Decide for robots, as a service: many at once, on all cores.",
         allow_abbrev=False,
@@ -378,6 +387,9 @@ def _serve(options: argparse.Namespace, supervised: Supervised | None = None) ->
     tls = _credentials(options)
     _checked_endpoints(options, tls)
 
+    if tls is None:
+        _import_without_openssl()
+
     from holdfast.runtime.descriptors import NEEDED, allow_descriptors
     from holdfast.transport.service_end import MAX_LINKS, StreamServiceTransport
 
@@ -430,6 +442,22 @@ def _serve(options: argparse.Namespace, supervised: Supervised | None = None) ->
         # the process.
         _end_at_once(status)
     return status
+
+
+def _import_without_openssl() -> None:
+    """Load asyncio and hashlib as they are where there is no OpenSSL, which takes long to load.
+
+    Neither needs it here: the links do TLS by themselves, and the digests are Python's own.
+    """
+    hidden = [name for name in ("ssl", "_hashlib") if name not in sys.modules]
+    for name in hidden:
+        sys.modules[name] = None  # type: ignore[assignment]
+    try:
+        import asyncio  # noqa: F401
+        import hashlib  # noqa: F401
+    finally:
+        for name in hidden:
+            del sys.modules[name]
 
 
 async def _run(

@@ -15,9 +15,8 @@ import asyncio
 import contextlib
 import math
 import socket
-import ssl
 import time
-from typing import Final, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
 
 from holdfast.transport.frames import (
     GOODBYE,
@@ -33,7 +32,9 @@ from holdfast.transport.frames import (
     encode_goodbye,
     read_goodbye,
 )
-from holdfast.transport.tls import PeerCertificate, TlsStream
+
+if TYPE_CHECKING:
+    from holdfast.transport.tls import PeerCertificate, TlsStream
 
 __all__ = ["HalfReceived", "Link", "LinkOwner", "LinkSettings"]
 
@@ -360,7 +361,7 @@ class Link(asyncio.BufferedProtocol):
         was_established = tls.established
         try:
             data = tls.receive(data)
-        except ssl.SSLError as error:
+        except OSError as error:  # OpenSSL's: it is not imported here, for it takes long
             assert self._transport is not None
             self._transport.write(tls.take())  # it is told, in an alert
             self.end(_what_is_wrong(error), refused=True)
@@ -454,8 +455,11 @@ class Link(asyncio.BufferedProtocol):
             self.end(f"was silent for {1e3 * self._patience_s:g} ms", abort=True)
 
 
-def _what_is_wrong(error: ssl.SSLError) -> str:
+def _what_is_wrong(error: OSError) -> str:
     """Say what OpenSSL's error means, as the rest of a sentence about the other end."""
+    import ssl
+
+    assert isinstance(error, ssl.SSLError)
     if isinstance(error, ssl.SSLCertVerificationError):
         return f"has a certificate that is refused: {error.verify_message}"
     reason = error.reason or ""

@@ -165,8 +165,10 @@ def listen(endpoint: Endpoint) -> socket.socket:
         family, address = socket.AF_UNIX, endpoint.host
         made = socket.socket(family, socket.SOCK_STREAM)
     else:
+        # As bytes, for the codec of other letters takes long to load.
+        host = endpoint.host.encode() if endpoint.host.isascii() else endpoint.host
         found = socket.getaddrinfo(
-            endpoint.host, endpoint.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+            host, endpoint.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
         )
         family, _, _, _, address = found[0]  # type: ignore[assignment]
         made = socket.socket(family, socket.SOCK_STREAM)

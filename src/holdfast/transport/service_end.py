@@ -10,7 +10,7 @@ import asyncio
 import socket
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from holdfast.errors import TransportError
 from holdfast.transport.calls import too_large
@@ -37,7 +37,11 @@ from holdfast.transport.frames import (
 from holdfast.transport.links import HalfReceived, Link, LinkSettings
 from holdfast.transport.listener import Listener
 from holdfast.transport.revocation import REVOKED_FILE, revoked_serials
-from holdfast.transport.tls import PeerCertificate, TlsStream, server_context
+
+if TYPE_CHECKING:
+    import ssl
+
+    from holdfast.transport.tls import PeerCertificate
 
 __all__ = ["MAX_LINKS", "StreamServiceTransport"]
 
@@ -169,7 +173,7 @@ class StreamServiceTransport:
         self._listening: Sequence[socket.socket | None] = listening or [None] * len(listen)
         self._boot = boot
         self._tls = tls
-        self._context = None if tls is None else server_context(tls, boot)
+        self._context = None if tls is None else self._make_context(tls)
         # Of the last list; a handshake looks into the one that was there when it began.
         self._revoked: frozenset[int] = frozenset()
         self._settings = LinkSettings(
@@ -277,7 +281,7 @@ class StreamServiceTransport:
         """
         if self._tls is None:
             return 0
-        context = server_context(self._tls, self._boot)
+        context = self._make_context(self._tls)
         self._revoked = revoked_serials(self._tls.authority.with_name(REVOKED_FILE))
         self._context = context
         return self.end_links(self._is_revoked, _REVOKED)
@@ -287,9 +291,17 @@ class StreamServiceTransport:
 
     # -- links -----------------------------------------------------------------------------------
 
+    def _make_context(self, tls: TlsFiles) -> ssl.SSLContext:
+        # OpenSSL takes long to load, which counts in the time that a service takes to be ready.
+        from holdfast.transport.tls import server_context
+
+        return server_context(tls, self._boot)
+
     def _make_link(self, endpoint: Endpoint, *, dialled: bool) -> Link:
         tls = None
         if endpoint.is_encrypted:
+            from holdfast.transport.tls import TlsStream
+
             assert self._context is not None
             tls = TlsStream(self._context)
         link = Link(self, self._settings, speaks_first=dialled and tls is None, tls=tls)
