@@ -159,7 +159,7 @@ class OffloadSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
     Attributes
     ----------
     services : tuple of str
-        Endpoints of the services in order of preference, in Zenoh's form (``tcp/10.0.0.7:7447``);
+        Endpoints of the services in order of preference (``tcp/10.0.0.7:7447``);
         at most 16, each once. None: the planner runs in the robot's own process.
     detection_timeout_ms : float
         A service from which a decision is awaited and that shows no sign of progress for this long

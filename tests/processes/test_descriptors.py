@@ -17,7 +17,7 @@ from tests.processes.faults import (
 )
 
 from holdfast.runtime.descriptors import NEEDED
-from holdfast.runtime.transport.zenoh_transport import MAX_ROBOTS
+from holdfast.transport.service_end import MAX_LINKS
 
 PEG = "peg_in_hole_2d"
 
@@ -63,7 +63,7 @@ def test_a_service_takes_what_it_is_allowed(site: Site, references: References) 
     cloud = site.service()
     cloud.command = limited("-S -n 12", *cloud.command)
     cloud.start()
-    wanted = NEEDED + MAX_ROBOTS
+    wanted = NEEDED + MAX_LINKS
     soft = wanted if hard == resource.RLIM_INFINITY else min(wanted, hard)
     assert resource.prlimit(cloud.process.pid, resource.RLIMIT_NOFILE) == (soft, hard)
     robot = Story(site, references, document_of(PEG)).run(cloud)

@@ -1,16 +1,18 @@
-"""A service that comes and goes a thousand times a second cannot fill a robot's log."""
+"""A service that comes and goes many times a second cannot fill a robot's log."""
 
 from __future__ import annotations
 
 import collections
+import contextlib
 import datetime as dt
-import json
+import socket
+import threading
 
-import zenoh
 from tests.ports import free_port
 from tests.processes.faults import (
     LOCAL_RECOVERY,
     LOST,
+    PATIENCE_S,
     QUICK,
     References,
     Site,
@@ -19,38 +21,59 @@ from tests.processes.faults import (
     events_of,
 )
 
-from holdfast.runtime.transport.zenoh_transport import KEY_VERSION
 from holdfast.session.messages import sealed
+from holdfast.transport.frames import CALL, LAST, FrameDecoder, encode_frame, encode_hello
 
-FLAPS = 3000
+FLAPS = 300
 BURST = 20
 
 
 class HostileService:
-    """Answers everything with rubbish, and says again and again that it is there and gone."""
+    """Answers everything with rubbish, and lets links end as soon as they are there."""
 
     def __init__(self, endpoint: str) -> None:
-        settings = {
-            "mode": "peer",
-            "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
-            "listen": {"endpoints": [endpoint]},
-        }
-        self.session = zenoh.open(zenoh.Config.from_json5(json.dumps(settings)))
-        self._prefix = f"holdfast/{KEY_VERSION}/cloud"
-        self._queryable = self.session.declare_queryable(
-            f"{self._prefix}/*/decide", zenoh.handlers.Callback(self._answer, indirect=False)
-        )
-        # While one stays, the robot keeps the link.
-        self._stays = self.session.liveliness().declare_token(f"{self._prefix}/stays/alive")
+        host, _, port = endpoint.removeprefix("tcp/").rpartition(":")
+        self._listener = socket.create_server((host, int(port)))
+        self._links = 0
+        self._flaps = threading.Event()
+        self._link: socket.socket | None = None
+        self._changed = threading.Condition()
+        threading.Thread(target=self._accept, daemon=True).start()
 
-    def _answer(self, query: zenoh.Query) -> None:
-        with query:
-            query.reply(query.key_expr, sealed(b"rubbish"))
+    def _accept(self) -> None:
+        with contextlib.suppress(OSError):
+            while True:
+                link, _ = self._listener.accept()
+                with self._changed:
+                    self._links += 1
+                    self._link = link
+                    self._changed.notify_all()
+                link.sendall(encode_hello("service", "cloud", f"b{self._links % 50}", 60_000.0))
+                if self._flaps.is_set():
+                    link.close()
+                else:
+                    threading.Thread(target=self._answer, args=(link,), daemon=True).start()
+
+    def _answer(self, link: socket.socket) -> None:
+        decoder = FrameDecoder(1 << 26)
+        with link, contextlib.suppress(OSError):
+            while data := link.recv(65536):
+                for frame in decoder.feed(data):
+                    if frame.kind == CALL:
+                        link.sendall(encode_frame(LAST, frame.call, sealed(b"rubbish")))
 
     def flap(self) -> None:
-        for number in range(FLAPS):
-            boot = f"{self._prefix}/b{number % 50}"
-            self.session.liveliness().declare_token(f"{boot}/alive").undeclare()
+        """End the link, and as many that the robot opens after it."""
+        with self._changed:
+            assert self._link is not None
+            self._flaps.set()
+            enough = self._links + FLAPS
+            self._link.shutdown(socket.SHUT_RDWR)
+            assert self._changed.wait_for(lambda: self._links >= enough, PATIENCE_S)
+            self._flaps.clear()
+
+    def close(self) -> None:
+        self._listener.close()
 
 
 def test_it_cannot_fill_the_log(site: Site, references: References) -> None:
@@ -61,7 +84,7 @@ def test_it_cannot_fill_the_log(site: Site, references: References) -> None:
         story.at("perform", 20, story.status(LOCAL_RECOVERY), service.flap)
         robot = story.run(endpoint)
     finally:
-        service.session.close()
+        service.close()
     assert robot.statuses() == [LOST]
     told: dict[str, list[float]] = collections.defaultdict(list)
     omitted: collections.Counter[str] = collections.Counter()

@@ -22,15 +22,13 @@ from tests.ports import free_port
 from holdfast.configuration import load
 from holdfast.runtime.links import make_links
 from holdfast.runtime.logs import NullEventLog
+from holdfast.transport.frames import FrameDecoder, decode_hello
 
 ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "examples" / "peg_in_hole_2d.yaml"
 PATIENCE_S = 60.0
 SERVICE_MS = 31_500
 ROBOT_MS = 47_250
-
-OPEN, ID_BITS, IN_SECONDS = 0x02, 0x1F, 0x40
-"""Of Zenoh's transport messages: the kind that says the lease, where kinds stand, and a flag."""
 
 
 class Relay:
@@ -83,20 +81,11 @@ class Relay:
                     each.shutdown(socket.SHUT_RDWR)
 
 
-def announced_ms(said: list[bytearray]) -> int:
-    """Return the lease in the message that opens a link; each one comes after its length."""
+def announced_ms(said: list[bytearray]) -> float:
+    """Return the lease in the first frame of a link."""
     for each in said:
-        left = bytes(each)
-        while left:
-            size = int.from_bytes(left[:2], "little")
-            message, left = left[2 : 2 + size], left[2 + size :]
-            if message and message[0] & ID_BITS == OPEN:
-                number = 0
-                for position, byte in enumerate(message[1:]):
-                    number |= (byte & 0x7F) << 7 * position
-                    if byte < 0x80:
-                        break
-                return number * (1000 if message[0] & IN_SECONDS else 1)
+        for frame in FrameDecoder(1 << 20).feed(bytes(each))[:1]:
+            return decode_hello(frame.payload).lease_ms
     raise AssertionError("no link was opened")
 
 

@@ -56,7 +56,7 @@ import holdfast.cli
 try:
     holdfast.cli.main()
 finally:
-    print(sorted({"numpy", "msgspec", "yaml", "sqlite3", "zenoh"} & sys.modules.keys()))
+    print(sorted({"numpy", "msgspec", "yaml", "sqlite3", "asyncio", "ssl"} & sys.modules.keys()))
 """
     assert python(program, "--help").stdout.endswith("\n[]\n")
 
@@ -65,44 +65,6 @@ def test_errors_are_one_message_and_exit_code_2() -> None:
     done = python("import holdfast.cli; holdfast.cli.main()", "run", "missing.yaml")
     assert done.returncode == 2
     assert done.stderr == "holdfast: error: missing.yaml: there is no such file\n"
-
-
-@pytest.mark.parametrize(
-    ("ending", "status", "last_words"),
-    [
-        ("return 7", 7, ""),
-        ("sys.exit()", 0, ""),
-        ("raise HoldfastError('no')", 2, "holdfast: error: no\n"),
-        ("raise KeyboardInterrupt", 130, ""),
-        ("raise ValueError('no')", 1, "ValueError: no\n"),
-    ],
-)
-def test_a_thread_that_is_held_up_does_not_change_how_a_command_ends(
-    ending: str, status: int, last_words: str
-) -> None:
-    program = f"""
-import sys, threading, time, types
-from holdfast.errors import HoldfastError
-from holdfast.runtime import last_threads
-
-last_threads._EXIT_TIMEOUT_WITH_STATUS_S = 0.1
-
-def main(arguments):
-    held_up = threading.Thread(target=time.sleep, args=[1e6], daemon=True)
-    held_up.start()
-    last_threads.join_until([held_up], 0.0)
-    print("told", end="")
-    {ending}
-
-module = types.ModuleType("holdfast.service.process")
-module.main = main
-sys.modules[module.__name__] = module
-import holdfast.cli
-holdfast.cli.main()
-"""
-    done = python(program, "serve")
-    assert (done.returncode, done.stdout) == (status, "told")
-    assert done.stderr.endswith(last_words)
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])

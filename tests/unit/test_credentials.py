@@ -1,4 +1,4 @@
-"""Credentials: what is made, what is found wrong with them, and what Zenoh makes of them.
+"""Credentials: what is made, what is found wrong with them, and what links make of them.
 
 The refusals are tested on real links, because what a TLS library checks is its own affair: whom it
 lets in decides, not what the certificates say.
@@ -6,7 +6,7 @@ lets in decides, not what the certificates say.
 
 from __future__ import annotations
 
-import json
+import asyncio
 import os
 import shutil
 import signal
@@ -14,20 +14,15 @@ import socket
 import subprocess
 import sys
 import textwrap
-import threading
 import time
-from collections.abc import Callable, Iterator
 from datetime import UTC, datetime, timedelta
 from ipaddress import ip_address
 from pathlib import Path
-from typing import Any, NamedTuple
 
 import pytest
-import zenoh
 from cryptography import x509
 from cryptography.hazmat.primitives import serialization
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
-from tests.ports import free_port
 
 from holdfast.files import NewFile, OutputError, create_directory_atomically
 from holdfast.runtime.credentials import (
@@ -37,7 +32,14 @@ from holdfast.runtime.credentials import (
     load_credentials,
     make_credentials,
 )
+from holdfast.session.events import Appeared, Ended, Replied
+from holdfast.transport.contract import IncomingCall
+from holdfast.transport.endpoints import ServiceAddress, TlsFiles
+from holdfast.transport.robot_end import StreamRobotTransport
+from holdfast.transport.service_end import StreamServiceTransport
 
+PATIENCE_S = 60.0
+LEASE_MS = 30_000.0
 NOW = datetime.now(UTC)
 DAY = timedelta(days=1)
 FILES = {"authority.pem", "certificate.pem", "key.pem"}
@@ -479,180 +481,110 @@ class TestLoading:
         done = subprocess.run(
             [sys.executable, "-c", program], capture_output=True, text=True, check=True
         )
-        assert not set(done.stdout.split()) & {"cryptography", "numpy", "zenoh", "typer", "rich"}
+        assert not set(done.stdout.split()) & {"cryptography", "numpy", "asyncio", "typer", "rich"}
 
 
-class End(NamedTuple):
-    """A Zenoh session, and who it is."""
+class Ends:
+    """Robots' and services' ends with credentials of all kinds, closed after the test."""
 
-    session: Any
-    identity: str
+    def __init__(self, keys: Path) -> None:
+        self._keys = keys
+        self._ends: list[StreamRobotTransport | StreamServiceTransport] = []
 
-    def peers(self) -> set[str]:
-        return {str(identity) for identity in self.session.info.peers_zid()}
+    def files(self, name: str) -> TlsFiles:
+        directory = self._keys / name
+        return TlsFiles(
+            directory / "authority.pem", directory / "certificate.pem", directory / "key.pem"
+        )
+
+    async def service(self, name: str, host: str = "127.0.0.1") -> str:
+        """Start a service that answers with the question backwards; return its endpoint."""
+        service = StreamServiceTransport(
+            "cloud", boot="b1", listen=[f"tls/{host}:0"], lease_ms=LEASE_MS, tls=self.files(name)
+        )
+        self._ends.append(service)
+
+        def answer(call: IncomingCall) -> None:
+            call.reply(f"{call.robot}: ".encode() + call.payload[::-1])
+            call.end()
+
+        await service.start(answer)
+        return service.endpoints[0]
+
+    async def ask(self, name: str, endpoint: str) -> list[object]:
+        """Connect as a robot and ask; return the replies, or why it is refused."""
+        said: asyncio.Queue[object] = asyncio.Queue()
+        robot = StreamRobotTransport(
+            {"cloud": ServiceAddress(endpoint)},
+            lease_ms=LEASE_MS,
+            tls=self.files(name),
+            on_refused=lambda _, reason: said.put_nowait(reason),
+        )
+        self._ends.append(robot)
+        robot.start(said.put_nowait)
+        first = await asyncio.wait_for(said.get(), PATIENCE_S)
+        if not isinstance(first, Appeared):
+            return [first]
+        robot.call("cloud", 1, b"abc")
+        return [await asyncio.wait_for(said.get(), PATIENCE_S) for _ in range(2)]
+
+    async def close_on_loop(self) -> None:
+        for end in self._ends:
+            await end.close()
 
 
 @pytest.fixture
-def open_end() -> Iterator[Callable[..., End]]:
-    """Open sessions much as the transport does, and close them afterwards."""
-    opened: list[Any] = []
-
-    def open_one(
-        directory: Path | None, *, listen: str | None = None, connect: tuple[str, ...] = ()
-    ) -> End:
-        tls: dict[str, object] = {}
-        if directory is not None:
-            side = "connect" if listen is None else "listen"
-            tls = {
-                "root_ca_certificate": str(directory / "authority.pem"),
-                "enable_mtls": True,
-                f"{side}_certificate": str(directory / "certificate.pem"),
-                f"{side}_private_key": str(directory / "key.pem"),
-            }
-        settings = {
-            "mode": "peer",
-            "scouting/multicast/enabled": False,
-            "scouting/gossip/enabled": False,
-            "listen/endpoints": [] if listen is None else [listen],
-            "connect/endpoints": list(connect),
-            "connect/timeout_ms": -1,
-            "connect/exit_on_failure": False,
-            "connect/retry": {
-                "period_init_ms": 50,
-                "period_max_ms": 100,
-                "period_increase_factor": 2,
-            },
-            "open/return_conditions/connect_scouted": False,
-            "transport/unicast/open_timeout": 1000,
-            # Long, for a machine that stands still for a moment: the handshakes are what is tested.
-            "transport/link/tx/lease": 10_000,
-            "transport/shared_memory/enabled": False,
-            "transport/link/tls": tls,
-        }
-        configuration = zenoh.Config()
-        for key, value in settings.items():
-            configuration.insert_json5(key, json.dumps(value))
-        session = zenoh.open(configuration)
-        opened.append(session)
-        return End(session, str(session.info.zid()))
-
-    yield open_one
-    # All at once, and for a bounded time: over QUIC a close can wait for an end that is gone.
-    closers = [threading.Thread(target=session.close, daemon=True) for session in opened]
-    for closer in closers:
-        closer.start()
-    for closer in closers:
-        closer.join(2.0)
+def ends(keys: Path) -> Ends:
+    return Ends(keys)
 
 
-def free_endpoint(protocol: str, host: str = "127.0.0.1") -> str:
-    return f"{protocol}/{host}:{free_port()}"
-
-
-def wait_until(condition: Callable[[], bool], timeout_s: float = 30.0) -> None:
-    """Wait for what Zenoh tells nobody of."""
-    deadline = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < deadline, "it did not come true in time"
-        time.sleep(0.01)
-
-
-REFUSAL_S = 0.6
-"""How long those that must be refused have tried in vain: about eight attempts each."""
-
-
-@pytest.mark.parametrize("protocol", ["tls", "quic"])
 class TestOnRealLinks:
     @pytest.mark.parametrize("host", ["127.0.0.1", "localhost"])
-    def test_a_robot_and_a_service_talk(
-        self, keys: Path, open_end: Callable[..., End], protocol: str, host: str
+    async def test_a_robot_and_a_service_talk(self, ends: Ends, host: str) -> None:
+        endpoint = await ends.service("service", host)
+        assert await ends.ask("robot", endpoint) == [Replied(1, b"robot: cba"), Ended(1)]
+
+    @pytest.mark.parametrize(
+        ("name", "reason"),
+        [
+            ("foreign_robot", "unknown ca"),
+            ("expired_robot", "certificate expired"),
+            ("future_robot", "bad certificate"),
+            ("service", "unsupported certificate"),
+        ],
+    )
+    async def test_a_service_lets_nobody_in_who_is_no_robot_of_its_authority(
+        self, ends: Ends, name: str, reason: str
     ) -> None:
-        endpoint = free_endpoint(protocol, host)
-        service = open_end(keys / "service", listen=endpoint)
+        endpoint = await ends.service("service")
+        (refusal,) = await ends.ask(name, endpoint)
+        assert isinstance(refusal, str)
+        assert reason in refusal
+        assert await ends.ask("robot", endpoint) == [Replied(1, b"robot: cba"), Ended(1)]
 
-        def answer(query: zenoh.Query) -> None:
-            with query:
-                query.reply("holdfast/test", bytes(query.payload or b"")[::-1])
-
-        service.session.declare_queryable("holdfast/test", answer)
-        robot = open_end(keys / "robot", connect=(endpoint,))
-        wait_until(lambda: robot.peers() == {service.identity})
-
-        def ask() -> list[bytes]:
-            replies = robot.session.get("holdfast/test", payload=b"abc", timeout=10.0)
-            return [bytes(reply.ok.payload) for reply in replies if reply.ok is not None]
-
-        # The link is there a moment before the declaration is known.
-        wait_until(lambda: ask() == [b"cba"])
-
-    def test_a_service_lets_nobody_in_who_is_no_robot_of_its_authority(
-        self, keys: Path, open_end: Callable[..., End], protocol: str
+    @pytest.mark.parametrize(
+        ("name", "reason"),
+        [
+            ("robot", "unsuitable certificate purpose"),
+            ("foreign_service", "unable to get local issuer certificate"),
+            ("expired_service", "certificate has expired"),
+            ("future_service", "certificate is not yet valid"),
+        ],
+    )
+    async def test_a_robot_believes_nobody_who_is_no_service_of_its_authority(
+        self, ends: Ends, name: str, reason: str
     ) -> None:
-        endpoint = free_endpoint(protocol)
-        service = open_end(keys / "service", listen=endpoint)
-        service.session.liveliness().declare_token("holdfast/test/alive")
-        # Without a certificate, but with the authority's, which is no secret.
-        without = zenoh.Config()
-        for key, value in {
-            "mode": "peer",
-            "scouting/multicast/enabled": False,
-            "connect/endpoints": [endpoint],
-            "connect/timeout_ms": -1,
-            "connect/exit_on_failure": False,
-            "connect/retry": {"period_init_ms": 50, "period_max_ms": 100},
-            "transport/link/tls": {"root_ca_certificate": str(keys / "robot" / "authority.pem")},
-        }.items():
-            without.insert_json5(key, json.dumps(value))
-        with zenoh.open(without) as anonymous:
-            intruders = [
-                open_end(keys / name, connect=(endpoint,))
-                for name in ("foreign_robot", "expired_robot", "future_robot", "service")
-            ]
-            intruders.append(End(anonymous, str(anonymous.info.zid())))
-            seen: list[str] = []
-            subscribers = [
-                intruder.session.liveliness().declare_subscriber(
-                    "**", lambda sample: seen.append(str(sample.key_expr)), history=True
-                )
-                for intruder in intruders
-            ]
-            robot = open_end(keys / "robot", connect=(endpoint,))
-            wait_until(lambda: robot.peers() == {service.identity})
-            time.sleep(REFUSAL_S)
-            assert service.peers() == {robot.identity}
-            assert [intruder.peers() for intruder in intruders] == [set()] * 5
-            assert seen == []
-            del subscribers
+        refusal = f"has a certificate that is refused: {reason}"
+        assert await ends.ask("robot", await ends.service(name)) == [refusal]
 
-    def test_a_robot_believes_nobody_who_is_no_service_of_its_authority(
-        self, keys: Path, open_end: Callable[..., End], protocol: str
-    ) -> None:
-        pretenders = {
-            name: free_endpoint(protocol)
-            for name in ("robot", "foreign_service", "expired_service", "future_service")
-        }
-        for name, endpoint in pretenders.items():
-            open_end(keys / name, listen=endpoint)
-        endpoint = free_endpoint(protocol)
-        service = open_end(keys / "service", listen=endpoint)
-        robot = open_end(keys / "robot", connect=(*pretenders.values(), endpoint))
-        wait_until(lambda: service.identity in robot.peers())
-        time.sleep(REFUSAL_S)
-        assert robot.peers() == {service.identity}
-
-    def test_a_robot_believes_a_service_only_at_its_own_hosts(
-        self, keys: Path, open_end: Callable[..., End], protocol: str
-    ) -> None:
+    async def test_a_robot_believes_a_service_only_at_its_own_hosts(self, ends: Ends) -> None:
         # Everything in 127/8 is this machine, but the certificate is for 127.0.0.1 alone.
-        right = free_endpoint(protocol)
-        wrong = right.replace("127.0.0.1", "127.0.0.2")
-        service = open_end(keys / "service", listen=right.replace("127.0.0.1", "0.0.0.0"))
-        astray = open_end(keys / "robot", connect=(wrong,))
-        robot = open_end(keys / "robot", connect=(right,))
-        wait_until(lambda: robot.peers() == {service.identity})
-        time.sleep(REFUSAL_S)
-        assert astray.peers() == set()
-        assert service.peers() == {robot.identity}
+        endpoint = await ends.service("service", "0.0.0.0")
+        (refusal,) = await ends.ask("robot", endpoint.replace("0.0.0.0", "127.0.0.2"))
+        assert isinstance(refusal, str)
+        assert "IP address mismatch" in refusal
+        right = await ends.ask("robot", endpoint.replace("0.0.0.0", "127.0.0.1"))
+        assert right == [Replied(1, b"robot: cba"), Ended(1)]
 
 
 class TestCommand:

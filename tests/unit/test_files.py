@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from holdfast import files
-from holdfast.cli import _main
+from holdfast.cli import main
 from holdfast.files import read_bounded
 
 
@@ -83,7 +83,7 @@ def test_what_is_no_file_is_refused(
             os.mkfifo(path)
         monkeypatch.setattr(sys, "argv", ["holdfast", *command, str(path)])
         with pytest.raises(SystemExit) as ended:
-            _main()
+            main()
     assert ended.value.code == 2
     said = capsys.readouterr().err
     assert said.startswith("holdfast: error: named: ")
@@ -101,7 +101,7 @@ def test_a_pipe_is_no_journal(
         pipe = str(tmp_path / "pipe")
         monkeypatch.setattr(sys, "argv", ["holdfast", "compare", pipe, pipe])
         with pytest.raises(SystemExit) as ended:
-            _main()
+            main()
         assert ended.value.code == 2
         assert "is a pipe or device, not a journal" in capsys.readouterr().err
     finally:

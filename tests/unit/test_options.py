@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import typer
 
-from holdfast.cli import _main
+from holdfast.cli import main
 from holdfast.cli.application import app
 from holdfast.cli.keys import keys
 from holdfast.runtime import credentials
@@ -63,7 +63,7 @@ def last_words(
     """Run a command that is to be refused, and return the one line that it says."""
     monkeypatch.setattr(sys, "argv", ["holdfast", *arguments])
     with pytest.raises(SystemExit) as ended:
-        _main()
+        main()
     assert ended.value.code == 2
     said = capsys.readouterr()
     assert said.out == ""
@@ -135,7 +135,7 @@ def test_without_arguments_there_is_help(
 ) -> None:
     monkeypatch.setattr(sys, "argv", ["holdfast", *arguments])
     with pytest.raises(SystemExit) as ended:
-        _main()
+        main()
     said = capsys.readouterr()
     assert ended.value.code in (0, 2)
     assert (said.out + said.err).startswith("Usage: holdfast")

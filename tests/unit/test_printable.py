@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from msgspec import structs
 
-from holdfast.cli import _main, _tell_defect
+from holdfast.cli import _tell_defect, main
 from holdfast.cli.terminal import PlainProgress, print_summary
 from holdfast.printable import printable
 from holdfast.recording.tables import SummaryBuilder
@@ -69,7 +69,7 @@ def said(
     def run(*arguments: str) -> str:
         monkeypatch.setattr(sys, "argv", ["holdfast", *arguments])
         with pytest.raises(SystemExit) as ended:
-            _main()
+            main()
         assert ended.value.code == 2
         shown = capsys.readouterr()
         return shown.out + shown.err

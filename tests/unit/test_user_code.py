@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from holdfast import planning
-from holdfast.cli import _main
+from holdfast.cli import main
 from holdfast.configuration import load
 from holdfast.runtime.trials import run_trials
 from holdfast.user_code import is_users_file
@@ -141,7 +141,7 @@ class TestWhateverItRaises:
     ) -> str:
         monkeypatch.setattr(sys, "argv", ["holdfast", *arguments])
         with pytest.raises(SystemExit) as ended:
-            _main()
+            main()
         said = capsys.readouterr().err
         assert ended.value.code == 2, said
         assert "Traceback" not in said

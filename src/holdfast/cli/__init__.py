@@ -22,22 +22,6 @@ __all__ = ["main"]
 
 def main() -> None:
     """Run the command line and exit."""
-    # Also where it ends with a defect's traceback, which the interpreter prints before it exits.
-    status = 1
-    try:
-        _main()
-        status = 0
-    except SystemExit as ending:
-        if ending.code is None or isinstance(ending.code, int):
-            status = ending.code or 0
-        raise
-    finally:
-        from holdfast.runtime.last_threads import end_with
-
-        end_with(status)
-
-
-def _main() -> None:
     from holdfast.cli.streams import (
         end_with_the_reader,
         forgive_unwritable_errors,

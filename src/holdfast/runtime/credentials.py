@@ -482,7 +482,7 @@ def _rehearse(authority: Path, certificate: Path, key: Path, role: Role) -> floa
     ours = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER if serving else ssl.PROTOCOL_TLS_CLIENT)
     theirs = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT if serving else ssl.PROTOCOL_TLS_SERVER)
     for context in (ours, theirs):
-        context.minimum_version = ssl.TLSVersion.TLSv1_3  # as Zenoh's
+        context.minimum_version = ssl.TLSVersion.TLSv1_3
         context.check_hostname = False
     ours.verify_mode = ssl.CERT_NONE
     theirs.verify_mode = ssl.CERT_REQUIRED

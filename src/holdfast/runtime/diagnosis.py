@@ -10,7 +10,6 @@ and nothing is decided by what it finds.
 from __future__ import annotations
 
 import contextlib
-import re
 import socket
 import threading
 from collections.abc import Mapping, Sequence
@@ -49,7 +48,6 @@ def why_unreachable(endpoint: str, tls_files: TlsFiles | None, timeout_s: float)
     Parameters
     ----------
     endpoint : str
-        In Zenoh's form.
     tls_files : TlsFiles or None
         The robot's credentials.
     timeout_s : float
@@ -69,16 +67,13 @@ def why_unreachable(endpoint: str, tls_files: TlsFiles | None, timeout_s: float)
         if place.is_local_socket:
             return _connect_local(place, timeout_s)
         try:
-            kind = socket.SOCK_DGRAM if place.protocol == "quic" else socket.SOCK_STREAM
-            socket.getaddrinfo(place.host, place.port, type=kind)
+            socket.getaddrinfo(place.host, place.port, type=socket.SOCK_STREAM)
         except (socket.gaierror, UnicodeError):
             return f"host name not found: {place.host}"
         if place.is_encrypted and tls_files is not None:
             wrong = _own_credentials(tls_files)
             if wrong is not None:
                 return wrong
-        if place.protocol == "quic":
-            return _connect_quic(place, tls_files, timeout_s)
         with socket.create_connection((place.host, place.port), timeout_s) as plain:
             if not place.is_encrypted:
                 return None
@@ -186,29 +181,6 @@ def _connect_local(place: Endpoint, timeout_s: float) -> str | None:
     return None
 
 
-def _connect_quic(place: Endpoint, files: TlsFiles | None, timeout_s: float) -> str | None:
-    """Let Zenoh connect: nothing else here speaks QUIC. Its error has the words of its library."""
-    from holdfast.runtime.transport.zenoh_transport import connection_error
-
-    error = connection_error(place, files, timeout_s)
-    if error is None:
-        return None
-    # As with TLS, that comes after the robot's part of the handshake; not always with the reason.
-    if any(words in error for words in ("by peer", "connection lost", "Connection closed")):
-        return "refuses this robot's certificate (is it of the same authority?)"
-    if "UnknownIssuer" in error:
-        return _BY_ANOTHER_AUTHORITY
-    if "not valid for name" in error:
-        names = re.findall(r"(?:DnsName|IpAddress)\(\"?([^)\"]*)\"?\)", error)
-        return _names_another(place, names)
-    found = re.search(r"invalid peer certificate: (.*?)(?: at /|$)", error)
-    if found is not None:
-        return f"the certificate is refused: {found[1]}"
-    if "deadline" in error or "timed out" in error:
-        return "nothing answers over QUIC"
-    return f"cannot be connected to: {error.partition(' at /')[0]}"
-
-
 def _own_credentials(files: TlsFiles) -> str | None:
     """Look at the robot's credentials once more: a certificate may have expired during the run."""
     from holdfast.runtime.credentials import CredentialsError, load_credentials
@@ -231,7 +203,7 @@ def _shake_hands(
     import ssl
 
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
-    context.minimum_version = ssl.TLSVersion.TLSv1_3  # as Zenoh's
+    context.minimum_version = ssl.TLSVersion.TLSv1_3
     if files is not None:
         context.load_verify_locations(cafile=files.authority)
         context.load_cert_chain(files.certificate, files.key, password="")

@@ -2,5 +2,5 @@
 
 Nothing in here reads a clock, opens a socket, starts a thread or sleeps. Each machine takes an
 event and the time and returns effects in the order in which they must be carried out. So the same
-code runs over Zenoh, inside one process, and in the fault simulator.
+code runs over sockets, inside one process, and in the fault simulator.
 """
