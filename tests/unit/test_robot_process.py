@@ -177,7 +177,7 @@ def scripted(robots: Robots, begin: Callable[[], object]) -> tuple[RobotProcess,
     robot, machine = robots.make(), Machine()
     robot._transport = NoWire()
     robot._robot = machine  # type: ignore[assignment]
-    robot._begin_next = begin  # type: ignore[method-assign]
+    robot._begin_next = begin  # type: ignore[method-assign, assignment]
     return robot, machine
 
 
