@@ -236,6 +236,7 @@ def run_robot(
             lambda _: None,
             rate_hz,
             links.offload,
+            make_planner=links.make_planner,
         )
         launcher = None if links.launcher is None else links.launcher(robot.deliver)
         with contextlib.suppress(_EnoughError):

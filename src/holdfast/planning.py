@@ -371,12 +371,7 @@ def plan_until_sensing(
     ProblemError
         If a function of the problem breaks its contract.
     """
-    actions: list[FloatArray] = []
-    while len(actions) < max_actions and not needs_sensing(settings, state):
-        action, _ = choose_task_action(problem, settings, state)
-        state = advance(problem, settings, state, action)
-        actions.append(action)
-    return actions, state
+    return Planner(problem, settings).plan_until_sensing(state, max_actions)
 
 
 class Planner:
@@ -417,9 +412,20 @@ class Planner:
         """Choose the next task action."""
         return choose_task_action(self.problem, self.settings, state)[0]
 
+    def plan_until_sensing(
+        self, state: PlanningState, max_actions: int
+    ) -> tuple[list[FloatArray], PlanningState]:
+        """Choose the task actions up to the next sensing step; see :func:`plan_until_sensing`."""
+        actions: list[FloatArray] = []
+        while len(actions) < max_actions and not self.needs_sensing(state):
+            action = self.choose_task_action(state)
+            state = self.advance(state, action)
+            actions.append(action)
+        return actions, state
+
     def decide(self, state: PlanningState, max_actions: int) -> Decision:
         """Decide all that can be decided before something is sensed again."""
-        actions, ahead = plan_until_sensing(self.problem, self.settings, state, max_actions)
+        actions, ahead = self.plan_until_sensing(state, max_actions)
         if not needs_sensing(self.settings, ahead):
             return Decision(tuple(actions), None, ahead)
         return Decision(

@@ -147,6 +147,7 @@ def run_as_robot(
             rate_hz,
             links.offload,
             distrusted,
+            make_planner=links.make_planner,
         )
         launcher = None if links.launcher is None else links.launcher(robot.deliver)
         robot.run(directory.journal.finished(), launcher)

@@ -15,10 +15,13 @@ from typing import NamedTuple
 import msgspec
 
 from holdfast.configuration import Configuration
+from holdfast.planning import Planner
+from holdfast.problems.problem import Problem
+from holdfast.robot.memory import RememberingPlanner, StateMemory
 from holdfast.runtime.logs import EventSink
 from holdfast.runtime.own_planner import OWN_PLANNER, OwnPlanner
 from holdfast.runtime.recovery_launcher import RecoveryExited, RecoveryLauncher
-from holdfast.settings import OffloadSettings
+from holdfast.settings import OffloadSettings, PlanningSettings
 from holdfast.transport.contract import RobotTransport
 from holdfast.user_code import describe_problem_error
 
@@ -47,6 +50,8 @@ class Links(NamedTuple):
         For the dispatcher.
     close : callable
         Releases what was made here; after the transport is closed.
+    make_planner : callable
+        Joins the robot's problem and settings to the functions that lead from state to state.
     """
 
     transport: RobotTransport
@@ -55,6 +60,7 @@ class Links(NamedTuple):
     launcher: Callable[[Callable[[RecoveryExited], None]], RecoveryLauncher] | None
     offload: OffloadSettings
     close: Callable[[], None]
+    make_planner: Callable[[Problem, PlanningSettings], Planner] = Planner
 
 
 def make_links(configuration: Configuration, log_path: Path | None, events: EventSink) -> Links:
@@ -84,11 +90,14 @@ def make_links(configuration: Configuration, log_path: Path | None, events: Even
             decision_timeout_ms=_FOR_EVER_MS,
             verify_share=0.0,
         )
+        # The robot, and the service in its process, come to the same states.
+        make_planner = functools.partial(RememberingPlanner, memory=StateMemory())
         planner = OwnPlanner(
             Configuration.from_plain(configuration.plain()).problem,
             functools.partial(describe_problem_error, configuration.problem_name),
+            make_planner,
         )
-        return Links(planner, (OWN_PLANNER,), None, None, patient, _nothing)
+        return Links(planner, (OWN_PLANNER,), None, None, patient, _nothing, make_planner)
     return _streams(configuration, log_path, events)
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable
 
+from holdfast.planning import Planner
 from holdfast.problems.problem import Problem
 from holdfast.protocol.verification import OWN_PLANNER
 from holdfast.service.shell import ServiceShell
@@ -17,6 +18,7 @@ from holdfast.session.events import TransportEvent
 from holdfast.session.messages import Opening
 from holdfast.session.service import Service
 from holdfast.session.service_limits import ServiceLimits
+from holdfast.settings import PlanningSettings
 from holdfast.transport.in_process import InProcessNetwork
 
 __all__ = ["OWN_PLANNER", "OwnPlanner"]
@@ -36,10 +38,15 @@ class OwnPlanner:
         by another thread.
     describe_error : callable
         Puts an error that the problem raised into words.
+    make_planner : callable
+        Joins the problem and the robot's settings to the functions that lead from state to state.
     """
 
     def __init__(
-        self, problem: Problem, describe_error: Callable[[BaseException], str] = repr
+        self,
+        problem: Problem,
+        describe_error: Callable[[BaseException], str] = repr,
+        make_planner: Callable[[Problem, PlanningSettings], Planner] = Planner,
     ) -> None:
         def make_problem(opening: Opening) -> Problem:
             del opening
@@ -48,7 +55,7 @@ class OwnPlanner:
         network = InProcessNetwork(max_message_bytes=_ANY_SIZE)
         self._robot_end = network.robot([OWN_PLANNER])
         self._shell = ServiceShell(
-            Service(make_problem, 1, _NO_LIMITS, describe_error),
+            Service(make_problem, 1, _NO_LIMITS, describe_error, make_planner),
             network.service(OWN_PLANNER, "own"),
             workers=1,
         )

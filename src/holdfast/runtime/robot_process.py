@@ -29,6 +29,7 @@ from holdfast.configuration import Configuration
 from holdfast.errors import HoldfastError, TrialError
 from holdfast.outcome import TrialResult
 from holdfast.planning import Planner
+from holdfast.problems.problem import Problem
 from holdfast.problems.registry import problem_class, problem_module
 from holdfast.robot.own_decisions import OwnDecisions
 from holdfast.runtime.diagnosis import MissingServices
@@ -63,7 +64,7 @@ from holdfast.session.events import (
 from holdfast.session.messages import Opening
 from holdfast.session.records import Record
 from holdfast.session.robot import HeldError, History, Robot, replay
-from holdfast.settings import OffloadSettings
+from holdfast.settings import OffloadSettings, PlanningSettings
 from holdfast.source_digest import core_version, problem_digest
 from holdfast.transport.contract import RobotTransport
 from holdfast.user_code import account_of_user_error, describe_problem_error
@@ -183,6 +184,8 @@ class RobotProcess:
         Instead of the configuration's.
     distrusted : collection of str
         Services that have answered wrongly in an earlier part of the run.
+    make_planner : callable
+        Joins the problem and the settings to the functions that lead from state to state.
     """
 
     def __init__(
@@ -200,6 +203,7 @@ class RobotProcess:
         rate_hz: float | None = None,
         offload: OffloadSettings | None = None,
         distrusted: Collection[str] = (),
+        make_planner: Callable[[Problem, PlanningSettings], Planner] = Planner,
     ) -> None:
         self._configuration = configuration
         self._transport = transport
@@ -255,7 +259,7 @@ class RobotProcess:
             functools.partial(describe_problem_error, configuration.problem_name),
             self.deliver,
         )
-        self._planner = Planner(problem, configuration.planning)
+        self._planner = make_planner(problem, configuration.planning)
         self._robot = Robot(self._planner, simulator, dispatcher, rate_hz)
 
     @property

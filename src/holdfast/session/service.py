@@ -31,7 +31,7 @@ from collections.abc import Callable
 import msgspec
 
 from holdfast.errors import InvalidValueError
-from holdfast.planning import PlanningState, needs_sensing
+from holdfast.planning import Planner, PlanningState, needs_sensing
 from holdfast.problems.problem import Problem
 from holdfast.session.messages import (
     MessageError,
@@ -55,6 +55,7 @@ from holdfast.session.service_sessions import (
     Sessions,
     Work,
 )
+from holdfast.settings import PlanningSettings
 
 __all__ = ["Service"]
 
@@ -110,6 +111,9 @@ class Service:
     limits : ServiceLimits, optional
     describe_error : callable, optional
         Puts an error that a problem raised into words.
+    make_planner : callable, optional
+        Joins a problem and settings to the functions that lead from state to state. It is called by
+        jobs, too.
     """
 
     def __init__(
@@ -118,10 +122,12 @@ class Service:
         workers: int,
         limits: ServiceLimits | None = None,
         describe_error: Callable[[BaseException], str] | None = None,
+        make_planner: Callable[[Problem, PlanningSettings], Planner] = Planner,
     ) -> None:
         if workers < 1:
             raise InvalidValueError(f"workers {workers}: a service needs at least 1")
         self._make_problem = make_problem
+        self._make_planner = make_planner
         self._describe_error = describe_error or _described
         self._limits = limits or ServiceLimits()
         self._statistics = ServiceStatistics()
@@ -478,6 +484,7 @@ class Service:
             self._limits,
             request,
             state,
+            self._make_planner,
         )
         self._lines.begin(work, job, now)
         expected_s = math.inf

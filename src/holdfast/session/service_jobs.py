@@ -23,17 +23,12 @@ from holdfast.errors import (
     UnknownProblemError,
 )
 from holdfast.planning import (
+    Planner,
     PlanningState,
-    advance,
     check_state,
     choose_sensing_action,
-    choose_task_action,
     decode_checkpoint,
-    digest,
-    initial_state,
     needs_sensing,
-    observe,
-    plan_until_sensing,
 )
 from holdfast.problems.problem import Problem
 from holdfast.session.messages import (
@@ -122,11 +117,14 @@ class Job:
         Names the state; None if ``state`` is that state already.
     state : PlanningState or None
         From where the request's state is reached; None if from the trial's beginning.
+    make_planner : callable, optional
+        Joins the problem and the settings to the functions that lead from state to state.
     """
 
     __slots__ = (
         "_describe_error",
         "_limits",
+        "_make_planner",
         "_make_problem",
         "_opening",
         "_planning",
@@ -149,6 +147,7 @@ class Job:
         limits: ServiceLimits,
         request: Request | None,
         state: PlanningState | None,
+        make_planner: Callable[[Problem, PlanningSettings], Planner] = Planner,
     ) -> None:
         self.kind = kind
         self._problem = problem
@@ -160,6 +159,7 @@ class Job:
         self._limits = limits
         self._request = request
         self._state = state
+        self._make_planner = make_planner
 
     @property
     def state(self) -> PlanningState | None:
@@ -217,12 +217,13 @@ class Job:
             assert self._state is not None
             index, _ = choose_sensing_action(problem, planning, self._state)
             return Outcome(problem=problem, sensing_action=index)
-        state = self._reached(problem, request)
+        planner = self._make_planner(problem, planning)
+        state = self._reached(planner, request)
         restored = request.checkpoint is not None
         if needs_sensing(planning, state):
             index, _ = choose_sensing_action(problem, planning, state)
             return Outcome(problem=problem, state=state, restored=restored, sensing_action=index)
-        actions, ahead = plan_until_sensing(problem, planning, state, MAX_TASK_ACTIONS)
+        actions, ahead = planner.plan_until_sensing(state, MAX_TASK_ACTIONS)
         return Outcome(
             problem=problem,
             state=state,
@@ -230,48 +231,45 @@ class Job:
             num_actions=len(actions),
             actions=numbers_to(actions),
             ahead=ahead,
-            ahead_digest=digest(ahead)[:DIGEST_SIZE],
+            ahead_digest=planner.digest(ahead)[:DIGEST_SIZE],
         )
 
-    def _reached(self, problem: Problem, request: Request) -> PlanningState:
+    def _reached(self, planner: Planner, request: Request) -> PlanningState:
         """Return the state that the request names."""
-        planning = self._planning
         if request.checkpoint is not None:
-            return self._restored(problem, request, request.checkpoint)
+            return self._restored(planner, request, request.checkpoint)
         state = self._state
         if state is None:
-            state = initial_state(problem, planning, self._seed, request.trial)
+            state = planner.initial_state(self._seed, request.trial)
         most = state.step + self._limits.max_steps
         for observed in request.observations:
             if (observed.step, True) <= (state.step, state.sensed):
                 continue  # part of the state already
-            state = self._rolled(problem, state, observed.step, most)
-            if not needs_sensing(planning, state):
+            state = self._rolled(planner, state, observed.step, most)
+            if not planner.needs_sensing(state):
                 raise _LacksStateError
             observation = numbers_from(observed.observation, len(observed.observation) // 8)
-            state, _ = observe(problem, planning, state, observed.sensing_action, observation)
-        state = self._rolled(problem, state, request.step, most)
-        if state.sensed != request.sensed or digest(state)[:DIGEST_SIZE] != request.digest:
+            state, _ = planner.observe(state, observed.sensing_action, observation)
+        state = self._rolled(planner, state, request.step, most)
+        if state.sensed != request.sensed or planner.digest(state)[:DIGEST_SIZE] != request.digest:
             raise _LacksStateError(differs=True)
         return state
 
     def _rolled(
-        self, problem: Problem, state: PlanningState, step: int, most: int
+        self, planner: Planner, state: PlanningState, step: int, most: int
     ) -> PlanningState:
         """Return the state at a later step, by task actions alone."""
         if not state.step <= step <= most:
             raise _LacksStateError
-        planning = self._planning
         while state.step < step:
-            if needs_sensing(planning, state):
+            if planner.needs_sensing(state):
                 raise _LacksStateError
-            action, _ = choose_task_action(problem, planning, state)
-            state = advance(problem, planning, state, action)
+            state = planner.advance(state, planner.choose_task_action(state))
         return state
 
-    def _restored(self, problem: Problem, request: Request, checkpoint: bytes) -> PlanningState:
+    def _restored(self, planner: Planner, request: Request, checkpoint: bytes) -> PlanningState:
         state = decode_checkpoint(checkpoint)
-        check_state(problem, self._planning, state)
+        check_state(planner.problem, planner.settings, state)
         for name, came, asked in (
             ("seed", state.seed, self._seed),
             ("trial", state.trial, request.trial),
@@ -280,7 +278,7 @@ class Job:
         ):
             if came != asked:
                 raise CheckpointError(f"checkpoint with {name} {came}: the request says {asked}")
-        if digest(state)[:DIGEST_SIZE] != request.digest:
+        if planner.digest(state)[:DIGEST_SIZE] != request.digest:
             raise CheckpointError("checkpoint of a state that has another digest than the request")
         return state
 

@@ -88,27 +88,32 @@ class ExpectedTimes:
         What is expected before anything was computed.
     """
 
-    __slots__ = ("_inertia", "_sensing_known", "_task_known", "sensing_s", "task_s")
+    __slots__ = ("_inertia", "_last_sensing_s", "_last_task_s", "sensing_s", "task_s")
 
     def __init__(self, inertia: float, task_s: float, sensing_s: float) -> None:
         self._inertia = inertia
-        self._task_known = self._sensing_known = False
+        self._last_task_s = self._last_sensing_s = math.inf
         self.task_s = task_s
         self.sensing_s = sensing_s
 
     def known_s(self, *, task: bool) -> float:
-        """Return what a part is expected to take; infinite if none was ever computed."""
-        if task:
-            return self.task_s if self._task_known else math.inf
-        return self.sensing_s if self._sensing_known else math.inf
+        """Return what a part usually takes; infinite if none was ever computed.
+
+        One that took long by chance (another process had the core) counts no more as soon as the
+        next one did not.
+        """
+        last_s, mean_s = (
+            (self._last_task_s, self.task_s) if task else (self._last_sensing_s, self.sensing_s)
+        )
+        return last_s if last_s == math.inf else min(last_s, mean_s)
 
     def learn(self, computed_s: float, *, task: bool) -> None:
         """Let a job's time count in what the next ones are expected to take."""
         if task:
-            self._task_known = True
+            self._last_task_s = computed_s
             self.task_s = self._moved(self.task_s, computed_s)
         else:
-            self._sensing_known = True
+            self._last_sensing_s = computed_s
             self.sensing_s = self._moved(self.sensing_s, computed_s)
 
     def _moved(self, mean_s: float, sample_s: float) -> float:

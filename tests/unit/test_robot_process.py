@@ -1,0 +1,437 @@
+"""The robot's process on its event loop: what is handled when, what ends it, who is blamed."""
+
+from __future__ import annotations
+
+import functools
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from holdfast.configuration import Configuration, load
+from holdfast.errors import TrialError
+from holdfast.outcome import TrialResult
+from holdfast.recording.run_directory import RunDirectory
+from holdfast.runtime.environment import EnvironmentMaker, load_environment
+from holdfast.runtime.links import Links, make_links
+from holdfast.runtime.logs import NullEventLog
+from holdfast.runtime.recovery_launcher import RecoveryExited
+from holdfast.runtime.robot_process import RobotProcess
+from holdfast.runtime.trial import run_trial
+from holdfast.service.shell import ServiceBrokenError
+from holdfast.session.effects import Effect, Paused, Report, Timing
+from holdfast.session.events import Acted, TransportEvent
+from holdfast.session.records import PausedRecord
+from holdfast.session.service import Service
+from holdfast.session.service_effects import Effect as ServiceEffect
+from holdfast.session.service_jobs import Job, Outcome
+
+PATIENCE_S = 30.0
+"""Longest wait for what is sure to come; nothing is measured by it."""
+
+
+@pytest.fixture
+def configuration(tmp_path: Path) -> Configuration:
+    path = tmp_path / "robot.yaml"
+    path.write_text(
+        "problem: peg_in_hole_2d\n"
+        "particle_filter: {num_particles: 50}\n"
+        "simulator: {num_trials: 2, max_steps: 60, sensing_intervals: 8, seed: 3}\n"
+    )
+    return load(path)
+
+
+class Robots:
+    """Makes robots that go on in one directory, and keeps what they say."""
+
+    def __init__(self, configuration: Configuration, path: Path) -> None:
+        self.configuration = configuration
+        self.links: Links | None = None
+        self.results: list[TrialResult] = []
+        self.on_timing: Callable[[Timing], None] = lambda _: None
+        self.told: list[tuple[str, dict[str, object]]] = []
+        self.path = path
+
+    @functools.cached_property
+    def directory(self) -> RunDirectory:
+        """The run's; it belongs to the thread that asks for it first."""
+        return RunDirectory.create(self.path, self.configuration)
+
+    def make(self) -> RobotProcess:
+        configuration = self.configuration
+        self.links = make_links(configuration, None, NullEventLog())
+        return RobotProcess(
+            configuration,
+            self.links.services,
+            self.links.recovery,
+            self.links.transport,
+            self.directory.journal,
+            load_environment(configuration),
+            self,
+            self._on_result,
+            lambda timing: self.on_timing(timing),
+            lambda _: None,
+            offload=self.links.offload,
+            make_planner=self.links.make_planner,
+        )
+
+    def run(self) -> None:
+        self.make().run(self.directory.journal.finished())
+
+    def _on_result(self, result: TrialResult) -> None:
+        self.directory.add(result)
+        self.results.append(result)
+
+    def event(self, name: str, /, **fields: object) -> None:
+        self.told.append((name, fields))
+
+    def close(self) -> None:
+        pass
+
+    @property
+    def digests(self) -> list[str]:
+        return [result.digest for result in self.results]
+
+
+@pytest.fixture
+def robots(configuration: Configuration, tmp_path: Path) -> Iterator[Robots]:
+    robots = Robots(configuration, tmp_path / "run")
+    yield robots
+    if "directory" in vars(robots):
+        robots.directory.close()
+
+
+def plain_digests(configuration: Configuration) -> list[str]:
+    """Return what a loop without journal, wire and service decides."""
+    return [
+        run_trial(
+            configuration.problem, configuration.planning, configuration.simulator, trial
+        ).digest
+        for trial in range(configuration.simulator.num_trials)
+    ]
+
+
+class Machine:
+    """A machine that is scripted: what it is told comes into a trace."""
+
+    trial = step = 0
+    num_unverified = 0
+
+    def __init__(self) -> None:
+        self.trace: list[str] = []
+        self.deaf_s: list[float] = []
+        self.wakeups: list[float] = []
+        self.answers: list[list[Effect]] = []
+
+    def start(self, now: float) -> list[Effect]:
+        return []
+
+    def handle(self, event: object, now: float) -> list[Effect]:
+        self.trace.append(f"handle {type(event).__name__}")
+        return self.answers.pop(0) if self.answers else []
+
+    def recovery_exited(self, launch: int, reason: str, now: float) -> list[Effect]:
+        return self.handle(RecoveryExited(launch, reason), now)
+
+    def wake(self, now: float) -> list[Effect]:
+        assert now >= self.wakeups.pop(0)
+        self.trace.append("wake")
+        return self.answers.pop(0) if self.answers else []
+
+    def was_deaf(self, seconds: float) -> None:
+        self.deaf_s.append(seconds)
+
+    def pause(self, now: float) -> list[Effect]:
+        return [Paused()]
+
+    def next_wakeup(self) -> float | None:
+        return self.wakeups[0] if self.wakeups else None
+
+    def salvage(self) -> list[Effect]:
+        return []
+
+
+class NoWire:
+    """A transport over which nothing comes."""
+
+    def start(self, deliver: Callable[[TransportEvent], None]) -> None:
+        pass
+
+    def call(self, service: str, call: int, payload: bytes) -> None:
+        pass
+
+    def abandon(self, call: int) -> None:
+        pass
+
+    async def close(self, timeout_s: float = 1.0) -> None:
+        pass
+
+
+def scripted(robots: Robots, begin: Callable[[], object]) -> tuple[RobotProcess, Machine]:
+    """Return a robot whose machine is a script, which begins with something of the test's own."""
+    robot, machine = robots.make(), Machine()
+    robot._transport = NoWire()
+    robot._robot = machine  # type: ignore[assignment]
+    robot._begin_next = begin  # type: ignore[method-assign, assignment]
+    return robot, machine
+
+
+def test_it_decides_as_a_plain_loop_does(robots: Robots) -> None:
+    robots.run()
+    assert robots.digests == plain_digests(robots.configuration)
+
+
+def test_it_runs_on_a_thread_that_is_not_the_main_one(robots: Robots) -> None:
+    def run() -> None:
+        robots.run()
+        vars(robots).pop("directory").close()
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    thread.join(PATIENCE_S)
+    assert robots.digests == plain_digests(robots.configuration)
+
+
+def test_what_comes_from_inside_an_effect_is_handled_after_the_effects_at_hand(
+    robots: Robots,
+) -> None:
+    def world_answers(name: str, **_: object) -> None:
+        machine.trace.append(name)
+        if name == "first":
+            robot._happens(Acted(0, None, False))
+
+    robots.event = world_answers  # type: ignore[method-assign, assignment]
+    robot, machine = scripted(robots, lambda: robot._happens(RecoveryExited(1, "begin")))
+    machine.answers = [[Report("first", {}), Report("second", {})], [Paused()]]
+    robot.run(())
+    assert machine.trace == ["handle RecoveryExited", "first", "second", "handle Acted"]
+
+
+def test_the_loop_looks_at_the_wire_before_it_handles_more_than_some_events(
+    robots: Robots,
+) -> None:
+    def event(name: str, **_: object) -> None:
+        machine.trace.append(name)
+        if name == "first":
+            # A simulated world of which each step takes long never lets the queue run empty.
+            robot._on_loop().call_soon(machine.trace.append, "the wire")
+            time.sleep(0.01)
+            robot._happens(Acted(0, None, False))
+            robot._happens(Acted(1, None, False))
+
+    robots.event = event  # type: ignore[method-assign, assignment]
+    robot, machine = scripted(robots, lambda: robot._happens(RecoveryExited(1, "begin")))
+    machine.answers = [[Report("first", {})], [], [Paused()]]
+    robot.run(())
+    assert machine.trace == [
+        *("handle RecoveryExited", "first", "the wire", "handle Acted", "handle Acted")
+    ]
+
+
+def test_events_come_from_any_thread_and_are_dropped_once_the_run_has_ended(
+    robots: Robots,
+) -> None:
+    def begin() -> None:
+        threading.Thread(target=robot.deliver, args=(RecoveryExited(1, "ended"),)).start()
+
+    robot, machine = scripted(robots, begin)
+    machine.answers = [[Paused()]]
+    robot.run(())
+    robot.deliver(RecoveryExited(2, "too late"))
+    assert machine.trace == ["handle RecoveryExited"]
+
+
+def test_the_machine_is_woken_when_it_asks_for_it(robots: Robots) -> None:
+    robot, machine = scripted(robots, lambda: None)
+    now = time.monotonic()
+    machine.wakeups = [now + 0.05, now + 0.01]  # it asks for an earlier time later on
+    machine.answers = [[], [Paused()]]
+    robot.run(())
+    assert machine.trace == ["wake", "wake"]
+
+
+def test_an_earlier_time_replaces_a_later_one(robots: Robots) -> None:
+    robot, machine = scripted(
+        robots,
+        lambda: robot._on_loop().call_later(0.001, robot._happens, RecoveryExited(1, "")),
+    )
+    machine.wakeups = [time.monotonic() + 10.0 * PATIENCE_S]
+
+    def handle(event: object, now: float) -> list[Effect]:
+        machine.trace.append("handle")
+        machine.wakeups = [now + 0.01]
+        return []
+
+    machine.handle = handle  # type: ignore[method-assign]
+    machine.answers = [[Paused()]]
+    robot.run(())
+    assert machine.trace == ["handle", "wake"]
+
+
+def test_nobody_is_blamed_for_the_time_in_which_the_loop_did_not_listen(robots: Robots) -> None:
+    blocked_s = 0.05
+
+    def event(name: str, **_: object) -> None:
+        time.sleep(blocked_s)
+
+    robots.event = event  # type: ignore[method-assign, assignment]
+    robot, machine = scripted(robots, lambda: robot._happens(RecoveryExited(1, "begin")))
+    machine.answers = [[Report("an event that is written to a slow disk", {})], [Paused()]]
+    machine.wakeups = [time.monotonic() + 2.0]
+    robot.run(())
+    assert machine.trace == ["handle RecoveryExited", "wake"]
+    assert machine.deaf_s
+    assert machine.deaf_s[0] >= 0.9 * blocked_s
+
+
+def test_nobody_is_blamed_if_the_process_was_stopped_when_it_should_have_woken_up(
+    robots: Robots,
+) -> None:
+    late_s = 0.05
+
+    def begin() -> None:
+        machine.wakeups = [time.monotonic() + 0.001]
+        # Something else on the loop, or another process, has the core.
+        robot._on_loop().call_soon(time.sleep, 0.001 + late_s)
+
+    robot, machine = scripted(robots, begin)
+    machine.answers = [[Paused()]]
+    robot.run(())
+    assert machine.trace == ["wake"]
+    assert machine.deaf_s
+    assert machine.deaf_s[0] >= 0.9 * late_s
+
+
+def test_an_error_in_what_is_called_on_the_loop_ends_the_run(robots: Robots) -> None:
+    class OwnError(Exception):
+        pass
+
+    def fail(_: object) -> None:
+        raise OwnError
+
+    robots.on_timing = fail
+    with pytest.raises(TrialError, match=r"trial 0 \(seed 3\), step 0: .* raised OwnError"):
+        robots.run()
+    assert robots.told[-1][0] == "stopped"
+
+
+def test_an_error_of_whatever_else_runs_on_the_loop_ends_the_run(robots: Robots) -> None:
+    class OwnError(Exception):
+        pass
+
+    def fail() -> None:
+        raise OwnError
+
+    robot, _ = scripted(robots, lambda: robot._on_loop().call_soon(fail) and None)
+    with pytest.raises(TrialError, match="raised OwnError"):
+        robot.run(())
+
+
+def test_a_defect_of_its_own_service_ends_the_run(
+    robots: Robots, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It would wait for ever: nothing else can decide."""
+
+    def fail(*_: object) -> None:
+        raise ZeroDivisionError("a defect")
+
+    monkeypatch.setattr(Service, "finished", fail)
+    with pytest.raises(ServiceBrokenError, match="ZeroDivisionError: a defect"):
+        robots.run()
+
+
+def test_a_problem_that_fails_is_named_with_the_step(
+    robots: Robots, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = EnvironmentMaker.__call__
+
+    def make(*arguments: Any, **options: Any) -> Any:
+        environment = real(*arguments, **options)
+        monkeypatch.setattr(type(environment), "perform", lambda *_: "no reward")
+        return environment
+
+    monkeypatch.setattr(EnvironmentMaker, "__call__", make)
+    with pytest.raises(Exception, match="trial 0, step 0") as raised:
+        robots.run()
+    assert not isinstance(raised.value, TrialError)
+
+
+class TestSignals:
+    @pytest.fixture(autouse=True)
+    def _handlers(self) -> Iterator[None]:
+        before = signal.signal(signal.SIGINT, signal.default_int_handler)
+        yield
+        signal.signal(signal.SIGINT, before)
+
+    def test_the_first_one_ends_the_run_in_order(self, robots: Robots) -> None:
+        timings: list[Timing] = []
+
+        def interrupt(timing: Timing) -> None:
+            timings.append(timing)
+            if len(timings) == 3:
+                os.kill(os.getpid(), signal.SIGINT)
+
+        robots.on_timing = interrupt
+        with pytest.raises(KeyboardInterrupt):
+            robots.run()
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+        unfinished = robots.directory.journal.unfinished()
+        assert unfinished is not None
+        assert unfinished.records[-1] == PausedRecord()
+        robots.on_timing = lambda _: None
+        robots.run()
+        assert robots.digests == plain_digests(robots.configuration)
+
+    def test_it_wakes_a_loop_that_sleeps(self, robots: Robots) -> None:
+        robot, _ = scripted(
+            robots,
+            lambda: threading.Timer(0.1, os.kill, (os.getpid(), signal.SIGINT)).start(),
+        )
+        with pytest.raises(KeyboardInterrupt):
+            robot.run(())
+
+    def test_the_second_one_ends_it_at_once_even_inside_a_problem_that_never_returns(
+        self, robots: Robots
+    ) -> None:
+        ends: list[str] = []
+
+        def stuck(_: object) -> None:
+            os.kill(os.getpid(), signal.SIGINT)
+            os.kill(os.getpid(), signal.SIGINT)
+            ends.append("it went on")
+
+        robots.on_timing = stuck
+        with pytest.raises(KeyboardInterrupt):
+            robots.run()
+        assert not ends
+
+
+def test_what_takes_long_is_computed_on_a_thread_while_the_robot_goes_on(
+    robots: Robots, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each first job of its kind does: nobody knows how long it takes."""
+    computed_on: set[str] = set()
+    told_on: set[str] = set()
+
+    class NotedJob(Job):
+        __slots__ = ()
+
+        def run(self) -> Outcome:
+            computed_on.add(threading.current_thread().name)
+            return super().run()
+
+    class NotedService(Service):
+        def finished(self, job: Job, outcome: Outcome, now: float) -> list[ServiceEffect]:
+            told_on.add(threading.current_thread().name)
+            return super().finished(job, outcome, now)
+
+    monkeypatch.setattr("holdfast.session.service.Job", NotedJob)
+    monkeypatch.setattr("holdfast.runtime.own_planner.Service", NotedService)
+    robots.run()
+    assert "holdfast-worker-0" in computed_on
+    assert told_on == {threading.current_thread().name}
