@@ -42,6 +42,7 @@ from holdfast.session.messages import (
 )
 from holdfast.settings import PlanningSettings
 from holdfast.transport.endpoints import ServiceAddress
+from holdfast.transport.robot_end import StreamRobotTransport
 
 __all__ = ["Asked", "Asker", "Caller", "Turn", "decided_in_process", "recorded_turns"]
 

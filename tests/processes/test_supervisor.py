@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import signal
@@ -120,7 +121,7 @@ class TestRobots:
             world.assert_each_once(references(document))
             assert not [each for each in events_of(robot.out) if each["event"] == "launch"]
         told.append(metrics(cloud))
-        for before, after in zip(told, told[1:], strict=False):
+        for before, after in itertools.pairwise(told):
             for name, value in before.items():
                 assert after[name] >= value, name
         decisions = "holdfast_decisions_total[('kind', 'sensing')]"
@@ -151,7 +152,7 @@ class TestEnding:
         assert cloud.process.wait() == code, cloud.process.account()
         for pid in pids:
             wait_for_end(pid)
-        (stopping, *others) = cloud.process.matching("stopping")
+        (stopping,) = cloud.process.matching("stopping")
         assert stopping["reason"] == number.name
         assert "Traceback" not in cloud.process.output
         with socket.socket() as again:
