@@ -17,7 +17,7 @@ PACKAGE_SOURCES := $(shell find cmake src -type f -not -name '*.pyc')
 CPP_FILES := $(shell find cpp -name '*.hpp' -o -name '*.cpp')
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-slow test-chosen test-compiled lint format simulate chaos fuzz soak bench results clean
+.PHONY: help demo install test test-gate test-real test-defects test-slow test-compiled lint format simulate chaos fuzz soak bench results clean
 
 help: ## what there is to make
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-13s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -26,22 +26,21 @@ demo: $(INSTALLED_FIGURES) ## a cloud and a robot are killed, and no decision ch
 	rm -rf demo-run
 	$(BIN)/holdfast demo --out demo-run
 
-test: $(INSTALLED_DEV) ## the quick tests
-	$(BIN)/pytest -q -n 2 --dist loadfile
+install: $(INSTALLED_DEV) $(INSTALLED_COMPILED) ## the environments, which the others make when they need them
 
-test-slow: $(INSTALLED_DEV) ## the tests that take minutes
+test: test-gate test-real ## the quick tests
+
+test-gate: $(INSTALLED_DEV) ## those of them that no clock and no network decides
+	$(BIN)/pytest -q -m "not real and not slow" -n 2 --dist worksteal
+
+test-real: $(INSTALLED_DEV) ## those with real processes and sockets
+	$(BIN)/pytest -q -m "real and not slow" -n 2 --dist worksteal
+
+test-defects: $(INSTALLED_DEV) ## the simulator finds every defect that is planted: a minute
+	$(BIN)/pytest -q -m slow -n 2 --dist worksteal tests/simulation/test_defects.py
+
+test-slow: $(INSTALLED_DEV) ## what repeats them with more seeds, problems and moments: half an hour
 	$(BIN)/pytest -q -m slow -n 2 --dist worksteal
-
-# What takes longest and what the quick tests and the compiled ones show, too, is left to test-slow:
-# studies, fuzzing for minutes, all steps at which a robot can be killed.
-CHOSEN := tests/contracts tests/processes/test_faults.py tests/processes/test_tls.py \
-    tests/processes/test_demo.py tests/processes/test_readme.py tests/processes/test_chaos.py \
-    tests/processes/test_own_robot.py tests/processes/test_own_robot_run.py \
-    tests/processes/test_many_robots.py tests/processes/test_run_command.py \
-    tests/simulation/test_defects.py
-
-test-chosen: $(INSTALLED_DEV) ## those of them that CI runs
-	$(BIN)/pytest -q -m slow -n 2 --dist worksteal $(CHOSEN)
 
 test-compiled: $(INSTALLED_COMPILED) ## the simulator's tests and 10,000 seeds through compiled machines
 	$(COMPILED)/bin/pytest -q -m "slow or not slow" tests/scenarios tests/simulation/test_world.py \

@@ -1,17 +1,91 @@
-"""Options of the tests, and tests that are coroutines."""
+"""Options of the tests, tests that are coroutines, and which are about decisions alone.
+
+Most tests come out the same on any machine at any speed: they touch no socket, wait for nobody and
+look at no clock. The others start real processes or talk over real sockets. They are the marker
+``real``, which is set here, by where a test stands, and nowhere else; whatever is not named here is
+held to it, since a socket or a sleep is an error there.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import inspect
 import os
-from typing import Any
+import signal
+import sys
+import time
+from collections.abc import Callable, Generator
+from pathlib import Path
+from typing import Any, NoReturn
 
 import pytest
 
 # Images for containers set it. The processes that tests start would compile all of holdfast each
 # time: half a second, in tests of how soon something is noticed or launched.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+
+HERE = Path(__file__).parent
+
+REAL = (
+    "processes/",
+    "contracts/test_transport.py",
+    "experiments/test_ray.py",
+    "fuzz/test_fuzz_processes.py",
+    "unit/test_chaos_datagrams.py::TestDatagramProxy",
+    "unit/test_chaos_namespace.py",
+    "unit/test_chaos_processes.py",
+    "unit/test_chaos_proxy.py",
+    "unit/test_chaos_wide_area.py",
+    "unit/test_credentials.py::TestNothingIsOverwritten",
+    "unit/test_credentials.py::TestOnRealLinks",
+    "unit/test_diagnosis.py",
+    "unit/test_endpoints.py::test_a_free_port_can_be_listened_on",
+    "unit/test_endpoints.py::test_an_address_of_another_machine_has_no_free_port",
+    "unit/test_endpoints.py::test_loopback_is_what_only_this_machine_can_reach",
+    "unit/test_files.py::test_what_is_no_file_is_refused",
+    "unit/test_last_threads.py",
+    "unit/test_metrics.py",
+    "unit/test_performer.py::TestStalls",
+    "unit/test_senders.py",
+    "unit/test_service_shell.py",
+)
+"""Folders, files, classes and tests with real sockets, waits or signals."""
+
+IN_PROCESS = "[in_process"
+"""How the parameters begin with which a test of a wire has no wire."""
+
+FORBIDDEN = {
+    "socket.bind": "a socket",
+    "socket.connect": "a socket",
+    "socket.getaddrinfo": "a look at the network",
+    "socket.sendto": "a socket",
+}
+"""What Python tells its audit hooks of, and what that is."""
+
+_guarded: str | None = None
+
+
+def _refuse(what: str) -> NoReturn:
+    raise AssertionError(
+        f"{what} in {_guarded}, which is about decisions alone: hand in a clock or a transport, or "
+        "name it in REAL in tests/conftest.py"
+    )
+
+
+def _audit(event: str, arguments: tuple[object, ...]) -> None:
+    if _guarded is not None and event in FORBIDDEN:
+        _refuse(f"{FORBIDDEN[event]} ({event})")
+
+
+def _sleep(seconds: float, _really: Callable[[float], None] = time.sleep) -> None:
+    # It is how the end of a process is waited for, which comes whatever the time.
+    if sys._getframe(1).f_globals["__name__"] != "subprocess":
+        _refuse(f"a sleep of {seconds} s")
+    _really(seconds)
+
+
+# For good, since Python takes no hook back.
+sys.addaudithook(_audit)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -47,3 +121,41 @@ def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
 
     asyncio.run(asyncio.wait_for(run(), COROUTINE_BOUND_S))
     return True
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark what is real before ``-m`` chooses."""
+    for item in items:
+        place = f"{item.path.relative_to(HERE).as_posix()}::{item.nodeid.partition('::')[2]}"
+        if place.startswith(REAL) and IN_PROCESS not in place:
+            item.add_marker(pytest.mark.real)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
+    """Hold a test that is not real to what it says of itself."""
+    global _guarded
+    if item.get_closest_marker("real"):
+        return (yield)
+    _guarded = item.nodeid
+    try:
+        with pytest.MonkeyPatch.context() as patch:
+            # Python tells the hook of it from 3.13 on.
+            patch.setattr(time, "sleep", _sleep)
+            return (yield)
+    finally:
+        _guarded = None
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _signals_are_heard() -> None:
+    """Let tests and their processes hear signals that a shell, or nohup, has its jobs ignore."""
+    handlers: dict[int, Any] = {
+        signal.SIGINT: signal.default_int_handler,
+        signal.SIGQUIT: signal.SIG_DFL,
+        signal.SIGHUP: signal.SIG_DFL,
+    }
+    for number, handler in handlers.items():
+        if signal.getsignal(number) is signal.SIG_IGN:
+            signal.signal(number, handler)

@@ -315,8 +315,6 @@ class World:
     ----------
     performed : dict of int to list of bytes
         Of each trial, the task actions that were carried out, in order, bit for bit.
-    moments_s : list of float
-        When each of them was carried out.
     wrongs : list of str
         What should never have been asked.
     """
@@ -333,7 +331,6 @@ class World:
         self._connections: list[socket.socket] = []
         self._failures: list[BaseException] = []
         self.performed: dict[int, list[bytes]] = {}
-        self.moments_s: list[float] = []
         self.wrongs: list[str] = []
         self._listener = socket.create_server(("127.0.0.1", free_port()))
         self.port: int = self._listener.getsockname()[1]
@@ -452,7 +449,6 @@ class World:
             action = np.array(command["task_action"])
             answer = {"reward": environment.perform(action)}
             self.performed[self._trial].append(action.tobytes())
-            self.moments_s.append(time.monotonic())
         self._call_hook(what, afterwards=True, step=step)
         return answer
 

@@ -83,7 +83,6 @@ def test_a_cloud_and_a_robot_are_killed(tmp_path: Path, wire: Wire) -> None:
     assert len({each.process for each in performed}) == 2
 
 
-@pytest.mark.slow
 def test_what_the_world_tells_is_believed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The twin is made to do one step less: so the robot has done one too many."""
 
@@ -100,7 +99,6 @@ def test_what_the_world_tells_is_believed(tmp_path: Path, monkeypatch: pytest.Mo
     assert "expected nothing, found trial" in outcome.reason
 
 
-@pytest.mark.slow
 def test_what_the_journals_tell_is_believed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -114,7 +112,6 @@ def test_what_the_journals_tell_is_believed(
     assert outcome.reason.startswith("different: seed")
 
 
-@pytest.mark.slow
 def test_a_journal_that_is_damaged_has_failed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -129,7 +126,6 @@ def test_a_journal_that_is_damaged_has_failed(
     assert "journal.sqlite: the journal is damaged" in outcome.reason
 
 
-@pytest.mark.slow
 def test_a_robot_that_ends_by_itself_has_failed(tmp_path: Path) -> None:
     def kill_the_robot() -> None:
         path = tmp_path / "performed-disturbed.txt"

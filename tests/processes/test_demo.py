@@ -197,7 +197,6 @@ def test_the_whole_story(directory: Path) -> None:
     assert list(demo.temporary.iterdir()) == []
 
 
-@pytest.mark.slow
 def test_an_interruption_ends_all_processes(directory: Path) -> None:
     demo = Demo(directory)
     try:

@@ -173,7 +173,9 @@ class TestCloud:
         robot = story.run(cloud)
         assert robot.statuses() == [LOST, RESTORED]
 
-    @pytest.mark.parametrize("holds_at", [0, 4, 21])
+    @pytest.mark.parametrize(
+        "holds_at", [0, *(pytest.param(n, marks=pytest.mark.slow) for n in (4, 21))]
+    )
     def test_killed_during_a_computation(
         self, holds_at: int, site: Site, references: References
     ) -> None:
@@ -259,7 +261,6 @@ class TestCloud:
         assert set(robot.statuses()) <= {LOST, RESTORED, LOST_AGAIN}
 
 
-@pytest.mark.slow
 class TestRecovery:
     @pytest.mark.parametrize("problem", PEG_AND_SLOWLY_ALL)
     def test_killed_together_with_the_cloud(
@@ -284,6 +285,7 @@ class TestRecovery:
         assert robot.statuses() == [LOST, RESTORED, LOST_AGAIN, RESTORED]
         assert len(robot.matching("launched")) == 2
 
+    @pytest.mark.slow
     def test_killed_while_the_cloud_is_away(self, site: Site, references: References) -> None:
         document = document_of(PEG)
         steps = sensing_steps(document)
@@ -302,6 +304,7 @@ class TestRecovery:
         assert robot.statuses() == [LOST]
         assert len(robot.matching("launched")) == 4
 
+    @pytest.mark.slow
     def test_stopped_while_the_cloud_is_away(self, site: Site, references: References) -> None:
         """It hangs, so another one takes its place."""
         document = document_of(PEG)
@@ -314,6 +317,7 @@ class TestRecovery:
         assert robot.statuses() == [LOST]
         assert len(robot.matching("launched")) == 2
 
+    @pytest.mark.slow
     def test_at_start_it_is_ready_before_it_is_needed(
         self, site: Site, references: References
     ) -> None:
@@ -356,7 +360,7 @@ class TestRecovery:
         [
             (None, "cannot be started: No such file or directory"),
             ("exit 3", "ended with exit code 3; see "),
-            ("exec sleep 1000", "not seen after "),
+            pytest.param("exec sleep 1000", "not seen after ", marks=pytest.mark.slow),
         ],
         ids=["absent", "failing", "hanging"],
     )

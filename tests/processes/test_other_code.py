@@ -141,7 +141,14 @@ WRITTEN_BY_A_USER = {
 
 
 class TestWhereTheCodeIsWritten:
-    @pytest.mark.parametrize("written", WRITTEN_BY_A_USER)
+    @pytest.mark.parametrize(
+        "written",
+        [
+            # What is a part of the digest, its own tests say; one of these shows that it is sent.
+            pytest.param(written, marks=[pytest.mark.slow] if number else [])
+            for number, written in enumerate(WRITTEN_BY_A_USER)
+        ],
+    )
     def test_a_change_is_refused_and_a_copy_is_not(self, site: Site, written: str) -> None:
         name, sources, constant = WRITTEN_BY_A_USER[written]
         services = []

@@ -79,7 +79,7 @@ class Forgetful(Lander):
             before = signal.getsignal(signal.SIGTERM)
             os.kill(os.getpid(), signal.SIGTERM)
             # Until it was heard; only what happens next may wake the one that hears it.
-            for _ in range(200):
+            for _ in range(6000):
                 if signal.getsignal(signal.SIGTERM) is not before:
                     break
                 time.sleep(0.005)

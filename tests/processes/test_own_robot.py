@@ -312,8 +312,8 @@ class Watched:
         return self.event()
 
 
-@pytest.mark.slow
 class TestFailures:
+    @pytest.mark.slow
     def test_a_silent_controller_stops_the_robot_and_the_count_settles_it(
         self, controller: Controller
     ) -> None:

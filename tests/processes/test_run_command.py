@@ -10,16 +10,17 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import pytest
 from tests.ports import free_port
+from tests.processes.faults import COMMAND
 
 from holdfast.recording.machine import machines
 from holdfast.source_digest import core_version
 
-COMMAND = [sys.executable, "-c", "from holdfast.cli import main; main()"]
+WITH_FIGURES = [sys.executable, "-c", "from holdfast.cli import main; main()"]
 
 PEG = """
 problem: peg_in_hole_2d
@@ -28,26 +29,36 @@ active_sensing: {num_observation_samples: 3, num_cores: 1}
 simulator: {num_trials: 6, max_steps: 80, seed: 3}
 """
 
-# Notes the process and the time of each trial's start, and makes it last a quarter of a second.
-SLOW = """
+# Notes the process and the time of each trial's start. All but the first trials of the workers wait
+# for leave, so that the run is still going on whatever a test does meanwhile; those of the command
+# itself, which come first, are long enough for workers to be worth their start.
+HELD = """
+import multiprocessing
 import os
 import time
 from pathlib import Path
 
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 
+HERE = Path(__file__).parent
 
-class Slow(PegInHole2D):
-    name = "slow"
+
+class Held(PegInHole2D):
+    name = "held"
 
     def initial_states(self, stream, count):
         if count == 1:
-            marks = Path(__file__).with_name("marks")
+            marks = HERE / "marks"
             marks.mkdir(exist_ok=True)
             (marks / f"{time.time_ns()}-{os.getpid()}").touch()
-            time.sleep(0.25)
+            if multiprocessing.parent_process() is None and not (HERE / "go").exists():
+                time.sleep(0.25)
+            else:
+                while len(list(marks.iterdir())) > FREELY and not (HERE / "go").exists():
+                    time.sleep(0.01)
         return super().initial_states(stream, count)
 """
+FREELY = 6
 
 BROKEN_ROBOT = """
 class MyRobot:
@@ -79,17 +90,19 @@ class MyWorld:
         return self.world.is_done()
 """
 
-SLOW_CONFIGURATION = """
-problem: slow_problem:Slow
+HELD_CONFIGURATION = """
+problem: held_problem:Held
 particle_filter: {num_particles: 20}
 active_sensing: {num_observation_samples: 2, num_cores: 1}
 simulator: {num_trials: 16, max_steps: 10, seed: 3}
 """
 
 
-def holdfast(directory: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+def holdfast(
+    directory: Path, *arguments: str, command: Sequence[str] = COMMAND
+) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [*COMMAND, *arguments],
+        [*command, *arguments],
         cwd=directory,
         capture_output=True,
         text=True,
@@ -116,8 +129,8 @@ def summary(directory: Path) -> dict[str, object]:
 @pytest.fixture
 def workplace(tmp_path: Path) -> Path:
     (tmp_path / "peg.yaml").write_text(PEG)
-    (tmp_path / "slow.yaml").write_text(SLOW_CONFIGURATION)
-    (tmp_path / "slow_problem.py").write_text(SLOW)
+    (tmp_path / "held.yaml").write_text(HELD_CONFIGURATION)
+    (tmp_path / "held_problem.py").write_text(HELD.replace("FREELY", str(FREELY)))
     return tmp_path
 
 
@@ -129,13 +142,13 @@ def wait_until(condition: Callable[[], bool], what: str) -> None:
         time.sleep(0.02)
 
 
-class SlowRun:
-    """A run of the slow problem that is going on."""
+class HeldRun:
+    """A run that goes on until :meth:`let_go`."""
 
     def __init__(self, workplace: Path) -> None:
         self._marks = workplace / "marks"
         self.process = subprocess.Popen(
-            [*COMMAND, "run", "slow.yaml", "--jobs", "2", "--out", "out"],
+            [*COMMAND, "run", "held.yaml", "--jobs", "2", "--out", "out"],
             cwd=workplace,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
@@ -151,7 +164,15 @@ class SlowRun:
         return [pid for pid in pids if pid != self.process.pid]
 
     def wait_for_workers(self) -> None:
-        wait_until(lambda: len(self.workers()) == 2, "two workers")
+        """Wait until both have begun a trial, and some trials are done."""
+        wait_until(
+            lambda: len(self.workers()) == 2 and len(list(self._marks.glob("*"))) > FREELY,
+            "two workers",
+        )
+
+    def let_go(self) -> None:
+        """Hold no trial any more."""
+        self._marks.with_name("go").touch()
 
     def end(self) -> str:
         _, errors = self.process.communicate(timeout=60)
@@ -159,8 +180,8 @@ class SlowRun:
 
 
 @pytest.fixture
-def slow_run(workplace: Path) -> Iterator[SlowRun]:
-    run = SlowRun(workplace)
+def held_run(workplace: Path) -> Iterator[HeldRun]:
+    run = HeldRun(workplace)
     with run.process:
         try:
             yield run
@@ -180,7 +201,7 @@ def is_alive(pid: int) -> bool:
 
 class TestOutput:
     def test_files_and_what_is_said(self, workplace: Path) -> None:
-        done = holdfast(workplace, "run", "peg.yaml", "--out", "out")
+        done = holdfast(workplace, "run", "peg.yaml", "--out", "out", command=WITH_FIGURES)
         assert done.returncode == 0, done.stderr
         names = {path.name for path in (workplace / "out").iterdir()}
         assert names == {
@@ -211,7 +232,7 @@ class TestOutput:
     def test_with_log_json_the_standard_error_has_nothing_else(self, workplace: Path) -> None:
         service = f"tcp/127.0.0.1:{free_port()}"
         arguments = ("run", "peg.yaml", "--trials", "1", "--log", "json", "--service", service)
-        done = holdfast(workplace, *arguments, "--out", "out")
+        done = holdfast(workplace, *arguments, "--out", "out", command=WITH_FIGURES)
         assert done.returncode == 0, done.stderr
         events = [json.loads(line) for line in done.stderr.splitlines()]
         assert [event["reason"] for event in events if event["event"] == "unreachable"] == [
@@ -269,7 +290,7 @@ class TestOutput:
             "raise ModuleNotFoundError(\"No module named 'matplotlib'\", name='matplotlib')\n"
         )
         done = subprocess.run(
-            [*COMMAND, "run", "peg.yaml", "--out", "out"],
+            [*WITH_FIGURES, "run", "peg.yaml", "--out", "out"],
             cwd=workplace,
             env=os.environ | {"PYTHONPATH": str(workplace / "absent")},
             capture_output=True,
@@ -285,7 +306,7 @@ class TestOutput:
     def test_a_world_of_ones_own_has_a_figure_of_the_belief(self, workplace: Path) -> None:
         (workplace / "my_world.py").write_text(MY_WORLD)
         arguments = ("run", "peg.yaml", "--environment", "my_world:MyWorld", "--out", "out")
-        done = holdfast(workplace, *arguments, "--trials", "1")
+        done = holdfast(workplace, *arguments, "--trials", "1", command=WITH_FIGURES)
         assert done.returncode == 0, done.stderr
         assert "figure" not in done.stderr
         # It reports no reward, which is not a reward of 0.
@@ -298,12 +319,12 @@ class TestOutput:
         assert figure.read_bytes().startswith(b"\x89PNG\r\n")
         # Of an earlier part of the run there are no observations: the figure stays as it is.
         before = figure.stat().st_mtime_ns
-        done = holdfast(workplace, *arguments, "--trials", "2", "--resume")
+        done = holdfast(workplace, *arguments, "--trials", "2", "--resume", command=WITH_FIGURES)
         assert done.returncode == 0, done.stderr
         assert "figure" not in done.stderr
         assert figure.stat().st_mtime_ns == before
         figure.unlink()
-        done = holdfast(workplace, *arguments, "--trials", "2", "--resume")
+        done = holdfast(workplace, *arguments, "--trials", "2", "--resume", command=WITH_FIGURES)
         assert done.returncode == 0, done.stderr
         assert "note: no figure, because trial 0 ended in an earlier part of the run" in done.stderr
 
@@ -338,29 +359,29 @@ class TestOutput:
 
 
 class TestInterruption:
-    @pytest.mark.slow
     def test_ctrl_c_ends_promptly_and_resume_ends_as_if_nothing_was(
-        self, workplace: Path, slow_run: SlowRun
+        self, workplace: Path, held_run: HeldRun
     ) -> None:
-        slow_run.wait_for_workers()
+        held_run.wait_for_workers()
         # The whole group, as Ctrl-C at a terminal does it: the workers get it as well.
-        os.killpg(slow_run.process.pid, signal.SIGINT)
-        errors = slow_run.end()
-        assert slow_run.process.returncode == 130
+        os.killpg(held_run.process.pid, signal.SIGINT)
+        errors = held_run.end()
+        assert held_run.process.returncode == 130
         assert "Traceback" not in errors
         assert "Interrupted." in errors
-        assert "holdfast run slow.yaml --jobs 2 --out out --resume" in errors
+        assert "holdfast run held.yaml --jobs 2 --out out --resume" in errors
         wait_until(
-            lambda: not any(is_alive(pid) for pid in slow_run.workers()), "the end of the workers"
+            lambda: not any(is_alive(pid) for pid in held_run.workers()), "the end of the workers"
         )
         kept = decided(workplace / "out")
         assert 0 < len(kept) < 16
         assert summary(workplace / "out")["finished"] == len(kept)
 
-        resumed = holdfast(workplace, "run", "slow.yaml", "--out", "out", "--resume")
+        held_run.let_go()
+        resumed = holdfast(workplace, "run", "held.yaml", "--out", "out", "--resume")
         assert resumed.returncode == 0, resumed.stderr
         assert f"{len(kept)} finished before" in resumed.stderr
-        whole = holdfast(workplace, "run", "slow.yaml", "--out", "whole", "--jobs", "1")
+        whole = holdfast(workplace, "run", "held.yaml", "--out", "whole", "--jobs", "1")
         assert whole.returncode == 0, whole.stderr
         assert decided(workplace / "out") == decided(workplace / "whole")
         assert len(decided(workplace / "out")) == 16
@@ -368,50 +389,51 @@ class TestInterruption:
     @pytest.mark.parametrize("ending", [signal.SIGTERM, signal.SIGHUP])
     @pytest.mark.parametrize("group", [False, True], ids=["parent", "group"])
     def test_other_signals_end_a_run_in_order(
-        self, workplace: Path, slow_run: SlowRun, ending: signal.Signals, group: bool
+        self, workplace: Path, held_run: HeldRun, ending: signal.Signals, group: bool
     ) -> None:
-        slow_run.wait_for_workers()
+        held_run.wait_for_workers()
         if group:
-            os.killpg(slow_run.process.pid, ending)
+            os.killpg(held_run.process.pid, ending)
         else:
-            slow_run.process.send_signal(ending)
-        errors = slow_run.end()
-        assert slow_run.process.returncode == 128 + ending
+            held_run.process.send_signal(ending)
+        errors = held_run.end()
+        assert held_run.process.returncode == 128 + ending
         assert "Traceback" not in errors
         assert f"Ended by {ending.name}." in errors
         wait_until(
-            lambda: not any(is_alive(pid) for pid in slow_run.workers()), "the end of the workers"
+            lambda: not any(is_alive(pid) for pid in held_run.workers()), "the end of the workers"
         )
         kept = len(decided(workplace / "out"))
         assert 0 < kept < 16
         assert summary(workplace / "out")["finished"] == kept
 
     def test_a_killed_worker_is_reported_with_its_trial(
-        self, workplace: Path, slow_run: SlowRun
+        self, workplace: Path, held_run: HeldRun
     ) -> None:
-        slow_run.wait_for_workers()
-        os.kill(slow_run.workers()[0], signal.SIGKILL)
-        errors = slow_run.end()
-        assert slow_run.process.returncode == 2
+        held_run.wait_for_workers()
+        os.kill(held_run.workers()[0], signal.SIGKILL)
+        errors = held_run.end()
+        assert held_run.process.returncode == 2
         assert "Traceback" not in errors
         assert "a worker process was killed by SIGKILL while it ran trial " in errors
         kept = len(decided(workplace / "out"))
         assert 0 < kept < 16
-        resumed = holdfast(workplace, "run", "slow.yaml", "--out", "out", "--resume")
+        held_run.let_go()
+        resumed = holdfast(workplace, "run", "held.yaml", "--out", "out", "--resume")
         assert resumed.returncode == 0, resumed.stderr
         assert summary(workplace / "out")["finished"] == 16
 
-    @pytest.mark.slow
     def test_a_killed_parent_leaves_a_run_that_can_go_on(
-        self, workplace: Path, slow_run: SlowRun
+        self, workplace: Path, held_run: HeldRun
     ) -> None:
-        slow_run.wait_for_workers()
-        os.kill(slow_run.process.pid, signal.SIGKILL)
-        slow_run.process.wait(timeout=60)
+        held_run.wait_for_workers()
+        os.kill(held_run.process.pid, signal.SIGKILL)
+        held_run.process.wait(timeout=60)
         wait_until(
-            lambda: not any(is_alive(pid) for pid in slow_run.workers()), "the end of the workers"
+            lambda: not any(is_alive(pid) for pid in held_run.workers()), "the end of the workers"
         )
-        resumed = holdfast(workplace, "run", "slow.yaml", "--out", "out", "--resume")
+        held_run.let_go()
+        resumed = holdfast(workplace, "run", "held.yaml", "--out", "out", "--resume")
         assert resumed.returncode == 0, resumed.stderr
         assert "finished before" in resumed.stderr
         assert summary(workplace / "out")["finished"] == 16
@@ -419,8 +441,8 @@ class TestInterruption:
 
 class TestErrors:
     @staticmethod
-    def fails(workplace: Path, *arguments: str) -> str:
-        done = holdfast(workplace, *arguments)
+    def fails(workplace: Path, *arguments: str, command: Sequence[str] = COMMAND) -> str:
+        done = holdfast(workplace, *arguments, command=command)
         assert done.returncode == 2
         assert done.stdout == ""
         assert done.stderr.startswith("holdfast: error: ")
@@ -470,7 +492,7 @@ class TestErrors:
         error = self.fails(workplace, "run", "peg.yaml", "--environment", name, *out)
         assert expected in error
         left = {path.name for path in workplace.iterdir()} - {"__pycache__"}
-        assert left == {"peg.yaml", "slow.yaml", "slow_problem.py", "my_robot.py"}
+        assert left == {"peg.yaml", "held.yaml", "held_problem.py", "my_robot.py"}
 
     @pytest.mark.parametrize(
         ("options", "expected"),
@@ -558,7 +580,7 @@ class TestErrors:
             "        return {}['scene']\n"
         )
         arguments = ("peg.yaml", "--problem", "unseen:Unseen", "--out", "out", "--quiet")
-        error = self.fails(workplace, "run", *arguments)
+        error = self.fails(workplace, "run", *arguments, command=WITH_FIGURES)
         assert "the figure of trial 0: unseen:Unseen raised KeyError: 'scene'" in error
         assert summary(workplace / "out")["finished"] == 6
 
@@ -582,7 +604,7 @@ class TestErrors:
         [
             (("--recovery", "at_start"), "--recovery at_start needs --service (or "),
             (("--tls", "keys"), "--tls keys needs --service (or "),
-            (("--problem", "slow_problem"), "did you mean slow_problem:Slow?"),
+            (("--problem", "held_problem"), "did you mean held_problem:Held?"),
         ],
     )
     def test_what_would_do_nothing_is_refused(

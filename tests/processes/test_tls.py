@@ -40,8 +40,7 @@ def secure(
     )
 
 
-@pytest.mark.parametrize("protocol", ["tls", "quic"])
-@pytest.mark.slow
+@pytest.mark.parametrize("protocol", ["tls", pytest.param("quic", marks=pytest.mark.slow)])
 def test_killed_stopped_and_started_again(
     protocol: str, keys: Path, site: Site, references: References
 ) -> None:

@@ -144,8 +144,15 @@ def test_what_is_not_computed_again_in_time_is_said(site: Site, references: Refe
     assert f"{summary['unverified_answers']} questions" in told
 
 
-@pytest.mark.parametrize(("what", "kind"), [("half", "task"), ("sensing", "sensing")])
-@pytest.mark.parametrize("simulated", [True, False])
+@pytest.mark.parametrize(
+    ("what", "kind", "simulated"),
+    [
+        ("half", "task", True),
+        ("sensing", "sensing", False),
+        pytest.param("half", "task", False, marks=pytest.mark.slow),
+        pytest.param("sensing", "sensing", True, marks=pytest.mark.slow),
+    ],
+)
 def test_a_lie_that_nobody_computed_again_is_found_when_the_figure_is_drawn(
     what: str, kind: str, simulated: bool, site: Site
 ) -> None:

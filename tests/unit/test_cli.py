@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import subprocess
 import sys
-import time
 
 import pytest
 
@@ -112,13 +110,12 @@ def test_a_signal_ends_in_order(number: signal.Signals) -> None:
     before = signal.getsignal(number)
     with pytest.raises(SystemExit) as ended, ended_by_signals():
         try:
-            os.kill(os.getpid(), number)
-            time.sleep(60.0)
+            signal.raise_signal(number)
         except KeyboardInterrupt as interruption:
             assert isinstance(interruption, EndedBySignal)
             assert signal_of(interruption) == number
             # A second one does not cut short what the first one began.
-            os.kill(os.getpid(), number)
+            signal.raise_signal(number)
             raise
     assert ended.value.code == 128 + number
     assert signal.getsignal(number) == before
@@ -128,7 +125,7 @@ def test_what_is_ignored_stays_ignored() -> None:
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
         with ended_by_signals():
-            os.kill(os.getpid(), signal.SIGHUP)
+            signal.raise_signal(signal.SIGHUP)
             assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
     finally:
         signal.signal(signal.SIGHUP, before)

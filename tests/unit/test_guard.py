@@ -1,0 +1,45 @@
+"""What is about decisions alone can open no socket and cannot sleep; what can is named."""
+
+from __future__ import annotations
+
+import socket
+import time
+from pathlib import Path
+
+import pytest
+from tests.conftest import HERE, REAL
+
+
+def test_a_socket_is_refused() -> None:
+    with socket.socket() as made:
+        with pytest.raises(AssertionError, match=r"socket\.bind.*test_guard.*REAL"):
+            made.bind(("127.0.0.1", 0))
+        with pytest.raises(AssertionError, match=r"socket\.connect"):
+            made.connect(("127.0.0.1", 1))
+
+
+def test_a_local_socket_is_refused(tmp_path: Path) -> None:
+    with (
+        socket.socket(socket.AF_UNIX) as made,
+        pytest.raises(AssertionError, match=r"socket\.bind"),
+    ):
+        made.bind(str(tmp_path / "s"))
+
+
+def test_a_look_at_the_network_is_refused() -> None:
+    with pytest.raises(AssertionError, match="look at the network"):
+        socket.getaddrinfo("localhost", 80)
+
+
+def test_a_sleep_is_refused() -> None:
+    with pytest.raises(AssertionError, match=r"a sleep of 0\.001 s"):
+        time.sleep(0.001)
+
+
+@pytest.mark.parametrize("place", REAL)
+def test_what_is_named_is_there(place: str) -> None:
+    path, *names = place.split("::")
+    assert (HERE / path).exists()
+    for name in names:
+        text = (HERE / path).read_text()
+        assert f"class {name}:" in text or f"def {name}(" in text
