@@ -49,11 +49,13 @@ class Mortal(CapsuleRobot):
 """
 
 
-def several(site: Site, *options: str, processes: int = 2) -> Service:
-    """Return a service of several processes that tells how it is."""
+def several(site: Site, *options: str, endpoint: str | None = None) -> Service:
+    """Return a service of two processes that tells how it is."""
     address = f"127.0.0.1:{free_port()}"
     return site.service(
-        *("--processes", str(processes), "--health", address, "--metrics", address), *options
+        *("--processes", "2", "--health", address, "--metrics", address),
+        *options,
+        endpoint=endpoint,
     ).start()
 
 
@@ -91,9 +93,17 @@ def started_again(service: Service, count: int) -> Callable[[], object]:
 
 
 class TestRobots:
-    def test_processes_are_killed_under_them(self, site: Site, references: References) -> None:
+    @pytest.mark.parametrize("protocol", ["tcp", "tls", "unix"])
+    def test_processes_are_killed_under_them(
+        self, protocol: str, site: Site, keys: Path, references: References
+    ) -> None:
         """Their runs decide the same; nothing but time is lost, and nothing is forgotten."""
-        cloud = several(site)
+        place = site.directory / "socket" if protocol == "unix" else f"127.0.0.1:{free_port()}"
+        credentials = {
+            end: ("--tls", str(keys / "ours" / end)) if protocol == "tls" else ()
+            for end in ("robot", "service")
+        }
+        cloud = several(site, *credentials["service"], endpoint=f"{protocol}/{place}")
         document = document_of(PEG)
         told: list[dict[str, float]] = []
 
@@ -113,7 +123,9 @@ class TestRobots:
                 world.on("perform", 20, in_order(lambda: kill(0), started_again(cloud, 1)))
                 world.on("sense", 36, in_order(lambda: kill(1), started_again(cloud, 2)))
                 world.on("perform", 50, in_order(lambda: kill(0), lambda: kill(-1)))
-            robots.append(site.run(file, services=[cloud], out=f"out-{number}"))
+            robots.append(
+                site.run(file, *credentials["robot"], services=[cloud], out=f"out-{number}")
+            )
         for robot, world in zip(robots, worlds, strict=True):
             robot.finish()
             world.check()
@@ -143,7 +155,9 @@ class TestRobots:
 
 
 class TestEnding:
-    @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 0), (signal.SIGINT, 130)])
+    @pytest.mark.parametrize(
+        ("number", "code"), [(signal.SIGTERM, 0), (signal.SIGINT, 130), (signal.SIGHUP, 129)]
+    )
     def test_in_order(self, site: Site, number: signal.Signals, code: int) -> None:
         cloud = several(site)
         pids = children(cloud)

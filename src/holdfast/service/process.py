@@ -285,6 +285,11 @@ def _serve_with_several(options: argparse.Namespace, arguments: Sequence[str]) -
             return await supervise(
                 supervisor,
                 events,
+                [
+                    number
+                    for number in _handled_signals()
+                    if options.tls is None or number != signal.SIGHUP
+                ],
                 options.drain_s + 2 * _CLOSE_TIMEOUT_S,
                 lambda: _say_ready(options, None, where),
             )
