@@ -15,6 +15,7 @@ import asyncio
 import contextlib
 import socket
 import ssl
+import time
 from typing import Final, NamedTuple, Protocol
 
 from holdfast.transport.frames import (
@@ -51,6 +52,8 @@ _RECEIVED_AT_ONCE_BYTES: Final = 256 * 1024
 _PINGS_IN_LEASE: Final = 3
 _CLOSE_TIMEOUT_S: Final = 1.0
 _PING: Final = encode_frame(PING)
+
+_EXPIRED: Final = "has a certificate that has expired"
 
 
 # What a link receives is copied out of it before anything else happens, so all share one: to
@@ -112,7 +115,7 @@ class LinkOwner(Protocol):
         """Hear that the TLS handshake is complete at this end; not called without TLS."""
         ...
 
-    def refusal(self, hello: Hello) -> str | None:
+    def refusal(self, link: Link, hello: Hello) -> str | None:
         """Return why the other end is not wanted, as the rest of a sentence about it."""
         ...
 
@@ -379,7 +382,7 @@ class Link(asyncio.BufferedProtocol):
         if kind == HELLO:
             try:
                 hello = decode_hello(frame.payload)
-                refusal = self._owner.refusal(hello)
+                refusal = self._owner.refusal(self, hello)
             except FrameError as error:
                 refusal = str(error)
             if refusal is not None:
@@ -416,6 +419,9 @@ class Link(asyncio.BufferedProtocol):
         if now >= self._silent_at:
             # If it is this process that stood still, what came meanwhile is still to be read.
             self._loop.call_soon(self._loop.call_soon, self._give_up_if_silent)
+            return
+        if self.peer is not None and time.time() >= self.peer.expires_at:
+            self.end(_EXPIRED, goodbye=_EXPIRED, refused=True)
             return
         transport = self._transport
         if self.hello is not None and transport is not None:

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import asyncio
 import socket
-import ssl
 from collections.abc import Callable, Mapping
 from itertools import count
 
@@ -40,7 +39,7 @@ from holdfast.transport.frames import (
 )
 from holdfast.transport.links import HalfReceived, Link, LinkSettings
 from holdfast.transport.listener import Listener
-from holdfast.transport.tls import TlsStream, client_context
+from holdfast.transport.tls import ClientCredentials, TlsStream
 
 __all__ = ["StreamRobotTransport"]
 
@@ -98,13 +97,14 @@ class StreamRobotTransport:
         self.calls = CallTable()
         self.on_refused = on_refused
         self._services: dict[str, _Service] = {}
+        credentials = None if tls is None else ClientCredentials(tls)
         for service, address in services.items():
             endpoint = check_endpoint(address.endpoint, listens=address.listens)
             check_credentials(endpoint, tls)
             if address.name is not None:
                 check_name("name of a service", address.name)
-            context = client_context(tls) if tls is not None and endpoint.is_encrypted else None
-            self._services[service] = _Service(self, service, address, endpoint, context)
+            own = credentials if endpoint.is_encrypted else None
+            self._services[service] = _Service(self, service, address, endpoint, own)
         self._started = False
         self._closed = False
 
@@ -189,12 +189,12 @@ class _Service:
         name: str,
         address: ServiceAddress,
         endpoint: Endpoint,
-        context: ssl.SSLContext | None,
+        credentials: ClientCredentials | None,
     ) -> None:
         self._robot = robot
         self._name = name
         self._address = address
-        self._context = context
+        self._credentials = credentials
         self._listener: Listener | None = None
         self._dialer: Dialer | None = None
         # Those over which it is seen, with the boot that was told, the newest last. There are
@@ -222,7 +222,7 @@ class _Service:
     def start(self) -> None:
         if self._address.listens:
             self._listener = Listener(
-                self.endpoint, self._accepted, speaks_first=self._context is not None
+                self.endpoint, self._accepted, speaks_first=self._credentials is not None
             )
             self.endpoint = self._listener.endpoint
         else:
@@ -249,9 +249,9 @@ class _Service:
 
     def _make_link(self) -> Link:
         tls = None
-        if self._context is not None:
+        if self._credentials is not None:
             host = None if self._address.listens else self.endpoint.host
-            tls = TlsStream(self._context, host, self._incarnation)
+            tls = TlsStream(self._credentials.context(), host, self._incarnation)
         link = Link(
             self,
             self._robot.settings,
@@ -274,7 +274,7 @@ class _Service:
         # What the process is called is not known yet: whatever it is, it is another one.
         self._appeared(link, self._boot if same else f"not-named-yet-{next(self._early)}")
 
-    def refusal(self, hello: Hello) -> str | None:
+    def refusal(self, link: Link, hello: Hello) -> str | None:
         """Refuse whoever is not the service that is looked for."""
         if hello.role != "service":
             return "is a robot, and a service was expected"

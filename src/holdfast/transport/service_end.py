@@ -36,12 +36,15 @@ from holdfast.transport.frames import (
 )
 from holdfast.transport.links import HalfReceived, Link, LinkSettings
 from holdfast.transport.listener import Listener
+from holdfast.transport.revocation import REVOKED_FILE, revoked_serials
 from holdfast.transport.tls import PeerCertificate, TlsStream, server_context
 
 __all__ = ["MAX_LINKS", "StreamServiceTransport"]
 
 MAX_LINKS: Final = 4096
 """Of robots, at the same time."""
+
+_REVOKED: Final = "has a certificate that has been revoked"
 
 _MAX_UNGREETED: Final = 256
 """Connections that have sent something, but no hello yet."""
@@ -167,6 +170,8 @@ class StreamServiceTransport:
         self._boot = boot
         self._tls = tls
         self._context = None if tls is None else server_context(tls, boot)
+        # Of the last list; a handshake looks into the one that was there when it began.
+        self._revoked: frozenset[int] = frozenset()
         self._settings = LinkSettings(
             encode_hello("service", name, boot, lease_ms),
             lease_ms,
@@ -257,16 +262,28 @@ class StreamServiceTransport:
             link.end(reason, goodbye=reason, refused=True)
         return len(links)
 
-    def reload_credentials(self) -> None:
-        """Read the credentials anew, for the links that are yet to come.
+    def reload_credentials(self) -> int:
+        """Read the credentials anew, and end the links of robots that are revoked now.
+
+        Returns
+        -------
+        int
+            How many links were ended; all others go on as they are.
 
         Raises
         ------
         TransportError
             If they cannot be used; then those of before are kept.
         """
-        if self._tls is not None:
-            self._context = server_context(self._tls, self._boot)
+        if self._tls is None:
+            return 0
+        context = server_context(self._tls, self._boot)
+        self._revoked = revoked_serials(self._tls.authority.with_name(REVOKED_FILE))
+        self._context = context
+        return self.end_links(self._is_revoked, _REVOKED)
+
+    def _is_revoked(self, peer: PeerCertificate) -> bool:
+        return peer.serial_number in self._revoked
 
     # -- links -----------------------------------------------------------------------------------
 
@@ -295,10 +312,12 @@ class StreamServiceTransport:
     def established(self, link: Link) -> None:
         """Nothing: a robot says who it is next."""
 
-    def refusal(self, hello: Hello) -> str | None:
-        """Refuse what is no robot, and more robots than there is room for."""
+    def refusal(self, link: Link, hello: Hello) -> str | None:
+        """Refuse what is no robot or revoked, and more robots than there is room for."""
         if hello.role != "robot":
             return "is a service, and a robot was expected"
+        if link.peer is not None and self._is_revoked(link.peer):
+            return _REVOKED
         if len(self._links) >= MAX_LINKS:
             return f"is one too many: {MAX_LINKS} robots are connected"
         return None

@@ -15,14 +15,16 @@ speaks (ALPN), and a service takes its own.
 
 from __future__ import annotations
 
+import contextlib
 import ssl
 from typing import Any, NamedTuple
 
 from holdfast.errors import TransportError
 from holdfast.transport.endpoints import TlsFiles
 from holdfast.transport.frames import FrameError
+from holdfast.transport.revocation import REVOKED_FILE, refuse_revoked
 
-__all__ = ["PeerCertificate", "TlsStream", "client_context", "server_context"]
+__all__ = ["ClientCredentials", "PeerCertificate", "TlsStream", "client_context", "server_context"]
 
 _ANY_INCARNATION = "holdfast"
 _READ_BYTES = 256 * 1024
@@ -81,11 +83,55 @@ def _context(protocol: int, files: TlsFiles) -> ssl.SSLContext:
         context.load_verify_locations(cafile=files.authority)
         # Without the empty password, an encrypted key would ask for one on the terminal.
         context.load_cert_chain(files.certificate, files.key, password="")
+        refuse_revoked(context, files.authority.parent)
     except (OSError, ssl.SSLError) as error:
         raise TransportError(
             f"credentials {files.certificate.parent} cannot be used: {error}"
         ) from error
     return context
+
+
+class ClientCredentials:
+    """A robot's credentials, read anew for a new link if somebody has replaced them.
+
+    So a list of revoked services counts as soon as it is there.
+
+    Parameters
+    ----------
+    files : TlsFiles
+
+    Raises
+    ------
+    TransportError
+        If they cannot be used.
+    """
+
+    def __init__(self, files: TlsFiles) -> None:
+        self._files = files
+        self._seen = self._look()
+        self._context = client_context(files)
+
+    def context(self) -> ssl.SSLContext:
+        """Return what a new link needs; that of before, if what is there now cannot be used."""
+        seen = self._look()
+        if seen != self._seen:
+            self._seen = seen
+            with contextlib.suppress(TransportError):
+                self._context = client_context(self._files)
+        return self._context
+
+    def _look(self) -> list[tuple[int, int, int] | None]:
+        files = self._files
+        found: list[tuple[int, int, int] | None] = []
+        revoked = files.authority.with_name(REVOKED_FILE)
+        for path in (files.authority, files.certificate, files.key, revoked):
+            try:
+                status = path.stat()
+            except OSError:
+                found.append(None)
+            else:
+                found.append((status.st_ino, status.st_mtime_ns, status.st_size))
+        return found
 
 
 def _of(incarnation: str) -> str:

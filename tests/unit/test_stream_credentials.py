@@ -1,0 +1,282 @@
+"""Links whose certificates are revoked or expire: they end, and no others do."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+import time
+from collections.abc import Callable
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+from tests.processes.faults import PATIENT
+
+from holdfast.runtime.credentials import load_credentials, make_credentials, revoke_credentials
+from holdfast.session.events import Appeared, Ended, Replied, TransportEvent, Vanished
+from holdfast.transport.contract import IncomingCall
+from holdfast.transport.endpoints import ServiceAddress, TlsFiles
+from holdfast.transport.frames import GOODBYE, FrameDecoder, encode_hello, read_goodbye
+from holdfast.transport.robot_end import StreamRobotTransport
+from holdfast.transport.service_end import StreamServiceTransport
+from holdfast.transport.tls import TlsStream, client_context
+
+PATIENCE_S = 8.0
+LEASE_MS = PATIENT["lease_ms"]
+REVOKED = "has a certificate that has been revoked"
+
+
+async def until(condition: Callable[[], bool], what: object = None) -> None:
+    """Wait until something is so."""
+    deadline = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < deadline, what
+        await asyncio.sleep(0.005)
+
+
+def files_of(directory: Path) -> TlsFiles:
+    return TlsFiles(*(directory / name for name in ("authority.pem", "certificate.pem", "key.pem")))
+
+
+class Robot:
+    """A robot's end, and what it was told."""
+
+    def __init__(self, directory: Path, endpoint: str) -> None:
+        self.events: list[TransportEvent] = []
+        self.refusals: list[str] = []
+        self.transport = StreamRobotTransport(
+            {"cloud": ServiceAddress(endpoint)},
+            lease_ms=LEASE_MS,
+            tls=files_of(directory),
+            on_refused=lambda _, reason: self.refusals.append(reason),
+        )
+        self.transport.start(self.events.append)
+
+    @property
+    def boots(self) -> list[str]:
+        return [each.boot for each in self.events if isinstance(each, Appeared)]
+
+    async def connected(self) -> None:
+        await until(lambda: bool(self.boots), (self.events, self.refusals))
+
+    async def ask(self, call: int) -> list[bytes]:
+        self.transport.call("cloud", call, b"?")
+        await until(lambda: Ended(call) in self.events, self.events)
+        return [each.payload for each in self.events if isinstance(each, Replied)]
+
+
+class Cloud:
+    """A service's end that answers with the name of who asks."""
+
+    def __init__(self, directory: Path) -> None:
+        self.told: list[tuple[str, dict[str, object]]] = []
+        self.held: list[IncomingCall] = []
+        self.holds = False
+        self.transport = StreamServiceTransport(
+            "cloud",
+            boot="b1",
+            listen=["tls/127.0.0.1:0"],
+            lease_ms=LEASE_MS,
+            tls=files_of(directory),
+            on_event=lambda name, **fields: self.told.append((name, fields)),
+        )
+
+    async def start(self) -> str:
+        await self.transport.start(self._received)
+        return self.transport.endpoints[0]
+
+    def _received(self, call: IncomingCall) -> None:
+        if self.holds:
+            self.held.append(call)
+            return
+        self.answer(call)
+
+    def answer(self, call: IncomingCall) -> None:
+        call.reply(str(call.robot).encode())
+        call.end()
+
+
+def test_a_revoked_robots_link_ends_and_no_other(tmp_path: Path) -> None:
+    make_credentials(tmp_path, robots=["anna", "berta"], services=["cloud"])
+
+    async def run() -> None:
+        cloud = Cloud(tmp_path / "cloud")
+        endpoint = await cloud.start()
+        anna, berta = (Robot(tmp_path / name, endpoint) for name in ("anna", "berta"))
+        for robot, name in ((anna, b"anna"), (berta, b"berta")):
+            await robot.connected()
+            assert await robot.ask(1) == [name]
+        cloud.holds = True
+        for robot in (anna, berta):
+            robot.transport.call("cloud", 2, b"?")
+        await until(lambda: len(cloud.held) == 2)
+        assert cloud.transport.reload_credentials() == 0, "nobody is revoked yet"
+        revoke_credentials(tmp_path, names=["anna"])
+        assert cloud.transport.reload_credentials() == 1
+        await until(lambda: Vanished("cloud", "b1") in anna.events, anna.events)
+        assert Ended(2) in anna.events or await anna.ask(3) == [b"anna"]
+        await until(lambda: f"refuses this end, which {REVOKED}" in anna.refusals, anna.refusals)
+        # It is not let in again, and is told why.
+        await until(
+            lambda: "refuses this end's certificate (certificate revoked)" in anna.refusals,
+            anna.refusals,
+        )
+        assert anna.boots == ["b1"]
+        # The other one has its answer over the link over which it asked.
+        for call in cloud.held:
+            cloud.answer(call)
+        await until(lambda: Ended(2) in berta.events)
+        assert berta.boots == ["b1"]
+        assert berta.refusals == []
+        assert [each.payload for each in berta.events if isinstance(each, Replied)] == [
+            b"berta"
+        ] * 2
+        told = [fields for name, fields in cloud.told if name == "robot_disconnected"]
+        assert told == [{"robot": "anna", "reason": REVOKED}]
+        for end in (anna.transport, berta.transport, cloud.transport):
+            await end.close()
+
+    asyncio.run(run())
+
+
+def test_a_rotated_robot_is_let_in_by_itself(tmp_path: Path) -> None:
+    """Its new credentials are read when it tries again."""
+    make_credentials(tmp_path, robots=["anna"], services=["cloud"])
+
+    async def run() -> None:
+        cloud = Cloud(tmp_path / "cloud")
+        anna = Robot(tmp_path / "anna", await cloud.start())
+        await anna.connected()
+        revoke_credentials(tmp_path, names=["anna"])
+        cloud.transport.reload_credentials()
+        await until(lambda: Vanished("cloud", "b1") in anna.events, anna.events)
+        make_credentials(tmp_path, robots=["anna"], rotate=True)
+        await until(lambda: len(anna.boots) == 2, (anna.events, anna.refusals))
+        assert await anna.ask(1) == [b"anna"]
+        for end in (anna.transport, cloud.transport):
+            await end.close()
+
+    asyncio.run(run())
+
+
+def test_a_robot_believes_no_service_that_is_revoked(tmp_path: Path) -> None:
+    make_credentials(tmp_path, robots=["anna"], services=["cloud"])
+
+    async def run() -> None:
+        cloud = Cloud(tmp_path / "cloud")
+        endpoint = await cloud.start()
+        first = Robot(tmp_path / "anna", endpoint)
+        await first.connected()
+        revoke_credentials(tmp_path, names=["cloud"])
+        # The robot has the list now; the thief who has the service's key has none.
+        (tmp_path / "cloud" / "revoked.pem").unlink()
+        second = Robot(tmp_path / "anna", endpoint)
+        wanted = "has a certificate that is refused: certificate revoked"
+        await until(lambda: wanted in second.refusals, second.refusals)
+        assert second.boots == []
+        # One that runs already finds the list when it connects again.
+        cloud.transport.end_links(lambda _: True, "is to come again")
+        await until(lambda: wanted in first.refusals, first.refusals)
+        assert first.boots == ["b1"]
+        for end in (first.transport, second.transport, cloud.transport):
+            await end.close()
+
+    asyncio.run(run())
+
+
+def test_who_shook_hands_before_the_list_came_is_not_let_in_after_it(tmp_path: Path) -> None:
+    make_credentials(tmp_path, robots=["anna"], services=["cloud"])
+
+    async def run() -> None:
+        cloud = Cloud(tmp_path / "cloud")
+        endpoint = await cloud.start()
+        host, port = endpoint.removeprefix("tls/").rsplit(":", 1)
+        loop = asyncio.get_running_loop()
+        with socket.create_connection((host, int(port))) as connection:
+            connection.setblocking(False)
+            tls = TlsStream(client_context(files_of(tmp_path / "anna")), host)
+            tls.begin()
+            await loop.sock_sendall(connection, tls.take())
+            while not tls.established:
+                tls.receive(await loop.sock_recv(connection, 65536))
+            revoke_credentials(tmp_path, names=["anna"])
+            assert cloud.transport.reload_credentials() == 0, "it has not shown a certificate yet"
+            tls.send(encode_hello("robot", "anna", "0", LEASE_MS))
+            await loop.sock_sendall(connection, tls.take())
+            told = b""
+            while data := await loop.sock_recv(connection, 65536):
+                told += tls.receive(data)
+        last = list(FrameDecoder(1000).feed(told))[-1]
+        assert last.kind == GOODBYE
+        assert read_goodbye(last.payload) == REVOKED
+        assert [name for name, _ in cloud.told] == ["link_refused"]
+        await cloud.transport.close()
+
+    asyncio.run(run())
+
+
+def test_credentials_that_cannot_be_read_leave_those_of_before(tmp_path: Path) -> None:
+    import pytest
+
+    from holdfast.errors import TransportError
+
+    make_credentials(tmp_path, robots=["anna"], services=["cloud"])
+
+    async def run() -> None:
+        cloud = Cloud(tmp_path / "cloud")
+        endpoint = await cloud.start()
+        for name in ("revoked.pem", "key.pem"):
+            (tmp_path / "cloud" / name).write_bytes(b"half a fi")
+            with pytest.raises(TransportError, match=name.partition(".")[0]):
+                cloud.transport.reload_credentials()
+            (tmp_path / "cloud" / name).unlink()
+        anna = Robot(tmp_path / "anna", endpoint)
+        await anna.connected()
+        for end in (anna.transport, cloud.transport):
+            await end.close()
+
+    asyncio.run(run())
+
+
+def short_lived(directory: Path, seconds: float, **names: list[str]) -> None:
+    """Make credentials that expire in a few seconds."""
+    end = datetime.now(UTC) + timedelta(seconds=seconds)
+    make_credentials(directory, days=1, now=end - timedelta(days=1), **names)  # type: ignore[arg-type]
+
+
+def test_a_robots_link_ends_when_its_certificate_expires(tmp_path: Path) -> None:
+    make_credentials(tmp_path, robots=["berta"], services=["cloud"])
+    short_lived(tmp_path, 4.0, robots=["anna"])
+    load_credentials(tmp_path / "anna", "robot", warn=lambda _: None)
+
+    async def run() -> None:
+        cloud = Cloud(tmp_path / "cloud")
+        endpoint = await cloud.start()
+        anna, berta = (Robot(tmp_path / name, endpoint) for name in ("anna", "berta"))
+        for robot in (anna, berta):
+            await robot.connected()
+        await until(lambda: Vanished("cloud", "b1") in anna.events, anna.events)
+        why = "refuses this end, which has a certificate that has expired"
+        await until(lambda: why in anna.refusals, anna.refusals)
+        assert anna.boots == ["b1"]
+        assert berta.boots == ["b1"]
+        assert not [each for each in berta.events if isinstance(each, Vanished)]
+        for end in (anna.transport, berta.transport, cloud.transport):
+            await end.close()
+
+    asyncio.run(run())
+
+
+def test_a_robot_leaves_a_service_whose_certificate_expires(tmp_path: Path) -> None:
+    make_credentials(tmp_path, robots=["anna"])
+    short_lived(tmp_path, 4.0, services=["cloud"])
+
+    async def run() -> None:
+        cloud = Cloud(tmp_path / "cloud")
+        anna = Robot(tmp_path / "anna", await cloud.start())
+        await anna.connected()
+        await until(lambda: Vanished("cloud", "b1") in anna.events, anna.events)
+        assert "has a certificate that has expired" in anna.refusals
+        for end in (anna.transport, cloud.transport):
+            await end.close()
+
+    asyncio.run(run())
