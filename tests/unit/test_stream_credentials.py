@@ -9,8 +9,10 @@ from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
+import pytest
 from tests.processes.faults import PATIENT
 
+from holdfast.errors import TransportError
 from holdfast.runtime.credentials import load_credentials, make_credentials, revoke_credentials
 from holdfast.session.events import Appeared, Ended, Replied, TransportEvent, Vanished
 from holdfast.transport.contract import IncomingCall
@@ -20,7 +22,7 @@ from holdfast.transport.robot_end import StreamRobotTransport
 from holdfast.transport.service_end import StreamServiceTransport
 from holdfast.transport.tls import TlsStream, client_context
 
-PATIENCE_S = 8.0
+PATIENCE_S = 60.0
 LEASE_MS = PATIENT["lease_ms"]
 REVOKED = "has a certificate that has been revoked"
 
@@ -55,12 +57,20 @@ class Robot:
     def boots(self) -> list[str]:
         return [each.boot for each in self.events if isinstance(each, Appeared)]
 
+    @property
+    def vanished(self) -> list[str]:
+        return [each.boot for each in self.events if isinstance(each, Vanished)]
+
+    @property
+    def ended(self) -> list[int]:
+        return [each.call for each in self.events if isinstance(each, Ended)]
+
     async def connected(self) -> None:
         await until(lambda: bool(self.boots), (self.events, self.refusals))
 
     async def ask(self, call: int) -> list[bytes]:
         self.transport.call("cloud", call, b"?")
-        await until(lambda: Ended(call) in self.events, self.events)
+        await until(lambda: call in self.ended, self.events)
         return [each.payload for each in self.events if isinstance(each, Replied)]
 
 
@@ -112,8 +122,8 @@ def test_a_revoked_robots_link_ends_and_no_other(tmp_path: Path) -> None:
         assert cloud.transport.reload_credentials() == 0, "nobody is revoked yet"
         revoke_credentials(tmp_path, names=["anna"])
         assert cloud.transport.reload_credentials() == 1
-        await until(lambda: Vanished("cloud", "b1") in anna.events, anna.events)
-        assert Ended(2) in anna.events or await anna.ask(3) == [b"anna"]
+        await until(lambda: bool(anna.vanished), anna.events)
+        assert 2 in anna.ended
         await until(lambda: f"refuses this end, which {REVOKED}" in anna.refusals, anna.refusals)
         # It is not let in again, and is told why.
         await until(
@@ -124,7 +134,7 @@ def test_a_revoked_robots_link_ends_and_no_other(tmp_path: Path) -> None:
         # The other one has its answer over the link over which it asked.
         for call in cloud.held:
             cloud.answer(call)
-        await until(lambda: Ended(2) in berta.events)
+        await until(lambda: 2 in berta.ended)
         assert berta.boots == ["b1"]
         assert berta.refusals == []
         assert [each.payload for each in berta.events if isinstance(each, Replied)] == [
@@ -148,7 +158,7 @@ def test_a_rotated_robot_is_let_in_by_itself(tmp_path: Path) -> None:
         await anna.connected()
         revoke_credentials(tmp_path, names=["anna"])
         cloud.transport.reload_credentials()
-        await until(lambda: Vanished("cloud", "b1") in anna.events, anna.events)
+        await until(lambda: bool(anna.vanished), anna.events)
         make_credentials(tmp_path, robots=["anna"], rotate=True)
         await until(lambda: len(anna.boots) == 2, (anna.events, anna.refusals))
         assert await anna.ask(1) == [b"anna"]
@@ -215,10 +225,6 @@ def test_who_shook_hands_before_the_list_came_is_not_let_in_after_it(tmp_path: P
 
 
 def test_credentials_that_cannot_be_read_leave_those_of_before(tmp_path: Path) -> None:
-    import pytest
-
-    from holdfast.errors import TransportError
-
     make_credentials(tmp_path, robots=["anna"], services=["cloud"])
 
     async def run() -> None:
@@ -226,7 +232,7 @@ def test_credentials_that_cannot_be_read_leave_those_of_before(tmp_path: Path) -
         endpoint = await cloud.start()
         for name in ("revoked.pem", "key.pem"):
             (tmp_path / "cloud" / name).write_bytes(b"half a fi")
-            with pytest.raises(TransportError, match=name.partition(".")[0]):
+            with pytest.raises(TransportError, match=r"cannot be used|revoked"):
                 cloud.transport.reload_credentials()
             (tmp_path / "cloud" / name).unlink()
         anna = Robot(tmp_path / "anna", endpoint)
@@ -254,12 +260,12 @@ def test_a_robots_link_ends_when_its_certificate_expires(tmp_path: Path) -> None
         anna, berta = (Robot(tmp_path / name, endpoint) for name in ("anna", "berta"))
         for robot in (anna, berta):
             await robot.connected()
-        await until(lambda: Vanished("cloud", "b1") in anna.events, anna.events)
+        await until(lambda: bool(anna.vanished), anna.events)
         why = "refuses this end, which has a certificate that has expired"
         await until(lambda: why in anna.refusals, anna.refusals)
         assert anna.boots == ["b1"]
         assert berta.boots == ["b1"]
-        assert not [each for each in berta.events if isinstance(each, Vanished)]
+        assert not berta.vanished
         for end in (anna.transport, berta.transport, cloud.transport):
             await end.close()
 
@@ -274,7 +280,7 @@ def test_a_robot_leaves_a_service_whose_certificate_expires(tmp_path: Path) -> N
         cloud = Cloud(tmp_path / "cloud")
         anna = Robot(tmp_path / "anna", await cloud.start())
         await anna.connected()
-        await until(lambda: Vanished("cloud", "b1") in anna.events, anna.events)
+        await until(lambda: bool(anna.vanished), anna.events)
         assert "has a certificate that has expired" in anna.refusals
         for end in (anna.transport, cloud.transport):
             await end.close()

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import math
 import socket
 import ssl
 import time
@@ -420,7 +421,8 @@ class Link(asyncio.BufferedProtocol):
             # If it is this process that stood still, what came meanwhile is still to be read.
             self._loop.call_soon(self._loop.call_soon, self._give_up_if_silent)
             return
-        if self.peer is not None and time.time() >= self.peer.expires_at:
+        valid_s = math.inf if self.peer is None else self.peer.expires_at - time.time()
+        if valid_s <= 0.0:
             self.end(_EXPIRED, goodbye=_EXPIRED, refused=True)
             return
         transport = self._transport
@@ -438,7 +440,7 @@ class Link(asyncio.BufferedProtocol):
                 return
         due = self._silent_at
         if self.hello is not None:
-            due = min(due, now + self._ping_interval_s)
+            due = min(due, now + self._ping_interval_s, now + valid_s)
         self._timer = self._loop.call_at(due, self._tick)
 
     def _give_up_if_silent(self) -> None:

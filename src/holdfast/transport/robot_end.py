@@ -204,7 +204,7 @@ class _Service:
         self._calls: dict[Link, dict[int, PendingCall]] = {}
         self._numbers = count()
         # What the last hello said, under which boot that was told, and whether the handshake alone
-        # is believed: not after one to which no hello came.
+        # is believed: not after one to which no hello came, or a refusal.
         self._incarnation: str | None = None
         self._boot = ""
         self._handshake_is_enough = False
@@ -276,6 +276,7 @@ class _Service:
 
     def refusal(self, link: Link, hello: Hello) -> str | None:
         """Refuse whoever is not the service that is looked for."""
+        del link
         if hello.role != "service":
             return "is a robot, and a service was expected"
         wanted = self._address.name
@@ -325,7 +326,7 @@ class _Service:
         self._calls.pop(link, None)
         was_current = next(reversed(self._links), None) is link
         boot = self._links.pop(link, None)
-        if link.hello is None and boot is not None:
+        if link.refused or (link.hello is None and boot is not None):
             self._handshake_is_enough = False
         dialer = self._dialer
         if dialer is not None:
