@@ -173,6 +173,17 @@ class TestEnding:
             host, _, port = cloud.endpoint.removeprefix("tcp/").rpartition(":")
             again.bind((host, int(port)))
 
+    def test_with_credentials_sighup_has_them_read_again(self, site: Site, keys: Path) -> None:
+        cloud = several(
+            site,
+            *("--tls", str(keys / "ours" / "service")),
+            endpoint=f"tls/127.0.0.1:{free_port()}",
+        )
+        pids = children(cloud)
+        cloud.process.signal(signal.SIGHUP)
+        cloud.process.wait_for("credentials_reloaded", 2)
+        assert children(cloud) == pids
+
     def test_processes_end_with_the_supervisor(self, site: Site) -> None:
         cloud = several(site)
         pids = children(cloud)
