@@ -2,9 +2,9 @@
 
 They play trials back that were run before, so they cost little themselves; but each has a session
 of its own and asks as a robot does: with what it has observed since the service last answered it,
-and with its whole state where the service says that it does not know it. One event loop has all their
-links, as little beside the service as it can be. Takes one JSON object and prints one, as child.py
-does.
+and with its whole state where the service says that it does not know it. One event loop has all
+their links, so that they take little of the machine from the service. Takes one JSON object and
+prints one, as child.py does.
 """
 
 from __future__ import annotations

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import signal
@@ -48,11 +49,13 @@ class Mortal(CapsuleRobot):
 """
 
 
-def several(site: Site, *options: str, processes: int = 2) -> Service:
-    """Return a service of several processes that tells how it is."""
+def several(site: Site, *options: str, endpoint: str | None = None) -> Service:
+    """Return a service of two processes that tells how it is."""
     address = f"127.0.0.1:{free_port()}"
     return site.service(
-        *("--processes", str(processes), "--health", address, "--metrics", address), *options
+        *("--processes", "2", "--health", address, "--metrics", address),
+        *options,
+        endpoint=endpoint,
     ).start()
 
 
@@ -90,9 +93,17 @@ def started_again(service: Service, count: int) -> Callable[[], object]:
 
 
 class TestRobots:
-    def test_processes_are_killed_under_them(self, site: Site, references: References) -> None:
+    @pytest.mark.parametrize("protocol", ["tcp", "tls", "unix"])
+    def test_processes_are_killed_under_them(
+        self, protocol: str, site: Site, keys: Path, references: References
+    ) -> None:
         """Their runs decide the same; nothing but time is lost, and nothing is forgotten."""
-        cloud = several(site)
+        place = site.directory / "socket" if protocol == "unix" else f"127.0.0.1:{free_port()}"
+        credentials = {
+            end: ("--tls", str(keys / "ours" / end)) if protocol == "tls" else ()
+            for end in ("robot", "service")
+        }
+        cloud = several(site, *credentials["service"], endpoint=f"{protocol}/{place}")
         document = document_of(PEG)
         told: list[dict[str, float]] = []
 
@@ -112,7 +123,9 @@ class TestRobots:
                 world.on("perform", 20, in_order(lambda: kill(0), started_again(cloud, 1)))
                 world.on("sense", 36, in_order(lambda: kill(1), started_again(cloud, 2)))
                 world.on("perform", 50, in_order(lambda: kill(0), lambda: kill(-1)))
-            robots.append(site.run(file, services=[cloud], out=f"out-{number}"))
+            robots.append(
+                site.run(file, *credentials["robot"], services=[cloud], out=f"out-{number}")
+            )
         for robot, world in zip(robots, worlds, strict=True):
             robot.finish()
             world.check()
@@ -120,7 +133,7 @@ class TestRobots:
             world.assert_each_once(references(document))
             assert not [each for each in events_of(robot.out) if each["event"] == "launch"]
         told.append(metrics(cloud))
-        for before, after in zip(told, told[1:], strict=False):
+        for before, after in itertools.pairwise(told):
             for name, value in before.items():
                 assert after[name] >= value, name
         decisions = "holdfast_decisions_total[('kind', 'sensing')]"
@@ -142,7 +155,9 @@ class TestRobots:
 
 
 class TestEnding:
-    @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 0), (signal.SIGINT, 130)])
+    @pytest.mark.parametrize(
+        ("number", "code"), [(signal.SIGTERM, 0), (signal.SIGINT, 130), (signal.SIGHUP, 129)]
+    )
     def test_in_order(self, site: Site, number: signal.Signals, code: int) -> None:
         cloud = several(site)
         pids = children(cloud)
@@ -151,12 +166,23 @@ class TestEnding:
         assert cloud.process.wait() == code, cloud.process.account()
         for pid in pids:
             wait_for_end(pid)
-        (stopping, *others) = cloud.process.matching("stopping")
+        (stopping,) = cloud.process.matching("stopping")
         assert stopping["reason"] == number.name
         assert "Traceback" not in cloud.process.output
         with socket.socket() as again:
             host, _, port = cloud.endpoint.removeprefix("tcp/").rpartition(":")
             again.bind((host, int(port)))
+
+    def test_with_credentials_sighup_has_them_read_again(self, site: Site, keys: Path) -> None:
+        cloud = several(
+            site,
+            *("--tls", str(keys / "ours" / "service")),
+            endpoint=f"tls/127.0.0.1:{free_port()}",
+        )
+        pids = children(cloud)
+        cloud.process.signal(signal.SIGHUP)
+        cloud.process.wait_for("credentials_reloaded", 2)
+        assert children(cloud) == pids
 
     def test_processes_end_with_the_supervisor(self, site: Site) -> None:
         cloud = several(site)

@@ -34,6 +34,8 @@ NUMBERS = [
     ["serve", "--lease-ms"],
     ["serve", "--max-sessions"],
     ["serve", "--metrics"],
+    ["serve", "--health"],
+    ["serve", "--processes"],
 ]
 PATHS = [
     ["run"],

@@ -16,7 +16,8 @@ late_replies, waiting, holding, resumed, busy, refused, malformed_reply, disagre
 wrong_answer, not_deterministic, verification_failed, distrusted,
 limits_unknown, verifying, prefetch_unused, unexplained, filter_diverged,
 resumed_trial, performed_unseen, trial, missed_ticks, stopped, note, interrupted.
-By a service: ready, session_opened, session_taken_over, restored, refused, busy, evicted, stopping.
+By a service: ready, session_opened, session_taken_over, restored, refused, busy, evicted, stopping,
+process_ended, process_started.
 By ``holdfast chaos``: chaos_trial, left_out, note, interrupted. By a command that ends with an
 error: error. Fields with a place of their own in the text form: ``from`` and ``to`` (of a change),
 ``service``, ``reason``, ``duration_ms``. Events that may come very often are written about once a

@@ -57,7 +57,8 @@ def main(arguments: Sequence[str]) -> int:
     Returns
     -------
     int
-        0 after SIGTERM or the end of standard input, 130 after SIGINT, 129 after SIGHUP.
+        0 after SIGTERM or the end of standard input, 130 after SIGINT, 129 after SIGHUP. With
+        credentials it is SIGHUP that has them read again.
 
     Raises
     ------
@@ -185,6 +186,13 @@ def _parser() -> _Parser:
         help="after SIGTERM, time for the answers that are owed (default: 5)",
     )
     add(
+        "--max-sessions-per-robot",
+        type=_whole_number(1, 1_000_000),
+        metavar="N",
+        help="runs remembered of those that use the certificate of one robot (default: as many as "
+        "there is room for)",
+    )
+    add(
         "--problem",
         action="append",
         default=[],
@@ -294,6 +302,11 @@ def _serve_with_several(options: argparse.Namespace, arguments: Sequence[str]) -
             return await supervise(
                 supervisor,
                 events,
+                [
+                    number
+                    for number in _handled_signals()
+                    if options.tls is None or number != signal.SIGHUP
+                ],
                 options.drain_s + 2 * _CLOSE_TIMEOUT_S,
                 lambda: _say_ready(options, None, where),
             )
@@ -408,6 +421,8 @@ def _serve(options: argparse.Namespace, supervised: Supervised | None = None) ->
 
     import asyncio
 
+    import msgspec
+
     from holdfast.runtime.allocator import limit_arenas
     from holdfast.runtime.logs import EventLog
     from holdfast.service.known_problems import KnownProblems
@@ -417,9 +432,9 @@ def _serve(options: argparse.Namespace, supervised: Supervised | None = None) ->
     from holdfast.session.service_limits import ServiceLimits
 
     limit_arenas()
-    limits = ServiceLimits()
+    limits = ServiceLimits(max_sessions_per_robot=options.max_sessions_per_robot)
     if options.max_sessions is not None:
-        limits = ServiceLimits(max_sessions=options.max_sessions)
+        limits = msgspec.structs.replace(limits, max_sessions=options.max_sessions)
     workers = options.workers or len(os.sched_getaffinity(0))
     problems = KnownProblems(options.problem, options.problem_directory or Path.cwd())
 
@@ -488,6 +503,8 @@ async def _run(
         where: dict[str, object] = dict(await watched.start())
         for number in _handled_signals():
             loop.add_signal_handler(number, shell.stop, number.name)
+        if options.tls is not None:
+            loop.add_signal_handler(signal.SIGHUP, _reload, options, transport, events)
         await shell.start()
         if options.until_stdin_closes:
             _watch_stdin(loop, shell)
@@ -514,7 +531,8 @@ async def _run(
         if reason == signal.SIGTERM.name:
             draining = loop.create_task(shell.drain(options.drain_s))
             for number in _handled_signals():
-                loop.add_signal_handler(number, draining.cancel)
+                if options.tls is None or number != signal.SIGHUP:
+                    loop.add_signal_handler(number, draining.cancel)
             await asyncio.wait((draining,))
     finally:
         await shell.close(_CLOSE_TIMEOUT_S)
@@ -522,6 +540,19 @@ async def _run(
         if supervised is not None:
             supervised.close()
     return _exit_status(reason)
+
+
+def _reload(
+    options: argparse.Namespace, transport: StreamServiceTransport, events: EventLog
+) -> None:
+    """Read the credentials and the list of what is revoked again."""
+    try:
+        _credentials(options)  # it knows more of what can be wrong with them
+        ended = transport.reload_credentials()
+    except HoldfastError as error:
+        events.event("credentials", reason=f"{error}; those of before stay in use")
+    else:
+        events.event("credentials_reloaded", links_ended=ended)
 
 
 def _exit_status(reason: str) -> int:

@@ -24,7 +24,7 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from time import monotonic
 from typing import Any, Protocol
 
@@ -432,6 +432,7 @@ class Supervisor:
 async def supervise(
     supervisor: Supervisor,
     events: EventSink,
+    ending: Iterable[signal.Signals],
     drain_s: float,
     ready: Callable[[], None],
 ) -> int:
@@ -441,6 +442,8 @@ async def supervise(
     ----------
     supervisor : Supervisor
     events : EventSink
+    ending : iterable of signal.Signals
+        Those that end the service. If SIGHUP is none of them, the processes get it.
     drain_s : float
         How long the processes may take to end in order. A second signal ends them at once.
     ready : callable
@@ -465,10 +468,9 @@ async def supervise(
         else:
             stopping.set_result(number)
 
-    for ending in (signal.SIGTERM, signal.SIGINT):
-        if signal.getsignal(ending) is not signal.SIG_IGN:
-            loop.add_signal_handler(ending, stop, ending)
     loop.add_signal_handler(signal.SIGHUP, supervisor.reload)
+    for each in ending:
+        loop.add_signal_handler(each, stop, each)
     starting = loop.create_task(supervisor.start())
     try:
         awaited: set[asyncio.Future[Any]] = {starting, stopping}

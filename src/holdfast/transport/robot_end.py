@@ -97,12 +97,14 @@ class StreamRobotTransport:
         self.calls = CallTable()
         self.on_refused = on_refused
         self._services: dict[str, _Service] = {}
-        credentials = None if tls is None else ClientCredentials(tls)
+        credentials: ClientCredentials | None = None
         for service, address in services.items():
             endpoint = check_endpoint(address.endpoint, listens=address.listens)
             check_credentials(endpoint, tls)
             if address.name is not None:
                 check_name("name of a service", address.name)
+            if credentials is None and tls is not None and endpoint.is_encrypted:
+                credentials = ClientCredentials(tls)
             own = credentials if endpoint.is_encrypted else None
             self._services[service] = _Service(self, service, address, endpoint, own)
         self._started = False

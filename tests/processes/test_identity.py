@@ -1,0 +1,187 @@
+"""Whose certificate is revoked or expires is cut off at once, and nobody else notices."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Callable, Iterator
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+from tests.ports import free_port
+from tests.processes.faults import (
+    LOCAL_RECOVERY,
+    LOST,
+    References,
+    Service,
+    Site,
+    Story,
+    document_of,
+    events_of,
+)
+
+from holdfast.runtime.credentials import make_credentials, revoke_credentials
+
+PEG = "peg_in_hole_2d"
+
+
+@pytest.fixture
+def home(tmp_path: Path) -> Path:
+    make_credentials(tmp_path / "home", robots=["anna", "berta"], services=["cloud"])
+    return tmp_path / "home"
+
+
+@pytest.fixture
+def elsewhere(tmp_path: Path) -> Iterator[Site]:
+    """Where another robot works."""
+    directory = tmp_path / "elsewhere"
+    directory.mkdir()
+    with Site(directory) as site:
+        yield site
+
+
+def cloud_of(site: Site, home: Path, *options: str) -> Service:
+    return site.service(
+        "--tls", str(home / "cloud"), *options, endpoint=f"tls/127.0.0.1:{free_port()}"
+    )
+
+
+def reload(cloud: Service, count: int = 1) -> dict[str, object]:
+    cloud.process.signal(signal.SIGHUP)
+    return cloud.process.wait_for("credentials_reloaded", count)
+
+
+def robot_beside(
+    home: Path,
+    cloud: Service,
+    site: Site,
+    elsewhere: Site,
+    references: References,
+    happens: Callable[[Story], None],
+) -> tuple[list[tuple[str, str]], Path]:
+    """Let anna run while berta's run goes on; return anna's changes of status, and her run."""
+    document = document_of(PEG)
+    bertas = Story(elsewhere, references, document)
+    found: list[tuple[list[tuple[str, str]], Path]] = []
+
+    def run_anna() -> None:
+        story = Story(site, references, document)
+        happens(story)
+        robot = story.run(cloud, options=("--tls", str(home / "anna")))
+        found.append((robot.statuses(), robot.out))
+
+    bertas.at("perform", 20, run_anna)
+    berta = bertas.run(cloud, options=("--tls", str(home / "berta")))
+    assert berta.statuses() == []
+    assert not [each for each in events_of(berta.out) if each["event"] == "refused"]
+    # One link, from the beginning to the end.
+    assert len(cloud.process.matching("robot_connected", robot="berta")) == 1
+    return found[0]
+
+
+def test_a_revoked_robot_is_cut_off_and_no_other(
+    home: Path, site: Site, elsewhere: Site, references: References
+) -> None:
+    cloud = cloud_of(site, home).start()
+
+    def happens(story: Story) -> None:
+        def revoke() -> None:
+            revoke_credentials(home, names=["anna"])
+            assert reload(cloud)["links_ended"] == 1
+
+        story.at("perform", 20, revoke, story.status(LOCAL_RECOVERY))
+
+    statuses, out = robot_beside(home, cloud, site, elsewhere, references, happens)
+    assert statuses == [LOST]
+    told = " ".join(str(each.get("reason")) for each in events_of(out))
+    assert "has a certificate that has been revoked" in told
+    (ended,) = cloud.process.matching("robot_disconnected", robot="anna")
+    assert ended["reason"] == "has a certificate that has been revoked"
+
+
+def test_a_robot_whose_certificate_expires_is_cut_off_and_no_other(
+    home: Path, site: Site, elsewhere: Site, references: References
+) -> None:
+    cloud = cloud_of(site, home).start()
+
+    def happens(story: Story) -> None:
+        expiring(home, "anna", seconds=8.0)
+        story.at("perform", 20, story.status(LOCAL_RECOVERY))
+
+    statuses, out = robot_beside(home, cloud, site, elsewhere, references, happens)
+    assert statuses == [LOST]
+    told = " ".join(str(each.get("reason")) for each in events_of(out))
+    assert "has a certificate that has expired" in told
+
+
+def expiring(home: Path, name: str, seconds: float) -> None:
+    """Give a robot a certificate that expires soon."""
+    end = datetime.now(UTC) + timedelta(seconds=seconds)
+    make_credentials(home, robots=[name], rotate=True, days=1, now=end - timedelta(days=1))
+
+
+def test_a_rotated_service_goes_on_with_the_links_that_it_has(
+    home: Path, site: Site, references: References
+) -> None:
+    cloud = cloud_of(site, home).start()
+    story = Story(site, references, document_of(PEG))
+
+    def rotate() -> None:
+        make_credentials(home, services=["cloud"], rotate=True)
+        assert reload(cloud)["links_ended"] == 0
+
+    story.at("perform", 20, rotate)
+    robot = story.run(cloud, options=("--tls", str(home / "anna")))
+    assert robot.statuses() == []
+    assert len(cloud.process.matching("robot_connected")) == 1
+
+
+def test_credentials_that_cannot_be_used_are_told_and_not_used(
+    home: Path, site: Site, references: References
+) -> None:
+    cloud = cloud_of(site, home).start()
+    (home / "cloud" / "revoked.pem").write_text("half a fi")
+    cloud.process.signal(signal.SIGHUP)
+    told = cloud.process.wait_for("credentials")
+    assert "revoked.pem: is no revocation list" in told["reason"]
+    assert "those of before stay in use" in told["reason"]
+    robot = Story(site, references, document_of(PEG)).run(
+        cloud, options=("--tls", str(home / "anna"))
+    )
+    assert robot.statuses() == []
+
+
+def test_a_service_that_is_revoked_does_not_start(home: Path, site: Site) -> None:
+    revoke_credentials(home, names=["cloud"])
+    ended = site.holdfast(
+        "serve", "--listen", f"tls/127.0.0.1:{free_port()}", "--tls", home / "cloud"
+    )
+    assert ended.process.returncode == 2
+    assert "certificate.pem: has been revoked" in ended.output
+
+
+def test_several_processes_read_them_again(home: Path, site: Site, references: References) -> None:
+    cloud = cloud_of(site, home, "--processes", "2").start()
+    story = Story(site, references, document_of(PEG))
+
+    def revoke() -> None:
+        revoke_credentials(home, names=["anna"])
+        reload(cloud, count=2)
+
+    story.at("perform", 20, revoke, story.status(LOCAL_RECOVERY))
+    robot = story.run(cloud, options=("--tls", str(home / "anna")))
+    assert robot.statuses() == [LOST]
+    ended = [each["links_ended"] for each in cloud.process.matching("credentials_reloaded")]
+    assert sorted(map(int, ended)) == [0, 1]
+
+
+def test_runs_of_one_certificate_have_a_limit(
+    home: Path, site: Site, references: References
+) -> None:
+    cloud = cloud_of(site, home, "--max-sessions-per-robot", "1").start()
+    for count in (1, 2):
+        story = Story(site, references, document_of(PEG))
+        robot = site.run(story.file, "--tls", home / "anna", services=[cloud], out=f"out-{count}")
+        story.finish(robot)
+    (evicted,) = cloud.process.matching("evicted")
+    assert (evicted["robot"], evicted["reason"]) == ("anna", "room needed")
