@@ -56,6 +56,9 @@ _PROBE = 0x7FFF_0001
 _OTHERS_CALLS = 40
 """Calls of robots are counted from 1 on: so many of them are aimed at."""
 
+_HALF = 40
+"""Bytes of a frame that is begun and not ended."""
+
 _ACTION_SIZE = 3
 _LAST_EPOCH = 2**32 - 1
 
@@ -214,7 +217,11 @@ class Intruder:
                 try:
                     greeted = self._bring(link, moment, calls)
                     link.say(message.data)
-                    calls.update(_calls_in(message))
+                    eaten = 0
+                    if moment == "in the middle of a frame":
+                        calls.add(1)
+                        eaten = len(frame_of(CALL, 1, self._own)) - _HALF
+                    calls.update(_calls_in(message.data[eaten:]))
                     if greeted and message.is_whole:
                         calls.add(_PROBE)
                         link.send(CALL, _PROBE, b"junk")
@@ -236,7 +243,7 @@ class Intruder:
             calls.add(1)
             link.send(CALL, 1, self._own)
         if moment == "in the middle of a frame":
-            link.say(frame_of(CALL, 1, self._own)[:40])
+            link.say(frame_of(CALL, 1, self._own)[:_HALF])
             return False
         return True
 
@@ -271,10 +278,10 @@ class Intruder:
             self.told.append(f"{when}: {reply}")
 
 
-def _calls_in(message: Message) -> Iterator[int]:
-    """Yield the calls that a message makes, or begins to make."""
+def _calls_in(data: bytes) -> Iterator[int]:
+    """Yield the calls that bytes make, or begin to make."""
     at = 0
-    data = message.data.removeprefix(MAGIC)
+    data = data.removeprefix(MAGIC)
     while at + 9 <= len(data):
         if data[at + 4] == CALL:
             yield int.from_bytes(data[at + 5 : at + 9], "little")

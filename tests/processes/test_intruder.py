@@ -81,7 +81,7 @@ class Raid:
             asked[0], session=os.urandom(16), opening=opening_of(configuration)
         )
         self.intruder = Intruder(self._cloud.endpoint, self._keys, asked, own)
-        self._thread = threading.Thread(target=self._run)
+        self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
 
     def finish_a_round(self) -> None:
