@@ -3,8 +3,8 @@
 glibc hands out memory from *arenas*, eight for each core, so that threads that allocate at the same
 time do not wait for each other. What is freed goes back to the arena that it came from, and an
 arena shrinks at its end alone. So each of them grows to the most that its threads ever held at the
-same time, and keeps that. A service has some fifty threads, whose greatest moments come by chance,
-so it seems to leak until every arena has had its own.
+same time, and keeps that. The greatest moments of a service's workers come by chance, so it seems
+to leak until every arena has had its own.
 
 A service gains little by arenas, since its threads mostly hold the interpreter when they allocate.
 """
