@@ -392,6 +392,7 @@ class Script(Service):
     def __init__(self, *runs: Run) -> None:
         super().__init__(KnownProblems(), 2)
         self.runs = list(runs)
+        self.begun_at = self.finished_at = 0.0
         self.trace: list[str] = []
         self.times: list[float] = []
 
@@ -402,10 +403,12 @@ class Script(Service):
 
     def begun(self, job: Job, now: float) -> None:
         self.trace.append(f"begun {job.kind}")
+        self.begun_at = now
         self.times.append(now)
 
     def finished(self, job: Job, outcome: Outcome, now: float) -> list[Effect]:
         self.trace.append(f"finished {job.kind}")
+        self.finished_at = now
         self.times.append(now)
         return []
 
@@ -515,6 +518,19 @@ class Clock:
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._loop, name)
+
+
+@on_a_loop
+async def test_a_job_on_a_thread_took_what_it_took_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The time to hand it over does not count: else no job would ever be known to be brief."""
+    monkeypatch.setattr(shell, "monotonic", iter([10.0, 10.25]).__next__)
+    machine, both = scripted(("one", math.inf, lambda: None))
+    await both.start()
+    both.deliver(Call(machine.trace))
+    while "finished one" not in machine.trace:
+        await asyncio.sleep(0.001)
+    assert machine.finished_at - machine.begun_at == pytest.approx(0.25)
+    await both.close()
 
 
 def broken(*_: object) -> None:
