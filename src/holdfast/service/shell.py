@@ -21,7 +21,6 @@ import itertools
 import traceback
 from collections import deque
 from collections.abc import Callable
-from time import monotonic
 from typing import Literal, TypeAlias
 
 import msgspec
@@ -327,12 +326,6 @@ class ServiceShell:
 
     def _log(self, event: CountedEvent) -> None:
         self._events.event(event.name, **event.told())
-
-
-def _timed(job: Job) -> tuple[Outcome, float]:
-    begun_at = monotonic()
-    outcome = job.run()
-    return outcome, monotonic() - begun_at
 
 
 def _decode(payload: bytes) -> Request | MessageError:
