@@ -31,7 +31,7 @@ from holdfast.session.records import RecordError, decode_record, encode_record
 
 __all__ = ["SPECIMENS", "TARGETS"]
 
-_CODES = ("malformed", "version", "too_large")
+_CODES = ("malformed", "version", "too_large", "other_code")
 
 
 def check_request(data: bytes) -> None:

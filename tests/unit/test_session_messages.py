@@ -36,6 +36,7 @@ from holdfast.session.messages import (
     numbers_from,
     numbers_to,
     sealed,
+    settings_digest,
 )
 from holdfast.settings import PlanningSettings
 
@@ -189,6 +190,50 @@ def test_a_large_message_that_is_no_request_is_not_read(payload: bytes) -> None:
     finally:
         tracemalloc.stop()
     assert peak < 100_000
+
+
+def test_settings_that_are_understood_otherwise_are_refused() -> None:
+    """As by a service that does not know one of them, or takes another default."""
+    encoded = encode(REQUEST)[:-CHECKSUM_SIZE]
+    assert REQUEST.opening is not None
+    ours = settings_digest(REQUEST.opening)
+    assert encoded.count(ours) == 1
+    for theirs in (b"t" * DIGEST_SIZE, None):
+        fields = msgspec.msgpack.decode(encoded)
+        fields[-1] = theirs
+        with pytest.raises(MessageError, match=ours.hex()) as raised:
+            decode_request(sealed(msgspec.msgpack.encode(fields)))
+        assert raised.value.code == "other_code"
+        assert (theirs.hex() if theirs else "not told") in str(raised.value)
+
+
+def test_each_setting_that_decides_has_its_part_in_the_digest() -> None:
+    opening = REQUEST.opening
+    assert opening is not None
+    others = [
+        msgspec.structs.replace(opening, **change)
+        for change in (
+            {"problem": "peg_in_hole_3d"},
+            {"model": {"peg_width": 2.0}},
+            {"state_space_planner": {"a": 1}},
+            {"planning": PlanningSettings(sensing_interval=7)},
+            {"seed": 10},
+        )
+    ]
+    digests = {settings_digest(each) for each in (opening, *others)}
+    assert len(digests) == 1 + len(others)
+    named = msgspec.structs.replace(opening, core_version="1", problem_digest="2")
+    assert settings_digest(named) == settings_digest(opening), "code has digests of its own"
+
+
+def test_a_whole_number_in_the_place_of_another_is_the_same_setting() -> None:
+    planning = msgspec.convert({"sensing_interval": 3}, PlanningSettings)
+    filter_ = msgspec.structs.replace(planning.particle_filter, num_particles=50)
+    planning = msgspec.structs.replace(planning, particle_filter=filter_)
+    request = msgspec.structs.replace(
+        REQUEST, opening=Opening("peg_in_hole_2d", {"peg_width": 1}, {}, planning, 9)
+    )
+    assert decode_request(encode(request)) == request
 
 
 def _opening(model: dict[str, object]) -> Opening:

@@ -1496,6 +1496,24 @@ def test_a_service_that_always_needs_the_state_is_given_up() -> None:
     assert len([sent for sent in world.sent if sent.service == "cloud"]) < 20
 
 
+def test_a_state_that_came_out_otherwise_is_told() -> None:
+    world = World()
+    told: list[Request] = []
+
+    def rule(request: Request) -> list[Reply] | None:
+        if request.checkpoint is None and request.step > 0 and not told:
+            told.append(request)
+            return [NeedState(request.number, True, diverged=True)]
+        return None
+
+    world.services["cloud"].rule = rule
+    world.start()
+    world.run()
+    world.assert_same_as_without_faults()
+    (fields,) = world.reports("state_diverged")
+    assert (fields["service"], fields["step"]) == ("cloud", told[0].step)
+
+
 def test_the_machine_sleeps_while_nothing_can_be_done() -> None:
     # The local service is up before the cloud was ever seen; World.run asserts the rest.
     world = World(launch="at_start")

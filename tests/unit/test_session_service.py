@@ -399,6 +399,7 @@ class TestRollingForward:
         request = robot.request(opening=False, since=1)
         assert bench.ask(request) == [NeedState(request.number, differs=True)]
         assert content(bench.ask(robot.restore())) == robot.right_answer()
+        assert bench.service.statistics.states_diverged == 0, "it only is where it was before"
 
     def test_other_digest(self) -> None:
         bench, robot = Bench(), Robot()
@@ -410,7 +411,10 @@ class TestRollingForward:
         other = numbers_from(last.observation, len(last.observation) // 8) + 0.5
         changed = msgspec.structs.replace(last, observation=numbers_to(other))
         request = robot.request(opening=False, observations=(changed,))
-        assert bench.ask(request) == [NeedState(request.number, differs=True)]
+        assert bench.ask(request) == [NeedState(request.number, True, diverged=True)]
+        assert bench.service.statistics.states_diverged == 1
+        told = [note.fields for note in bench.notes if note.event == "state_diverged"]
+        assert [(each["trial"], each["step"]) for each in told] == [(0, robot.state.step)]
         # The state from before is still there.
         assert content(bench.ask(robot.request(opening=False, since=1))) == robot.right_answer()
 

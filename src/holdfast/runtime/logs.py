@@ -11,13 +11,14 @@ A log must never hurt what it watches. A terminal that was closed, a full disk, 
 a number, a text of a megabyte or with control characters in it cost at most the line.
 
 Names of events in use. By the robot: status, launch, launched, launch_failed, recovery_exited,
-retry, hedge, restore, restored, service_appeared, service_vanished, service_suspected, unreachable,
+retry, hedge, restore, restored, state_diverged, service_appeared, service_vanished,
+service_suspected, unreachable,
 late_replies, waiting, holding, resumed, busy, refused, malformed_reply, disagreement,
 wrong_answer, not_deterministic, verification_failed, distrusted,
 limits_unknown, verifying, prefetch_unused, unexplained, filter_diverged,
 resumed_trial, performed_unseen, trial, missed_ticks, stopped, note, interrupted.
-By a service: ready, session_opened, session_taken_over, restored, refused, busy, evicted, stopping,
-process_ended, process_started.
+By a service: ready, session_opened, session_taken_over, restored, state_diverged, refused, busy,
+evicted, credentials, credentials_reloaded, stopping, process_ended, process_started.
 By ``holdfast chaos``: chaos_trial, left_out, note, interrupted. By a command that ends with an
 error: error. Fields with a place of their own in the text form: ``from`` and ``to`` (of a change),
 ``service``, ``reason``, ``duration_ms``. Events that may come very often are written about once a

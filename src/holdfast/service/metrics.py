@@ -49,6 +49,7 @@ CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 _COUNTERS = (
     ("restores", "States taken from a robot's checkpoint."),
     ("state_requests", "Requests answered with the wish for the state."),
+    ("states_diverged", "States that came out otherwise than on the robot."),
     ("busy", "Requests turned away for want of capacity."),
     ("cache_hits", "Requests answered from what was computed before."),
     ("attached", "Requests that joined one already in work."),

@@ -17,6 +17,7 @@ SIGCOMM 2000).
 
 from __future__ import annotations
 
+import hashlib
 import zlib
 from typing import Annotated, TypeAlias
 
@@ -54,12 +55,13 @@ __all__ = [
     "numbers_to",
     "pack_opening",
     "sealed",
+    "settings_digest",
     "unpack_opening",
 ]
 
 FloatArray = npt.NDArray[np.float64]
 
-PROTOCOL_VERSION = 3
+PROTOCOL_VERSION = 4
 """Raised whenever a message changes its form or its meaning; its checksum is the same in all."""
 
 CHECKSUM_SIZE = 4
@@ -130,8 +132,10 @@ class Observed(msgspec.Struct, array_like=True, frozen=True, forbid_unknown_fiel
 class Opening(msgspec.Struct, array_like=True, frozen=True):
     """What a service must know of a robot's run to plan for it: names and plain data, never code.
 
-    The settings are complete, with all defaults filled in. Code is only named, by its digest, so
-    that a service with other code refuses instead of deciding otherwise.
+    The settings are complete, with all defaults filled in, and on the wire their digest goes with
+    them (:func:`settings_digest`), so that a service that understands them otherwise refuses. Code
+    is only named, by its digest, so that a service with other code refuses instead of deciding
+    otherwise.
 
     Attributes
     ----------
@@ -221,6 +225,8 @@ class _SentRequest(msgspec.Struct, array_like=True, frozen=True, forbid_unknown_
     # So much is read of one that is too large, so that the robot can be told that.
     opening: Annotated[bytes, msgspec.Meta(max_length=16 * MAX_OPENING_BYTES)] | None = None
     checkpoint: bytes | None = None
+    # Of the opening's, as the robot understands them.
+    settings: Digest | None = None
 
 
 class TaskAnswer(msgspec.Struct, array_like=True, frozen=True, tag=1):
@@ -291,11 +297,15 @@ class NeedState(msgspec.Struct, array_like=True, frozen=True, tag=4):
     number : int
         Of the request.
     differs : bool
-        True if the service holds the session and came to another digest.
+        True if the service holds a state of the trial from which it does not come to the robot's:
+        only the state will do.
+    diverged : bool
+        True if it came to a state of that step with all that was sensed, but with another digest.
     """
 
     number: Word
     differs: bool
+    diverged: bool = False
 
 
 class Busy(msgspec.Struct, array_like=True, frozen=True, tag=5):
@@ -360,6 +370,18 @@ def pack_opening(opening: Opening) -> bytes:
     return _ENCODER.encode(opening)
 
 
+def settings_digest(opening: Opening) -> bytes:
+    """Return the digest of the settings that decide: the problem's, the planning's and the seed."""
+    decide = (
+        opening.problem,
+        opening.model,
+        opening.state_space_planner,
+        opening.planning,
+        opening.seed,
+    )
+    return hashlib.blake2b(_ENCODER.encode(decide), digest_size=DIGEST_SIZE).digest()
+
+
 def unpack_opening(packed: bytes) -> Opening:
     """Return an opening that was packed here, and checked before."""
     return _OPENING_DECODER.decode(packed)
@@ -390,8 +412,9 @@ def decode_request(payload: bytes) -> Request:
     ------
     MessageError
         If the bytes were changed on their way (``damaged``), are no request (``malformed``), one of
-        another version (``version``), or one whose opening has more than
-        :data:`MAX_OPENING_BYTES` or :data:`MAX_OPENING_VALUES` (``too_large``).
+        another version (``version``), one whose opening has more than :data:`MAX_OPENING_BYTES` or
+        :data:`MAX_OPENING_VALUES` (``too_large``), or one whose settings are understood otherwise
+        here than on the robot (``other_code``).
     """
     content = _unsealed(payload)
     # Other versions may have other fields.
@@ -400,7 +423,7 @@ def decode_request(payload: bytes) -> Request:
         raise _other_version(version)
     try:
         sent = _REQUEST_DECODER.decode(content)
-        opening = None if sent.opening is None else _opening_of(sent.opening)
+        opening = None if sent.opening is None else _opening_of(sent.opening, sent.settings)
     except (msgspec.DecodeError, RecursionError, UnicodeDecodeError) as error:
         raise MessageError("malformed", f"{len(payload)} bytes are no request: {error}") from error
     if sent.version != PROTOCOL_VERSION:
@@ -471,6 +494,8 @@ def _sent(request: Request, opening: bytes) -> _SentRequest:
         request.observations,
         opening,
         request.checkpoint,
+        # What a service will make of them, not what they were before: an int where a float belongs.
+        settings_digest(unpack_opening(opening)),
     )
 
 
@@ -489,7 +514,7 @@ def _version_of(content: memoryview) -> int | None:
     return int.from_bytes(content[start + 1 : start + 1 + size], "big")
 
 
-def _opening_of(data: bytes) -> Opening:
+def _opening_of(data: bytes, settings: bytes | None) -> Opening:
     if len(data) > MAX_OPENING_BYTES:
         raise MessageError(
             "too_large",
@@ -502,6 +527,14 @@ def _opening_of(data: bytes) -> Opening:
             "too_large",
             f"problem {opening.problem}: more than {MAX_OPENING_VALUES} values in the sections "
             f"model and state_space_planner",
+        )
+    understood = settings_digest(opening)
+    if settings != understood:
+        raise MessageError(
+            "other_code",
+            f"problem {opening.problem}: the digest of the settings is {understood.hex()} as this "
+            f"service understands them, {settings.hex() if settings else 'not told'} on the robot; "
+            "they may decide differently, so deploy the same version on both",
         )
     return opening
 

@@ -210,6 +210,15 @@ class Replies:
     def _need_state(self, call: Call, reply: NeedState, now: float) -> News:
         service = call.service
         service.note_lost_state(differs=reply.differs)
+        if reply.diverged:
+            self._report(
+                "state_diverged",
+                service=service.name,
+                trial=call.question.state.trial,
+                step=call.question.state.step,
+                reason="the service came to another state than the robot from the same "
+                "observations, so it is handed the robot's",
+            )
         if call.opens and call.restores:
             # It was handed everything and asks for it again.
             self._refusal(call, "need_state", "asks again for a state that it was sent", now)

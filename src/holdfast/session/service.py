@@ -495,10 +495,18 @@ class Service:
     # -- outcomes --------------------------------------------------------------------------------
 
     def _failed(self, work: Work, outcome: Outcome) -> None:
-        session = work.session
+        session, request = work.session, work.request
+        if outcome.diverged and request is not None:
+            self._statistics.states_diverged += 1
+            self._note("state_diverged", session, trial=request.trial, step=request.step)
         for record in self._calls.released(work):
             if outcome.failure is None:
-                self._calls.need_state(record.call, record.number, differs=outcome.differs)
+                self._calls.need_state(
+                    record.call,
+                    record.number,
+                    differs=outcome.differs,
+                    diverged=outcome.diverged,
+                )
             else:
                 self._calls.refuse(record.call, record.number, *outcome.failure)
         if not session.built:

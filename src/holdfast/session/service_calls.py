@@ -140,10 +140,10 @@ class Calls:
         )
         self._effects += (Answer(call, payload), End(call))
 
-    def need_state(self, call: int, number: int, *, differs: bool) -> None:
+    def need_state(self, call: int, number: int, *, differs: bool, diverged: bool = False) -> None:
         """End a call with the wish for the state."""
         self._statistics.state_requests += 1
-        self._effects += (Answer(call, encode(NeedState(number, differs))), End(call))
+        self._effects += (Answer(call, encode(NeedState(number, differs, diverged))), End(call))
 
     def turn_away(self, call: int, number: int, key: bytes, wait_ms: float, waiting: int) -> None:
         """End a call for lack of capacity.

@@ -64,8 +64,8 @@ class Noted(NamedTuple):
     Attributes
     ----------
     event : str
-        ``session_opened``, ``session_taken_over``, ``restored``, ``refused``, ``busy`` or
-        ``evicted``.
+        ``session_opened``, ``session_taken_over``, ``restored``, ``state_diverged``,
+        ``refused``, ``busy`` or ``evicted``.
     fields : dict
         Plain data.
     """

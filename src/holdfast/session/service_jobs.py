@@ -60,6 +60,8 @@ class Outcome(NamedTuple):
         The requested state does not follow from what the service holds.
     differs : bool
         It held a state of this trial that leads elsewhere.
+    diverged : bool
+        It came to the step that the request names, and to another digest.
     problem : Problem or None
         As far as it was there or could be built.
     state : PlanningState or None
@@ -81,6 +83,7 @@ class Outcome(NamedTuple):
     failure: tuple[str, str] | None = None
     lacks_state: bool = False
     differs: bool = False
+    diverged: bool = False
     problem: Problem | None = None
     state: PlanningState | None = None
     restored: bool = False
@@ -94,9 +97,10 @@ class Outcome(NamedTuple):
 class _LacksStateError(Exception):
     """The events of a request do not connect to the state at hand, or lead to another one."""
 
-    def __init__(self, *, differs: bool = False) -> None:
+    def __init__(self, *, differs: bool = False, diverged: bool = False) -> None:
         super().__init__()
         self.differs = differs
+        self.diverged = diverged
 
 
 class Job:
@@ -197,7 +201,9 @@ class Job:
             return self._computed(problem)
         except _LacksStateError as lack:
             differs = lack.differs or self._state is not None
-            return Outcome(lacks_state=True, differs=differs, problem=problem)
+            return Outcome(
+                lacks_state=True, differs=differs, diverged=lack.diverged, problem=problem
+            )
         except MemoryError as error:
             text = _account(error, self._describe_error)
             asked = _work_in_words(problem, self._planning)
@@ -251,8 +257,10 @@ class Job:
             observation = numbers_from(observed.observation, len(observed.observation) // 8)
             state, _ = planner.observe(state, observed.sensing_action, observation)
         state = self._rolled(planner, state, request.step, most)
-        if state.sensed != request.sensed or planner.digest(state)[:DIGEST_SIZE] != request.digest:
+        if state.sensed != request.sensed:
             raise _LacksStateError(differs=True)
+        if planner.digest(state)[:DIGEST_SIZE] != request.digest:
+            raise _LacksStateError(differs=True, diverged=True)
         return state
 
     def _rolled(

@@ -99,6 +99,8 @@ class ServiceStatistics(msgspec.Struct):
         States taken from a checkpoint.
     state_requests : int
         Requests answered with the wish for the state.
+    states_diverged : int
+        States that came out otherwise than on the robot, which its copy has replaced since.
     busy : int
         Requests turned away for lack of capacity.
     refusals : dict of str to int
@@ -115,6 +117,7 @@ class ServiceStatistics(msgspec.Struct):
     superseded: int = 0
     restores: int = 0
     state_requests: int = 0
+    states_diverged: int = 0
     busy: int = 0
     refusals: dict[str, int] = msgspec.field(default_factory=dict)
     sessions_opened: int = 0
