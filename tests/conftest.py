@@ -43,10 +43,11 @@ REAL = (
     "unit/test_endpoints.py::test_an_address_of_another_machine_has_no_free_port",
     "unit/test_endpoints.py::test_loopback_is_what_only_this_machine_can_reach",
     "unit/test_files.py::test_what_is_no_file_is_refused",
+    "unit/test_health.py",
     "unit/test_last_threads.py",
-    "unit/test_metrics.py",
     "unit/test_performer.py::TestStalls",
     "unit/test_senders.py",
+    "unit/test_service_listening.py",
     "unit/test_service_shell.py",
 )
 """Folders, files, classes and tests with real sockets, waits or signals."""

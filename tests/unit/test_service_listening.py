@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import socket
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 
 import pytest
 from tests.ports import free_port
@@ -99,3 +100,30 @@ def test_closed_sockets_are_free_for_others() -> None:
         sockets.of(1)
     with shared(str(endpoint)) as again:
         assert again.endpoints == (endpoint,)
+
+
+def test_a_local_socket_is_shared_and_removed(tmp_path: Path) -> None:
+    path = tmp_path / "socket"
+    with socket.socket(socket.AF_UNIX) as killed:
+        killed.bind(str(path))  # what a service has left that was killed
+    with shared(f"unix/{path}") as sockets:
+        assert sockets.of(0) == sockets.of(1)
+        sockets.give_up(0)  # the other process still listens
+        with socket.socket(socket.AF_UNIX) as client:
+            client.connect(str(path))
+            assert accepted(sockets.of(1)) == 1
+        with pytest.raises(TransportError, match="another process listens there"):
+            SharedEndpoints(sockets.endpoints)
+    assert not path.exists()
+
+
+def test_what_was_bound_is_closed_if_another_endpoint_cannot_be() -> None:
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", free_port()))
+        other.listen()
+        taken = parse_endpoint(f"tcp/127.0.0.1:{other.getsockname()[1]}")
+        free = parse_endpoint(f"tcp/127.0.0.1:{free_port()}")
+        with pytest.raises(TransportError):
+            SharedEndpoints([free, taken])
+    with shared(str(free)) as sockets:
+        assert sockets.endpoints == (free,)
