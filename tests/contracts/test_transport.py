@@ -1440,6 +1440,24 @@ class TestCertificates:
         assert await inbox.of_call(1) == [Replied(1, b"question"), Ended(1)]
 
 
+    async def test_a_robot_can_be_closed_amid_a_handshake(self, tls: StreamWire) -> None:
+        host, _, port = tls.endpoint("cloud").removeprefix("tls/").rpartition(":")
+        heard = asyncio.Event()
+
+        async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+            await reader.readexactly(1)
+            heard.set()
+            await reader.read()
+            writer.close()
+
+        async with await asyncio.start_server(serve, host, int(port)):
+            robot, inbox = tls.robot("cloud"), Inbox()
+            robot.start(inbox)
+            await asyncio.wait_for(heard.wait(), PATIENCE_S)
+            await robot.close()
+        assert inbox.events == []
+
+
 class TestHandshakeIsEnough:
     """Over TLS a robot that knows the service asks it before that has said hello."""
 
