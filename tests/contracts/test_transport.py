@@ -824,6 +824,21 @@ class TestStreams:
         await service.close()
         await robot.close()
 
+    async def test_a_service_that_takes_no_more_links_does_not_look_for_robots(
+        self, socket_directory: Path
+    ) -> None:
+        wire = StreamWire("unix", socket_directory, robot_listens=True)
+        robot, inbox, service = await connected(wire)
+        assert isinstance(service, StreamServiceTransport)
+        (dialer,) = service._dialers.values()
+        robot.call("cloud", 1, b"")
+        await inbox.of_call(1)
+        service.stop_listening()
+        await robot.close()
+        await until(lambda: len(wire.told) == 2)
+        assert dialer._next is None
+        await wire.close_on_loop()
+
     async def test_a_host_name_is_looked_up(self, tcp: StreamWire) -> None:
         await tcp.service("cloud", "b1").start(echo)
         endpoint = tcp.endpoint("cloud").replace("127.0.0.1", "localhost")
@@ -1062,10 +1077,9 @@ class TestVisitors:
         await until(lambda: bool(wire.reasons()))
         assert wanted in wire.reasons()[0]
 
-    async def test_connections_that_say_nothing_keep_no_robot_out(
-        self, wire: StreamWire, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        await wire.service("cloud", "b1").start(echo)
+    async def test_connections_that_say_nothing_keep_no_robot_out(self, wire: StreamWire) -> None:
+        service = wire.service("cloud", "b1")
+        await service.start(echo)
         begun = b"\x16\x03\x01" if wire.protocol == "tls" else frames.MAGIC[:3]
         with contextlib.ExitStack() as stack:
             for k in range(600):
@@ -1073,6 +1087,7 @@ class TestVisitors:
                 await visitor.connect()
                 if k % 2:
                     await visitor.say(begun)
+                assert len(service._ungreeted) <= service_end._MAX_UNGREETED
             robot, inbox = wire.robot("cloud"), Inbox()
             robot.start(inbox)
             await inbox.wait_for(Appeared("cloud", "b1"))
@@ -1423,6 +1438,24 @@ class TestCertificates:
         assert late_inbox.events == []
         robot.call("cloud", 1, b"question")
         assert await inbox.of_call(1) == [Replied(1, b"question"), Ended(1)]
+
+
+    async def test_a_robot_can_be_closed_amid_a_handshake(self, tls: StreamWire) -> None:
+        host, _, port = tls.endpoint("cloud").removeprefix("tls/").rpartition(":")
+        heard = asyncio.Event()
+
+        async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+            await reader.readexactly(1)
+            heard.set()
+            await reader.read()
+            writer.close()
+
+        async with await asyncio.start_server(serve, host, int(port)):
+            robot, inbox = tls.robot("cloud"), Inbox()
+            robot.start(inbox)
+            await asyncio.wait_for(heard.wait(), PATIENCE_S)
+            await robot.close()
+        assert inbox.events == []
 
 
 class TestHandshakeIsEnough:

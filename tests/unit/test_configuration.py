@@ -609,7 +609,7 @@ class TestOffload:
                 """\
                 problem: peg_in_hole_2d
                 offload:
-                  services: [tcp/127.0.0.1:7447, quic/10.0.0.7:7447]
+                  services: [tcp/127.0.0.1:7447, tls/10.0.0.7:7447]
                   detection_timeout_ms: 5000
                   decision_deadline_ms: 20.5
                 recovery: {launch: at_start, journal_survives: power_cut}
@@ -617,7 +617,7 @@ class TestOffload:
             )
         )
         assert configuration.offload == OffloadSettings(
-            services=("tcp/127.0.0.1:7447", "quic/10.0.0.7:7447"),
+            services=("tcp/127.0.0.1:7447", "tls/10.0.0.7:7447"),
             detection_timeout_ms=5000.0,
             decision_deadline_ms=20.5,
         )

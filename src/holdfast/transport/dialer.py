@@ -58,7 +58,7 @@ class Dialer:
         self._links: set[Link] = set()
         self._next: asyncio.TimerHandle | None = None
         self._absent_since: float | None = None
-        self._connected_at = float("-inf")
+        self._attempted_at = self._connected_at = float("-inf")
         self._turn = 0
         self._resolved_at = float("-inf")
         self._addresses: list[tuple[socket.AddressFamily, _Address]] = []
@@ -81,7 +81,9 @@ class Dialer:
                 return
             self._next.cancel()
         self._connected_at = float("-inf")
-        self._next = self._loop.call_later(_REFUSED_PAUSE_S if refused else 0.0, self._attempt)
+        # A service that comes and goes is not reached more often than one that is not there.
+        at = max(now + (_REFUSED_PAUSE_S if refused else 0.0), self._attempted_at + _FIRST_PAUSE_S)
+        self._next = self._loop.call_at(at, self._attempt)
 
     def won(self, winner: Link) -> None:
         """Connect no more, and end all links that were made but this one."""
@@ -123,6 +125,7 @@ class Dialer:
             threading.Thread(target=self._resolve, name="holdfast-resolve", daemon=True).start()
         if not self._addresses or now < self._connected_at + _NEXT_LINK_S:
             return
+        self._attempted_at = now
         family, address = self._addresses[self._turn % len(self._addresses)]
         self._turn += 1
         self._connect(family, address)

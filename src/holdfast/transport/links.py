@@ -218,11 +218,13 @@ class Link(asyncio.BufferedProtocol):
             self.connection_lost(error)
 
     def send(self, data: bytes) -> None:
-        """Send frames; never waits. Of a link that has ended it goes nowhere."""
+        """Send frames; never waits. Nothing is sent before the handshake, or after the end."""
         transport = self._transport
         if self._ended or transport is None:
             return
         if self.tls is not None:
+            if not self.tls.established:
+                return
             self.tls.send(data)
             data = self.tls.take()
         transport.write(data)

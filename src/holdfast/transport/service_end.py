@@ -185,6 +185,7 @@ class StreamServiceTransport:
         self._on_event = on_event
         self._deliver: Callable[[IncomingCall], None] | None = None
         self._started = False
+        self._takes_links = True
         self._listeners: list[Listener] = []
         self._dialers: dict[Endpoint, Dialer] = {}
         self._dialled: dict[Link, Dialer] = {}
@@ -228,6 +229,7 @@ class StreamServiceTransport:
             listener.close()
         for dialer in self._dialers.values():
             dialer.stop()
+        self._takes_links = False
 
     async def close(self, timeout_s: float = 1.0) -> None:
         """End all calls, send what was to be sent, and close all links, within this time."""
@@ -306,7 +308,9 @@ class StreamServiceTransport:
             tls = TlsStream(self._context)
         link = Link(self, self._settings, speaks_first=dialled and tls is None, tls=tls)
         if len(self._ungreeted) >= _MAX_UNGREETED:
-            next(iter(self._ungreeted)).end("has said no hello, and others wait", abort=True)
+            oldest = next(iter(self._ungreeted))
+            del self._ungreeted[oldest]
+            oldest.end("has said no hello, and others wait", abort=True)
         self._ungreeted[link] = None
         self._closing.add(link.closed)
         link.closed.add_done_callback(self._closing.discard)
@@ -378,7 +382,7 @@ class StreamServiceTransport:
         dialer = self._dialled.pop(link, None)
         if dialer is not None:
             dialer.ended(link)
-            if self._deliver is not None and (was_there or link.refused):
+            if self._takes_links and (was_there or link.refused):
                 dialer.start(refused=link.refused)
 
     def _tell(self, name: str, **fields: object) -> None:

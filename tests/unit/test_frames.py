@@ -1,0 +1,158 @@
+"""Frames: however a stream is cut, the same ones come out; and what is none is found at once."""
+
+from __future__ import annotations
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from holdfast.transport.frames import (
+    CALL,
+    END,
+    GOODBYE,
+    HELLO,
+    LAST,
+    MAGIC,
+    MAX_HELLO_BYTES,
+    PING,
+    REPLY,
+    WIRE_VERSION,
+    Frame,
+    FrameDecoder,
+    FrameError,
+    Hello,
+    decode_hello,
+    encode_frame,
+    encode_goodbye,
+    encode_hello,
+    read_goodbye,
+)
+
+MAX_BYTES = 300
+GREETING = encode_hello("robot", "r", "i1", 400.0)
+FRAMES = st.lists(
+    st.one_of(
+        st.tuples(
+            st.sampled_from((CALL, REPLY, LAST)),
+            st.integers(0, 2**32 - 1),
+            st.binary(max_size=2 * MAX_BYTES),
+        ),
+        st.tuples(st.sampled_from((END, PING)), st.integers(0, 2**32 - 1), st.just(b"")),
+    ),
+    max_size=8,
+)
+
+
+@given(st.data(), FRAMES)
+def test_a_stream_gives_the_same_frames_however_it_is_cut(
+    data: st.DataObject, sent: list[tuple[int, int, bytes]]
+) -> None:
+    stream = GREETING + b"".join(encode_frame(*each) for each in sent)
+    cuts = data.draw(st.lists(st.integers(0, len(stream)), max_size=8).map(sorted))
+    decoder = FrameDecoder(MAX_BYTES)
+    came: list[Frame] = []
+    for start, end in zip([0, *cuts], [*cuts, len(stream)], strict=True):
+        came += decoder.feed(stream[start:end])
+        # What is too large is not kept, and the rest of a frame only until it is whole.
+        assert decoder.held_bytes <= len(GREETING) + MAX_BYTES
+    assert decoder.error is None
+    assert decoder.held_bytes == 0
+    assert came[0].kind == HELLO
+    expected = [
+        Frame(kind, call, payload, 0)
+        if len(payload) <= MAX_BYTES
+        else Frame(kind, call, b"", len(payload))
+        for kind, call, payload in sent
+    ]
+    assert came[1:] == expected
+
+
+@given(st.binary(max_size=64), st.booleans())
+def test_any_bytes_are_frames_or_an_error(noise: bytes, greeted: bool) -> None:
+    decoder = FrameDecoder(MAX_BYTES)
+    decoder.feed((GREETING if greeted else b"") + noise)
+    if decoder.error is not None:
+        assert str(decoder.error)
+        assert str(decoder.error).isprintable()
+
+
+@pytest.mark.parametrize("size", range(1, len(MAGIC) + 1))
+def test_a_wrong_greeting_is_seen_at_its_first_wrong_byte(size: int) -> None:
+    decoder = FrameDecoder(MAX_BYTES)
+    decoder.feed(MAGIC[: size - 1])
+    assert decoder.error is None
+    decoder.feed(b"?")
+    assert "does not speak holdfast" in str(decoder.error)
+
+
+def test_frames_before_an_error_are_frames() -> None:
+    decoder = FrameDecoder(MAX_BYTES)
+    came = decoder.feed(GREETING + encode_frame(CALL, 3, b"x") + encode_frame(77) + b"more")
+    assert [frame.kind for frame in came] == [HELLO, CALL]
+    assert str(decoder.error) == "sends a frame of the unknown kind 77"
+
+
+@pytest.mark.parametrize(
+    ("stream", "error"),
+    [
+        (MAGIC + encode_frame(CALL, 1, b"x"), "begins with a frame of kind 2 instead of a hello"),
+        (MAGIC + encode_frame(HELLO, 0, bytes(MAX_HELLO_BYTES + 1)), "of kind 1 with 4097 bytes"),
+        (GREETING + GREETING[len(MAGIC) :], "sends a frame of the unknown kind 1"),
+        (GREETING + encode_frame(PING, 0, b"x"), "sends a frame of kind 6 with 1 bytes"),
+        (GREETING + encode_frame(GOODBYE, 0, bytes(2000)), "of kind 7 with 2000 bytes"),
+        (b"HTTP/1.1 400 Bad Request", "speaks HTTP"),
+        (b"PRI * HTTP/2.0", "speaks HTTP"),
+        (b"\x16\x03\x01\x02\x00\x01", "speaks TLS at an endpoint that does not"),
+    ],
+)
+def test_what_is_no_frame_of_ours_is_refused_before_it_is_kept(stream: bytes, error: str) -> None:
+    decoder = FrameDecoder(MAX_BYTES)
+    decoder.feed(stream)
+    assert error in str(decoder.error)
+    assert decoder.held_bytes <= 16
+
+
+def test_a_hello_is_read_as_it_was_written() -> None:
+    (frame,) = FrameDecoder(MAX_BYTES).feed(encode_hello("service", "cloud", "b1", 250.0))
+    hello = decode_hello(frame.payload)
+    assert (hello.role, hello.name, hello.incarnation) == ("service", "cloud", "b1")
+    assert (hello.version, hello.lease_ms) == (WIRE_VERSION, 250.0)
+
+
+def changed(**values: object) -> bytes:
+    (frame,) = FrameDecoder(MAX_BYTES).feed(GREETING)
+    return msgspec.msgpack.encode({**msgspec.msgpack.decode(frame.payload), **values})
+
+
+@pytest.mark.parametrize(
+    ("payload", "error"),
+    [
+        (changed(version=9, release="2.0"), "is holdfast 2.0 with version 9 of the wire; here"),
+        (msgspec.msgpack.encode({"version": 9}), "is holdfast unknown with version 9"),
+        (changed(version=9, release="\x1b[2J"), r"is holdfast \x1b[2J with"),
+        (b"\xff", "sends a malformed hello"),
+        (changed(role="king"), "sends a malformed hello"),
+        (changed(name="a b"), "sends a malformed hello: name 'a b'"),
+        (changed(role="service", name=""), "sends a malformed hello: name ''"),
+        (changed(incarnation=""), "sends a malformed hello: incarnation ''"),
+        (changed(lease_ms=0.5), "a lease of 0.5 ms"),
+        (changed(lease_ms=float("nan")), "a lease of nan ms"),
+    ],
+)
+def test_a_hello_that_is_none_of_ours_is_refused_in_words(payload: bytes, error: str) -> None:
+    with pytest.raises(FrameError) as raised:
+        decode_hello(payload)
+    assert error in str(raised.value)
+    assert str(raised.value).isprintable()
+
+
+def test_a_later_version_may_say_more() -> None:
+    assert isinstance(decode_hello(changed(something=1)), Hello)
+
+
+def test_a_goodbye_is_cut_and_fit_to_be_shown() -> None:
+    (frame,) = FrameDecoder(MAX_BYTES).feed(MAGIC + encode_goodbye("\x1b" + "x" * 5000))
+    text = read_goodbye(frame.payload)
+    assert text.startswith(r"\x1bxxx")
+    assert len(text) < 1100
