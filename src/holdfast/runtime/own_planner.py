@@ -60,7 +60,6 @@ class OwnPlanner:
             workers=1,
         )
         self._serving: asyncio.Task[None] | None = None
-        self._is_there = False
         self.call = self._robot_end.call
         self.abandon = self._robot_end.abandon
 
@@ -77,12 +76,10 @@ class OwnPlanner:
             return
         serving.cancel()
         await self._robot_end.close(timeout_s)
-        if self._is_there:
-            await self._shell.close(timeout_s)
+        await self._shell.close(timeout_s)
 
     async def _serve(self) -> None:
         await self._shell.start()
-        self._is_there = True
         await self._shell.wait()
 
 
