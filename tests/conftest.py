@@ -29,7 +29,12 @@ HERE = Path(__file__).parent
 REAL = (
     "processes/",
     "contracts/test_transport.py",
+    "experiments/test_cloud_worth.py::test_asking_a_service_over_tcp",
+    "experiments/test_cloud_worth.py::test_the_whole_study",
+    "experiments/test_command.py::test_interrupted_and_gone_on_with",
     "experiments/test_ray.py",
+    "experiments/test_thesis_chapter_6.py::test_over_a_proxy",
+    "experiments/test_thesis_chapter_6.py::test_really",
     "fuzz/test_fuzz_processes.py",
     "unit/test_chaos_datagrams.py::TestDatagramProxy",
     "unit/test_chaos_namespace.py",
