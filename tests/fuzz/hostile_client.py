@@ -44,6 +44,7 @@ _COSTLY_SHARE = 0.0002
 _FRAMES_SHARE = 0.01
 _PATIENCE_S = 30.0
 _TIMEOUT_S = 10.0
+_ROOM_S = 1.0
 _WORDS = (0, 1, 2, 3, 7, 64, 2**16, 2**31, 2**32 - 1)
 
 
@@ -258,12 +259,13 @@ class _Client:
     def send(self, message: Message) -> None:
         """Send a message, once there is room for its call."""
         with self._changed:
-            self._changed.wait_for(
-                lambda: self._link is None or len(self._open) < self._outstanding, _TIMEOUT_S
+            has_room = self._changed.wait_for(
+                lambda: self._link is None or len(self._open) < self._outstanding, _ROOM_S
             )
             lost = self._link is None
-        if lost:
-            self.replies["link lost"] += 1
+        if lost or not has_room:
+            # What was asked behind a frame that is too long is never answered.
+            self.replies["link lost" if lost else "link given up"] += 1
             self.connect()
         self.kinds[message.kind] += 1
         link = self._link

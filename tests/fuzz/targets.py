@@ -10,8 +10,10 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Mapping
 
+import msgspec
 import numpy as np
 from tests.fuzz import corpus
+from tests.wire import MAGIC, frame_of, hello_of
 
 from holdfast import yaml_document
 from holdfast.errors import CheckpointError, ConfigurationError, InvalidValueError
@@ -28,8 +30,11 @@ from holdfast.session.messages import (
     sealed,
 )
 from holdfast.session.records import RecordError, decode_record, encode_record
+from holdfast.transport.frames import WIRE_VERSION, FrameError, decode_hello
 
 __all__ = ["SPECIMENS", "TARGETS"]
+
+_HELLO_BEGINS = len(MAGIC) + len(frame_of(0))
 
 _CODES = ("malformed", "version", "too_large", "other_code")
 
@@ -114,7 +119,22 @@ def check_configuration(data: bytes) -> None:
     assert yaml_document.read(written.encode(), "written.yaml").data == document.data
 
 
+def check_hello(data: bytes) -> None:
+    """Check ``decode_hello``."""
+    try:
+        decoded = decode_hello(data)
+    except FrameError as error:
+        assert len(str(error)) < 2000
+        return
+    assert decoded.version == WIRE_VERSION
+    assert decoded.role in ("robot", "service")
+    assert 0 < len(decoded.incarnation) <= 200
+    assert decoded.lease_ms > 0.0
+    assert decode_hello(msgspec.msgpack.encode(decoded)) == decoded
+
+
 TARGETS: Mapping[str, Callable[[bytes], None]] = {
+    "hello": check_hello,
     "request": check_request,
     "reply": check_reply,
     "record": check_record,
@@ -125,6 +145,9 @@ TARGETS: Mapping[str, Callable[[bytes], None]] = {
 
 def _specimens() -> dict[str, list[bytes]]:
     return {
+        "hello": [
+            hello_of(*who)[_HELLO_BEGINS:] for who in (("robot",), ("service", "cloud", "a1"))
+        ],
         "request": [corpus.content_of(each) for each in corpus.requests()],
         "reply": [corpus.content_of(each) for each in corpus.replies()],
         "record": [encode_record(each) for each in corpus.records()],

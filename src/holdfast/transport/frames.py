@@ -157,7 +157,7 @@ def decode_hello(payload: bytes) -> Hello:
                 "the same release at both ends"
             )
         hello = msgspec.msgpack.decode(payload, type=Hello)
-    except msgspec.MsgspecError as error:
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         raise FrameError(f"sends a malformed hello: {printable(str(error))}") from None
     try:
         check_name("incarnation", hello.incarnation)
