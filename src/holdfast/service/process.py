@@ -596,7 +596,7 @@ def _check_safe(endpoint: Endpoint, tls: TlsFiles | None, *, insecure: bool) -> 
         return  # the transport says that credentials are missing
     raise TransportError(
         f"endpoint {endpoint}: other machines can reach it, and nobody there has to prove who he "
-        f"is; use tls/... or quic/... with --tls DIR ('holdfast keys DIR' makes the credentials), "
+        f"is; use tls/... with --tls DIR ('holdfast keys DIR' makes the credentials), "
         f"an address of this machine alone, as in tcp/{_DEFAULT_PLACE}, or say --insecure"
     )
 
