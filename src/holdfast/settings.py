@@ -167,9 +167,10 @@ class OffloadSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
     startup_timeout_ms : float
         At the start of a run, how long to wait for a service that has never been seen yet.
     lease_ms : float
-        How long this robot may be silent before services give up the link to it. Each side sets how
-        long it may be silent: the robot here, a service by ``holdfast serve --lease-ms``. For the
-        local service, which the robot starts, it is both.
+        How long this robot may be silent before services give up the link to it. It is silent while
+        its own code computes, and a service has no hurry: of a robot that dies it hears by the end
+        of the link. How long a service may be silent is its own ``holdfast serve --lease-ms``; for
+        the local service, which the robot starts, it is this one.
     decision_deadline_ms : float or None
         A decision that is not there this long after it was needed is asked of the local service
         as well, if that is running; the first answer wins.
@@ -190,7 +191,7 @@ class OffloadSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
     services: Annotated[tuple[Text, ...], msgspec.Meta(max_length=MAX_SERVICES)] = ()
     detection_timeout_ms: Milliseconds = 250.0
     startup_timeout_ms: Milliseconds = 1000.0
-    lease_ms: Annotated[float, msgspec.Meta(ge=50.0, le=60_000.0)] = 400.0
+    lease_ms: Annotated[float, msgspec.Meta(ge=50.0, le=60_000.0)] = 30_000.0
     decision_deadline_ms: Milliseconds | None = None
     max_hedged_share: Annotated[float, msgspec.Meta(ge=0.0, le=1.0)] = 0.1
     decision_timeout_ms: Milliseconds = 60_000.0

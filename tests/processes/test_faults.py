@@ -104,7 +104,7 @@ class TestCloud:
         document = document_of(PEG)
         steps = sensing_steps(document)
         defaults = OffloadSettings()
-        cloud = site.service(lease_ms=defaults.lease_ms).start()
+        cloud = site.service(lease_ms=400.0).start()
         offload = {key: getattr(defaults, key) for key in PATIENT}
         story = Story(site, references, document, offload=offload)
         story.at("sense", steps[1], cloud.stop)

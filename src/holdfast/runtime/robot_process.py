@@ -427,9 +427,16 @@ class RobotProcess:
             self._on_loop().stop()
 
     def _loop_failed(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-        """Take an error of what else runs on the loop: nobody would wait for what it owes."""
+        """Take an error of what else runs on the loop: nobody would wait for what it owes.
+
+        Only a link's own code costs no more than the link, which asyncio closes.
+        """
         del loop
-        self._fail(context.get("exception") or RuntimeError(context["message"]))
+        error = context.get("exception") or RuntimeError(context["message"])
+        if "protocol" in context:
+            self._events.event("link_failed", reason=repr(error))
+        else:
+            self._fail(error)
 
     def _on_loop(self) -> asyncio.AbstractEventLoop:
         assert self._loop is not None
