@@ -54,6 +54,7 @@ REAL = (
     "unit/test_senders.py",
     "unit/test_service_listening.py",
     "unit/test_service_shell.py",
+    "unit/test_stream_credentials.py",
 )
 """Folders, files, classes and tests with real sockets, waits or signals."""
 

@@ -186,6 +186,9 @@ class OffloadSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
     tls : str or None
         Directory with this robot's credentials, as ``holdfast keys`` makes it. In a file it may be
         relative to that file.
+    name : str or None
+        The robot's name in the logs of services, as long as it shows no certificate, whose name
+        counts then: at most 100 letters, digits, ``_``, ``-`` and ``.``. None takes this machine's.
     """
 
     services: Annotated[tuple[Text, ...], msgspec.Meta(max_length=MAX_SERVICES)] = ()
@@ -197,6 +200,7 @@ class OffloadSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
     decision_timeout_ms: Milliseconds = 60_000.0
     verify_share: Annotated[float, msgspec.Meta(ge=0.0, le=1.0)] = 0.05
     tls: Text | None = None
+    name: Text | None = None
 
 
 class RecoverySettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import functools
 import os
+import re
+import socket
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -108,6 +110,7 @@ def _streams(configuration: Configuration, log_path: Path | None, events: EventS
         PrivateSocket,
         ServiceAddress,
         check_credentials,
+        check_name,
         parse_endpoint,
     )
     from holdfast.transport.robot_end import StreamRobotTransport
@@ -118,6 +121,8 @@ def _streams(configuration: Configuration, log_path: Path | None, events: EventS
         tls = load_credentials(
             Path(offload.tls), "robot", warn=lambda text: events.event("credentials", reason=text)
         )
+    if offload.name is not None:
+        check_name("offload.name", offload.name)
     for service in offload.services:
         endpoint = parse_endpoint(service)
         check_credentials(endpoint, tls)
@@ -154,6 +159,7 @@ def _streams(configuration: Configuration, log_path: Path | None, events: EventS
     try:
         transport = StreamRobotTransport(
             addresses,
+            name=offload.name or _machine_name(),
             incarnation=os.urandom(8).hex(),
             lease_ms=offload.lease_ms,
             tls=tls,
@@ -175,6 +181,11 @@ def _problem_arguments(configuration: Configuration) -> list[str]:
     if configuration.problem_directory is not None:
         arguments += ["--problem-directory", str(configuration.problem_directory)]
     return arguments
+
+
+def _machine_name() -> str:
+    """Return the name of this machine, as far as it can be told to a service."""
+    return re.sub(r"[^A-Za-z0-9_.-]", "-", socket.gethostname()).lstrip("_.-")[:100]
 
 
 def _nothing() -> None:
