@@ -185,3 +185,18 @@ def test_runs_of_one_certificate_have_a_limit(
         story.finish(robot)
     (evicted,) = cloud.process.matching("evicted")
     assert (evicted["robot"], evicted["reason"]) == ("anna", "room needed")
+
+
+def test_a_robot_without_a_certificate_has_the_name_that_it_says(
+    site: Site, references: References
+) -> None:
+    cloud = site.service().start()
+    Story(site, references, document_of(PEG), offload={"name": "anna"}).run(cloud)
+    assert cloud.process.matching("robot_connected", robot="anna")
+
+
+def test_a_name_that_is_none_is_refused(site: Site) -> None:
+    file = site.configure(document_of(PEG), offload={"name": "no name!"})
+    robot = site.run(file, services=["tcp/127.0.0.1:1"])
+    assert robot.wait() == 2
+    assert "offload.name 'no name!': allowed are 1 to 100 letters" in robot.output

@@ -310,7 +310,9 @@ _defect(
     "restored_unverified",
     "A checkpoint is restored without looking at the digest, nor at the checksum of its request.",
     Edit(service, "decode_request", "_unsealed(payload)", "memoryview(payload)[:-CHECKSUM_SIZE]"),
-    Edit(Job, "_restored", "if digest(state)[:DIGEST_SIZE] != request.digest:", "if False:"),
+    Edit(
+        Job, "_restored", "if planner.digest(state)[:DIGEST_SIZE] != request.digest:", "if False:"
+    ),
 )
 _defect(
     "held_work_left",
