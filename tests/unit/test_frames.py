@@ -86,6 +86,21 @@ def test_a_wrong_greeting_is_seen_at_its_first_wrong_byte(size: int) -> None:
     assert "does not speak holdfast" in str(decoder.error)
 
 
+@pytest.mark.parametrize("behind", [b"", encode_frame(END, 8), encode_frame(END, 9)[:1]])
+def test_a_large_message_comes_as_it_was_sent(behind: bytes) -> None:
+    payload = bytes(range(256)) * 8192
+    stream = encode_frame(PING) + encode_frame(CALL, 7, payload) + behind
+    decoder = FrameDecoder(1 << 22)
+    came = decoder.feed(GREETING)
+    for start in range(0, len(stream), 100_000):
+        came += decoder.feed(stream[start : start + 100_000])
+    came += decoder.feed(encode_frame(END, 9)[len(behind) % 9 :])
+    assert [(frame.kind, frame.call) for frame in came[1:3]] == [(PING, 0), (CALL, 7)]
+    assert came[2].payload == payload
+    assert came[-1].kind == END
+    assert decoder.held_bytes == 0
+
+
 def test_frames_before_an_error_are_frames() -> None:
     decoder = FrameDecoder(MAX_BYTES)
     came = decoder.feed(GREETING + encode_frame(CALL, 3, b"x") + encode_frame(77) + b"more")

@@ -32,14 +32,15 @@ FloatArray = npt.NDArray[np.float64]
 
 
 class Appeared(NamedTuple):
-    """A service is there: its liveliness token is seen.
+    """A service is there: it can be asked.
 
     Attributes
     ----------
     service : str
         The robot's name for it.
     boot : str
-        Of the service's process; another one is another process, with another memory.
+        Of the service's process; another one is another process, with another memory. It is the
+        process's own word for itself, or the robot's, where the process is there before its word.
     """
 
     service: str

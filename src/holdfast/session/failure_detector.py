@@ -4,8 +4,8 @@ Nobody can know, so the detector is made to be wrong cheaply: a service that is 
 no more at first, but whatever it says clears it, and a decision that two services make is the same
 decision. Four things are looked at:
 
-- *presence*: the liveliness token, which goes when the process dies or the link breaks; this finds
-  a killed service in milliseconds, but a hung one keeps its token;
+- *presence*: the link, which breaks when the process dies; this finds a killed service in
+  milliseconds, but a hung one keeps its link for a while;
 - *signs of life*: a service that has a robot's request in work says so every few tens of
   milliseconds, so silence while something is awaited from it means that its process hangs, is
   stopped or cut off (a single computation that never ends is not seen by this);
@@ -31,7 +31,7 @@ class FailureDetector:
     Attributes
     ----------
     boot : str or None
-        Of the process whose token is seen; None if none is.
+        Of the process that is there; None if none is.
     suspicion : str or None
         Why the service is not trusted; None if it is.
     seen : bool
@@ -50,7 +50,7 @@ class FailureDetector:
 
     @property
     def present(self) -> bool:
-        """Whether its token is seen."""
+        """Whether it is there."""
         return self.boot is not None
 
     @property
@@ -59,7 +59,7 @@ class FailureDetector:
         return self.boot is not None and self.suspicion is None
 
     def appeared(self, boot: str) -> bool:
-        """Take note of a token; True if it is a process that was not there before."""
+        """Take note that a process is there; True if it was not there before."""
         fresh = boot != self.boot
         self.boot = boot
         self.seen = True
@@ -68,7 +68,7 @@ class FailureDetector:
         return fresh
 
     def vanished(self, boot: str) -> bool:
-        """Take note that a token went; True if it was the present one's."""
+        """Take note that a process is gone; True if it was the present one."""
         if boot != self.boot:
             return False
         self.boot = None

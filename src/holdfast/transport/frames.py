@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import re
 import struct
-from typing import Final, Literal, NamedTuple, TypeAlias
+from typing import Final, Literal, NamedTuple, TypeAlias, cast
 
 import msgspec
 
@@ -62,6 +62,8 @@ GOODBYE: Final = 7  # why this end closes the link, in words
 MAX_HELLO_BYTES: Final = 4096
 _MAX_GOODBYE_BYTES: Final = 1024
 
+_LARGE_BYTES: Final = 1 << 20
+
 _HEADER: Final = struct.Struct("<IBI")  # bytes that follow it, kind, call
 
 
@@ -76,6 +78,7 @@ class Frame(NamedTuple):
     ----------
     kind, call : int
     payload : bytes
+        A large one is a ``bytearray``, which nobody else has.
     passed_over_bytes : int
         Of a message that is larger than allowed and is not kept, so that the payload is empty.
     """
@@ -253,6 +256,14 @@ class FrameDecoder:
             if start + size > end:
                 break
             self._greeted = True
+            if source is buffer and size >= _LARGE_BYTES:
+                # To copy it would take a tenth of a second, in which nobody else is heard.
+                behind = bytes(buffer[start + size :])
+                del buffer[start + size :], buffer[:start]
+                frames.append(Frame(kind, call, cast(bytes, buffer)))
+                self._buffer = bytearray()
+                self._feed(behind, frames)
+                return
             with memoryview(source) as view:
                 frames.append(Frame(kind, call, bytes(view[start : start + size])))
             at = start + size
