@@ -24,7 +24,7 @@ import time
 from collections.abc import AsyncIterator, Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Protocol, TypeAlias
+from typing import Any, Protocol, TypeAlias
 
 import pytest
 from cryptography import x509
@@ -39,6 +39,7 @@ from holdfast.session.events import Appeared, Ended, Replied, TransportEvent, Va
 from holdfast.session.messages import Refused, decode_reply
 from holdfast.transport import frames, links, listener, service_end
 from holdfast.transport.contract import IncomingCall, RobotTransport, ServiceTransport
+from holdfast.transport.dialer import Dialer
 from holdfast.transport.endpoints import PrivateSocket, ServiceAddress, TlsFiles
 from holdfast.transport.in_process import InProcessNetwork
 from holdfast.transport.robot_end import StreamRobotTransport
@@ -774,10 +775,10 @@ class Visitor:
         family = socket.AF_INET if port.isdigit() else socket.AF_UNIX
         self.socket = socket.socket(family)
         self.socket.setblocking(False)
-        self._address: object = (host, int(port)) if port.isdigit() else place
+        self.address: Any = (host, int(port)) if port.isdigit() else place
 
     async def connect(self) -> Visitor:
-        await asyncio.get_running_loop().sock_connect(self.socket, self._address)  # type: ignore[arg-type]
+        await asyncio.get_running_loop().sock_connect(self.socket, self.address)
         return self
 
     async def say(self, data: bytes) -> None:
@@ -1082,12 +1083,20 @@ class TestVisitors:
         await service.start(echo)
         begun = b"\x16\x03\x01" if wire.protocol == "tls" else frames.MAGIC[:3]
         with contextlib.ExitStack() as stack:
-            for k in range(600):
-                visitor = stack.enter_context(Visitor(wire.endpoint("cloud")))
-                await visitor.connect()
-                if k % 2:
-                    await visitor.say(begun)
-                assert len(service._ungreeted) <= service_end._MAX_UNGREETED
+            for first in (b"", begun):
+                # All of them before the service looks.
+                visitors = [
+                    stack.enter_context(Visitor(wire.endpoint("cloud"))) for _ in range(400)
+                ]
+                for visitor in visitors:
+                    visitor.socket.setblocking(True)
+                    visitor.socket.connect(visitor.address)
+                    visitor.socket.sendall(first)
+                (place,) = service._listeners
+                for _ in range(100):
+                    await asyncio.sleep(0)
+                    assert len(place._silent) <= listener._MAX_SILENT
+                    assert len(service._ungreeted) <= service_end._MAX_UNGREETED
             robot, inbox = wire.robot("cloud"), Inbox()
             robot.start(inbox)
             await inbox.wait_for(Appeared("cloud", "b1"))
@@ -1439,7 +1448,6 @@ class TestCertificates:
         robot.call("cloud", 1, b"question")
         assert await inbox.of_call(1) == [Replied(1, b"question"), Ended(1)]
 
-
     async def test_a_robot_can_be_closed_amid_a_handshake(self, tls: StreamWire) -> None:
         host, _, port = tls.endpoint("cloud").removeprefix("tls/").rpartition(":")
         heard = asyncio.Event()
@@ -1760,6 +1768,61 @@ async def test_a_robot_that_stood_still_longer_than_the_lease_gives_nobody_up(
             robot.send_signal(signal.SIGCONT)
             robot.kill()
             robot.communicate()
+
+
+async def test_what_came_while_a_robot_stood_still_is_read_before_anybody_is_given_up(
+    tcp: StreamWire, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It stands still just when it has looked at its sockets, and before it looks at the time."""
+    selector = asyncio.get_running_loop()._selector  # type: ignore[attr-defined]
+    look = selector.select
+    still_s = 0.0
+
+    def select(timeout: float | None = None) -> object:
+        nonlocal still_s
+        found = look(timeout)
+        if not found:
+            still_s, seconds = 0.0, still_s
+            time.sleep(seconds)
+        return found
+
+    async with service_process(tcp.endpoint("cloud"), "b1", lease_ms=300.0):
+        robot, inbox = tcp.robot("cloud"), Inbox()
+        robot.start(inbox)
+        await inbox.wait_for(Appeared("cloud", "b1"))
+        monkeypatch.setattr(selector, "select", select)
+        for number in range(3):
+            still_s = 1.0
+            await until(lambda: still_s == 0.0)
+            robot.call("cloud", number, b"echo")
+            assert await inbox.of_call(number) == [Replied(number, b"echo"), Ended(number)]
+        assert Vanished("cloud", "b1") not in inbox
+
+
+async def test_a_service_that_comes_and_goes_is_not_dialled_without_a_pause(
+    tcp: StreamWire, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    dialled: list[float] = []
+    connect = Dialer._connect
+
+    def note(self: Dialer, *arguments: Any) -> None:
+        dialled.append(asyncio.get_running_loop().time())
+        connect(self, *arguments)
+
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        writer.write(frames.encode_hello("service", "cloud", f"b{len(dialled)}", 30_000.0))
+        await reader.read(1)
+        writer.close()
+
+    monkeypatch.setattr(Dialer, "_connect", note)
+    port = int(tcp.endpoint("cloud").rpartition(":")[2])
+    async with await asyncio.start_server(serve, "127.0.0.1", port):
+        robot, inbox = tcp.robot("cloud"), Inbox()
+        robot.start(inbox)
+        await inbox.appeared(times=8)
+        await robot.close()
+    pauses = [after - before for before, after in itertools.pairwise(dialled)]
+    assert min(pauses) > 0.019
 
 
 ROBOT_THAT_ENDS = """
