@@ -1085,10 +1085,8 @@ class TestVisitors:
         with contextlib.ExitStack() as stack:
             for first in (b"", begun):
                 # All of them before the service looks.
-                visitors = [
-                    stack.enter_context(Visitor(wire.endpoint("cloud"))) for _ in range(400)
-                ]
-                for visitor in visitors:
+                for _ in range(400):
+                    visitor = stack.enter_context(Visitor(wire.endpoint("cloud")))
                     visitor.socket.setblocking(True)
                     visitor.socket.connect(visitor.address)
                     visitor.socket.sendall(first)
@@ -1776,14 +1774,13 @@ async def test_what_came_while_a_robot_stood_still_is_read_before_anybody_is_giv
     """It stands still just when it has looked at its sockets, and before it looks at the time."""
     selector = asyncio.get_running_loop()._selector  # type: ignore[attr-defined]
     look = selector.select
-    still_s = 0.0
+    still_s = [0.0]
 
     def select(timeout: float | None = None) -> object:
-        nonlocal still_s
         found = look(timeout)
         if not found:
-            still_s, seconds = 0.0, still_s
-            time.sleep(seconds)
+            time.sleep(still_s[0])
+            still_s[0] = 0.0
         return found
 
     async with service_process(tcp.endpoint("cloud"), "b1", lease_ms=300.0):
@@ -1792,8 +1789,8 @@ async def test_what_came_while_a_robot_stood_still_is_read_before_anybody_is_giv
         await inbox.wait_for(Appeared("cloud", "b1"))
         monkeypatch.setattr(selector, "select", select)
         for number in range(3):
-            still_s = 1.0
-            await until(lambda: still_s == 0.0)
+            still_s[0] = 1.0
+            await until(lambda: still_s[0] == 0.0)
             robot.call("cloud", number, b"echo")
             assert await inbox.of_call(number) == [Replied(number, b"echo"), Ended(number)]
         assert Vanished("cloud", "b1") not in inbox
