@@ -44,8 +44,6 @@ REAL = (
     "unit/test_credentials.py::TestNothingIsOverwritten",
     "unit/test_credentials.py::TestOnRealLinks",
     "unit/test_diagnosis.py",
-    "unit/test_endpoints.py::test_a_free_port_can_be_listened_on",
-    "unit/test_endpoints.py::test_an_address_of_another_machine_has_no_free_port",
     "unit/test_endpoints.py::test_loopback_is_what_only_this_machine_can_reach",
     "unit/test_files.py::test_what_is_no_file_is_refused",
     "unit/test_health.py",

@@ -14,7 +14,6 @@ from holdfast.transport.endpoints import (
     PrivateSocket,
     TlsFiles,
     check_credentials,
-    free_port,
     parse_endpoint,
 )
 
@@ -122,20 +121,6 @@ def test_credentials_go_with_the_protocols_that_use_them(tmp_path: Path) -> None
     files.key.unlink()
     with pytest.raises(TransportError, match=r"key\.pem cannot be read: No such file"):
         check_credentials(tls, files)
-
-
-@pytest.mark.parametrize("text", ["tcp/127.0.0.1:0", "udp/localhost:0"])
-def test_a_free_port_can_be_listened_on(text: str) -> None:
-    endpoint = parse_endpoint(text)
-    port = free_port(endpoint)
-    kind = socket.SOCK_DGRAM if endpoint.protocol == "udp" else socket.SOCK_STREAM
-    with socket.socket(socket.AF_INET, kind) as probe:
-        probe.bind(("127.0.0.1", port))
-
-
-def test_an_address_of_another_machine_has_no_free_port() -> None:
-    with pytest.raises(TransportError, match=r"cannot listen on tcp/192\.0\.2\.1:0"):
-        free_port(parse_endpoint("tcp/192.0.2.1:0"))
 
 
 def test_a_private_socket_is_private_and_goes_away() -> None:

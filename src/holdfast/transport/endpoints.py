@@ -31,7 +31,6 @@ __all__ = [
     "check_credentials",
     "check_endpoint",
     "check_name",
-    "free_port",
     "parse_endpoint",
 ]
 
@@ -350,26 +349,6 @@ def check_credentials(endpoint: Endpoint, tls: TlsFiles | None) -> None:
                 raise TransportError(
                     f"endpoint {endpoint}: credentials {file} cannot be read: {error.strerror}"
                 ) from error
-
-
-def free_port(endpoint: Endpoint) -> int:
-    """Return a port that nobody listens on now, at the host of an endpoint.
-
-    Raises
-    ------
-    TransportError
-        If this machine has no such address.
-    """
-    kind = socket.SOCK_DGRAM if endpoint.protocol == "udp" else socket.SOCK_STREAM
-    try:
-        family, _, _, _, address = socket.getaddrinfo(
-            endpoint.host, 0, type=kind, flags=socket.AI_PASSIVE
-        )[0]
-        with socket.socket(family, kind) as probe:
-            probe.bind(address)
-            return int(probe.getsockname()[1])
-    except OSError as error:
-        raise TransportError(f"cannot listen on {endpoint}: {error.strerror}") from error
 
 
 def _local_socket(text: str, path: str) -> Endpoint:
