@@ -86,6 +86,7 @@ class _DatagramLink(Link):
         self._due: asyncio.TimerHandle | None = None
         self._stream_heard_at = self._loop.time()
         self._datagram_heard_at = float("-inf")
+        self._peer_address: Any = None
         self._ways = Ways(self._send_datagram, self._send_on_stream, self._lost_of_theirs)
 
     # -- sending ---------------------------------------------------------------------------------
@@ -111,20 +112,32 @@ class _DatagramLink(Link):
 
     # -- receiving -------------------------------------------------------------------------------
 
-    def data_received(self, data: bytes) -> None:
+    def buffer_updated(self, nbytes: int) -> None:
         """Take what has come on the stream."""
         self._stream_heard_at = self._loop.time()
-        super().data_received(data)
+        super().buffer_updated(nbytes)
 
-    def _opened(self, datagram: bytes) -> bytes | None:
-        """Return the message of a datagram, and take note that the other end lives."""
-        if self._ended or self._sealing is None:
-            return None
-        message = self._sealing.open(datagram)
-        if message is not None:
-            self._datagram_heard_at = self._loop.time()
-            self._silent_at = max(self._silent_at, self._datagram_heard_at + self._patience_s)
-        return message
+    def take_datagram(self, datagram: bytes, address: Any) -> None:
+        """Take a datagram that claims to be of this link."""
+        sealing = self._sealing
+        if self._ended or sealing is None:
+            return
+        newest = sealing.window.newest
+        message = sealing.open(datagram)
+        if message is None:
+            return
+        if sealing.window.newest > newest:
+            # Of older ones, one that was held back could lead the answers to where nobody is.
+            self._peer_address = address
+        self._datagram_heard_at = self._loop.time()
+        self._silent_at = max(self._silent_at, self._datagram_heard_at + self._patience_s)
+        try:
+            self._received(message, datagram=True)
+        except FrameError as error:
+            self.end(str(error), goodbye=str(error), refused=True)
+
+    def _received(self, message: bytes, *, datagram: bool) -> None:
+        raise NotImplementedError
 
     # -- the stream breaks -----------------------------------------------------------------------
 
@@ -195,15 +208,14 @@ class RobotDatagramLink(_DatagramLink):
         super().__init__(owner, settings, speaks_first=True, tls=tls)
         self._questions = Questions(self._ways)
         self._socket: socket.socket | None = None
-        self._service_address: Any = None
         self._doubting = False
         self._closed_since: float | None = None
         self._told_closed = False
 
     @property
-    def is_idle(self) -> bool:
-        """Whether nothing is awaited."""
-        return not self._questions.calls
+    def sends_datagrams(self) -> bool:
+        """Whether short messages go beside the stream."""
+        return self._questions.open
 
     def send_message(self, kind: int, call: int, payload: bytes = b"") -> None:
         """Ask."""
@@ -234,7 +246,7 @@ class RobotDatagramLink(_DatagramLink):
         association, to_service, to_robot, port = _KEYS.unpack(payload)
         self._sealing = Sealing(Keys(association, to_service, to_robot), service=False)
         address = self._transport.get_extra_info("peername")
-        self._service_address = (address[0], port or address[1], *address[2:])
+        self._peer_address = (address[0], port or address[1], *address[2:])
         self._closed_since = self._loop.time()
         self._open_socket()
         self._questions.begin(self._loop.time())
@@ -245,12 +257,12 @@ class RobotDatagramLink(_DatagramLink):
     def _open_socket(self) -> None:
         """Open a socket from whatever address the robot has now."""
         self._close_socket()
-        family = socket.AF_INET6 if len(self._service_address) == 4 else socket.AF_INET
+        family = socket.AF_INET6 if len(self._peer_address) == 4 else socket.AF_INET
         opened = socket.socket(family, socket.SOCK_DGRAM)
         try:
             opened.setblocking(False)
             # Connected, it hears from nobody else, and hears when nobody has the service's port.
-            opened.connect(self._service_address)
+            opened.connect(self._peer_address)
         except OSError:
             opened.close()
             return  # it is tried again with the next probe
@@ -290,9 +302,7 @@ class RobotDatagramLink(_DatagramLink):
                 if error.errno in _NO_WAY:
                     self._close_socket()
                 return
-            message = self._opened(datagram)
-            if message is not None:
-                self._received(message, datagram=True)
+            self.take_datagram(datagram, self._peer_address)
 
     def _received(self, message: bytes, *, datagram: bool) -> None:
         self._hand_over(self._questions.received(message, self._loop.time(), datagram=datagram))
@@ -387,7 +397,6 @@ class ServiceDatagramLink(_DatagramLink):
         self._answers = Answers(self._ways)
         self._sockets = sockets
         self._socket: _DatagramSocket | None = None
-        self._robot_address: Any = None
 
     def send_message(self, kind: int, call: int, payload: bytes = b"") -> None:
         """Answer."""
@@ -425,19 +434,6 @@ class ServiceDatagramLink(_DatagramLink):
         content = _KEYS.pack(*keys, 0 if port == address[1] else port)
         self.send(encode_frame(KEYS, 0, content))
 
-    def datagram_received(self, datagram: bytes, address: Any) -> None:
-        """Take a datagram that claims to be of this link."""
-        sealing = self._sealing
-        if sealing is None:
-            return
-        newest = sealing.window.newest
-        message = self._opened(datagram)
-        if message is None:
-            return
-        if sealing.window.newest > newest:
-            self._robot_address = address
-        self._received(message, datagram=True)
-
     def _received(self, message: bytes, *, datagram: bool) -> None:
         arrived = self._answers.received(message, datagram=datagram)
         if arrived is None:
@@ -449,8 +445,8 @@ class ServiceDatagramLink(_DatagramLink):
         self._owner.received(self, frame)
 
     def _put(self, datagram: bytes) -> None:
-        if self._socket is not None and self._robot_address is not None:
-            self._socket.send(datagram, self._robot_address)
+        if self._socket is not None and self._peer_address is not None:
+            self._socket.send(datagram, self._peer_address)
 
     def _expire(self) -> None:
         self._due, self._due_at = None, float("inf")
@@ -563,4 +559,4 @@ class _DatagramSocket:
                 continue
             link = self._links.get(association)
             if link is not None:
-                link.datagram_received(datagram, address)
+                link.take_datagram(datagram, address)

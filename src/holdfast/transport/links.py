@@ -223,6 +223,11 @@ class Link(asyncio.BufferedProtocol):
         """Whether nothing can be sent any more."""
         return self._ended
 
+    @property
+    def sends_datagrams(self) -> bool:
+        """Whether short messages go beside the stream."""
+        return False
+
     async def connect(self, stream: socket.socket) -> None:
         """Begin to speak over a connection; never raises."""
         try:

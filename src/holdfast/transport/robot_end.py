@@ -125,6 +125,11 @@ class StreamRobotTransport:
         """
         return str(self._service(service).endpoint)
 
+    def sends_datagrams(self, service: str) -> bool:
+        """Whether short messages to a service go as datagrams now."""
+        link = self._service(service).current
+        return link is not None and link.sends_datagrams
+
     def start(self, deliver: Callable[[TransportEvent], None]) -> None:
         """Begin to connect, and to deliver events; returns at once, connected or not.
 
