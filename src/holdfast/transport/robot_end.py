@@ -23,6 +23,7 @@ from holdfast.transport.endpoints import (
     ServiceAddress,
     TlsFiles,
     check_credentials,
+    check_direction,
     check_endpoint,
     check_name,
 )
@@ -105,6 +106,7 @@ class StreamRobotTransport:
         for service, address in services.items():
             endpoint = check_endpoint(address.endpoint, listens=address.listens)
             check_credentials(endpoint, tls)
+            check_direction(endpoint, service_listens=not address.listens)
             if address.name is not None:
                 check_name("name of a service", address.name)
             if credentials is None and tls is not None and endpoint.is_encrypted:

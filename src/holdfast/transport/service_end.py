@@ -20,6 +20,7 @@ from holdfast.transport.endpoints import (
     Endpoint,
     TlsFiles,
     check_credentials,
+    check_direction,
     check_endpoint,
     check_name,
 )
@@ -172,9 +173,11 @@ class StreamServiceTransport:
         self._connect = [check_endpoint(text, listens=False) for text in connect]
         for endpoint in (*self._listen, *self._connect):
             check_credentials(endpoint, tls)
+        for endpoint in self._connect:
+            check_direction(endpoint, service_listens=False)
         self._listening: Sequence[socket.socket | None] = listening or [None] * len(listen)
         self._sockets: DatagramSockets | None = None
-        if any(endpoint.protocol == "udp" for endpoint in (*self._listen, *self._connect)):
+        if any(endpoint.protocol == "udp" for endpoint in self._listen):
             from holdfast.transport.datagrams import DatagramSockets
             from holdfast.transport.sealing import require_cryptography
 
