@@ -28,6 +28,7 @@ HERE = Path(__file__).parent
 
 REAL = (
     "processes/",
+    "contracts/test_datagram_links.py",
     "contracts/test_transport.py",
     "experiments/test_cloud_worth.py::test_asking_a_service_over_tcp",
     "experiments/test_cloud_worth.py::test_the_whole_study",

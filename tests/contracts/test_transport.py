@@ -302,7 +302,7 @@ def socket_directory() -> Iterator[Path]:
         yield Path(place.endpoint.removeprefix("unix/")).parent
 
 
-WIRES = ["in_process", "tcp", "tls", "unix", "robot_listens", "robot_listens_tls"]
+WIRES = ["in_process", "tcp", "tls", "udp", "unix", "robot_listens", "robot_listens_tls"]
 
 
 @pytest.fixture(params=WIRES)
@@ -317,13 +317,13 @@ def wire(
             return InProcessWire()
         case "robot_listens":
             return StreamWire("unix", socket_directory, robot_listens=True)
-        case "tls" | "robot_listens_tls":
+        case "tls" | "udp" | "robot_listens_tls":
             return StreamWire(
-                "tls",
+                "udp" if request.param == "udp" else "tls",
                 socket_directory,
                 robot_tls=robot_tls,
                 service_tls=service_tls,
-                robot_listens=request.param != "tls",
+                robot_listens=request.param == "robot_listens_tls",
             )
         case protocol:
             return StreamWire(protocol, socket_directory)
@@ -373,6 +373,9 @@ async def connected(
     inbox = Inbox()
     robot.start(inbox)
     await inbox.wait_for(Appeared("cloud", boot))
+    if isinstance(wire, StreamWire) and wire.protocol == "udp":
+        assert isinstance(robot, StreamRobotTransport)
+        await until(lambda: robot.sends_datagrams("cloud"))
     return robot, inbox, serving
 
 
@@ -590,7 +593,7 @@ class TestEveryWire:
         there_and_gone = [e("cloud", boot) for boot in boots for e in (Appeared, Vanished)]
         assert list(map(repr, seen)) == list(map(repr, there_and_gone[:-1]))
         assert len(set(boots)) == 4
-        if not (isinstance(wire, StreamWire) and wire.protocol == "tls"):
+        if not (isinstance(wire, StreamWire) and wire.protocol in ("tls", "udp")):
             # Over TLS it is seen before it can say what it is called.
             assert boots == ["b1", "b2", "b3", "b4"]
 
@@ -1031,7 +1034,7 @@ class TestStreams:
             await robot.close()
 
 
-@pytest.mark.parametrize("protocol", ["tcp", "tls", "unix"])
+@pytest.mark.parametrize("protocol", ["tcp", "tls", "udp", "unix"])
 class TestVisitors:
     """What connects to a service and is no robot of ours costs the robots nothing."""
 
@@ -1039,8 +1042,10 @@ class TestVisitors:
     def wire(
         self, protocol: str, socket_directory: Path, robot_tls: TlsFiles, service_tls: TlsFiles
     ) -> StreamWire:
-        if protocol == "tls":
-            return StreamWire("tls", socket_directory, robot_tls=robot_tls, service_tls=service_tls)
+        if protocol in ("tls", "udp"):
+            return StreamWire(
+                protocol, socket_directory, robot_tls=robot_tls, service_tls=service_tls
+            )
         return StreamWire(protocol, socket_directory)
 
     @pytest.mark.parametrize(
@@ -1068,7 +1073,7 @@ class TestVisitors:
         self, wire: StreamWire, greeting: bytes, plain: str, over_tls: str | None
     ) -> None:
         await wire.service("cloud", "b1").start(echo)
-        wanted = over_tls if wire.protocol == "tls" else plain
+        wanted = over_tls if wire.protocol in ("tls", "udp") else plain
         if wanted is None:
             pytest.skip("it is the beginning of a greeting")
         with await Visitor(wire.endpoint("cloud")).connect() as visitor:
@@ -1081,7 +1086,7 @@ class TestVisitors:
     async def test_connections_that_say_nothing_keep_no_robot_out(self, wire: StreamWire) -> None:
         service = wire.service("cloud", "b1")
         await service.start(echo)
-        begun = b"\x16\x03\x01" if wire.protocol == "tls" else frames.MAGIC[:3]
+        begun = b"\x16\x03\x01" if wire.protocol in ("tls", "udp") else frames.MAGIC[:3]
         with contextlib.ExitStack() as stack:
             for first in (b"", begun):
                 # All of them before the service looks.
@@ -1108,7 +1113,7 @@ class TestVisitors:
         monkeypatch.setattr(listener, "OPENING_TIMEOUT_S", 0.2)
         monkeypatch.setattr(links, "OPENING_TIMEOUT_S", 0.2)
         await wire.service("cloud", "b1").start(echo)
-        begun = b"\x16\x03\x01" if wire.protocol == "tls" else frames.MAGIC[:3]
+        begun = b"\x16\x03\x01" if wire.protocol in ("tls", "udp") else frames.MAGIC[:3]
         with Visitor(wire.endpoint("cloud")) as mute, Visitor(wire.endpoint("cloud")) as slow:
             await mute.connect()
             await slow.connect()
@@ -1611,13 +1616,13 @@ def stop(process: subprocess.Popen[bytes]) -> None:
 Start: TypeAlias = Callable[[str], contextlib.AbstractAsyncContextManager[subprocess.Popen[bytes]]]
 
 
-@pytest.mark.parametrize("kind", ["tcp", "tls", "unix", "robot_listens"])
+@pytest.mark.parametrize("kind", ["tcp", "tls", "udp", "unix", "robot_listens"])
 class TestProcesses:
     @pytest.fixture
     def wire(
         self, kind: str, socket_directory: Path, robot_tls: TlsFiles, service_tls: TlsFiles
     ) -> StreamWire:
-        if kind == "tls":
+        if kind in ("tls", "udp"):
             wire = StreamWire(kind, socket_directory, robot_tls=robot_tls, service_tls=service_tls)
         elif kind == "robot_listens":
             wire = StreamWire("unix", socket_directory, robot_listens=True)

@@ -93,14 +93,14 @@ def started_again(service: Service, count: int) -> Callable[[], object]:
 
 
 class TestRobots:
-    @pytest.mark.parametrize("protocol", ["tcp", "tls", "unix"])
+    @pytest.mark.parametrize("protocol", ["tcp", "tls", "udp", "unix"])
     def test_processes_are_killed_under_them(
         self, protocol: str, site: Site, keys: Path, references: References
     ) -> None:
         """Their runs decide the same; nothing but time is lost, and nothing is forgotten."""
         place = site.directory / "socket" if protocol == "unix" else f"127.0.0.1:{free_port()}"
         credentials = {
-            end: ("--tls", str(keys / "ours" / end)) if protocol == "tls" else ()
+            end: ("--tls", str(keys / "ours" / end)) if protocol in ("tls", "udp") else ()
             for end in ("robot", "service")
         }
         cloud = several(site, *credentials["service"], endpoint=f"{protocol}/{place}")

@@ -39,7 +39,7 @@ def secure(
     )
 
 
-@pytest.mark.parametrize("protocol", ["tls"])
+@pytest.mark.parametrize("protocol", ["tls", "udp"])
 def test_killed_stopped_and_started_again(
     protocol: str, keys: Path, site: Site, references: References
 ) -> None:
@@ -55,7 +55,7 @@ def test_killed_stopped_and_started_again(
     assert robot.statuses() == [LOST, RESTORED, LOST_AGAIN, RESTORED]
 
 
-@pytest.mark.parametrize("protocol", ["tls"])
+@pytest.mark.parametrize("protocol", ["tls", "udp"])
 def test_a_robot_of_another_authority_stays_outside(
     protocol: str, keys: Path, site: Site, references: References
 ) -> None:
@@ -69,7 +69,7 @@ def test_a_robot_of_another_authority_stays_outside(
     assert not cloud.process.matching("session_opened")
 
 
-@pytest.mark.parametrize("protocol", ["tls"])
+@pytest.mark.parametrize("protocol", ["tls", "udp"])
 def test_a_service_of_another_authority_is_not_believed(
     protocol: str, keys: Path, site: Site, references: References
 ) -> None:
@@ -77,7 +77,7 @@ def test_a_service_of_another_authority_is_not_believed(
     assert_not_believed(cloud, keys, site, references)
 
 
-@pytest.mark.parametrize("protocol", ["tls"])
+@pytest.mark.parametrize("protocol", ["tls", "udp"])
 def test_a_service_at_another_address_than_it_was_certified_for_is_not_believed(
     protocol: str, keys: Path, site: Site, references: References
 ) -> None:

@@ -166,6 +166,11 @@ def _streams(configuration: Configuration, log_path: Path | None, events: EventS
             on_refused=lambda service, reason: events.event(
                 "link_refused", service=service, reason=reason
             ),
+            on_closed_to_datagrams=lambda service: events.event(
+                "no_datagrams",
+                service=service,
+                reason="none gets through, so everything goes on the TLS stream; is UDP filtered?",
+            ),
         )
     except BaseException:
         close()

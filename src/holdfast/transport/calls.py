@@ -109,6 +109,11 @@ class CallTable:
         for call in calls:
             self.ended(call)
 
+    def lost(self, peer: object) -> None:
+        """Deliver the ends of the calls to a peer."""
+        for call in [call for call in self._pending.values() if call.peer is peer]:
+            self.ended(call)
+
     def close(self) -> None:
         """Forget all calls and deliver nothing more."""
         self._deliver = None

@@ -29,6 +29,7 @@ __all__ = [
     "ServiceAddress",
     "TlsFiles",
     "check_credentials",
+    "check_direction",
     "check_endpoint",
     "check_name",
     "parse_endpoint",
@@ -302,6 +303,21 @@ def check_endpoint(text: str, *, listens: bool) -> Endpoint:
             f"as in {endpoint.with_port(7447)}"
         )
     return endpoint
+
+
+def check_direction(endpoint: Endpoint, *, service_listens: bool) -> None:
+    """Check that the end that listens is the one that can, with this protocol.
+
+    Raises
+    ------
+    TransportError
+        If robots are to be called over ``udp``.
+    """
+    if endpoint.protocol == "udp" and not service_listens:
+        raise TransportError(
+            f"endpoint {endpoint}: over udp it is the service that listens and the robot that "
+            f"connects; write tls/... where a robot listens"
+        )
 
 
 def check_name(what: str, name: str) -> None:

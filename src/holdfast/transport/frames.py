@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import re
 import struct
+from collections.abc import Mapping
 from typing import Final, Literal, NamedTuple, TypeAlias, cast
 
 import msgspec
@@ -25,9 +26,11 @@ __all__ = [
     "END",
     "GOODBYE",
     "HELLO",
+    "KEYS",
     "LAST",
     "MAGIC",
     "MAX_HELLO_BYTES",
+    "MESSAGE",
     "PING",
     "REPLY",
     "WIRE_VERSION",
@@ -58,6 +61,8 @@ END: Final = 4  # no more replies to a call
 LAST: Final = 5  # a reply and the end
 PING: Final = 6  # this end lives
 GOODBYE: Final = 7  # why this end closes the link, in words
+KEYS: Final = 8  # with which datagrams are sealed
+MESSAGE: Final = 9  # of an exchange that is too large for a datagram
 
 MAX_HELLO_BYTES: Final = 4096
 _MAX_GOODBYE_BYTES: Final = 1024
@@ -180,6 +185,8 @@ class FrameDecoder:
     ----------
     max_message_bytes : int
         A larger request or reply is passed over.
+    more : mapping of int to int, optional
+        Bounds of the kinds that are known beyond those of any stream.
 
     Attributes
     ----------
@@ -187,7 +194,7 @@ class FrameDecoder:
         What came after the last frame and is none of ours. Nothing may be fed after that.
     """
 
-    def __init__(self, max_message_bytes: int) -> None:
+    def __init__(self, max_message_bytes: int, more: Mapping[int, int] | None = None) -> None:
         self.error: FrameError | None = None
         self._buffer = bytearray()
         self._passing_over = 0
@@ -200,6 +207,7 @@ class FrameDecoder:
             END: 0,
             PING: 0,
             GOODBYE: _MAX_GOODBYE_BYTES,
+            **(more or {}),
         }
 
     @property
@@ -247,7 +255,7 @@ class FrameDecoder:
                 break
             size, kind, call = _HEADER.unpack_from(source, at)
             if size > self._bound(kind):
-                if kind not in (CALL, REPLY, LAST):
+                if kind not in (CALL, REPLY, LAST, MESSAGE):
                     raise FrameError(f"sends a frame of kind {kind} with {size} bytes")
                 frames.append(Frame(kind, call, b"", size))
                 self._passing_over = size
@@ -279,6 +287,8 @@ class FrameDecoder:
             return MAX_HELLO_BYTES
         bound = self._bounds.get(kind)
         if bound is None:
+            if kind in (KEYS, MESSAGE):
+                raise FrameError("is at a udp/... endpoint, which goes with udp/... at both ends")
             raise FrameError(f"sends a frame of the unknown kind {kind}")
         return bound
 

@@ -129,6 +129,17 @@ class LinkOwner(Protocol):
         """Take a frame of a call."""
         ...
 
+    def went_adrift(self, link: Link) -> None:
+        """Hear that a link goes on without its stream, so that another one has to take its place.
+
+        Only of links that have something beside the stream.
+        """
+        ...
+
+    def closed_to_datagrams(self, link: Link) -> None:
+        """Hear that no datagram gets through, so that all goes on the stream; told once."""
+        ...
+
     def lost(self, link: Link) -> None:
         """Hear that the link has ended: once of each link, and nothing more of it after that."""
         ...
@@ -162,6 +173,8 @@ class Link(asyncio.BufferedProtocol):
     refused : bool
         Whether it has ended because one of the ends does not want the other, so that to try again
         at once is of no use.
+    adrift : bool
+        Whether it goes on without its stream.
     """
 
     def __init__(
@@ -198,6 +211,7 @@ class Link(asyncio.BufferedProtocol):
         self.peer: PeerCertificate | None = None
         self.reason = ""
         self.refused = False
+        self.adrift = False
 
     @property
     def max_message_bytes(self) -> int:
@@ -208,6 +222,11 @@ class Link(asyncio.BufferedProtocol):
     def ended(self) -> bool:
         """Whether nothing can be sent any more."""
         return self._ended
+
+    @property
+    def sends_datagrams(self) -> bool:
+        """Whether short messages go beside the stream."""
+        return False
 
     async def connect(self, stream: socket.socket) -> None:
         """Begin to speak over a connection; never raises."""
@@ -232,6 +251,13 @@ class Link(asyncio.BufferedProtocol):
         self._handed_over_bytes += len(data)
         if transport.get_write_buffer_size() > self._max_unsent_bytes:
             self.end("does not read what it is sent", abort=True)
+
+    def send_message(self, kind: int, call: int, payload: bytes = b"") -> None:
+        """Send a frame of a call; never waits."""
+        self.send(encode_frame(kind, call, payload))
+
+    def forget(self, call: int) -> None:
+        """Take note that nobody wants to hear more of a call."""
 
     def end(
         self,

@@ -23,6 +23,7 @@ from holdfast.transport.endpoints import (
     ServiceAddress,
     TlsFiles,
     check_credentials,
+    check_direction,
     check_endpoint,
     check_name,
 )
@@ -34,7 +35,6 @@ from holdfast.transport.frames import (
     Frame,
     FrameError,
     Hello,
-    encode_frame,
     encode_hello,
 )
 from holdfast.transport.links import HalfReceived, Link, LinkSettings
@@ -67,6 +67,9 @@ class StreamRobotTransport:
     on_refused : callable or None
         Is told the service and the reason when a service refuses this robot or is not what the
         robot looks for; each reason once until the service is there again.
+    on_closed_to_datagrams : callable or None
+        Is told, once, of a service at ``udp`` to which no datagram gets through, so that the
+        stream carries all.
 
     Raises
     ------
@@ -84,6 +87,7 @@ class StreamRobotTransport:
         max_message_bytes: int = DEFAULT_MAX_MESSAGE_BYTES,
         tls: TlsFiles | None = None,
         on_refused: Callable[[str, str], None] | None = None,
+        on_closed_to_datagrams: Callable[[str], None] | None = None,
     ) -> None:
         if name:
             check_name("name of a robot", name)
@@ -96,15 +100,21 @@ class StreamRobotTransport:
         )
         self.calls = CallTable()
         self.on_refused = on_refused
+        self.on_closed_to_datagrams = on_closed_to_datagrams
         self._services: dict[str, _Service] = {}
         credentials: ClientCredentials | None = None
         for service, address in services.items():
             endpoint = check_endpoint(address.endpoint, listens=address.listens)
             check_credentials(endpoint, tls)
+            check_direction(endpoint, service_listens=not address.listens)
             if address.name is not None:
                 check_name("name of a service", address.name)
             if credentials is None and tls is not None and endpoint.is_encrypted:
                 credentials = ClientCredentials(tls)
+            if endpoint.protocol == "udp":
+                from holdfast.transport.sealing import require_cryptography
+
+                require_cryptography()
             own = credentials if endpoint.is_encrypted else None
             self._services[service] = _Service(self, service, address, endpoint, own)
         self._started = False
@@ -116,6 +126,11 @@ class StreamRobotTransport:
         For one that the robot listens for, where to connect; port 0 is replaced by the start.
         """
         return str(self._service(service).endpoint)
+
+    def sends_datagrams(self, service: str) -> bool:
+        """Whether short messages to a service go as datagrams now."""
+        link = self._service(service).current
+        return link is not None and link.sends_datagrams
 
     def start(self, deliver: Callable[[TransportEvent], None]) -> None:
         """Begin to connect, and to deliver events; returns at once, connected or not.
@@ -154,7 +169,10 @@ class StreamRobotTransport:
 
     def abandon(self, call: int) -> None:
         """Give a call up: nothing more of it is delivered, not even its end."""
-        self.calls.abandon(call)
+        pending = self.calls.abandon(call)
+        if pending is not None:
+            for service in self._services.values():
+                service.forget(pending)
 
     async def close(self, timeout_s: float = 1.0) -> None:
         """Close all links, within this time whatever the other ends do. May be repeated."""
@@ -212,6 +230,7 @@ class _Service:
         self._handshake_is_enough = False
         self._early = count(1)
         self._told_reasons: set[str] = set()
+        self._told_closed = False
         self._stopped = False
         self.endpoint = endpoint
 
@@ -245,7 +264,16 @@ class _Service:
     def send(self, link: Link, pending: PendingCall, payload: bytes) -> None:
         number = next(self._numbers) % _CALL_NUMBERS
         self._calls[link][number] = pending
-        link.send(encode_frame(CALL, number, payload))
+        link.send_message(CALL, number, payload)
+
+    def forget(self, pending: PendingCall) -> None:
+        """Take note that nobody wants to hear more of a call."""
+        link = pending.peer
+        if isinstance(link, Link):
+            for number, call in list(self._calls.get(link, {}).items()):
+                if call is pending:
+                    del self._calls[link][number]
+                    link.forget(number)
 
     # -- links -----------------------------------------------------------------------------------
 
@@ -254,12 +282,19 @@ class _Service:
         if self._credentials is not None:
             host = None if self._address.listens else self.endpoint.host
             tls = TlsStream(self._credentials.context(), host, self._incarnation)
-        link = Link(
-            self,
-            self._robot.settings,
-            speaks_first=tls is not None or not self._address.listens,
-            tls=tls,
-        )
+        link: Link
+        if self.endpoint.protocol == "udp":
+            from holdfast.transport.datagrams import RobotDatagramLink
+
+            assert tls is not None
+            link = RobotDatagramLink(self, self._robot.settings, tls=tls)
+        else:
+            link = Link(
+                self,
+                self._robot.settings,
+                speaks_first=tls is not None or not self._address.listens,
+                tls=tls,
+            )
         self._made.add(link)
         return link
 
@@ -298,13 +333,25 @@ class _Service:
             self._dialer.succeeded()
         if link not in self._links:
             self._appeared(link, boot)
+        self._replace_adrift(link, boot)
 
     def _appeared(self, link: Link, boot: str) -> None:
+        is_news = boot not in self._links.values()
         self._links[link] = boot
         self._calls[link] = {}
         if self._dialer is not None:
             self._dialer.won(link)
-        self._robot.calls.appeared(self._name, boot)
+        if is_news:
+            self._robot.calls.appeared(self._name, boot)
+
+    def _replace_adrift(self, by: Link, boot: str) -> None:
+        """End the links that go on without a stream, now that there is a whole one.
+
+        Those to the same process first hear the answers that are on their way.
+        """
+        for link, its_boot in list(self._links.items()):
+            if link is not by and link.adrift and (its_boot != boot or not self._calls[link]):
+                link.end("")
 
     def received(self, link: Link, frame: Frame) -> None:
         """Take a reply, or the end of a call."""
@@ -321,6 +368,21 @@ class _Service:
         if frame.kind != REPLY:
             calls.pop(frame.call, None)
             self._robot.calls.ended(call)
+            if link.adrift and not calls and link is not self.current:
+                link.end("")
+
+    def went_adrift(self, link: Link) -> None:
+        """Make another link, while this one goes on."""
+        if self._dialer is not None and not self._stopped and link is self.current:
+            self._dialer.start()
+
+    def closed_to_datagrams(self, link: Link) -> None:
+        """Tell that no datagram gets through, once."""
+        del link
+        on_closed = self._robot.on_closed_to_datagrams
+        if on_closed is not None and not self._told_closed:
+            self._told_closed = True
+            on_closed(self._name)
 
     def lost(self, link: Link) -> None:
         """Take note that a link has ended."""
@@ -339,7 +401,9 @@ class _Service:
         if link.refused and on_refused is not None and link.reason not in self._told_reasons:
             self._told_reasons.add(link.reason)
             on_refused(self._name, link.reason)
-        if boot is not None:
+        if boot is not None and boot in self._links.values():
+            self._robot.calls.lost(link)  # it goes on over another link
+        elif boot is not None:
             self._robot.calls.vanished(self._name, boot, link)
             older = next(reversed(self._links), None)
             if older is not None and was_current:

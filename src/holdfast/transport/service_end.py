@@ -20,6 +20,7 @@ from holdfast.transport.endpoints import (
     Endpoint,
     TlsFiles,
     check_credentials,
+    check_direction,
     check_endpoint,
     check_name,
 )
@@ -31,7 +32,6 @@ from holdfast.transport.frames import (
     Frame,
     FrameError,
     Hello,
-    encode_frame,
     encode_hello,
 )
 from holdfast.transport.links import HalfReceived, Link, LinkSettings
@@ -42,6 +42,9 @@ if TYPE_CHECKING:
     import ssl
 
     from holdfast.transport.tls import PeerCertificate
+
+if TYPE_CHECKING:
+    from holdfast.transport.datagrams import DatagramSockets
 
 __all__ = ["MAX_LINKS", "StreamServiceTransport"]
 
@@ -105,15 +108,15 @@ class _StreamCall:
         self._calls.discard(self)
         reply, self._reply = self._reply, None
         if reply is None:
-            self._link.send(encode_frame(END, self._number))
+            self._link.send_message(END, self._number)
         else:
-            self._link.send(encode_frame(LAST, self._number, reply))
+            self._link.send_message(LAST, self._number, reply)
 
     def flush(self) -> None:
         """Send a reply that waits for the end."""
         reply, self._reply = self._reply, None
         if reply is not None:
-            self._link.send(encode_frame(REPLY, self._number, reply))
+            self._link.send_message(REPLY, self._number, reply)
 
 
 class StreamServiceTransport:
@@ -170,7 +173,16 @@ class StreamServiceTransport:
         self._connect = [check_endpoint(text, listens=False) for text in connect]
         for endpoint in (*self._listen, *self._connect):
             check_credentials(endpoint, tls)
+        for endpoint in self._connect:
+            check_direction(endpoint, service_listens=False)
         self._listening: Sequence[socket.socket | None] = listening or [None] * len(listen)
+        self._sockets: DatagramSockets | None = None
+        if any(endpoint.protocol == "udp" for endpoint in self._listen):
+            from holdfast.transport.datagrams import DatagramSockets
+            from holdfast.transport.sealing import require_cryptography
+
+            require_cryptography()
+            self._sockets = DatagramSockets()
         self._boot = boot
         self._tls = tls
         self._context = None if tls is None else self._make_context(tls)
@@ -244,6 +256,8 @@ class StreamServiceTransport:
             link.end("")
         if self._closing:
             await asyncio.wait(set(self._closing), timeout=timeout_s)
+        if self._sockets is not None:
+            self._sockets.close()
 
     def end_links(self, condition: Callable[[PeerCertificate], bool], reason: str) -> int:
         """End the links of robots whose certificate meets a condition.
@@ -306,7 +320,14 @@ class StreamServiceTransport:
 
             assert self._context is not None
             tls = TlsStream(self._context)
-        link = Link(self, self._settings, speaks_first=dialled and tls is None, tls=tls)
+        link: Link
+        if endpoint.protocol == "udp":
+            from holdfast.transport.datagrams import ServiceDatagramLink
+
+            assert tls is not None and self._sockets is not None
+            link = ServiceDatagramLink(self, self._settings, tls=tls, sockets=self._sockets)
+        else:
+            link = Link(self, self._settings, speaks_first=dialled and tls is None, tls=tls)
         if len(self._ungreeted) >= _MAX_UNGREETED:
             oldest = next(iter(self._ungreeted))
             del self._ungreeted[oldest]
@@ -357,11 +378,11 @@ class StreamServiceTransport:
             raise FrameError(f"is a robot and sends a frame of kind {frame.kind}")
         if frame.passed_over_bytes:
             refusal = too_large(frame.passed_over_bytes, self._settings.max_message_bytes)
-            link.send(encode_frame(LAST, frame.call, refusal))
+            link.send_message(LAST, frame.call, refusal)
             return
         deliver = self._deliver
         if deliver is None:
-            link.send(encode_frame(END, frame.call))
+            link.send_message(END, frame.call)
             return
         call = _StreamCall(link, frame.call, frame.payload, calls, asyncio.get_running_loop())
         calls.add(call)
@@ -369,6 +390,12 @@ class StreamServiceTransport:
         deliver(call)
         call.is_being_delivered = False
         call.flush()
+
+    def went_adrift(self, link: Link) -> None:
+        """Nothing: it is the robot that makes another link."""
+
+    def closed_to_datagrams(self, link: Link) -> None:
+        """Nothing: it is the robot that finds out."""
 
     def lost(self, link: Link) -> None:
         """Take note that a link has ended."""

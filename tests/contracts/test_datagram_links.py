@@ -1,0 +1,449 @@
+"""Links with datagrams beside the stream: who gets in, what goes which way, how an end is found."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import socket
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tests.contracts.test_transport import (
+    LEASE_MS,
+    Inbox,
+    Received,
+    StreamWire,
+    authority,
+    echo,
+    robot_tls,
+    service_tls,
+    socket_directory,
+    until,
+)
+from tests.ports import free_port
+from tests.relay import relay
+
+from holdfast.chaos.proxy import Impairment, Proxy
+from holdfast.errors import TransportError
+from holdfast.session.events import Appeared, Ended, Replied, Vanished
+from holdfast.transport import sealing
+from holdfast.transport.contract import IncomingCall
+from holdfast.transport.datagrams import RobotDatagramLink, ServiceDatagramLink
+from holdfast.transport.endpoints import ServiceAddress, TlsFiles
+from holdfast.transport.exchanges import MAX_PAYLOAD_BYTES
+from holdfast.transport.robot_end import StreamRobotTransport
+from holdfast.transport.sealing import Keys, Sealing
+from holdfast.transport.service_end import StreamServiceTransport
+
+__all__ = ["authority", "robot_tls", "service_tls", "socket_directory"]  # fixtures
+
+
+@pytest.fixture
+def udp(socket_directory: Path, robot_tls: TlsFiles, service_tls: TlsFiles) -> StreamWire:
+    return StreamWire("udp", socket_directory, robot_tls=robot_tls, service_tls=service_tls)
+
+
+async def connected(
+    wire: StreamWire, serve: Callable[[IncomingCall], None] = echo
+) -> tuple[StreamRobotTransport, Inbox, StreamServiceTransport]:
+    service = wire.service("cloud", "b1")
+    await service.start(serve)
+    robot, inbox = wire.robot("cloud"), Inbox()
+    robot.start(inbox)
+    await inbox.appeared()
+    await until(lambda: robot.sends_datagrams("cloud"))
+    return robot, inbox, service
+
+
+def link_of(robot: StreamRobotTransport) -> RobotDatagramLink:
+    link = robot._services["cloud"].current
+    assert isinstance(link, RobotDatagramLink)
+    return link
+
+
+def link_at(service: StreamServiceTransport, number: int = 0) -> ServiceDatagramLink:
+    link = list(service._links)[number]
+    assert isinstance(link, ServiceDatagramLink)
+    return link
+
+
+def place_of(wire: StreamWire) -> tuple[str, int]:
+    return "127.0.0.1", int(wire.endpoint("cloud").rpartition(":")[2])
+
+
+@contextlib.contextmanager
+def stranger(to: tuple[str, int]) -> Iterator[socket.socket]:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as made:
+        made.connect(to)
+        made.setblocking(False)
+        yield made
+
+
+async def answers(robot: StreamRobotTransport, inbox: Inbox, call: int) -> None:
+    robot.call("cloud", call, b"question %d" % call)
+    assert await inbox.of_call(call) == [Replied(call, b"question %d" % call), Ended(call)]
+
+
+class TestWhatGoesWhichWay:
+    async def test_short_questions_and_answers_are_not_on_the_stream(
+        self, udp: StreamWire, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        robot, inbox, service = await connected(udp)
+        link, other = link_of(robot), link_at(service)
+        on_stream: list[bytes] = []
+        for each in (link, other):
+            monkeypatch.setattr(each, "send", on_stream.append)
+        for call in range(20):
+            robot.call("cloud", call, bytes(MAX_PAYLOAD_BYTES))
+            assert len(await inbox.of_call(call)) == 2
+        assert [sent for sent in on_stream if len(sent) > 9] == []
+        monkeypatch.undo()
+
+    async def test_what_is_longer_is(self, udp: StreamWire) -> None:
+        robot, inbox, _ = await connected(udp)
+        link = link_of(robot)
+        before = link._sealing, 0 if link._sealing is None else link._sealing._counter
+        for size in (MAX_PAYLOAD_BYTES + 1, 100_000):
+            robot.call("cloud", size, bytes(size))
+            assert await inbox.of_call(size) == [Replied(size, bytes(size)), Ended(size)]
+        assert link._sealing is before[0]
+        assert before[0] is not None and before[0]._counter - before[1] <= 2  # probes
+
+    async def test_a_service_at_all_addresses_answers_from_the_one_that_was_called(
+        self, robot_tls: TlsFiles, service_tls: TlsFiles
+    ) -> None:
+        port = free_port("0.0.0.0")
+        service = StreamServiceTransport(
+            "cloud", boot="b1", listen=[f"udp/0.0.0.0:{port}"], tls=service_tls
+        )
+        await service.start(echo)
+        robot = StreamRobotTransport(
+            {"cloud": ServiceAddress(f"udp/127.0.0.1:{port}")}, tls=robot_tls
+        )
+        robot.start(Inbox())
+        await until(lambda: robot.sends_datagrams("cloud"))
+        await robot.close()
+        await service.close()
+
+    async def test_where_somebody_has_the_port_the_service_takes_another(
+        self, udp: StreamWire
+    ) -> None:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as somebody:
+            somebody.bind(place_of(udp))
+            robot, inbox, _ = await connected(udp)
+            await answers(robot, inbox, 1)
+
+
+class TestStrangers:
+    async def test_what_is_forged_reaches_nobody_and_is_not_answered(self, udp: StreamWire) -> None:
+        received: list[bytes] = []
+
+        def serve(call: IncomingCall) -> None:
+            received.append(call.payload)
+            echo(call)
+
+        robot, inbox, service = await connected(udp, serve)
+        link = link_at(service)
+        assert link._sealing is not None
+        number = link._sealing.association
+        forger = Sealing(Keys.draw(number), service=False)
+        question = b"\1\0" + (7).to_bytes(4, "big") * 2 + b"\0\0" + b"forged"
+        reply = b"\2\0" + (1).to_bytes(4, "big") + b"\x80\0" + b"forged"
+        service_forger = Sealing(Keys.draw(number), service=True)
+        with stranger(place_of(udp)) as to_service:
+            for k in range(50):
+                to_service.send(forger.seal(question))
+                to_service.send(bytes(k))
+                to_service.send(number.to_bytes(4, "big") + bytes(60 + k))
+                link._put(service_forger.seal(reply))  # as if from the service's address
+                await answers(robot, inbox, k)
+            with pytest.raises(BlockingIOError):
+                to_service.recv(1)
+        assert received == [b"question %d" % k for k in range(50)]
+        assert Vanished("cloud", "b1") not in inbox
+
+    async def test_a_robot_cannot_use_the_keys_of_another(self, udp: StreamWire) -> None:
+        calls = Received()
+        robot, inbox, service = await connected(udp, calls)
+        other, other_inbox = udp.robot("cloud"), Inbox()
+        other.start(other_inbox)
+        await until(lambda: other.sends_datagrams("cloud"))
+        theirs, ours = link_at(service, 0), link_at(service, 1)
+        assert theirs._sealing is not None and ours._sealing is not None
+        mine = link_of(other)
+        assert mine._sealing is not None
+        question = b"\1\0" + (1).to_bytes(4, "big") * 2 + b"\0\0" + b"as another"
+        # Sealed with its own keys, and said to be of the other's association.
+        datagram = mine._sealing.seal(question)
+        for association in (theirs._sealing.association, 0, 2**32 - 1):
+            with stranger(place_of(udp)) as to_service:
+                to_service.send(association.to_bytes(4, "big") + datagram[4:])
+        robot.call("cloud", 5, b"mine")
+        call = await calls.next()
+        assert call.payload == b"mine"
+        echo(call)
+        assert len(await inbox.of_call(5)) == 2
+        await answers_of(other, other_inbox, calls)
+
+    async def test_what_was_recorded_leads_no_answer_elsewhere(
+        self, udp: StreamWire, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        robot, inbox, service = await connected(udp)
+        link = link_of(robot)
+        sent: list[bytes] = []
+        put = link._put
+
+        def record(datagram: bytes) -> None:
+            sent.append(datagram)
+            put(datagram)
+
+        monkeypatch.setattr(link, "_put", record)
+        for call in range(5):
+            await answers(robot, inbox, call)
+        before = link_at(service)._peer_address
+        with stranger(place_of(udp)) as to_service:
+            for datagram in sent:
+                to_service.send(datagram)
+            await answers(robot, inbox, 6)
+            with pytest.raises(BlockingIOError):
+                to_service.recv(1)
+        assert link_at(service)._peer_address == before
+
+    async def test_one_that_was_held_back_leads_no_answer_elsewhere(
+        self, udp: StreamWire, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """It is genuine and comes for the first time, but newer ones have come before it."""
+        robot, inbox, service = await connected(udp)
+        link = link_of(robot)
+        held: list[bytes] = []
+        put = link._put
+        monkeypatch.setattr(link, "_put", held.append)
+        link._questions.probe(asyncio.get_running_loop().time())
+        monkeypatch.setattr(link, "_put", put)
+        await answers(robot, inbox, 1)
+        before = link_at(service)._peer_address
+        with stranger(place_of(udp)) as to_service:
+            for datagram in held:
+                to_service.send(datagram)
+            await answers(robot, inbox, 2)
+            await answers(robot, inbox, 3)
+            assert link_at(service)._peer_address == before
+            with pytest.raises(BlockingIOError):
+                to_service.recv(1)
+
+    @given(data=st.lists(st.binary(max_size=80), max_size=5), tail=st.binary(max_size=40))
+    @settings(max_examples=30, deadline=None)
+    def test_arbitrary_datagrams(
+        self, data: list[bytes], tail: bytes, robot_tls: TlsFiles, service_tls: TlsFiles
+    ) -> None:
+        """Of strangers, and of a robot that has keys and sends nonsense: its link alone may go."""
+
+        async def run() -> None:
+            wire = StreamWire("udp", Path(), robot_tls=robot_tls, service_tls=service_tls)
+            try:
+                robot, inbox, _ = await connected(wire)
+                link = link_of(robot)
+                hostile = wire.robot("cloud")
+                hostile.start(Inbox())
+                await until(lambda: hostile.sends_datagrams("cloud"))
+                with stranger(place_of(wire)) as to_service:
+                    for each in data:
+                        to_service.send(each)
+                        for kind in range(7):
+                            link_of(hostile)._send_datagram(bytes((kind,)) + each[:1] + tail)
+                await answers(robot, inbox, 1)
+                assert link_of(robot) is link
+            finally:
+                await wire.close_on_loop()
+
+        asyncio.run(run())
+
+
+async def answers_of(robot: StreamRobotTransport, inbox: Inbox, calls: Received) -> None:
+    robot.call("cloud", 1, b"other")
+    call = await calls.next()
+    assert call.payload == b"other"
+    echo(call)
+    assert await inbox.of_call(1) == [Replied(1, b"other"), Ended(1)]
+
+
+class TestEnds:
+    async def test_a_stream_that_breaks_ends_nothing_while_datagrams_come(
+        self, udp: StreamWire, robot_tls: TlsFiles
+    ) -> None:
+        calls = Received()
+        service = udp.service("cloud", "b1")
+        await service.start(calls)
+        _, target = place_of(udp)
+        entry = free_port()
+        with Proxy(entry, target, "seed") as stream, relay(entry, target):
+            robot = StreamRobotTransport(
+                {"cloud": ServiceAddress(f"udp/127.0.0.1:{entry}")}, tls=robot_tls
+            )
+            udp.ends.insert(0, robot)
+            inbox = Inbox()
+            robot.start(inbox)
+            await until(lambda: robot.sends_datagrams("cloud"))
+            link = link_of(robot)
+            robot.call("cloud", 1, b"in the middle")
+            first = await calls.next()
+            heal = await asyncio.to_thread(stream.impair, Impairment(cut=True))
+            await until(lambda: link.adrift)
+            robot.call("cloud", 2, b"without a stream")
+            second = await calls.next()
+            echo(second)
+            assert await inbox.of_call(2) == [Replied(2, b"without a stream"), Ended(2)]
+            await asyncio.to_thread(heal)
+            await until(lambda: link_of(robot) is not link)
+            echo(first)
+            assert await inbox.of_call(1) == [Replied(1, b"in the middle"), Ended(1)]
+            robot.call("cloud", 3, bytes(100_000))
+            echo(await calls.next())
+            assert len(await inbox.of_call(3)) == 2
+            await until(lambda: link.ended)
+            assert [e for e in inbox.events if isinstance(e, Appeared | Vanished)] == [
+                Appeared("cloud", "b1")
+            ]
+            await robot.close()
+
+    async def test_adrift_it_is_lost_when_nothing_comes(
+        self, udp: StreamWire, robot_tls: TlsFiles
+    ) -> None:
+        udp.lease_ms = LEASE_MS
+        service = udp.service("cloud", "b1")
+        await service.start(echo)
+        _, target = place_of(udp)
+        entry = free_port()
+        with Proxy(entry, target, "seed") as stream, relay(entry, target) as line:
+            robot = StreamRobotTransport(
+                {"cloud": ServiceAddress(f"udp/127.0.0.1:{entry}")}, tls=robot_tls
+            )
+            udp.ends.insert(0, robot)
+            inbox = Inbox()
+            robot.start(inbox)
+            await until(lambda: robot.sends_datagrams("cloud"))
+            link = link_of(robot)
+            await asyncio.to_thread(stream.impair, Impairment(cut=True))
+            await until(lambda: link.adrift)
+            await answers(robot, inbox, 1)
+            line.close()
+            await inbox.wait_for(Vanished("cloud", "b1"))
+            robot.call("cloud", 2, b"nobody is there")
+            assert await inbox.of_call(2) == [Ended(2)]
+            await robot.close()
+
+    async def test_a_port_that_is_closed_is_a_service_that_is_gone(
+        self, udp: StreamWire, robot_tls: TlsFiles
+    ) -> None:
+        """Although its stream, held open by a line that has fallen silent, says nothing."""
+        udp.lease_ms = 3.6e6
+        service = udp.service("cloud", "b1")
+        await service.start(echo)
+        _, target = place_of(udp)
+        entry = free_port()
+        with Proxy(entry, target, "seed") as stream, relay(entry, target) as line:
+            robot = StreamRobotTransport(
+                {"cloud": ServiceAddress(f"udp/127.0.0.1:{entry}")},
+                tls=robot_tls,
+                lease_ms=3.6e6,
+            )
+            udp.ends.insert(0, robot)
+            inbox = Inbox()
+            robot.start(inbox)
+            await until(lambda: robot.sends_datagrams("cloud"))
+            await asyncio.to_thread(stream.impair, Impairment(silent=True))
+            line.close()  # from now on the system answers
+            robot.call("cloud", 1, b"question")
+            await inbox.wait_for(Vanished("cloud", "b1"), Ended(1))
+            await robot.close()
+
+    async def test_what_the_system_says_of_a_port_is_not_believed_while_datagrams_are_answered(
+        self, udp: StreamWire
+    ) -> None:
+        robot, inbox, _ = await connected(udp)
+        link = link_of(robot)
+        for call in range(20):
+            link._refused()  # anybody can send such a message
+            await answers(robot, inbox, call)
+            await asyncio.sleep(0.02)
+        assert link_of(robot) is link
+        assert Vanished("cloud", "b1") not in inbox
+
+    async def test_a_service_that_closes_has_answered_before(
+        self, udp: StreamWire, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        calls = Received()
+        robot, inbox, service = await connected(udp, calls)
+        robot.call("cloud", 1, b"last")
+        call = await calls.next()
+        link = link_at(service)
+        monkeypatch.setattr(link, "_put", lambda _: None)  # lost
+        echo(call)
+        await service.close()
+        assert await inbox.of_call(1) == [Replied(1, b"last"), Ended(1)]
+
+    async def test_keys_that_are_used_up_make_way_for_new_ones(
+        self, udp: StreamWire, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        robot, _, _ = await connected(udp)
+        link = link_of(robot)
+        monkeypatch.setattr(sealing, "MAX_DATAGRAMS", 10)
+        for call in range(20):
+            robot.call("cloud", call, b"question")
+        await until(lambda: robot.sends_datagrams("cloud") and link_of(robot) is not link)
+        assert link.ended
+
+
+class TestWhatGoesTogether:
+    async def test_a_robot_over_tls_at_a_service_over_udp(
+        self, udp: StreamWire, robot_tls: TlsFiles
+    ) -> None:
+        await udp.service("cloud", "b1").start(echo)
+        refusals: list[str] = []
+        robot = StreamRobotTransport(
+            {"cloud": ServiceAddress(udp.endpoint("cloud").replace("udp", "tls"))},
+            tls=robot_tls,
+            on_refused=lambda _, reason: refusals.append(reason),
+        )
+        robot.start(Inbox())
+        await until(lambda: bool(refusals))
+        assert "is at a udp/... endpoint, which goes with udp/... at both ends" in refusals[0]
+        await robot.close()
+
+    @pytest.mark.parametrize("end", ["robot", "service"])
+    def test_robots_do_not_listen_over_udp(
+        self, end: str, robot_tls: TlsFiles, service_tls: TlsFiles
+    ) -> None:
+        place = "udp/127.0.0.1:7447"
+        with pytest.raises(TransportError, match=f"{place}: over udp it is the service that liste"):
+            if end == "robot":
+                StreamRobotTransport({"cloud": ServiceAddress(place, True)}, tls=robot_tls)
+            else:
+                StreamServiceTransport("cloud", boot="b1", connect=[place], tls=service_tls)
+
+    @pytest.mark.parametrize("end", ["robot", "service"])
+    def test_without_the_package_it_is_said_how_to_get_it(
+        self,
+        end: str,
+        robot_tls: TlsFiles,
+        service_tls: TlsFiles,
+        monkeypatch: pytest.MonkeyPatch,
+    ) -> None:
+        monkeypatch.setitem(sys.modules, "cryptography.hazmat.primitives.ciphers.aead", None)
+        with pytest.raises(TransportError, match=r"pip install 'holdfast\[udp\]'"):
+            if end == "robot":
+                StreamRobotTransport({"c": ServiceAddress("udp/127.0.0.1:1")}, tls=robot_tls)
+            else:
+                StreamServiceTransport(
+                    "cloud", boot="b1", listen=["udp/127.0.0.1:0"], tls=service_tls
+                )
+
+    def test_without_credentials(self) -> None:
+        with pytest.raises(TransportError, match="udp needs credentials"):
+            StreamRobotTransport({"cloud": ServiceAddress("udp/127.0.0.1:1")})
+        with pytest.raises(TransportError, match="udp needs credentials"):
+            StreamServiceTransport("cloud", boot="b1", listen=["udp/127.0.0.1:0"])

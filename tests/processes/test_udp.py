@@ -1,0 +1,115 @@
+"""Services over UDP: what becomes of datagrams, or of the stream, changes no decision."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from tests.ports import free_port
+from tests.processes.faults import (
+    References,
+    Service,
+    Site,
+    Story,
+    document_of,
+    sensing_steps,
+)
+from tests.relay import relay
+
+from holdfast.chaos.proxy import Impairment, Proxy
+
+PEG = "peg_in_hole_2d"
+
+
+@pytest.fixture
+def cloud(site: Site, keys: Path) -> Service:
+    return site.service(
+        *("--tls", str(keys / "ours" / "service")), endpoint=f"udp/127.0.0.1:{free_port()}"
+    ).start()
+
+
+@pytest.fixture
+def credentials(keys: Path) -> tuple[str, str]:
+    return ("--tls", str(keys / "ours" / "robot"))
+
+
+def port_of(service: Service) -> int:
+    return int(service.endpoint.rpartition(":")[2])
+
+
+def test_losses_and_late_datagrams(
+    site: Site, references: References, cloud: Service, credentials: tuple[str, str]
+) -> None:
+    entry = free_port()
+    story = Story(site, references, document_of(PEG))
+    with Proxy(entry, port_of(cloud), "losses", datagrams=True) as proxy:
+        proxy.impair(Impairment(latency_s=0.005, jitter_s=0.02, loss=0.2))
+        robot = story.run(f"udp/127.0.0.1:{entry}", options=credentials)
+    assert robot.statuses() == []
+    assert len(robot.matching("service_appeared")) == 1
+    assert robot.matching("no_datagrams") == []
+
+
+def test_datagrams_that_come_twice_and_again_later(
+    site: Site, references: References, cloud: Service, credentials: tuple[str, str]
+) -> None:
+    entry = free_port()
+    document = document_of(PEG)
+    story = Story(site, references, document)
+    with Proxy(entry, port_of(cloud), "twice"), relay(entry, port_of(cloud)) as between:
+        between.repeat = True
+        for step in sensing_steps(document)[2:]:
+            story.at("perform", step, between.replay)
+        robot = story.run(f"udp/127.0.0.1:{entry}", options=credentials)
+        assert between.carried["to_service"] > len(sensing_steps(document))
+    assert robot.statuses() == []
+    assert len(cloud.process.matching("session_opened")) == 1
+
+
+def test_a_robot_whose_address_changes(
+    site: Site, references: References, cloud: Service, credentials: tuple[str, str]
+) -> None:
+    """The stream breaks, as one does that is bound to an address, and datagrams go on."""
+    entry = free_port()
+    document = document_of(PEG)
+    steps = sensing_steps(document)
+    story = Story(site, references, document)
+    with (
+        Proxy(entry, port_of(cloud), "address") as stream,
+        relay(entry, port_of(cloud)) as datagrams,
+    ):
+        healed = []
+
+        def move() -> None:
+            healed.append(stream.impair(Impairment(cut=True)))
+            datagrams.change_address()
+
+        story.at("perform", steps[1] + 1, move)
+        before = datagrams.carried
+        story.at("perform", steps[3] + 1, lambda: before.update(datagrams.carried))
+        story.at("perform", steps[4] + 1, lambda: healed.pop()())
+        story.at(
+            "perform",
+            steps[5] + 1,
+            lambda: cloud.process.wait_for("robot_connected", 2),
+            move,
+        )
+        robot = story.run(f"udp/127.0.0.1:{entry}", options=credentials)
+        assert datagrams.addresses == 3
+    assert robot.statuses() == []
+    assert len(robot.matching("service_appeared")) == 1
+    assert robot.matching("service_lost") == []
+    assert len(cloud.process.matching("session_opened")) == 1
+
+
+def test_where_no_datagram_gets_through(
+    site: Site, references: References, cloud: Service, credentials: tuple[str, str]
+) -> None:
+    entry = free_port()
+    story = Story(site, references, document_of(PEG))
+    story.at("perform", 20, lambda: story.running.wait_for("no_datagrams"))
+    with Proxy(entry, port_of(cloud), "filtered"):
+        robot = story.run(f"udp/127.0.0.1:{entry}", options=credentials)
+    assert robot.statuses() == []
+    (told,) = robot.matching("no_datagrams")
+    assert told["service"] == f"udp/127.0.0.1:{entry}"
