@@ -112,6 +112,8 @@ class ServiceProcess:
         Where it listens; a free one by default.
     options : str
         Further ones.
+    protocol : str, optional
+        Of its endpoint.
 
     Attributes
     ----------
@@ -119,8 +121,9 @@ class ServiceProcess:
         Of :func:`time.monotonic`: just before it was started, and when its ready line came.
     """
 
-    def __init__(self, *options: str, port: int | None = None) -> None:
+    def __init__(self, *options: str, port: int | None = None, protocol: str = "tcp") -> None:
         self.port = free_tcp_port() if port is None else port
+        self._protocol = protocol
         self._options = options
         self._process: subprocess.Popen[str] | None = None
         self._ready = threading.Event()
@@ -129,7 +132,7 @@ class ServiceProcess:
     @property
     def endpoint(self) -> str:
         """Where robots find it."""
-        return f"tcp/127.0.0.1:{self.port}"
+        return f"{self._protocol}/127.0.0.1:{self.port}"
 
     @property
     def process_id(self) -> int:

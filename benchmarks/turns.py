@@ -41,7 +41,7 @@ from holdfast.session.messages import (
     numbers_to,
 )
 from holdfast.settings import PlanningSettings
-from holdfast.transport.endpoints import ServiceAddress
+from holdfast.transport.endpoints import ServiceAddress, TlsFiles
 from holdfast.transport.robot_end import StreamRobotTransport
 
 __all__ = ["Asked", "Asker", "Caller", "Turn", "decided_in_process", "recorded_turns"]
@@ -186,10 +186,11 @@ class Caller:
     Parameters
     ----------
     endpoint : str
+    tls : TlsFiles or None
     """
 
-    def __init__(self, endpoint: str) -> None:
-        self._transport = StreamRobotTransport({endpoint: ServiceAddress(endpoint)})
+    def __init__(self, endpoint: str, tls: TlsFiles | None = None) -> None:
+        self._transport = StreamRobotTransport({endpoint: ServiceAddress(endpoint)}, tls=tls)
         self._endpoint = endpoint
         self._number = 0
         self._replies: list[tuple[float, Reply]] = []
@@ -247,10 +248,13 @@ class Asker(Caller):
     opening : Opening
     session : bytes
         Of 16 bytes.
+    tls : TlsFiles or None
     """
 
-    def __init__(self, endpoint: str, opening: Opening, session: bytes) -> None:
-        super().__init__(endpoint)
+    def __init__(
+        self, endpoint: str, opening: Opening, session: bytes, tls: TlsFiles | None = None
+    ) -> None:
+        super().__init__(endpoint, tls)
         self._opening: Opening | None = opening
         self._session = session
 
