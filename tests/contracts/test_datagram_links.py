@@ -27,7 +27,7 @@ from tests.contracts.test_transport import (
 from tests.ports import free_port
 from tests.relay import relay
 
-from holdfast.chaos.proxy import Impairment, Proxy
+from holdfast.chaos.proxy import Direction, Impairment, Proxy
 from holdfast.errors import TransportError
 from holdfast.session.events import Appeared, Ended, Replied, Vanished
 from holdfast.transport import sealing
@@ -308,6 +308,35 @@ class TestEnds:
             assert [e for e in inbox.events if isinstance(e, Appeared | Vanished)] == [
                 Appeared("cloud", "b1")
             ]
+            await robot.close()
+
+    @pytest.mark.parametrize("direction", ["both", "to_service", "to_robot"])
+    async def test_a_stream_that_is_held_up_ends_nothing(
+        self, direction: Direction, udp: StreamWire, robot_tls: TlsFiles
+    ) -> None:
+        """For several leases neither end hears the other one on the stream, and nobody asks."""
+        udp.lease_ms = 1000.0
+        await udp.service("cloud", "b1").start(echo)
+        _, target = place_of(udp)
+        entry = free_port()
+        with Proxy(entry, target, "seed") as stream, relay(entry, target):
+            robot = StreamRobotTransport(
+                {"cloud": ServiceAddress(f"udp/127.0.0.1:{entry}")}, tls=robot_tls, lease_ms=1000.0
+            )
+            udp.ends.insert(0, robot)
+            inbox = Inbox()
+            robot.start(inbox)
+            await until(lambda: robot.sends_datagrams("cloud"))
+            link = link_of(robot)
+            silent = Impairment(direction=direction, silent=True)
+            heal = await asyncio.to_thread(stream.impair, silent)
+            await asyncio.sleep(3.0)
+            await answers(robot, inbox, 1)
+            await asyncio.to_thread(heal)
+            robot.call("cloud", 2, bytes(100_000))
+            assert len(await inbox.of_call(2)) == 2
+            assert link_of(robot) is link
+            assert [event for event, _ in udp.told if event == "robot_disconnected"] == []
             await robot.close()
 
     async def test_adrift_it_is_lost_when_nothing_comes(

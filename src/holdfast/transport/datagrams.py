@@ -53,6 +53,9 @@ _LARGEST_DATAGRAM: Final = 2048
 _DATAGRAMS_AT_ONCE: Final = 64
 """Before streams are heard again."""
 
+_STREAM_PING_S: Final = 1.5
+"""So often a stream shows that it lives, while datagrams show that its ends do."""
+
 _STREAM_SILENT_S: Final = 5.0
 _STREAM_SILENT_LEASES: Final = 3.0
 """For so long, and so many leases, nothing may come on a stream while datagrams do."""
@@ -84,12 +87,17 @@ class _DatagramLink(Link):
         self._sealing: Sealing | None = None
         self._due_at = float("inf")
         self._due: asyncio.TimerHandle | None = None
-        self._stream_heard_at = self._loop.time()
-        self._datagram_heard_at = float("-inf")
+        self._stream_heard_at = self._stream_spoke_at = self._loop.time()
+        self._datagram_heard_at = self._datagram_sent_at = float("-inf")
         self._peer_address: Any = None
         self._ways = Ways(self._send_datagram, self._send_on_stream, self._lost_of_theirs)
 
     # -- sending ---------------------------------------------------------------------------------
+
+    def send(self, data: bytes) -> None:
+        """Send frames on the stream; never waits."""
+        self._stream_spoke_at = self._loop.time()
+        super().send(data)
 
     def _send_on_stream(self, number: int, message: bytes) -> None:
         self.send(encode_frame(MESSAGE, number, message))
@@ -102,6 +110,7 @@ class _DatagramLink(Link):
         except KeysExhaustedError as error:
             self.end(f"has to be called anew: {error}")
             return
+        self._datagram_sent_at = self._loop.time()
         self._put(datagram)
 
     def _put(self, datagram: bytes) -> None:
@@ -164,6 +173,10 @@ class _DatagramLink(Link):
         silent = now > self._stream_heard_at + longest_s
         if silent and transport is not None and not self.adrift and self._drift():
             transport.abort()
+        heard_beside = now < self._datagram_heard_at + self._patience_s
+        spoke_beside = now < self._datagram_sent_at + self._ping_interval_s
+        if heard_beside and spoke_beside and now < self._stream_spoke_at + _STREAM_PING_S:
+            self._spoke = True  # a datagram is a sign of life, and nothing holds it up
         super()._tick()
 
     def end(
@@ -355,10 +368,8 @@ class RobotDatagramLink(_DatagramLink):
 
     def _tick(self) -> None:
         now = self._loop.time()
-        heard_at = max(self._stream_heard_at, self._datagram_heard_at)
-        if self._sealing is not None and (
-            self.adrift or now > heard_at + 1.5 * self._ping_interval_s
-        ):
+        due = now >= self._datagram_sent_at + 0.9 * self._ping_interval_s
+        if due and (self._questions.open or self.adrift):
             self._probe()
         super()._tick()
         if self._questions.open:
