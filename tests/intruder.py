@@ -13,19 +13,23 @@ import itertools
 import random
 import socket
 import ssl
+import struct
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import msgspec
+from cryptography.hazmat.primitives.ciphers.aead import AESGCM
 from tests.wire import (
     CALL,
     END,
     GOODBYE,
     HELLO,
+    KEYS,
     LAST,
     MAGIC,
+    MESSAGE,
     PING,
     REPLY,
     Frame,
@@ -55,6 +59,9 @@ _PROBE = 0x7FFF_0001
 
 _OTHERS_CALLS = 40
 """Calls of robots are counted from 1 on: so many of them are aimed at."""
+
+_QUESTION_MESSAGE, _REPLY_MESSAGE = 1, 2
+"""Of what goes as datagrams: which kind it is stands first."""
 
 _HALF = 40
 """Bytes of a frame that is begun and not ended."""
@@ -89,7 +96,12 @@ def _stale(number: int) -> bytes:
     return encode(Refused(number, "stale_epoch", "epoch 1: epoch 2 is there"))
 
 
-def messages(questions: Sequence[Request], service: str, incarnation: str) -> list[Message]:
+def messages(
+    questions: Sequence[Request],
+    service: str,
+    incarnation: str,
+    call_of: Callable[[int, bytes], bytes],
+) -> list[Message]:
     """Return all that can be said.
 
     Parameters
@@ -98,6 +110,8 @@ def messages(questions: Sequence[Request], service: str, incarnation: str) -> li
         What the honest robot asks, with its session, its epoch and its numbers.
     service, incarnation : str
         As what the service is known.
+    call_of : callable
+        Makes the frame of a call, of its number and its request.
     """
     chance = random.Random(7)
     garbage = chance.randbytes(80)
@@ -142,9 +156,7 @@ def messages(questions: Sequence[Request], service: str, incarnation: str) -> li
             encode(msgspec.structs.replace(question, opening=None, checkpoint=None, **changes))
             for question in questions
         ]
-        said = b"".join(
-            frame_of(CALL, 1000 + number, payload) for number, payload in enumerate(asked)
-        )
+        said = b"".join(call_of(1000 + number, payload) for number, payload in enumerate(asked))
         found.append(Message(f"all questions of the robot, {what}", said))
     return found
 
@@ -197,7 +209,7 @@ class Intruder:
             frame = link.receive()
             assert frame is not None and frame.kind == HELLO, "the intruder was not let in"
             hello = msgspec.msgpack.decode(frame.payload)
-        self._messages = messages(questions, hello["name"], hello["incarnation"])
+        self._messages = messages(questions, hello["name"], hello["incarnation"], self._call)
 
     def run(self) -> None:
         """Say all messages at all moments, once."""
@@ -205,6 +217,49 @@ class Intruder:
             if moment == "before the handshake" and self._keys is None:
                 continue
             self._say(moment, message)
+        if self._endpoint.startswith("udp/"):
+            self._send_datagrams()
+
+    def _send_datagrams(self) -> None:
+        """Say everything in datagrams, too: sealed with its own keys, in its own name and others'.
+
+        A service answers wherever the last datagram of a robot has come from. So what comes here
+        and is not sealed for this end was meant for another robot.
+        """
+        host, _, port = self._endpoint.removeprefix("udp/").rpartition(":")
+        self.links += 1
+        with (
+            RawLink(self._endpoint, self._keys) as link,
+            socket.socket(type=socket.SOCK_DGRAM) as datagrams,
+        ):
+            datagrams.connect((host, int(port)))
+            link.say(hello_of(incarnation=f"intruder-{self.links}"))
+            handed_over = next(frame for frame in link.until_the_end() if frame.kind == KEYS)
+            own, *keys = struct.unpack_from(">I32s32s", handed_over.payload)
+            counters = itertools.count()
+            names = [own, *((own + step) % 2**32 for step in range(-20, 20) if step), 0, 2**32 - 1]
+            for name, message, key in itertools.product(names, self._messages, keys):
+                if name != own and len(message.data) > 200:
+                    continue
+                header = struct.pack(">II", name, next(counters))
+                sealed = AESGCM(key).encrypt(bytes(4) + header, message.data[:1200], None)
+                with contextlib.suppress(OSError):
+                    datagrams.send(header + sealed)
+                    if name != own:
+                        datagrams.send(header + bytes(len(sealed)))
+            datagrams.settimeout(0.3)
+            with contextlib.suppress(OSError):
+                while True:
+                    answer = datagrams.recv(65_536)
+                    if int.from_bytes(answer[:4], "big") != own:
+                        self.told.append("a datagram for another robot")
+
+    def _call(self, number: int, request: bytes) -> bytes:
+        """Return the frame of a call; over udp it is what else would be a datagram."""
+        if self._endpoint.startswith("udp/"):
+            head = struct.pack(">BBIIH", _QUESTION_MESSAGE, 0, number, 0, 0)
+            return frame_of(MESSAGE, number, head + request)
+        return frame_of(CALL, number, request)
 
     def _say(self, moment: str, message: Message) -> None:
         """Have a link, bring it to a moment, say something and note all that comes."""
@@ -220,11 +275,11 @@ class Intruder:
                     eaten = 0
                     if moment == "in the middle of a frame":
                         calls.add(1)
-                        eaten = len(frame_of(CALL, 1, self._own)) - _HALF
+                        eaten = len(self._call(1, self._own)) - _HALF
                     calls.update(_calls_in(message.data[eaten:]))
                     if greeted and message.is_whole:
                         calls.add(_PROBE)
-                        link.send(CALL, _PROBE, b"junk")
+                        link.say(self._call(_PROBE, b"junk"))
                     else:
                         # Past TLS, for which a half-closed stream is none.
                         socket.socket.shutdown(link.socket, socket.SHUT_WR)
@@ -241,15 +296,22 @@ class Intruder:
         link.say(hello_of(incarnation=f"intruder-{self.links}"))
         if moment == "in the middle of a call":
             calls.add(1)
-            link.send(CALL, 1, self._own)
+            link.say(self._call(1, self._own))
         if moment == "in the middle of a frame":
-            link.say(frame_of(CALL, 1, self._own)[:_HALF])
+            link.say(self._call(1, self._own)[:_HALF])
             return False
         return True
 
     def _listen(self, link: RawLink, when: str, calls: set[int]) -> None:
         for frame in _until_the_end(link):
-            if frame.kind in (HELLO, PING, GOODBYE):
+            if frame.kind == MESSAGE:
+                if frame.payload[0] != _REPLY_MESSAGE:
+                    continue
+                # What would be a datagram, with a number of the call and the part.
+                call = int.from_bytes(frame.payload[2:6], "big")
+                is_last = bool(frame.payload[6] & 0x80)
+                frame = Frame(LAST if is_last else REPLY, call, frame.payload[8:])
+            if frame.kind in (HELLO, KEYS, PING, GOODBYE):
                 continue
             if frame.kind not in (REPLY, LAST, END) or frame.call not in calls:
                 self.told.append(f"{when}: kind {frame.kind} of call {frame.call}")
@@ -283,7 +345,7 @@ def _calls_in(data: bytes) -> Iterator[int]:
     at = 0
     data = data.removeprefix(MAGIC)
     while at + 9 <= len(data):
-        if data[at + 4] == CALL:
+        if data[at + 4] in (CALL, MESSAGE):
             yield int.from_bytes(data[at + 5 : at + 9], "little")
         at += 9 + int.from_bytes(data[at : at + 4], "little")
 

@@ -26,9 +26,11 @@ __all__ = [
     "END",
     "GOODBYE",
     "HELLO",
+    "KEYS",
     "KINDS",
     "LAST",
     "MAGIC",
+    "MESSAGE",
     "PATIENCE_S",
     "PING",
     "REPLY",
@@ -41,7 +43,7 @@ __all__ = [
 ]
 
 MAGIC = b"holdfast"
-HELLO, CALL, REPLY, END, LAST, PING, GOODBYE = range(1, 8)
+HELLO, CALL, REPLY, END, LAST, PING, GOODBYE, KEYS, MESSAGE = range(1, 10)
 KINDS = {
     "hello": HELLO,
     "call": CALL,
@@ -103,9 +105,10 @@ class RawLink:
     Parameters
     ----------
     endpoint : str
-        ``tcp/HOST:PORT``, ``tls/HOST:PORT`` or ``unix/PATH``.
+        ``tcp/HOST:PORT``, ``tls/HOST:PORT`` or ``unix/PATH``; of ``udp/HOST:PORT`` the stream that
+        is beside the datagrams.
     keys : Path or None
-        Directory with the credentials of this end, for ``tls``.
+        Directory with the credentials of this end, for ``tls`` and ``udp``.
     shakes_hands : bool
         False leaves a link over TLS without its handshake.
     """
@@ -125,7 +128,7 @@ class RawLink:
         host, _, port = place.rpartition(":")
         self.socket = socket.create_connection((host, int(port)), PATIENCE_S)
         self.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        if protocol == "tls" and shakes_hands:
+        if protocol in ("tls", "udp") and shakes_hands:
             assert keys is not None, "tls takes credentials"
             try:
                 self.socket = robot_context(keys).wrap_socket(self.socket, server_hostname=host)
