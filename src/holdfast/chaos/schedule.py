@@ -34,7 +34,7 @@ __all__ = [
 Wire: TypeAlias = Literal["tcp", "tls", "unix", "udp"]
 """Over which robots reach their services."""
 
-WIRES: tuple[Wire, ...] = ("tcp", "tls", "unix")
+WIRES: tuple[Wire, ...] = ("tcp", "tls", "unix", "udp")
 """Of a series."""
 
 
