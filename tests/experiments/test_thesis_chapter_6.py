@@ -262,7 +262,7 @@ def test_really(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("transport", ["tcp", "tls"])
+@pytest.mark.parametrize("transport", ["tcp", "tls", "udp"])
 def test_over_a_proxy(transport: str) -> None:
     table = cloud_trials.run_cloud_trials(
         particles=50,
@@ -276,5 +276,6 @@ def test_over_a_proxy(transport: str) -> None:
     )
     assert all(table.columns["identical"])
     assert set(table.columns["run"]) == {4, 5}
-    assert set(table.columns["emulated_by"]) == {"tcp proxy"}
+    way = "datagram proxy" if transport == "udp" else "tcp proxy"
+    assert set(table.columns["emulated_by"]) == {way}
     assert "local" in table.columns["service"]

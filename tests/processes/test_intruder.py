@@ -40,7 +40,7 @@ def stolen(keys: Path) -> Path:
     return keys / "ours" / "stolen"
 
 
-@pytest.fixture(params=["tcp", "tls"])
+@pytest.fixture(params=["tcp", "tls", "udp"])
 def protocol(request: pytest.FixtureRequest) -> str:
     return str(request.param)
 
