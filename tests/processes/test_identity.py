@@ -20,7 +20,7 @@ from tests.processes.faults import (
     events_of,
 )
 
-from holdfast.runtime.credentials import make_credentials, revoke_credentials
+from holdfast.transport.key_ring import make_credentials, revoke_credentials
 
 PEG = "peg_in_hole_2d"
 

@@ -36,7 +36,9 @@ from holdfast.session.messages import (
     encode,
     sealed,
 )
+from holdfast.transport.credentials import load_credentials
 from holdfast.transport.endpoints import PrivateSocket, ServiceAddress, TlsFiles
+from holdfast.transport.key_ring import make_credentials
 from holdfast.transport.robot_end import StreamRobotTransport
 
 PATIENCE_S = 30.0
@@ -547,10 +549,8 @@ class TestRefusing:
 
 class TestTls:
     def test_robot_with_credentials(self, tmp_path: Path) -> None:
-        credentials = pytest.importorskip("holdfast.runtime.credentials")
-        pytest.importorskip("cryptography")
-        credentials.make_credentials(tmp_path)
-        tls = credentials.load_credentials(tmp_path / "robot", "robot")
+        make_credentials(tmp_path)
+        tls = load_credentials(tmp_path / "robot", "robot")
         with served("--listen", "tls/127.0.0.1:0", "--tls", str(tmp_path / "service")) as service:
             with robots_end(service.endpoint, tls=tls) as end:
                 end.appeared()
@@ -558,9 +558,7 @@ class TestTls:
             assert service.end()[0] == 0
 
     def test_credentials_that_would_not_be_used(self, tmp_path: Path) -> None:
-        credentials = pytest.importorskip("holdfast.runtime.credentials")
-        pytest.importorskip("cryptography")
-        credentials.make_credentials(tmp_path)
+        make_credentials(tmp_path)
         text = refused_to_start("--listen", "tcp/127.0.0.1:0", "--tls", str(tmp_path / "service"))
         assert "tcp does not use the credentials" in text
 

@@ -25,16 +25,16 @@ from cryptography.hazmat.primitives import serialization
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from holdfast.files import NewFile, OutputError, create_directory_atomically
-from holdfast.runtime.credentials import (
+from holdfast.session.events import Appeared, Ended, Replied
+from holdfast.transport.contract import IncomingCall
+from holdfast.transport.credentials import (
     CredentialsError,
     CredentialsWarning,
     Role,
     load_credentials,
-    make_credentials,
 )
-from holdfast.session.events import Appeared, Ended, Replied
-from holdfast.transport.contract import IncomingCall
 from holdfast.transport.endpoints import ServiceAddress, TlsFiles
+from holdfast.transport.key_ring import make_credentials
 from holdfast.transport.robot_end import StreamRobotTransport
 from holdfast.transport.service_end import StreamServiceTransport
 
@@ -205,7 +205,7 @@ class TestNothingIsOverwritten:
         program = textwrap.dedent("""
             import sys
             from pathlib import Path
-            from holdfast.runtime.credentials import make_credentials
+            from holdfast.transport.key_ring import make_credentials
             make_credentials(Path(sys.argv[1]), robots=[f"r{i}" for i in range(400)])
         """)
         with subprocess.Popen([sys.executable, "-c", program, str(home)]) as process:
@@ -450,15 +450,15 @@ class TestLoading:
 
     def test_loading_needs_no_package_and_making_says_which_it_needs(self, keys: Path) -> None:
         program = textwrap.dedent("""
-            import sys
+            import importlib, sys
             sys.modules["cryptography"] = None
             from pathlib import Path
-            from holdfast.runtime.credentials import *
+            from holdfast.transport.credentials import *
             keys = Path(sys.argv[1])
             print(load_credentials(keys / "robot", "robot").key)
             for attempt in (
                 lambda: load_credentials(keys / "expired_robot", "robot"),
-                lambda: make_credentials(keys / "new"),
+                lambda: importlib.import_module("holdfast.transport.key_ring"),
             ):
                 try:
                     attempt()
@@ -475,7 +475,7 @@ class TestLoading:
 
     def test_loading_imports_nothing_heavy(self, keys: Path) -> None:
         program = (
-            "import sys; from holdfast.runtime.credentials import load_credentials; "
+            "import sys; from holdfast.transport.credentials import load_credentials; "
             f"load_credentials({str(keys / 'service')!r}, 'service'); print(*sys.modules)"
         )
         done = subprocess.run(
@@ -492,10 +492,7 @@ class Ends:
         self._ends: list[StreamRobotTransport | StreamServiceTransport] = []
 
     def files(self, name: str) -> TlsFiles:
-        directory = self._keys / name
-        return TlsFiles(
-            directory / "authority.pem", directory / "certificate.pem", directory / "key.pem"
-        )
+        return TlsFiles.of(self._keys / name)
 
     async def service(self, name: str, host: str = "127.0.0.1") -> str:
         """Start a service that answers with the question backwards; return its endpoint."""
@@ -622,6 +619,6 @@ class TestCommand:
         assert {path.name for path in tmp_path.iterdir()} == {"authority", "a", "b", "c"}
 
     def test_the_default_of_days_is_the_librarys(self) -> None:
-        from holdfast.runtime.credentials import DEFAULT_DAYS
+        from holdfast.transport.key_ring import DEFAULT_DAYS
 
         assert f"[default: {DEFAULT_DAYS}]" in self.run("--help").stdout

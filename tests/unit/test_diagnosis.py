@@ -16,16 +16,12 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from tests.ports import free_port
 
-from holdfast.runtime.credentials import make_credentials
 from holdfast.runtime.diagnosis import MissingServices, why_unreachable
 from holdfast.transport.endpoints import TlsFiles
+from holdfast.transport.key_ring import make_credentials
 
 TIMEOUT_S = 20.0
 """Generous: a test that passes does not wait for it."""
-
-
-def files_of(directory: Path) -> TlsFiles:
-    return TlsFiles(*(directory / name for name in ("authority.pem", "certificate.pem", "key.pem")))
 
 
 @pytest.fixture(scope="module")
@@ -101,7 +97,7 @@ def listening(answer: Callable[[socket.socket], None]) -> Iterator[int]:
 def tls_service(keys: Path, authority: str, *, names_another: bool = False) -> Iterator[int]:
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.verify_mode = ssl.CERT_REQUIRED
-    files = files_of(keys / authority / "service")
+    files = TlsFiles.of(keys / authority / "service")
     context.load_verify_locations(files.authority)
     if names_another:
         name_another(context, keys)
@@ -122,13 +118,13 @@ class TestWhyUnreachable:
 
     @pytest.mark.parametrize("protocol", ["tcp", "tls"])
     def test_nobody_listens(self, protocol: str, keys: Path) -> None:
-        files = files_of(keys / "ours" / "robot")
+        files = TlsFiles.of(keys / "ours" / "robot")
         endpoint = f"{protocol}/127.0.0.1:{free_port()}"
         assert why_unreachable(endpoint, files, TIMEOUT_S) == "connection refused"
 
     @pytest.mark.parametrize("protocol", ["tcp", "tls", "udp"])
     def test_a_name_that_nobody_has(self, protocol: str, keys: Path) -> None:
-        files = files_of(keys / "ours" / "robot")
+        files = TlsFiles.of(keys / "ours" / "robot")
         # A label this long exists nowhere, and no server need be asked to know it.
         host = "a" * 70 + ".invalid"
         reason = why_unreachable(f"{protocol}/{host}:7447", files, TIMEOUT_S)
@@ -144,18 +140,21 @@ class TestWhyUnreachable:
 
     def test_a_service_of_ours_has_no_reason(self, keys: Path) -> None:
         with tls_service(keys, "ours") as port:
-            files = files_of(keys / "ours" / "robot")
+            files = TlsFiles.of(keys / "ours" / "robot")
             assert why_unreachable(f"tls/127.0.0.1:{port}", files, TIMEOUT_S) is None
 
     def test_a_service_of_another_authority(self, keys: Path) -> None:
         with tls_service(keys, "theirs") as port:
-            files = files_of(keys / "ours" / "robot")
+            files = TlsFiles.of(keys / "ours" / "robot")
             reason = why_unreachable(f"tls/127.0.0.1:{port}", files, TIMEOUT_S)
         assert reason == "the certificate is signed by another authority"
 
     def test_a_service_that_refuses_this_robot(self, keys: Path) -> None:
         """It trusts another authority than that which signed its own certificate."""
-        ours, theirs = files_of(keys / "ours" / "service"), files_of(keys / "theirs" / "robot")
+        ours, theirs = (
+            TlsFiles.of(keys / "ours" / "service"),
+            TlsFiles.of(keys / "theirs" / "robot"),
+        )
         context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
         context.verify_mode = ssl.CERT_REQUIRED
         context.load_verify_locations(theirs.authority)
@@ -166,14 +165,14 @@ class TestWhyUnreachable:
                 secure.recv(1)
 
         with listening(answer) as port:
-            files = files_of(keys / "ours" / "robot")
+            files = TlsFiles.of(keys / "ours" / "robot")
             reason = why_unreachable(f"tls/127.0.0.1:{port}", files, TIMEOUT_S)
         assert reason is not None
         assert reason.startswith("refuses this robot's certificate (")
 
     def test_a_certificate_for_another_name(self, keys: Path) -> None:
         with tls_service(keys, "ours", names_another=True) as port:
-            files = files_of(keys / "ours" / "robot")
+            files = TlsFiles.of(keys / "ours" / "robot")
             reason = why_unreachable(f"tls/127.0.0.1:{port}", files, TIMEOUT_S)
         assert reason == "the certificate does not name 127.0.0.1 (it names planner.example)"
 
@@ -184,7 +183,7 @@ class TestWhyUnreachable:
             connection.recv(65536)
 
         with listening(answer) as port:
-            files = files_of(keys / "ours" / "robot")
+            files = TlsFiles.of(keys / "ours" / "robot")
             reason = why_unreachable(f"tls/127.0.0.1:{port}", files, TIMEOUT_S)
         assert reason == "answers, but does not speak TLS"
 
@@ -196,7 +195,7 @@ class TestWhyUnreachable:
             release.wait(TIMEOUT_S)
 
         with listening(answer) as port:
-            files = files_of(keys / "ours" / "robot")
+            files = TlsFiles.of(keys / "ours" / "robot")
             reason = why_unreachable(f"tls/127.0.0.1:{port}", files, 0.2)
             release.set()
         assert reason is not None
@@ -204,7 +203,7 @@ class TestWhyUnreachable:
 
     @pytest.mark.parametrize("protocol", ["tls", "udp"])
     def test_credentials_that_are_not_there(self, protocol: str, tmp_path: Path) -> None:
-        reason = why_unreachable(f"{protocol}/127.0.0.1:7447", files_of(tmp_path), TIMEOUT_S)
+        reason = why_unreachable(f"{protocol}/127.0.0.1:7447", TlsFiles.of(tmp_path), TIMEOUT_S)
         assert reason is not None
         assert reason.startswith("this robot's credentials: ")
 

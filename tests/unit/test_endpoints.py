@@ -106,7 +106,7 @@ def test_localhost_that_leads_elsewhere_is_not_loopback(monkeypatch: pytest.Monk
 
 
 def test_credentials_go_with_the_protocols_that_use_them(tmp_path: Path) -> None:
-    files = TlsFiles(*(tmp_path / name for name in ("authority.pem", "certificate.pem", "key.pem")))
+    files = TlsFiles.of(tmp_path)
     for file in (files.authority, files.certificate, files.key):
         file.touch()
     tcp, tls, unix = map(parse_endpoint, ("tcp/localhost:1", "tls/localhost:1", "unix//run/s"))

@@ -12,7 +12,7 @@ import typer
 from holdfast.cli import main
 from holdfast.cli.application import app
 from holdfast.cli.keys import keys
-from holdfast.runtime import credentials
+from holdfast.transport import key_ring
 
 NUMBERS = [
     ["run", "peg.yaml", "--trials"],
@@ -162,5 +162,5 @@ def test_every_number_and_path_of_the_commands_is_in_these_tables() -> None:
 
 def test_limits_that_are_stated_twice_agree() -> None:
     here = keys.__globals__
-    assert here["_DEFAULT_DAYS"] == credentials.DEFAULT_DAYS
-    assert here["_MAX_DAYS"] == credentials.AUTHORITY_DAYS
+    assert here["_DEFAULT_DAYS"] == key_ring.DEFAULT_DAYS
+    assert here["_MAX_DAYS"] == key_ring.AUTHORITY_DAYS

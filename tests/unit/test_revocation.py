@@ -20,14 +20,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from holdfast.errors import TransportError
-from holdfast.runtime.credentials import (
-    CredentialsError,
-    Role,
-    list_credentials,
-    load_credentials,
-    make_credentials,
-    revoke_credentials,
-)
+from holdfast.transport.credentials import CredentialsError, Role, load_credentials
+from holdfast.transport.key_ring import list_credentials, make_credentials, revoke_credentials
 from holdfast.transport.revocation import REVOKED_FILE, refuse_revoked, revoked_serials
 
 NOW = datetime.now(UTC)

@@ -13,11 +13,12 @@ import pytest
 from tests.processes.faults import PATIENT
 
 from holdfast.errors import TransportError
-from holdfast.runtime.credentials import load_credentials, make_credentials, revoke_credentials
 from holdfast.session.events import Appeared, Ended, Replied, TransportEvent, Vanished
 from holdfast.transport.contract import IncomingCall
+from holdfast.transport.credentials import load_credentials
 from holdfast.transport.endpoints import ServiceAddress, TlsFiles
 from holdfast.transport.frames import GOODBYE, FrameDecoder, encode_hello, read_goodbye
+from holdfast.transport.key_ring import make_credentials, revoke_credentials
 from holdfast.transport.robot_end import StreamRobotTransport
 from holdfast.transport.service_end import StreamServiceTransport
 from holdfast.transport.tls import TlsStream, client_context
@@ -35,10 +36,6 @@ async def until(condition: Callable[[], bool], what: object = None) -> None:
         await asyncio.sleep(0.005)
 
 
-def files_of(directory: Path) -> TlsFiles:
-    return TlsFiles(*(directory / name for name in ("authority.pem", "certificate.pem", "key.pem")))
-
-
 class Robot:
     """A robot's end, and what it was told."""
 
@@ -48,7 +45,7 @@ class Robot:
         self.transport = StreamRobotTransport(
             {"cloud": ServiceAddress(endpoint)},
             lease_ms=LEASE_MS,
-            tls=files_of(directory),
+            tls=TlsFiles.of(directory),
             on_refused=lambda _, reason: self.refusals.append(reason),
         )
         self.transport.start(self.events.append)
@@ -86,7 +83,7 @@ class Cloud:
             boot="b1",
             listen=["tls/127.0.0.1:0"],
             lease_ms=LEASE_MS,
-            tls=files_of(directory),
+            tls=TlsFiles.of(directory),
             on_event=lambda name, **fields: self.told.append((name, fields)),
         )
 
@@ -203,7 +200,7 @@ def test_who_shook_hands_before_the_list_came_is_not_let_in_after_it(tmp_path: P
         loop = asyncio.get_running_loop()
         with socket.create_connection((host, int(port))) as connection:
             connection.setblocking(False)
-            tls = TlsStream(client_context(files_of(tmp_path / "anna")), host)
+            tls = TlsStream(client_context(TlsFiles.of(tmp_path / "anna")), host)
             tls.begin()
             await loop.sock_sendall(connection, tls.take())
             while not tls.established:

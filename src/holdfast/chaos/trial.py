@@ -339,7 +339,7 @@ class _Trial:
             self._prefix = self._namespace.prefix
         wire = self._schedule.wire
         if wire in ("tls", "udp"):
-            from holdfast.runtime.credentials import make_credentials
+            from holdfast.transport.key_ring import make_credentials
 
             self._keys = Path(self._temporary) / "keys"
             make_credentials(self._keys)

@@ -14,11 +14,11 @@ from holdfast.errors import InvalidValueError
 from holdfast.printable import printable
 
 if TYPE_CHECKING:
-    from holdfast.runtime.credentials import Issued, KeyRing, Revocation
+    from holdfast.transport.key_ring import Issued, KeyRing, Revocation
 
 __all__ = ["keys"]
 
-# Those of holdfast.runtime.credentials, which need not be imported for a --help.
+# Those of holdfast.transport.key_ring, which need not be imported for a --help.
 _DEFAULT_DAYS = 365
 _MAX_DAYS = 3650
 
@@ -93,7 +93,7 @@ def keys(
     signal SIGHUP, copied to a robot with its next run. Together with --rotate, what is revoked are
     the certificates of before.
     """
-    from holdfast.runtime.credentials import list_credentials, make_credentials, revoke_credentials
+    from holdfast.transport.key_ring import list_credentials, make_credentials, revoke_credentials
 
     def warn(text: str) -> None:
         typer.echo(f"warning: {printable(text)}", err=True)

@@ -477,7 +477,7 @@ def _require_effect(options: _Options, configuration: Configuration, *, as_robot
         endpoints = [parse_endpoint(service) for service in configuration.offload.services]
         tls = None
         if configuration.offload.tls is not None:
-            from holdfast.runtime.credentials import load_credentials
+            from holdfast.transport.credentials import load_credentials
 
             # What is only to be warned of is told when the run begins.
             directory = Path(configuration.offload.tls)

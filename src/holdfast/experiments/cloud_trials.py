@@ -482,7 +482,7 @@ class _Processes:
     def _credentials(self) -> Path:
         """Return the directory with keys for both ends."""
         if self._keys is None:
-            from holdfast.runtime.credentials import make_credentials
+            from holdfast.transport.key_ring import make_credentials
 
             self._keys = self._directory / "keys"
             make_credentials(self._keys, hosts=[self._path.host])

@@ -156,8 +156,7 @@ class MissingServices:
     def _examine(self, service: str) -> None:
         tls_files = None
         if self._tls_directory is not None:
-            names = ("authority.pem", "certificate.pem", "key.pem")
-            tls_files = TlsFiles(*(self._tls_directory / name for name in names))
+            tls_files = TlsFiles.of(self._tls_directory)
         reason = why_unreachable(service, tls_files, _TIMEOUT_S) or _unexplained(service)
         # It may have come meanwhile.
         if service in self._absent:
@@ -183,7 +182,7 @@ def _connect_local(place: Endpoint, timeout_s: float) -> str | None:
 
 def _own_credentials(files: TlsFiles) -> str | None:
     """Look at the robot's credentials once more: a certificate may have expired during the run."""
-    from holdfast.runtime.credentials import CredentialsError, load_credentials
+    from holdfast.transport.credentials import CredentialsError, load_credentials
 
     try:
         load_credentials(files.certificate.parent, "robot", warn=_ignore)

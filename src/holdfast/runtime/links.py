@@ -105,7 +105,7 @@ def make_links(configuration: Configuration, log_path: Path | None, events: Even
 
 def _streams(configuration: Configuration, log_path: Path | None, events: EventSink) -> Links:
     # Only a robot that has services needs these.
-    from holdfast.runtime.credentials import load_credentials
+    from holdfast.transport.credentials import load_credentials
     from holdfast.transport.endpoints import (
         PrivateSocket,
         ServiceAddress,

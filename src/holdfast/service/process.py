@@ -341,7 +341,7 @@ def _serve_supervised(options: argparse.Namespace) -> int:
 def _credentials(options: argparse.Namespace) -> TlsFiles | None:
     if options.tls is None:
         return None
-    from holdfast.runtime.credentials import load_credentials
+    from holdfast.transport.credentials import load_credentials
 
     return load_credentials(options.tls, "service", warn=lambda text: _warn(options, text))
 

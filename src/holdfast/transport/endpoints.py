@@ -21,7 +21,10 @@ import msgspec
 from holdfast.errors import TransportError
 
 __all__ = [
+    "AUTHORITY_FILE",
+    "CERTIFICATE_FILE",
     "ENCRYPTED_PROTOCOLS",
+    "KEY_FILE",
     "MAX_SOCKET_PATH_BYTES",
     "PROTOCOLS",
     "Endpoint",
@@ -43,6 +46,9 @@ ENCRYPTED_PROTOCOLS = frozenset({"tls", "udp"})
 
 MAX_SOCKET_PATH_BYTES = 107
 """Bound on the path of a local socket: the system's ``sockaddr_un`` has room for no more."""
+
+AUTHORITY_FILE, CERTIFICATE_FILE, KEY_FILE = "authority.pem", "certificate.pem", "key.pem"
+"""Names of the credentials' files."""
 
 _UNIX = "unix"
 
@@ -76,6 +82,11 @@ class TlsFiles(msgspec.Struct, frozen=True):
     authority: Path
     certificate: Path
     key: Path
+
+    @classmethod
+    def of(cls, directory: Path) -> TlsFiles:
+        """Return the files of a robot's or a service's directory, which need not be there."""
+        return cls(*(directory / name for name in (AUTHORITY_FILE, CERTIFICATE_FILE, KEY_FILE)))
 
 
 class Endpoint(NamedTuple):

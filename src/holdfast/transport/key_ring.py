@@ -1,4 +1,4 @@
-"""Who may talk to whom: a private authority, and keys for robots and services.
+"""A private authority: makes the keys of robots and services, rotates and revokes them.
 
 Both ends of a link show a certificate, and each accepts only those that its authority has signed.
 The authority is one key file, made here, which stays at home; whoever holds it decides who belongs.
@@ -8,10 +8,9 @@ to be a service to the others. A certificate whose key is lost or stolen is revo
 into a list that the authority signs and that lies beside everybody's credentials. What was ever
 signed is written down, so that no older certificate of a name is forgotten then.
 
-:func:`make_credentials` makes them, with the package ``cryptography``. :func:`load_credentials`
-finds out before a link is opened whether they will work, because a TLS library later only says
-that they did not: it plays the handshake of both ends through in memory, with the ``ssl`` module
-of the standard library, which is there on every robot and imports in a fraction of the time.
+This module needs the package ``cryptography``; without it, importing raises
+:class:`~holdfast.transport.credentials.CredentialsError`. To use what was made takes only
+:mod:`holdfast.transport.credentials`.
 """
 
 from __future__ import annotations
@@ -19,49 +18,57 @@ from __future__ import annotations
 import contextlib
 import csv
 import re
-import warnings
+import socket
 from collections.abc import Callable, Iterable, Sequence
 from datetime import UTC, datetime, timedelta
 from ipaddress import ip_address
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias
+from typing import NamedTuple
 
-from holdfast.errors import HoldfastError, TransportError
 from holdfast.files import (
     NewFile,
     create_directory_atomically,
     replace_directory,
     write_atomically,
 )
-from holdfast.transport.endpoints import TlsFiles
-from holdfast.transport.revocation import REVOKED_FILE, refuse_revoked
+from holdfast.transport.credentials import (
+    CredentialsError,
+    Role,
+    date_text,
+    give_to_warnings,
+    warn_if_open,
+)
+from holdfast.transport.endpoints import AUTHORITY_FILE, CERTIFICATE_FILE, KEY_FILE
+from holdfast.transport.revocation import REVOKED_FILE
 
-if TYPE_CHECKING:
-    import ssl
-
+try:
     from cryptography import x509
-    from cryptography.hazmat.primitives.asymmetric.ec import (
-        EllipticCurvePrivateKey,
-        EllipticCurvePublicKey,
+    from cryptography.exceptions import InvalidSignature
+    from cryptography.hazmat.primitives import hashes
+    from cryptography.hazmat.primitives.asymmetric import ec
+    from cryptography.hazmat.primitives.serialization import (
+        Encoding,
+        NoEncryption,
+        PrivateFormat,
+        load_pem_private_key,
     )
+    from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+except ImportError as error:
+    raise CredentialsError(
+        'making keys needs the package cryptography: pip install "holdfast[service]"'
+    ) from error
 
 __all__ = [
     "AUTHORITY_DAYS",
     "DEFAULT_DAYS",
-    "CredentialsError",
-    "CredentialsWarning",
     "Issued",
     "KeyRing",
     "MadeCredentials",
     "Revocation",
-    "Role",
     "list_credentials",
-    "load_credentials",
     "make_credentials",
     "revoke_credentials",
 ]
-
-Role: TypeAlias = Literal["robot", "service"]
 
 DEFAULT_DAYS = 365
 """Days for which a certificate is valid unless said otherwise."""
@@ -69,17 +76,11 @@ DEFAULT_DAYS = 365
 AUTHORITY_DAYS = 3650
 """Days for which a new authority is valid; no certificate outlives its authority."""
 
-EXPIRES_SOON_DAYS = 14
-"""A certificate with fewer days left is warned of when it is loaded."""
-
 MAX_PARTIES = 1000
 """Bound on the names of one call."""
 
 _AUTHORITY = "authority"
-_AUTHORITY_CERTIFICATE = "authority.pem"
 _AUTHORITY_KEY = "authority.key"
-_CERTIFICATE = "certificate.pem"
-_KEY = "key.pem"
 _ISSUED = "issued.csv"
 _ISSUED_FIELDS = ("serial", "name", "role", "expires")
 _MAX_SERIAL = 2**159
@@ -93,15 +94,6 @@ _HOST_LABEL = re.compile(r"[A-Za-z0-9_]([A-Za-z0-9_-]{0,61}[A-Za-z0-9_])?")
 
 _PRIVATE_FILE = 0o600
 _PUBLIC_FILE = 0o644
-_OPEN_TO_OTHERS = 0o077
-
-
-class CredentialsError(HoldfastError):
-    """Credentials cannot be made or used; the message names the file and the reason."""
-
-
-class CredentialsWarning(UserWarning):
-    """Credentials work, but somebody should look at them."""
 
 
 class MadeCredentials(NamedTuple):
@@ -232,13 +224,11 @@ def make_credentials(
     Raises
     ------
     CredentialsError
-        If a name, host or number is out of bounds, a file is in the way or missing, or
-        ``cryptography`` is not installed.
+        If a name, host or number is out of bounds, or a file is in the way or missing.
     OutputError
         If a file cannot be written.
     """
-    _require_cryptography()
-    warn = warn or _give_to_warnings
+    warn = warn or give_to_warnings
     # Certificates have whole seconds.
     now = (now or datetime.now(UTC)).replace(microsecond=0)
     if not robots and not services:
@@ -259,20 +249,20 @@ def make_credentials(
     end = min(now + timedelta(days=days), authority.certificate.not_valid_after_utc)
     roles: list[tuple[str, Role]] = [(name, "service") for name in services]
     roles += [(name, "robot") for name in robots]
-    parties = []
+    parties: list[_Party] = []
     for name, role in roles:
         place = directory / name
         occupied = _first_file_of(place)
         if occupied is None:
-            parties.append(_new_party(name, role, hosts, authority, now, end))
+            parties.append(_party(place, role, hosts, authority, now, end))
         elif renew or rotate:
             old = _old_certificate(place, role, authority)
             if renew and old.serial_number in numbers:
                 raise CredentialsError(
-                    f"{place / _CERTIFICATE}: is revoked, so its key gets no new certificate; "
+                    f"{place / CERTIFICATE_FILE}: is revoked, so its key gets no new certificate; "
                     f"make a new key (--rotate)"
                 )
-            parties.append(_renewed_party(place, old, role, hosts, authority, now, end, rotate))
+            parties.append(_party(place, role, hosts, authority, now, end, old, rotate=rotate))
         else:
             raise CredentialsError(
                 f"{occupied}: exists already, and nothing was changed; choose another name, or "
@@ -288,7 +278,7 @@ def make_credentials(
         create_directory_atomically(
             home,
             {
-                _AUTHORITY_CERTIFICATE: NewFile(_pem(authority.certificate), _PUBLIC_FILE),
+                AUTHORITY_FILE: NewFile(_pem(authority.certificate), _PUBLIC_FILE),
                 _AUTHORITY_KEY: NewFile(_key_pem(authority.key), _PRIVATE_FILE),
             },
         )
@@ -299,12 +289,12 @@ def make_credentials(
     for party in parties:
         place = directory / party.name
         if party.key is None:
-            write_atomically(place / _CERTIFICATE, _pem(party.certificate))
+            write_atomically(place / CERTIFICATE_FILE, _pem(party.certificate))
         else:
             files = {
-                _AUTHORITY_CERTIFICATE: NewFile(_pem(authority.certificate), _PUBLIC_FILE),
-                _CERTIFICATE: NewFile(_pem(party.certificate), _PUBLIC_FILE),
-                _KEY: NewFile(_key_pem(party.key), _PRIVATE_FILE),
+                AUTHORITY_FILE: NewFile(_pem(authority.certificate), _PUBLIC_FILE),
+                CERTIFICATE_FILE: NewFile(_pem(party.certificate), _PUBLIC_FILE),
+                KEY_FILE: NewFile(_key_pem(party.key), _PRIVATE_FILE),
             }
             if (home / REVOKED_FILE).exists():
                 files[REVOKED_FILE] = NewFile(_read(home / REVOKED_FILE), _PUBLIC_FILE)
@@ -350,15 +340,14 @@ def revoke_credentials(
     Raises
     ------
     CredentialsError
-        If a name never had a certificate, a number cannot be one, a file is missing or malformed,
-        or ``cryptography`` is not installed.
+        If a name never had a certificate, a number cannot be one, or a file is missing or
+        malformed.
     OutputError
         If a file cannot be written.
     """
-    _require_cryptography()
     now = (now or datetime.now(UTC)).replace(microsecond=0)
     home = directory / _AUTHORITY
-    authority = _read_authority(home, now, warn or _give_to_warnings)
+    authority = _read_authority(home, now, warn or give_to_warnings)
     issued = _read_issued(directory, authority.certificate)
     wanted: dict[int, Issued] = {}
     for name in names:
@@ -393,11 +382,10 @@ def list_credentials(directory: Path) -> tuple[Issued, ...]:
     Raises
     ------
     CredentialsError
-        If there is no authority, a file is malformed, or ``cryptography`` is not installed.
+        If there is no authority, or a file is malformed.
     """
-    _require_cryptography()
     home = directory / _AUTHORITY
-    certificate = _read_certificate(home / _AUTHORITY_CERTIFICATE)
+    certificate = _read_certificate(home / AUTHORITY_FILE)
     listed = {
         entry.serial_number: entry.revocation_date_utc for entry in _read_revoked(home, certificate)
     }
@@ -406,178 +394,6 @@ def list_credentials(directory: Path) -> tuple[Issued, ...]:
         for each in _read_issued(directory, certificate)
     ]
     return (*issued, *(Issued(serial, "", None, None, at) for serial, at in listed.items()))
-
-
-def load_credentials(
-    directory: Path | str, role: Role, *, warn: Callable[[str], None] | None = None
-) -> TlsFiles:
-    """Check a robot's or a service's credentials, and return where they are.
-
-    Parameters
-    ----------
-    directory : Path or str
-        With ``authority.pem``, ``certificate.pem`` and ``key.pem``.
-    role : {"robot", "service"}
-        Whose they must be.
-    warn : callable or None
-        Takes texts that somebody should read: a key that others can read, a certificate that
-        expires soon. None gives them to :mod:`warnings`.
-
-    Returns
-    -------
-    TlsFiles
-
-    Raises
-    ------
-    CredentialsError
-        If the other end would not accept them: a file is missing, unreadable or malformed, the key
-        belongs to another certificate, the certificate is not valid now, was signed by another
-        authority, or is for the other role.
-    """
-    warn = warn or _give_to_warnings
-    directory = Path(directory)
-    paths = [directory / name for name in (_AUTHORITY_CERTIFICATE, _CERTIFICATE, _KEY)]
-    for path in paths:
-        try:
-            with path.open("rb"):
-                pass
-        except OSError as error:
-            raise CredentialsError(_unreadable(directory, path, role, error)) from error
-    authority, certificate, key = paths
-    _warn_if_open(key, warn)
-    expires_s = _rehearse(authority, certificate, key, role)
-    days_left = (expires_s - datetime.now(UTC).timestamp()) / 86_400.0
-    if days_left < EXPIRES_SOON_DAYS:
-        warn(f"{certificate}: expires in {days_left:.1f} days, on {_date(expires_s)}")
-    return TlsFiles(authority, certificate, key)
-
-
-# Checking
-
-
-def _give_to_warnings(text: str) -> None:
-    warnings.warn(text, CredentialsWarning, stacklevel=3)
-
-
-def _unreadable(directory: Path, path: Path, role: Role, error: OSError) -> str:
-    text = f"{path}: cannot be read: {error.strerror}"
-    if (directory / role / _CERTIFICATE).exists():
-        return f"{text}; did you mean {directory / role}?"
-    if isinstance(error, FileNotFoundError):
-        return f'{text}; "holdfast keys DIR" makes such files'
-    return text
-
-
-def _warn_if_open(key: Path, warn: Callable[[str], None]) -> None:
-    mode = key.stat().st_mode
-    if mode & _OPEN_TO_OTHERS:
-        warn(f"{key}: others can read this key (mode {mode & 0o777:03o}); chmod 600 {key}")
-
-
-def _rehearse(authority: Path, certificate: Path, key: Path, role: Role) -> float:
-    """Let both ends of a link shake hands in memory; return when the certificate expires."""
-    import ssl
-
-    serving = role == "service"
-    ours = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER if serving else ssl.PROTOCOL_TLS_CLIENT)
-    theirs = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT if serving else ssl.PROTOCOL_TLS_SERVER)
-    for context in (ours, theirs):
-        context.minimum_version = ssl.TLSVersion.TLSv1_3
-        context.check_hostname = False
-    ours.verify_mode = ssl.CERT_NONE
-    theirs.verify_mode = ssl.CERT_REQUIRED
-    try:
-        theirs.load_verify_locations(cafile=authority)
-    except ssl.SSLError as error:
-        raise CredentialsError(f"{authority}: is no certificate in PEM form") from error
-    try:
-        refuse_revoked(theirs, authority.parent)
-    except TransportError as error:
-        raise CredentialsError(str(error)) from error
-    # A server needs a certificate of its own; nobody looks at it here.
-    for context in (ours,) if serving else (ours, theirs):
-        try:
-            # Without the empty password, an encrypted key would ask for one on the terminal.
-            context.load_cert_chain(certificate, key, password="")
-        except ssl.SSLError as error:
-            raise CredentialsError(_unusable_pair(certificate, key, error)) from error
-
-    to_ours, to_theirs = ssl.MemoryBIO(), ssl.MemoryBIO()
-    near = ours.wrap_bio(to_ours, to_theirs, server_side=serving)
-    far = theirs.wrap_bio(to_theirs, to_ours, server_side=not serving)
-    try:
-        for _ in range(4):  # more flights than TLS 1.3 has
-            for end in (near, far):
-                try:
-                    end.do_handshake()
-                except ssl.SSLWantReadError:
-                    continue
-        shown = far.getpeercert()
-    except ssl.SSLCertVerificationError as error:
-        if error.verify_code in _LIST_IS_WRONG:
-            reason = _LIST_IS_WRONG[error.verify_code]
-            raise CredentialsError(f"{authority.with_name(REVOKED_FILE)}: {reason}") from error
-        reason = _refusal(certificate, role, error)
-        raise CredentialsError(f"{certificate}: {reason}") from error
-    except (ssl.SSLError, ValueError) as error:
-        raise CredentialsError(f"{certificate}: does not work for TLS: {error}") from error
-    return float(ssl.cert_time_to_seconds(str(shown["notAfter"]))) if shown else 0.0
-
-
-def _unusable_pair(certificate: Path, key: Path, error: ssl.SSLError) -> str:
-    if error.reason == "KEY_VALUES_MISMATCH":
-        return f"{key}: is not the key of {certificate}"
-    if b"PRIVATE KEY" not in key.read_bytes():
-        return f"{key}: is no private key in PEM form"
-    if b"ENCRYPTED" in key.read_bytes():
-        return f"{key}: is encrypted; a key that a program reads by itself must not be"
-    if b"BEGIN CERTIFICATE" not in certificate.read_bytes():
-        return f"{certificate}: is no certificate in PEM form"
-    return f"{certificate} and {key} cannot be used: {error.reason or error}"
-
-
-_LIST_IS_WRONG = {
-    3: f"is not of the authority beside it, {_AUTHORITY_CERTIFICATE}",
-    8: f"was not signed by the authority beside it, {_AUTHORITY_CERTIFICATE}",
-    11: "is not valid yet; is this machine's clock right?",
-    12: "has expired",
-}
-"""By OpenSSL's numbers: what can be wrong with a revocation list."""
-
-
-def _refusal(certificate: Path, role: Role, error: ssl.SSLCertVerificationError) -> str:
-    """Say why the other end refuses the certificate, by OpenSSL's number of the reason."""
-    other: Role = "robot" if role == "service" else "service"
-    match error.verify_code:
-        case 9:
-            return f"is not valid yet{_validity(certificate)}; is this machine's clock right?"
-        case 10:
-            return f"has expired{_validity(certificate)}"
-        case 23:
-            return "has been revoked; 'holdfast keys DIR --rotate' makes new ones"
-        case 26:
-            return f"is not for a {role} but for a {other}"
-        case 7 | 18 | 19 | 20 | 21:
-            return f"was not signed by the authority beside it, {_AUTHORITY_CERTIFICATE}"
-        case _:
-            return f"is refused: {error.verify_message}"
-
-
-def _validity(certificate: Path) -> str:
-    """Return when a certificate is valid, if the package that can read it is installed."""
-    try:
-        from cryptography import x509
-    except ImportError:
-        return ""
-    read = x509.load_pem_x509_certificate(certificate.read_bytes())
-    return (
-        f" (valid from {_date(read.not_valid_before_utc.timestamp())}"
-        f" to {_date(read.not_valid_after_utc.timestamp())})"
-    )
-
-
-def _date(time_s: float) -> str:
-    return datetime.fromtimestamp(time_s, UTC).strftime("%Y-%m-%d %H:%M UTC")
 
 
 def _check_arguments(
@@ -621,8 +437,8 @@ def _first_file_of(place: Path) -> Path | None:
     """Return what would be in the way of a new directory, if anything."""
     if not place.is_dir():
         return place if place.exists() else None
-    if (place / _CERTIFICATE).exists():
-        return place / _CERTIFICATE
+    if (place / CERTIFICATE_FILE).exists():
+        return place / CERTIFICATE_FILE
     return min(place.iterdir(), default=None)
 
 
@@ -631,7 +447,7 @@ def _first_file_of(place: Path) -> Path | None:
 
 class _Authority(NamedTuple):
     certificate: x509.Certificate
-    key: EllipticCurvePrivateKey
+    key: ec.EllipticCurvePrivateKey
 
 
 class _Party(NamedTuple):
@@ -639,16 +455,7 @@ class _Party(NamedTuple):
     role: Role
     hosts: tuple[str, ...]
     certificate: x509.Certificate
-    key: EllipticCurvePrivateKey | None  # None: renewed, its key stays as it is
-
-
-def _require_cryptography() -> None:
-    try:
-        import cryptography  # noqa: F401
-    except ImportError as error:
-        raise CredentialsError(
-            'making keys needs the package cryptography: pip install "holdfast[service]"'
-        ) from error
+    key: ec.EllipticCurvePrivateKey | None  # None: renewed, its key stays as it is
 
 
 def _present(directory: Path) -> tuple[tuple[str, ...], tuple[str, ...]]:
@@ -664,10 +471,6 @@ def _present(directory: Path) -> tuple[tuple[str, ...], tuple[str, ...]]:
 
 
 def _new_authority(now: datetime) -> _Authority:
-    from cryptography import x509
-    from cryptography.hazmat.primitives import hashes
-    from cryptography.hazmat.primitives.asymmetric import ec
-
     key = ec.generate_private_key(ec.SECP256R1())
     serial = x509.random_serial_number()
     # Two authorities must not have the same name: a chain is looked up by it.
@@ -689,51 +492,29 @@ def _new_authority(now: datetime) -> _Authority:
 
 
 def _read_authority(home: Path, now: datetime, warn: Callable[[str], None]) -> _Authority:
-    from cryptography.hazmat.primitives import serialization
-    from cryptography.hazmat.primitives.asymmetric import ec
-
-    certificate = _read_certificate(home / _AUTHORITY_CERTIFICATE)
+    certificate = _read_certificate(home / AUTHORITY_FILE)
     path = home / _AUTHORITY_KEY
     try:
-        key = serialization.load_pem_private_key(_read(path), password=None)
+        key = load_pem_private_key(_read(path), password=None)
     except (ValueError, TypeError) as error:
         raise CredentialsError(f"{path}: is no private key in PEM form: {error}") from error
     if not isinstance(key, ec.EllipticCurvePrivateKey):
         raise CredentialsError(f"{path}: is no elliptic-curve key, as this program makes them")
     if key.public_key() != certificate.public_key():
-        raise CredentialsError(f"{path}: is not the key of {home / _AUTHORITY_CERTIFICATE}")
-    _warn_if_open(path, warn)
+        raise CredentialsError(f"{path}: is not the key of {home / AUTHORITY_FILE}")
+    warn_if_open(path, warn)
     if certificate.not_valid_after_utc <= now:
         raise CredentialsError(
-            f"{home / _AUTHORITY_CERTIFICATE}: has expired on "
-            f"{_date(certificate.not_valid_after_utc.timestamp())}; make keys with a new "
+            f"{home / AUTHORITY_FILE}: has expired on "
+            f"{date_text(certificate.not_valid_after_utc.timestamp())}; make keys with a new "
             f"authority in another directory"
         )
     return _Authority(certificate, key)
 
 
-def _new_party(
-    name: str,
-    role: Role,
-    hosts: Sequence[str],
-    authority: _Authority,
-    now: datetime,
-    end: datetime,
-) -> _Party:
-    from cryptography.hazmat.primitives.asymmetric import ec
-
-    key = ec.generate_private_key(ec.SECP256R1())
-    reached_at = _hosts_of_this_machine(hosts) if role == "service" else ()
-    certificate = _sign(name, role, reached_at, key.public_key(), authority, now, end)
-    return _Party(name, role, reached_at, certificate, key)
-
-
 def _old_certificate(place: Path, role: Role, authority: _Authority) -> x509.Certificate:
     """Return the certificate that is to be replaced, if it is one of ours."""
-    from cryptography.exceptions import InvalidSignature
-    from cryptography.hazmat.primitives.asymmetric import ec
-
-    path = place / _CERTIFICATE
+    path = place / CERTIFICATE_FILE
     old = _read_certificate(path)
     try:
         old.verify_directly_issued_by(authority.certificate)
@@ -744,23 +525,29 @@ def _old_certificate(place: Path, role: Role, authority: _Authority) -> x509.Cer
     return old
 
 
-def _renewed_party(
+def _party(
     place: Path,
-    old: x509.Certificate,
     role: Role,
     hosts: Sequence[str],
     authority: _Authority,
     now: datetime,
     end: datetime,
-    rotate: bool,
+    old: x509.Certificate | None = None,
+    *,
+    rotate: bool = False,
 ) -> _Party:
-    from cryptography.hazmat.primitives.asymmetric import ec
-
-    key = ec.generate_private_key(ec.SECP256R1()) if rotate else None
-    public_key = old.public_key() if key is None else key.public_key()
+    """Certify a new party, or one that has a certificate: with its key or with a new one."""
+    key: ec.EllipticCurvePrivateKey | None = None
+    if old is not None and not rotate:
+        public_key: object = old.public_key()
+    else:
+        key = ec.generate_private_key(ec.SECP256R1())
+        public_key = key.public_key()
     assert isinstance(public_key, ec.EllipticCurvePublicKey)
-    reached_at = tuple(dict.fromkeys((*_hosts_of(old), *map(_normal, hosts))))
-    reached_at = reached_at if role == "service" else ()
+    reached_at: tuple[str, ...] = ()
+    if role == "service":
+        before = _hosts_of_this_machine() if old is None else _hosts_of(old)
+        reached_at = tuple(dict.fromkeys(map(_normal, (*before, *hosts))))
     certificate = _sign(place.name, role, reached_at, public_key, authority, now, end)
     return _Party(place.name, role, reached_at, certificate, key)
 
@@ -769,13 +556,11 @@ def _sign(
     name: str,
     role: Role,
     hosts: Sequence[str],
-    public_key: EllipticCurvePublicKey,
+    public_key: ec.EllipticCurvePublicKey,
     authority: _Authority,
     now: datetime,
     end: datetime,
 ) -> x509.Certificate:
-    from cryptography import x509
-    from cryptography.hazmat.primitives import hashes
 
     usage = _usage_of(role)
     builder = (
@@ -805,8 +590,6 @@ def _sign(
 
 
 def _issued(certificate: x509.Certificate) -> Issued:
-    from cryptography.x509.oid import NameOID
-
     names = certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
     return Issued(
         certificate.serial_number,
@@ -818,8 +601,6 @@ def _issued(certificate: x509.Certificate) -> Issued:
 
 def _read_issued(directory: Path, authority: x509.Certificate) -> list[Issued]:
     """Return what was signed: what is written down, and what is there besides."""
-    from cryptography.exceptions import InvalidSignature
-
     path = directory / _AUTHORITY / _ISSUED
     issued: dict[int, Issued] = {}
     if path.exists():
@@ -849,7 +630,7 @@ def _rows_of(text: str) -> list[list[str]]:
 
 def _certificates_in(directory: Path) -> list[Path]:
     """Return the certificates of all parties that have a directory here."""
-    found = sorted(directory.glob(f"*/{_CERTIFICATE}"))
+    found = sorted(directory.glob(f"*/{CERTIFICATE_FILE}"))
     return [path for path in found if _NAME.fullmatch(path.parent.name)]
 
 
@@ -870,9 +651,6 @@ def _read_revoked(home: Path, authority: x509.Certificate) -> tuple[x509.Revoked
 
 
 def _load_revoked(home: Path, authority: x509.Certificate) -> x509.CertificateRevocationList | None:
-    from cryptography import x509
-    from cryptography.hazmat.primitives.asymmetric import ec
-
     path = home / REVOKED_FILE
     if not path.exists():
         return None
@@ -883,7 +661,7 @@ def _load_revoked(home: Path, authority: x509.Certificate) -> x509.CertificateRe
     key = authority.public_key()
     assert isinstance(key, ec.EllipticCurvePublicKey)
     if not revoked.is_signature_valid(key):
-        raise CredentialsError(f"{path}: was not signed by {home / _AUTHORITY_CERTIFICATE}")
+        raise CredentialsError(f"{path}: was not signed by {home / AUTHORITY_FILE}")
     return revoked
 
 
@@ -895,10 +673,6 @@ def _sign_revoked(
     now: datetime,
 ) -> bytes:
     """Return the next list, in PEM."""
-    from cryptography import x509
-    from cryptography.hazmat.primitives import hashes
-    from cryptography.hazmat.primitives.serialization import Encoding
-
     before = _load_revoked(home, authority.certificate)
     number = 1
     if before is not None:
@@ -923,12 +697,9 @@ def _sign_revoked(
     return builder.sign(authority.key, hashes.SHA256()).public_bytes(Encoding.PEM)
 
 
-def _hosts_of_this_machine(hosts: Sequence[str]) -> tuple[str, ...]:
-    import socket
-
+def _hosts_of_this_machine() -> list[str]:
     own = socket.gethostname()
-    every = ["localhost", "127.0.0.1", "::1", *([own] if _is_host(own) else []), *hosts]
-    return tuple(dict.fromkeys(map(_normal, every)))
+    return ["localhost", "127.0.0.1", "::1", *([own] if _is_host(own) else [])]
 
 
 def _normal(host: str) -> str:
@@ -939,8 +710,6 @@ def _normal(host: str) -> str:
 
 
 def _general_name(host: str) -> x509.GeneralName:
-    from cryptography import x509
-
     try:
         return x509.IPAddress(ip_address(host))
     except ValueError:
@@ -948,8 +717,6 @@ def _general_name(host: str) -> x509.GeneralName:
 
 
 def _hosts_of(certificate: x509.Certificate) -> tuple[str, ...]:
-    from cryptography import x509
-
     try:
         names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
     except x509.ExtensionNotFound:
@@ -958,8 +725,6 @@ def _hosts_of(certificate: x509.Certificate) -> tuple[str, ...]:
 
 
 def _role_of(certificate: x509.Certificate) -> Role | None:
-    from cryptography import x509
-
     try:
         usages = certificate.extensions.get_extension_for_class(x509.ExtendedKeyUsage).value
     except x509.ExtensionNotFound:
@@ -969,16 +734,12 @@ def _role_of(certificate: x509.Certificate) -> Role | None:
 
 
 def _usage_of(role: Role) -> x509.ObjectIdentifier:
-    from cryptography.x509.oid import ExtendedKeyUsageOID
-
     if role == "service":
         return ExtendedKeyUsageOID.SERVER_AUTH
     return ExtendedKeyUsageOID.CLIENT_AUTH
 
 
 def _key_usage(*, signs_certificates: bool) -> x509.KeyUsage:
-    from cryptography import x509
-
     return x509.KeyUsage(
         digital_signature=not signs_certificates,
         content_commitment=False,
@@ -993,15 +754,10 @@ def _key_usage(*, signs_certificates: bool) -> x509.KeyUsage:
 
 
 def _common_name(name: str) -> x509.Name:
-    from cryptography import x509
-    from cryptography.x509.oid import NameOID
-
     return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
 
 
 def _read_certificate(path: Path) -> x509.Certificate:
-    from cryptography import x509
-
     try:
         return x509.load_pem_x509_certificate(_read(path))
     except ValueError as error:
@@ -1016,16 +772,8 @@ def _read(path: Path) -> bytes:
 
 
 def _pem(certificate: x509.Certificate) -> bytes:
-    from cryptography.hazmat.primitives.serialization import Encoding
-
     return certificate.public_bytes(Encoding.PEM)
 
 
-def _key_pem(key: EllipticCurvePrivateKey) -> bytes:
-    from cryptography.hazmat.primitives.serialization import (
-        Encoding,
-        NoEncryption,
-        PrivateFormat,
-    )
-
+def _key_pem(key: ec.EllipticCurvePrivateKey) -> bytes:
     return key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())

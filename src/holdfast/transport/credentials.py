@@ -1,0 +1,220 @@
+"""Will these credentials work? Found out before a link is opened.
+
+A TLS library says late, and in few words, that a certificate was refused. So the handshake of both
+ends is played through in memory, with the ``ssl`` module of the standard library, when a robot or a
+service starts: what the other end would refuse is named then, with the file and the reason.
+
+:mod:`holdfast.transport.key_ring` makes credentials.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal, TypeAlias
+
+from holdfast.errors import HoldfastError, TransportError
+from holdfast.transport.endpoints import AUTHORITY_FILE, TlsFiles
+from holdfast.transport.revocation import REVOKED_FILE, refuse_revoked
+
+if TYPE_CHECKING:
+    import ssl
+
+__all__ = [
+    "CredentialsError",
+    "CredentialsWarning",
+    "Role",
+    "date_text",
+    "give_to_warnings",
+    "load_credentials",
+    "warn_if_open",
+]
+
+Role: TypeAlias = Literal["robot", "service"]
+
+EXPIRES_SOON_DAYS = 14
+"""A certificate with fewer days left is warned of when it is loaded."""
+
+_OPEN_TO_OTHERS = 0o077
+
+
+class CredentialsError(HoldfastError):
+    """Credentials cannot be made or used; the message names the file and the reason."""
+
+
+class CredentialsWarning(UserWarning):
+    """Credentials work, but somebody should look at them."""
+
+
+def load_credentials(
+    directory: Path | str, role: Role, *, warn: Callable[[str], None] | None = None
+) -> TlsFiles:
+    """Check a robot's or a service's credentials, and return where they are.
+
+    Parameters
+    ----------
+    directory : Path or str
+        With ``authority.pem``, ``certificate.pem`` and ``key.pem``.
+    role : {"robot", "service"}
+        Whose they must be.
+    warn : callable or None
+        Takes texts that somebody should read: a key that others can read, a certificate that
+        expires soon. None gives them to :mod:`warnings`.
+
+    Returns
+    -------
+    TlsFiles
+
+    Raises
+    ------
+    CredentialsError
+        If the other end would not accept them: a file is missing, unreadable or malformed, the key
+        belongs to another certificate, the certificate is not valid now, was signed by another
+        authority, or is for the other role.
+    """
+    warn = warn or give_to_warnings
+    directory = Path(directory)
+    files = TlsFiles.of(directory)
+    for path in (files.authority, files.certificate, files.key):
+        try:
+            with path.open("rb"):
+                pass
+        except OSError as error:
+            raise CredentialsError(_unreadable(directory, path, role, error)) from error
+    warn_if_open(files.key, warn)
+    expires_s = _rehearse(files, role)
+    days_left = (expires_s - datetime.now(UTC).timestamp()) / 86_400.0
+    if days_left < EXPIRES_SOON_DAYS:
+        warn(f"{files.certificate}: expires in {days_left:.1f} days, on {date_text(expires_s)}")
+    return files
+
+
+def give_to_warnings(text: str) -> None:
+    """Warn as Python does."""
+    warnings.warn(text, CredentialsWarning, stacklevel=3)
+
+
+def _unreadable(directory: Path, path: Path, role: Role, error: OSError) -> str:
+    text = f"{path}: cannot be read: {error.strerror}"
+    if TlsFiles.of(directory / role).certificate.exists():
+        return f"{text}; did you mean {directory / role}?"
+    if isinstance(error, FileNotFoundError):
+        return f'{text}; "holdfast keys DIR" makes such files'
+    return text
+
+
+def warn_if_open(key: Path, warn: Callable[[str], None]) -> None:
+    """Warn of a key that others can read."""
+    mode = key.stat().st_mode
+    if mode & _OPEN_TO_OTHERS:
+        warn(f"{key}: others can read this key (mode {mode & 0o777:03o}); chmod 600 {key}")
+
+
+def _rehearse(files: TlsFiles, role: Role) -> float:
+    """Let both ends of a link shake hands in memory; return when the certificate expires."""
+    import ssl
+
+    authority, certificate, key = files.authority, files.certificate, files.key
+    serving = role == "service"
+    ours = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER if serving else ssl.PROTOCOL_TLS_CLIENT)
+    theirs = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT if serving else ssl.PROTOCOL_TLS_SERVER)
+    for context in (ours, theirs):
+        context.minimum_version = ssl.TLSVersion.TLSv1_3
+        context.check_hostname = False
+    ours.verify_mode = ssl.CERT_NONE
+    theirs.verify_mode = ssl.CERT_REQUIRED
+    try:
+        theirs.load_verify_locations(cafile=authority)
+    except ssl.SSLError as error:
+        raise CredentialsError(f"{authority}: is no certificate in PEM form") from error
+    try:
+        refuse_revoked(theirs, authority.parent)
+    except TransportError as error:
+        raise CredentialsError(str(error)) from error
+    # A server needs a certificate of its own; nobody looks at it here.
+    for context in (ours,) if serving else (ours, theirs):
+        try:
+            # Without the empty password, an encrypted key would ask for one on the terminal.
+            context.load_cert_chain(certificate, key, password="")
+        except ssl.SSLError as error:
+            raise CredentialsError(_unusable_pair(certificate, key, error)) from error
+
+    to_ours, to_theirs = ssl.MemoryBIO(), ssl.MemoryBIO()
+    near = ours.wrap_bio(to_ours, to_theirs, server_side=serving)
+    far = theirs.wrap_bio(to_theirs, to_ours, server_side=not serving)
+    try:
+        for _ in range(4):  # more flights than TLS 1.3 has
+            for end in (near, far):
+                try:
+                    end.do_handshake()
+                except ssl.SSLWantReadError:
+                    continue
+        shown = far.getpeercert()
+    except ssl.SSLCertVerificationError as error:
+        if error.verify_code in _LIST_IS_WRONG:
+            reason = _LIST_IS_WRONG[error.verify_code]
+            raise CredentialsError(f"{authority.with_name(REVOKED_FILE)}: {reason}") from error
+        reason = _refusal(certificate, role, error)
+        raise CredentialsError(f"{certificate}: {reason}") from error
+    except (ssl.SSLError, ValueError) as error:
+        raise CredentialsError(f"{certificate}: does not work for TLS: {error}") from error
+    return float(ssl.cert_time_to_seconds(str(shown["notAfter"]))) if shown else 0.0
+
+
+def _unusable_pair(certificate: Path, key: Path, error: ssl.SSLError) -> str:
+    if error.reason == "KEY_VALUES_MISMATCH":
+        return f"{key}: is not the key of {certificate}"
+    if b"PRIVATE KEY" not in key.read_bytes():
+        return f"{key}: is no private key in PEM form"
+    if b"ENCRYPTED" in key.read_bytes():
+        return f"{key}: is encrypted; a key that a program reads by itself must not be"
+    if b"BEGIN CERTIFICATE" not in certificate.read_bytes():
+        return f"{certificate}: is no certificate in PEM form"
+    return f"{certificate} and {key} cannot be used: {error.reason or error}"
+
+
+_LIST_IS_WRONG = {
+    3: f"is not of the authority beside it, {AUTHORITY_FILE}",
+    8: f"was not signed by the authority beside it, {AUTHORITY_FILE}",
+    11: "is not valid yet; is this machine's clock right?",
+    12: "has expired",
+}
+"""By OpenSSL's numbers: what can be wrong with a revocation list."""
+
+
+def _refusal(certificate: Path, role: Role, error: ssl.SSLCertVerificationError) -> str:
+    """Say why the other end refuses the certificate, by OpenSSL's number of the reason."""
+    other: Role = "robot" if role == "service" else "service"
+    match error.verify_code:
+        case 9:
+            return f"is not valid yet{_validity(certificate)}; is this machine's clock right?"
+        case 10:
+            return f"has expired{_validity(certificate)}"
+        case 23:
+            return "has been revoked; 'holdfast keys DIR --rotate' makes new ones"
+        case 26:
+            return f"is not for a {role} but for a {other}"
+        case 7 | 18 | 19 | 20 | 21:
+            return f"was not signed by the authority beside it, {AUTHORITY_FILE}"
+        case _:
+            return f"is refused: {error.verify_message}"
+
+
+def _validity(certificate: Path) -> str:
+    """Return when a certificate is valid, if the package that can read it is installed."""
+    try:
+        from cryptography import x509
+    except ImportError:
+        return ""
+    read = x509.load_pem_x509_certificate(certificate.read_bytes())
+    return (
+        f" (valid from {date_text(read.not_valid_before_utc.timestamp())}"
+        f" to {date_text(read.not_valid_after_utc.timestamp())})"
+    )
+
+
+def date_text(time_s: float) -> str:
+    """Return a time, in seconds since 1970, as people read it."""
+    return datetime.fromtimestamp(time_s, UTC).strftime("%Y-%m-%d %H:%M UTC")
