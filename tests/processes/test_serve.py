@@ -628,19 +628,25 @@ class TestTelling:
 
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="where there are such arenas")
-def test_the_threads_share_arenas() -> None:
+def test_the_threads_share_arenas(tmp_path: Path) -> None:
     """Each keeps as much as its threads ever held at the same time (runtime/allocator.py)."""
-    with served(*ANYWHERE, "--workers", "8") as service, contextlib.ExitStack() as stack:
+    robot = robot_of_busy(tmp_path)
+    arguments = ["--problem", "busy_problem:Busy", "--workers", "8"]
+    with (
+        served(*ANYWHERE, *arguments, directory=tmp_path) as service,
+        contextlib.ExitStack() as stack,
+    ):
         ends = [stack.enter_context(robots_end(service.endpoint)) for _ in range(8)]
         for key, end in enumerate(ends, 1):
-            end.appeared()
-            end.send(encode(Robot(key=key).request()))
+            robot.session = key.to_bytes(16, "big")
+            in_work(end, robot)
+        (tmp_path / "let_go").touch()
         for end in ends:
             end.collect()
         process = Path(f"/proc/{service.process.pid}")
         threads = len(list((process / "task").iterdir()))
         heaps = _heaps((process / "maps").read_text())
-    assert threads > 6
+    assert threads > 8
     # The first arena is the process's own heap.
     assert heaps <= 1
 
