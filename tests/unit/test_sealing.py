@@ -6,6 +6,7 @@ from hypothesis import strategies as st
 
 from holdfast.transport import sealing
 from holdfast.transport.sealing import (
+    KNOWN_AFTER,
     LOSS_SAMPLE,
     OVERHEAD,
     WINDOW,
@@ -121,6 +122,18 @@ class TestSealing:
         assert service.window.newest == -1
 
 
+WINDOW_BEGINS = 2 * KNOWN_AFTER
+
+
+def known() -> ReplayWindow:
+    """Return a window of a way that is known to lose none."""
+    window = ReplayWindow()
+    for counter in range(WINDOW_BEGINS):
+        window.note(counter)
+    assert window.lost == 0
+    return window
+
+
 class TestReplayWindow:
     @given(st.lists(st.integers(0, 3 * WINDOW), max_size=300))
     def test_as_a_set_of_all_that_came(self, counters: list[int]) -> None:
@@ -138,12 +151,12 @@ class TestReplayWindow:
         window = ReplayWindow()
         for counter in range(1000):
             window.note(counter)
-            assert window.lost == 0
+            assert window.lost == (counter < KNOWN_AFTER + 2)
 
     def test_what_is_late_is_not_lost(self) -> None:
-        window = ReplayWindow()
+        window = known()
         for counter in (0, 1, 2, 5, 4, 3, 8, 7, 6):
-            window.note(counter)
+            window.note(WINDOW_BEGINS + counter)
             assert window.lost == 0
 
     def test_what_does_not_come_is_lost_until_it_is_long_ago(self) -> None:
@@ -153,7 +166,7 @@ class TestReplayWindow:
             if counter != 100:
                 window.note(counter)
                 seen[counter] = window.lost
-        assert all(seen[counter] == 0 for counter in range(100))
+        assert all(seen[counter] == 0 for counter in range(KNOWN_AFTER + 2, 100))
         assert all(seen[counter] == 1 for counter in range(104, 100 + LOSS_SAMPLE))
         assert all(seen[counter] == 0 for counter in range(110 + LOSS_SAMPLE, 400))
 

@@ -16,7 +16,8 @@ To ask again takes a round trip, which on a long way is dear, and these messages
 the way is seen to lose any, each message is sent twice, a few milliseconds apart, for losses come
 in bunches. What is lost is measured where it should have arrived, over the last 128 datagrams
 (:class:`~holdfast.transport.sealing.ReplayWindow`), and each message carries the count back; where
-nothing is lost, nothing is sent twice. All that is sent again is paid for from a budget of twice
+nothing is lost, nothing is sent twice. Nobody knows in the beginning, so a link begins with a few
+dozen probes, and as if some were lost. All that is sent again is paid for from a budget of twice
 the bytes that were sent for the first time, so a way in trouble is never given more than three
 times the load.
 
@@ -40,7 +41,7 @@ import struct
 from collections.abc import Callable
 from typing import Final, NamedTuple
 
-from holdfast.transport.sealing import OVERHEAD
+from holdfast.transport.sealing import KNOWN_AFTER, OVERHEAD
 
 __all__ = [
     "COPY_DELAY_S",
@@ -98,6 +99,10 @@ _SILENCE_IN_PATIENCES: Final = 2.9
 heard; then they take the stream."""
 
 _PROBES_BEFORE_SILENCE: Final = 3
+
+_NEWEST: Final = 4
+_FIRST_PROBES_S: Final = 0.005
+"""In the beginning as many probes as it takes to know whether the way loses any, so far apart."""
 
 _FIRST_GUESS_S: Final = 0.2
 _MARGIN_S: Final = 0.01
@@ -189,7 +194,7 @@ class _Sender:
 
     def __init__(self, ways: Ways) -> None:
         self.ways = ways
-        self.lost_of_ours = 0
+        self.lost_of_ours = 1  # as long as nobody knows
         self._copies: list[tuple[float, int, int, bytes, Callable[[], bool]]] = []
         self._num_copies = 0
         self._budget_bytes = _EXTRA_BURST
@@ -293,6 +298,7 @@ class Questions:
         self._number = 0
         self._probes = 0
         self._probe_at = math.inf
+        self._first_probes = 0
         self._unheard = 0
         self._unheard_since = math.inf
         self.open = False
@@ -325,6 +331,7 @@ class Questions:
         now : float
             Seconds of any clock that never goes back, here and below.
         """
+        self._first_probes = KNOWN_AFTER + _NEWEST
         self.probe(now)
 
     def ask(self, call: int, payload: bytes, now: float) -> None:
@@ -361,6 +368,10 @@ class Questions:
     def probe(self, now: float) -> None:
         """Ask at once whether datagrams get through; the answer shows in ``heard_at``."""
         self._sender.small(_PROBE, _PROBE_HEAD.pack(now))
+        if self._first_probes > 0:
+            self._first_probes -= 1
+            self._probe_at = now + _FIRST_PROBES_S
+            return
         self._probes += 1
         wait_s = self.round_trips.patience_s * 2.0 ** min(self._probes - 1, 10)
         self._probe_at = now + min(_LONGEST_WAIT_S, wait_s)
@@ -382,7 +393,8 @@ class Questions:
             self.heard_at = now
             self.open = True
             self._probes = self._unheard = 0
-            self._probe_at = now + KEEP_ALIVE_S
+            if not self._first_probes:
+                self._probe_at = now + KEEP_ALIVE_S
             self._sender.lost_of_ours = message[1]
         kind, body = message[0], message[2:]
         if kind == _REPLY and len(body) >= _REPLY_HEAD.size:

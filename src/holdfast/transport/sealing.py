@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from cryptography.hazmat.primitives.ciphers.aead import AESGCM
 
 __all__ = [
+    "KNOWN_AFTER",
     "LOSS_SAMPLE",
     "MAX_DATAGRAMS",
     "OVERHEAD",
@@ -58,6 +59,9 @@ WINDOW = 1024
 
 LOSS_SAMPLE = 128
 """Counters over which losses are counted."""
+
+KNOWN_AFTER = 32
+"""Before so many counters have come or been lost, nobody knows whether the way loses any."""
 
 _REORDERED = 3
 """The newest counters may only be late, so they are not counted as lost yet."""
@@ -155,10 +159,13 @@ class ReplayWindow:
 
     @property
     def lost(self) -> int:
-        """How many of the last :data:`LOSS_SAMPLE` counters have not come, the newest left out."""
+        """How many of the last :data:`LOSS_SAMPLE` counters have not come, the newest left out.
+
+        At least 1 as long as there were fewer than :data:`KNOWN_AFTER`.
+        """
         settled = min(LOSS_SAMPLE, max(0, self.newest + 1 - _REORDERED))
         came = (self._seen >> _REORDERED & (1 << LOSS_SAMPLE) - 1).bit_count()
-        return max(0, settled - came)
+        return max(int(settled < KNOWN_AFTER), settled - came)
 
 
 class Sealing:
