@@ -7,37 +7,32 @@ this module imports nothing at its top that takes time, and the options are read
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import gc
 import os
 import signal
 import socket
 import sys
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
-from holdfast.errors import HoldfastError, InvalidValueError, TransportError
+from holdfast.errors import HoldfastError, InvalidValueError
 from holdfast.printable import printable
+from holdfast.service.options import Options, checked_endpoints, options_of_each, parse_options
 
 if TYPE_CHECKING:
     import asyncio
 
     from holdfast.runtime.logs import EventLog
-    from holdfast.service.health import HttpAddress, Watched
     from holdfast.service.metrics import DecisionTimes, Report
     from holdfast.service.shell import ServiceShell
     from holdfast.service.supervisor import Supervised
-    from holdfast.transport.endpoints import Endpoint, TlsFiles
+    from holdfast.transport.endpoints import TlsFiles
     from holdfast.transport.service_end import StreamServiceTransport
 
-__all__ = ["DEFAULT_NAME", "main"]
+__all__ = ["main"]
 
-DEFAULT_NAME = "cloud_active_sensing"
-"""The name of the service in the cloud (the thesis's)."""
-
-_DEFAULT_PLACE = "127.0.0.1:7447"
 _SWITCH_INTERVAL_S = 0.0005
 """How long a thread may hold the interpreter while the one that has the answer waits for it."""
 
@@ -65,7 +60,7 @@ def main(arguments: Sequence[str]) -> int:
     HoldfastError
         If an option cannot be used; the message says which and why.
     """
-    options = _parser().parse_args(arguments)
+    options = parse_options(arguments)
     # Nothing is thrown away while modules are loaded, so there is nothing to look for.
     gc.disable()
     # NumPy's BLAS would start threads that nothing here has work for.
@@ -73,199 +68,14 @@ def main(arguments: Sequence[str]) -> int:
     if options.processes > 1:
         return _serve_with_several(options, arguments)
     if options.supervised is not None:
-        return _serve_supervised(options)
+        return _serve_supervised(options, *options.supervised)
     return _serve(options)
 
 
-class _Parser(argparse.ArgumentParser):
-    """Raises what another one would write as text, with its usage."""
-
-    def error(self, message: str) -> NoReturn:
-        raise InvalidValueError(message.removeprefix("argument "))
-
-
-def _formatter(prog: str) -> argparse.HelpFormatter:
-    """Return what writes the help; it is told its width, and so need not load shutil for that."""
-    columns = 80
-    with contextlib.suppress(OSError):
-        columns = os.get_terminal_size().columns
-    return argparse.HelpFormatter(prog, width=columns - 2)
-
-
-def _parser() -> _Parser:
-    parser = _Parser(
-        formatter_class=_formatter,
-        prog="holdfast serve",
-        description="Decide for robots, as a service: many at once, on all cores.",
-        allow_abbrev=False,
-    )
-    add = parser.add_argument
-    add(
-        "--listen",
-        action="append",
-        default=[],
-        metavar="ENDPOINT",
-        help=f"where robots can connect; may be repeated (default: tcp/{_DEFAULT_PLACE}, "
-        "with --tls over TLS)",
-    )
-    add(
-        "--connect",
-        action="append",
-        default=[],
-        metavar="ENDPOINT",
-        help="a robot that listens; may be repeated. Then nothing listens here unless --listen "
-        "says so",
-    )
-    add("--name", default=DEFAULT_NAME, help=f"name of the service (default: {DEFAULT_NAME})")
-    add(
-        "--tls",
-        type=_directory,
-        metavar="DIR",
-        help="directory with this service's credentials, as 'holdfast keys' makes it; robots must "
-        "have theirs of the same authority",
-    )
-    add(
-        "--insecure",
-        action="store_true",
-        help="allow an address that other machines can reach without --tls: whoever reaches it "
-        "can use the service and read along",
-    )
-    add(
-        "--processes",
-        type=_whole_number(1, 256),
-        default=1,
-        metavar="N",
-        help="processes behind the same address, watched by one more (default: 1)",
-    )
-    add(
-        "--health",
-        type=_http_address,
-        metavar="HOST:PORT",
-        help="answer http://HOST:PORT/livez and /readyz; a PORT alone is one of 127.0.0.1, 0 takes "
-        "a free one",
-    )
-    add(
-        "--metrics",
-        type=_http_address,
-        metavar="HOST:PORT",
-        help="offer metrics for Prometheus at http://HOST:PORT/metrics, which may be the address "
-        "of --health, too",
-    )
-    add(
-        "--log",
-        choices=("text", "json"),
-        default="text",
-        help="form of the ready line and of the log on standard error (default: text)",
-    )
-    add(
-        "--workers",
-        type=_whole_number(1, 256),
-        metavar="N",
-        help="decisions that each process computes at a time (default: its share of the cores)",
-    )
-    add(
-        "--lease-ms",
-        type=_number(50.0, 60_000.0),
-        default=400.0,
-        metavar="MS",
-        help="robots give up this service when nothing comes from it for this long (default: 400); "
-        "how long a robot may be silent, the robot says: offload.lease_ms",
-    )
-    add(
-        "--max-sessions",
-        type=_whole_number(1, 1_000_000),
-        metavar="N",
-        help="robots that each process remembers; the one unused the longest is forgotten first "
-        "(default: 1000)",
-    )
-    add(
-        "--drain-s",
-        type=_number(0.0, 3600.0),
-        default=5.0,
-        metavar="S",
-        help="after SIGTERM, time for the answers that are owed (default: 5)",
-    )
-    add(
-        "--max-sessions-per-robot",
-        type=_whole_number(1, 1_000_000),
-        metavar="N",
-        help="runs remembered of those that use the certificate of one robot (default: as many as "
-        "there is room for)",
-    )
-    add(
-        "--problem",
-        action="append",
-        default=[],
-        metavar="NAME",
-        help="a problem to have loaded from the start; one of your own, module:Class, is only "
-        "served if it is named here. May be repeated",
-    )
-    add(
-        "--problem-directory",
-        type=_directory,
-        metavar="DIR",
-        help="where the modules of --problem are looked for first (default: the current directory)",
-    )
-    add(
-        "--until-stdin-closes",
-        action="store_true",
-        help="stop when standard input ends, as it does when the process that started this one "
-        "dies",
-    )
-    # For the processes that a supervisor starts: its number, and the descriptors that they inherit.
-    add("--supervised", type=_whole_numbers, help=argparse.SUPPRESS)
-    add("--sockets", type=_whole_numbers, default=[], help=argparse.SUPPRESS)
-    return parser
-
-
-def _whole_number(least: int, most: int) -> type[int]:
-    def number(text: str) -> int:
-        with contextlib.suppress(ValueError):
-            if least <= int(text) <= most:
-                return int(text)
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from {least} to {most}")
-
-    return number  # type: ignore[return-value]
-
-
-def _number(least: float, most: float) -> type[float]:
-    def number(text: str) -> float:
-        with contextlib.suppress(ValueError):
-            if least <= float(text) <= most:
-                return float(text)
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number from {least:g} to {most:g}")
-
-    return number  # type: ignore[return-value]
-
-
-def _directory(text: str) -> Path:
-    if not text:
-        raise argparse.ArgumentTypeError("'' is no path (. is the current directory)")
-    return Path(text)
-
-
-def _http_address(text: str) -> HttpAddress:
-    from holdfast.service.health import HealthError, parse_http_address
-
-    try:
-        return parse_http_address(text)
-    except HealthError as error:
-        raise argparse.ArgumentTypeError(str(error)) from error
-
-
-def _whole_numbers(text: str) -> list[int]:
-    return [int(word) for word in text.split(",")]
-
-
-def _serve_with_several(options: argparse.Namespace, arguments: Sequence[str]) -> int:
+def _serve_with_several(options: Options, arguments: Sequence[str]) -> int:
     """Watch several processes that serve, each with the same options but for the supervisor's."""
-    for option, given in (
-        ("--connect", options.connect),
-        ("--until-stdin-closes", options.until_stdin_closes),
-    ):
-        if given:
-            raise InvalidValueError(f"{option}: goes with one process only, not with --processes")
-    listen, _ = _checked_endpoints(options, _credentials(options))
+    _credentials(options)
+    listen = checked_endpoints(options)
 
     import asyncio
 
@@ -273,45 +83,30 @@ def _serve_with_several(options: argparse.Namespace, arguments: Sequence[str]) -
     from holdfast.service.listening import SharedEndpoints
     from holdfast.service.supervisor import Supervisor, supervise
 
-    own = _Parser(allow_abbrev=False, add_help=False)
-    for option in ("--listen", "--processes", "--health", "--metrics", "--workers"):
-        own.add_argument(option)
-    _, others = own.parse_known_args(arguments)
     workers = options.workers or max(1, len(os.sched_getaffinity(0)) // options.processes)
     shared = SharedEndpoints(listen)
     events = EventLog(sys.stderr, format=options.log, component=options.name)
     endpoints = [str(endpoint) for endpoint in shared.endpoints]
+    of_each = [*options_of_each(arguments), f"--workers={workers}"]
+    of_each += [f"--listen={endpoint}" for endpoint in endpoints]
 
     async def run() -> int:
-        supervisor = Supervisor(
-            [*others, f"--workers={workers}", *(f"--listen={each}" for each in endpoints)],
-            options.processes,
-            shared,
-            events,
-        )
-        watched = _watched(
+        supervisor = Supervisor(of_each, options.processes, shared, events)
+        async with _watched(
             options,
             supervisor.why_not_alive,
             supervisor.why_not_ready,
             supervisor.report,
             supervisor.process_ids,
-        )
-        where: dict[str, object] = {"listen": endpoints, "processes": options.processes}
-        try:
-            where.update(await watched.start())
+        ) as watched:
+            where = {"listen": endpoints, "processes": options.processes, **watched}
             return await supervise(
                 supervisor,
                 events,
-                [
-                    number
-                    for number in _handled_signals()
-                    if options.tls is None or number != signal.SIGHUP
-                ],
+                options.ending_signals,
                 options.drain_s + 2 * _CLOSE_TIMEOUT_S,
-                lambda: _say_ready(options, None, where),
+                lambda: _say_ready(options, where),
             )
-        finally:
-            watched.close()
 
     try:
         return _exit_status(signal.Signals(asyncio.run(run())).name)
@@ -320,12 +115,11 @@ def _serve_with_several(options: argparse.Namespace, arguments: Sequence[str]) -
         events.close()
 
 
-def _serve_supervised(options: argparse.Namespace) -> int:
+def _serve_supervised(options: Options, parent: int, descriptor: int) -> int:
     """Be one of several processes, and end with the one that watches them."""
     from holdfast.runtime.leash import end_with_parent
     from holdfast.service.supervisor import Supervised
 
-    parent, descriptor = options.supervised
     end_with_parent(parent)
     supervised = Supervised(descriptor)
     try:
@@ -338,67 +132,12 @@ def _serve_supervised(options: argparse.Namespace) -> int:
         return 2
 
 
-def _credentials(options: argparse.Namespace) -> TlsFiles | None:
-    if options.tls is None:
-        return None
-    from holdfast.transport.credentials import load_credentials
-
-    return load_credentials(options.tls, "service", warn=lambda text: _warn(options, text))
-
-
-def _checked_endpoints(
-    options: argparse.Namespace, tls: TlsFiles | None
-) -> tuple[list[Endpoint], list[Endpoint]]:
-    """Return where to listen and where to connect."""
-    from holdfast.transport.endpoints import parse_endpoint
-
-    if not options.listen and not options.connect:
-        options.listen = [f"{'tcp' if tls is None else 'tls'}/{_DEFAULT_PLACE}"]
-    listen, connect = (
-        [parse_endpoint(text) for text in texts] for texts in (options.listen, options.connect)
-    )
-    for endpoint in (*listen, *connect):
-        _check_safe(endpoint, tls, insecure=options.insecure)
-    return listen, connect
-
-
-def _watched(
-    options: argparse.Namespace,
-    why_not_alive: Callable[[], str | None],
-    why_not_ready: Callable[[], str | None],
-    report: Callable[[], Awaitable[Report]],
-    processes: Callable[[], Sequence[int]] = lambda: (os.getpid(),),
-) -> Watched:
-    """Return what --health and --metrics ask for."""
-    from holdfast.service.health import Page, Watched
-
-    async def alive() -> Page:
-        return Page.of(why_not_alive())
-
-    async def ready() -> Page:
-        return Page.of(why_not_ready())
-
-    watched = Watched()
-    if options.health is not None:
-        watched.add("health", options.health, {"/livez": alive, "/readyz": ready})
-    if options.metrics is not None:
-        from holdfast.service.metrics import CONTENT_TYPE, Exposition
-
-        exposition = Exposition(options.name, processes)
-
-        async def metrics() -> Page:
-            return Page(200, exposition.text(await report()), CONTENT_TYPE)
-
-        watched.add("metrics", options.metrics, {"/metrics": metrics})
-    return watched
-
-
-def _serve(options: argparse.Namespace, supervised: Supervised | None = None) -> int:
+def _serve(options: Options, supervised: Supervised | None = None) -> int:
     if options.until_stdin_closes and sys.stdin is None:
         raise InvalidValueError("--until-stdin-closes: this process has no standard input")
     # In the order in which they are needed, so that a mistake in the options is told at once.
     tls = _credentials(options)
-    _checked_endpoints(options, tls)
+    checked_endpoints(options)
 
     if tls is None:
         _import_without_openssl()
@@ -459,24 +198,8 @@ def _serve(options: argparse.Namespace, supervised: Supervised | None = None) ->
     return status
 
 
-def _import_without_openssl() -> None:
-    """Load asyncio and hashlib as they are where there is no OpenSSL, which takes long to load.
-
-    Neither needs it here: the links do TLS by themselves, and the digests are Python's own.
-    """
-    hidden = [name for name in ("ssl", "_hashlib") if name not in sys.modules]
-    for name in hidden:
-        sys.modules[name] = None  # type: ignore[assignment]
-    try:
-        import asyncio  # noqa: F401
-        import hashlib  # noqa: F401
-    finally:
-        for name in hidden:
-            del sys.modules[name]
-
-
 async def _run(
-    options: argparse.Namespace,
+    options: Options,
     boot: str,
     transport: StreamServiceTransport,
     shell: ServiceShell,
@@ -495,75 +218,122 @@ async def _run(
     def why_not_ready() -> str | None:
         return "draining" if shell.is_draining else None if is_serving else "starting"
 
-    async def report() -> Report:
+    def report() -> Report:
         return Report(shell.statistics(), times)
 
-    watched = _watched(options, lambda: None, why_not_ready, report)
-    try:
-        where: dict[str, object] = dict(await watched.start())
-        for number in _handled_signals():
-            loop.add_signal_handler(number, shell.stop, number.name)
-        if options.tls is not None:
-            loop.add_signal_handler(signal.SIGHUP, _reload, options, transport, events)
-        await shell.start()
-        if options.until_stdin_closes:
-            _watch_stdin(loop, shell)
-        # What was loaded stays; the collector need never look at it again.
-        gc.freeze()
-        gc.set_threshold(_BETWEEN_COLLECTIONS)
-        gc.enable()
-        is_serving = True
-        if supervised is None:
-            where["listen"] = list(transport.endpoints)
-            if options.connect:
-                where["connect"] = options.connect
-            _say_ready(options, boot, where)
+    async def reported() -> Report:
+        return report()
+
+    def reload() -> None:
+        try:
+            _credentials(options)  # it knows more of what can be wrong with them
+            ended = transport.reload_credentials()
+        except HoldfastError as error:
+            events.event("credentials", reason=f"{error}; those of before stay in use")
         else:
-            supervised.start(
-                lambda: Report(shell.statistics(), times),
-                lambda: shell.stop("the supervisor is gone"),
-            )
-        reason = await shell.wait()
-        if supervised is None:
-            events.event("stopping", reason=reason)
-        else:
-            supervised.not_ready()
-        if reason == signal.SIGTERM.name:
-            draining = loop.create_task(shell.drain(options.drain_s))
-            for number in _handled_signals():
-                if options.tls is None or number != signal.SIGHUP:
+            events.event("credentials_reloaded", links_ended=ended)
+
+    async with _watched(options, lambda: None, why_not_ready, reported) as watched:
+        try:
+            for number in options.ending_signals:
+                loop.add_signal_handler(number, shell.stop, number.name)
+            if options.tls is not None:
+                loop.add_signal_handler(signal.SIGHUP, reload)
+            await shell.start()
+            if options.until_stdin_closes:
+                _watch_stdin(loop, shell)
+            # What was loaded stays; the collector need never look at it again.
+            gc.freeze()
+            gc.set_threshold(_BETWEEN_COLLECTIONS)
+            gc.enable()
+            is_serving = True
+            if supervised is None:
+                where: dict[str, object] = {"boot": boot, **watched}
+                where["listen"] = list(transport.endpoints)
+                if options.connect:
+                    where["connect"] = options.connect
+                _say_ready(options, where)
+            else:
+                supervised.start(report, lambda: shell.stop("the supervisor is gone"))
+            reason = await shell.wait()
+            if supervised is None:
+                events.event("stopping", reason=reason)
+            else:
+                supervised.not_ready()
+            if reason == signal.SIGTERM.name:
+                draining = loop.create_task(shell.drain(options.drain_s))
+                for number in options.ending_signals:
                     loop.add_signal_handler(number, draining.cancel)
-            await asyncio.wait((draining,))
-    finally:
-        await shell.close(_CLOSE_TIMEOUT_S)
-        watched.close()
-        if supervised is not None:
-            supervised.close()
+                await asyncio.wait((draining,))
+        finally:
+            await shell.close(_CLOSE_TIMEOUT_S)
+            if supervised is not None:
+                supervised.close()
     return _exit_status(reason)
 
 
-def _reload(
-    options: argparse.Namespace, transport: StreamServiceTransport, events: EventLog
-) -> None:
-    """Read the credentials and the list of what is revoked again."""
+def _credentials(options: Options) -> TlsFiles | None:
+    if options.tls is None:
+        return None
+    from holdfast.transport.credentials import load_credentials
+
+    return load_credentials(options.tls, "service", warn=lambda text: _warn(options, text))
+
+
+@contextlib.asynccontextmanager
+async def _watched(
+    options: Options,
+    why_not_alive: Callable[[], str | None],
+    why_not_ready: Callable[[], str | None],
+    report: Callable[[], Awaitable[Report]],
+    processes: Callable[[], Sequence[int]] = lambda: (os.getpid(),),
+) -> AsyncIterator[dict[str, str]]:
+    """Answer what --health and --metrics ask for; give where."""
+    from holdfast.service.health import Page, Watched
+
+    async def alive() -> Page:
+        return Page.of(why_not_alive())
+
+    async def ready() -> Page:
+        return Page.of(why_not_ready())
+
+    watched = Watched()
+    if options.health is not None:
+        watched.add("health", options.health, {"/livez": alive, "/readyz": ready})
+    if options.metrics is not None:
+        from holdfast.service.metrics import CONTENT_TYPE, Exposition
+
+        exposition = Exposition(options.name, processes)
+
+        async def metrics() -> Page:
+            return Page(200, exposition.text(await report()), CONTENT_TYPE)
+
+        watched.add("metrics", options.metrics, {"/metrics": metrics})
     try:
-        _credentials(options)  # it knows more of what can be wrong with them
-        ended = transport.reload_credentials()
-    except HoldfastError as error:
-        events.event("credentials", reason=f"{error}; those of before stay in use")
-    else:
-        events.event("credentials_reloaded", links_ended=ended)
+        yield await watched.start()
+    finally:
+        watched.close()
+
+
+def _import_without_openssl() -> None:
+    """Load asyncio and hashlib as they are where there is no OpenSSL, which takes long to load.
+
+    Neither needs it here: the links do TLS by themselves, and the digests are Python's own.
+    """
+    hidden = [name for name in ("ssl", "_hashlib") if name not in sys.modules]
+    for name in hidden:
+        sys.modules[name] = None  # type: ignore[assignment]
+    try:
+        import asyncio  # noqa: F401
+        import hashlib  # noqa: F401
+    finally:
+        for name in hidden:
+            del sys.modules[name]
 
 
 def _exit_status(reason: str) -> int:
     number = getattr(signal, reason, signal.SIGTERM)
     return 0 if number == signal.SIGTERM else 128 + int(number)
-
-
-def _handled_signals() -> list[signal.Signals]:
-    """Return the signals that end a service; whoever started it may have them ignored."""
-    ending = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-    return [number for number in ending if signal.getsignal(number) is not signal.SIG_IGN]
 
 
 def _watch_stdin(loop: asyncio.AbstractEventLoop, shell: ServiceShell) -> None:
@@ -588,20 +358,7 @@ def _end_at_once(status: int) -> NoReturn:
     os._exit(status)
 
 
-def _check_safe(endpoint: Endpoint, tls: TlsFiles | None, *, insecure: bool) -> None:
-    """Refuse an address that other machines can reach, unless they have to prove who they are."""
-    if endpoint.is_loopback or insecure or (endpoint.is_encrypted and tls is not None):
-        return
-    if endpoint.is_encrypted:
-        return  # the transport says that credentials are missing
-    raise TransportError(
-        f"endpoint {endpoint}: other machines can reach it, and nobody there has to prove who he "
-        f"is; use tls/... or udp/... with --tls DIR ('holdfast keys DIR' makes the credentials), "
-        f"an address of this machine alone, as in tcp/{_DEFAULT_PLACE}, or say --insecure"
-    )
-
-
-def _warn(options: argparse.Namespace, text: str) -> None:
+def _warn(options: Options, text: str) -> None:
     if options.log == "json":
         from holdfast.runtime.logs import tell_event
 
@@ -610,16 +367,12 @@ def _warn(options: argparse.Namespace, text: str) -> None:
         sys.stderr.write(f"holdfast serve: warning: {printable(text)}\n")
 
 
-def _say_ready(options: argparse.Namespace, boot: str | None, where: dict[str, object]) -> None:
+def _say_ready(options: Options, where: Mapping[str, object]) -> None:
     if options.log == "json":
         from holdfast.runtime.logs import EventLog
 
         EventLog(sys.stdout, format="json", component=options.name).event(
-            "ready",
-            service=options.name,
-            pid=os.getpid(),
-            **({} if boot is None else {"boot": boot}),
-            **where,
+            "ready", service=options.name, pid=os.getpid(), **where
         )
         return
     parts = [

@@ -1,0 +1,298 @@
+"""The options of ``holdfast serve``, read before anything that takes time is loaded."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+import signal
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal, NoReturn
+
+from holdfast.errors import InvalidValueError, TransportError
+
+if TYPE_CHECKING:
+    from holdfast.service.health import HttpAddress
+    from holdfast.transport.endpoints import Endpoint
+
+__all__ = ["DEFAULT_NAME", "Options", "checked_endpoints", "options_of_each", "parse_options"]
+
+DEFAULT_NAME = "cloud_active_sensing"
+"""The name of the service in the cloud (the thesis's)."""
+
+_DEFAULT_PLACE = "127.0.0.1:7447"
+
+_OF_THE_SUPERVISOR = ("--listen", "--processes", "--health", "--metrics", "--workers")
+"""Options that the processes of a service do not get as they were given."""
+
+
+class Options(argparse.Namespace):
+    """What was given, or its default; ``--help`` says what each means."""
+
+    listen: list[str]
+    connect: list[str]
+    name: str
+    tls: Path | None
+    insecure: bool
+    processes: int
+    health: HttpAddress | None
+    metrics: HttpAddress | None
+    log: Literal["text", "json"]
+    workers: int | None
+    lease_ms: float
+    max_sessions: int | None
+    drain_s: float
+    max_sessions_per_robot: int | None
+    problem: list[str]
+    problem_directory: Path | None
+    until_stdin_closes: bool
+    supervised: tuple[int, int] | None
+    sockets: list[int]
+
+    @property
+    def ending_signals(self) -> list[signal.Signals]:
+        """Those that end a service; whoever started it may have them ignored.
+
+        With credentials, SIGHUP has them read again instead.
+        """
+        ending = [signal.SIGINT, signal.SIGTERM, *([] if self.tls else [signal.SIGHUP])]
+        return [number for number in ending if signal.getsignal(number) is not signal.SIG_IGN]
+
+
+def parse_options(arguments: Sequence[str]) -> Options:
+    """Read what follows ``serve`` on the command line.
+
+    Raises
+    ------
+    InvalidValueError
+        If an option cannot be used, or two do not go together.
+    """
+    options = _parser().parse_args(arguments, Options())
+    if options.processes > 1:
+        for option, given in (
+            ("--connect", options.connect),
+            ("--until-stdin-closes", options.until_stdin_closes),
+        ):
+            if given:
+                raise InvalidValueError(
+                    f"{option}: goes with one process only, not with --processes"
+                )
+    if not options.listen and not options.connect:
+        options.listen = [f"{'tls' if options.tls else 'tcp'}/{_DEFAULT_PLACE}"]
+    return options
+
+
+def options_of_each(arguments: Sequence[str]) -> list[str]:
+    """Return which of the options given hold for each process of a service as they are."""
+    own = _Parser(allow_abbrev=False, add_help=False)
+    for option in _OF_THE_SUPERVISOR:
+        own.add_argument(option)
+    _, others = own.parse_known_args(arguments)
+    return others
+
+
+def checked_endpoints(options: Options) -> list[Endpoint]:
+    """Return where to listen.
+
+    Raises
+    ------
+    TransportError
+        If an endpoint is malformed, or is one that other machines can reach although they do not
+        have to prove who they are.
+    """
+    from holdfast.transport.endpoints import parse_endpoint
+
+    listen, connect = (
+        [parse_endpoint(text) for text in texts] for texts in (options.listen, options.connect)
+    )
+    for endpoint in (*listen, *connect):
+        # Of an encrypted one without credentials the transport says that they are missing.
+        if not (endpoint.is_loopback or options.insecure or endpoint.is_encrypted):
+            raise TransportError(
+                f"endpoint {endpoint}: other machines can reach it, and nobody there has to prove "
+                f"who he is; use tls/... or udp/... with --tls DIR ('holdfast keys DIR' makes the "
+                f"credentials), an address of this machine alone, as in tcp/{_DEFAULT_PLACE}, or "
+                f"say --insecure"
+            )
+    return listen
+
+
+class _Parser(argparse.ArgumentParser):
+    """Raises what another one would write as text, with its usage."""
+
+    def error(self, message: str) -> NoReturn:
+        raise InvalidValueError(message.removeprefix("argument "))
+
+
+def _formatter(prog: str) -> argparse.HelpFormatter:
+    """Return what writes the help; it is told its width, and so need not load shutil for that."""
+    columns = 80
+    with contextlib.suppress(OSError):
+        columns = os.get_terminal_size().columns
+    return argparse.HelpFormatter(prog, width=columns - 2)
+
+
+def _parser() -> _Parser:
+    parser = _Parser(
+        formatter_class=_formatter,
+        prog="holdfast serve",
+        description="Decide for robots, as a service: many at once, on all cores.",
+        allow_abbrev=False,
+    )
+    add = parser.add_argument
+    add(
+        "--listen",
+        action="append",
+        default=[],
+        metavar="ENDPOINT",
+        help=f"where robots can connect; may be repeated (default: tcp/{_DEFAULT_PLACE}, "
+        "with --tls over TLS)",
+    )
+    add(
+        "--connect",
+        action="append",
+        default=[],
+        metavar="ENDPOINT",
+        help="a robot that listens; may be repeated. Then nothing listens here unless --listen "
+        "says so",
+    )
+    add("--name", default=DEFAULT_NAME, help=f"name of the service (default: {DEFAULT_NAME})")
+    add(
+        "--tls",
+        type=_directory,
+        metavar="DIR",
+        help="directory with this service's credentials, as 'holdfast keys' makes it; robots must "
+        "have theirs of the same authority",
+    )
+    add(
+        "--insecure",
+        action="store_true",
+        help="allow an address that other machines can reach without --tls: whoever reaches it "
+        "can use the service and read along",
+    )
+    add(
+        "--processes",
+        type=_whole_number(1, 256),
+        default=1,
+        metavar="N",
+        help="processes behind the same address, watched by one more (default: 1)",
+    )
+    add(
+        "--health",
+        type=_http_address,
+        metavar="HOST:PORT",
+        help="answer http://HOST:PORT/livez and /readyz; a PORT alone is one of 127.0.0.1, 0 takes "
+        "a free one",
+    )
+    add(
+        "--metrics",
+        type=_http_address,
+        metavar="HOST:PORT",
+        help="offer metrics for Prometheus at http://HOST:PORT/metrics, which may be the address "
+        "of --health, too",
+    )
+    add(
+        "--log",
+        choices=("text", "json"),
+        default="text",
+        help="form of the ready line and of the log on standard error (default: text)",
+    )
+    add(
+        "--workers",
+        type=_whole_number(1, 256),
+        metavar="N",
+        help="decisions that each process computes at a time (default: its share of the cores)",
+    )
+    add(
+        "--lease-ms",
+        type=_number(50.0, 60_000.0),
+        default=400.0,
+        metavar="MS",
+        help="robots give up this service when nothing comes from it for this long (default: 400); "
+        "how long a robot may be silent, the robot says: offload.lease_ms",
+    )
+    add(
+        "--max-sessions",
+        type=_whole_number(1, 1_000_000),
+        metavar="N",
+        help="robots that each process remembers; the one unused the longest is forgotten first "
+        "(default: 1000)",
+    )
+    add(
+        "--drain-s",
+        type=_number(0.0, 3600.0),
+        default=5.0,
+        metavar="S",
+        help="after SIGTERM, time for the answers that are owed (default: 5)",
+    )
+    add(
+        "--max-sessions-per-robot",
+        type=_whole_number(1, 1_000_000),
+        metavar="N",
+        help="runs remembered of those that use the certificate of one robot (default: as many as "
+        "there is room for)",
+    )
+    add(
+        "--problem",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="a problem to have loaded from the start; one of your own, module:Class, is only "
+        "served if it is named here. May be repeated",
+    )
+    add(
+        "--problem-directory",
+        type=_directory,
+        metavar="DIR",
+        help="where the modules of --problem are looked for first (default: the current directory)",
+    )
+    add(
+        "--until-stdin-closes",
+        action="store_true",
+        help="stop when standard input ends, as it does when the process that started this one "
+        "dies",
+    )
+    # For the processes that a supervisor starts: its number, and the descriptors that they inherit.
+    add("--supervised", type=_whole_numbers, help=argparse.SUPPRESS)
+    add("--sockets", type=_whole_numbers, default=[], help=argparse.SUPPRESS)
+    return parser
+
+
+def _whole_number(least: int, most: int) -> type[int]:
+    def number(text: str) -> int:
+        with contextlib.suppress(ValueError):
+            if least <= int(text) <= most:
+                return int(text)
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from {least} to {most}")
+
+    return number  # type: ignore[return-value]
+
+
+def _number(least: float, most: float) -> type[float]:
+    def number(text: str) -> float:
+        with contextlib.suppress(ValueError):
+            if least <= float(text) <= most:
+                return float(text)
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number from {least:g} to {most:g}")
+
+    return number  # type: ignore[return-value]
+
+
+def _directory(text: str) -> Path:
+    if not text:
+        raise argparse.ArgumentTypeError("'' is no path (. is the current directory)")
+    return Path(text)
+
+
+def _http_address(text: str) -> HttpAddress:
+    from holdfast.service.health import HealthError, parse_http_address
+
+    try:
+        return parse_http_address(text)
+    except HealthError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
+
+
+def _whole_numbers(text: str) -> list[int]:
+    return [int(word) for word in text.split(",")]
