@@ -65,7 +65,10 @@ def why_unreachable(endpoint: str, tls_files: TlsFiles | None, timeout_s: float)
         return None
     try:
         if place.is_local_socket:
-            return _connect_local(place, timeout_s)
+            with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as plain:
+                plain.settimeout(timeout_s)
+                plain.connect(place.host)
+            return None
         try:
             socket.getaddrinfo(place.host, place.port, type=socket.SOCK_STREAM)
         except (socket.gaierror, UnicodeError):
@@ -75,7 +78,7 @@ def why_unreachable(endpoint: str, tls_files: TlsFiles | None, timeout_s: float)
             if wrong is not None:
                 return wrong
         with socket.create_connection((place.host, place.port), timeout_s) as plain:
-            if not place.is_encrypted:
+            if not place.is_encrypted or tls_files is None:
                 return None
             return _shake_hands(plain, place, tls_files, timeout_s)
     except TimeoutError:
@@ -173,39 +176,25 @@ def _unexplained(service: str) -> str:
     )
 
 
-def _connect_local(place: Endpoint, timeout_s: float) -> str | None:
-    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as plain:
-        plain.settimeout(timeout_s)
-        plain.connect(place.host)
-    return None
-
-
 def _own_credentials(files: TlsFiles) -> str | None:
     """Look at the robot's credentials once more: a certificate may have expired during the run."""
     from holdfast.transport.credentials import CredentialsError, load_credentials
 
     try:
-        load_credentials(files.certificate.parent, "robot", warn=_ignore)
+        load_credentials(files.certificate.parent, "robot", warn=lambda _: None)
     except CredentialsError as error:
         return f"this robot's credentials: {error}"
     return None
 
 
-def _ignore(text: str) -> None:
-    """Leave out a warning; it was given when the run began."""
-    del text
-
-
 def _shake_hands(
-    plain: socket.socket, place: Endpoint, files: TlsFiles | None, timeout_s: float
+    plain: socket.socket, place: Endpoint, files: TlsFiles, timeout_s: float
 ) -> str | None:
     import ssl
 
-    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
-    context.minimum_version = ssl.TLSVersion.TLSv1_3
-    if files is not None:
-        context.load_verify_locations(cafile=files.authority)
-        context.load_cert_chain(files.certificate, files.key, password="")
+    from holdfast.transport.tls import client_context
+
+    context = client_context(files)
     try:
         with context.wrap_socket(plain, server_hostname=place.host) as secure:
             secure.settimeout(min(timeout_s, _REFUSAL_S))
