@@ -1379,6 +1379,18 @@ class TestCertificates:
         with pytest.raises(ssl.SSLError, match="PROTOCOL_VERSION"):
             await asyncio.open_connection(host, int(port), ssl=context)
 
+    @pytest.mark.parametrize("group", ["ffdhe8192", "secp521r1"])
+    async def test_nobody_chooses_a_key_exchange_that_takes_long(
+        self, tls: StreamWire, group: str
+    ) -> None:
+        await tls.service("cloud", "b1").start(echo)
+        assert tls.robot_tls is not None
+        context = client_context(tls.robot_tls)
+        context.set_ecdh_curve(group)
+        host, _, port = tls.endpoint("cloud").removeprefix("tls/").rpartition(":")
+        with pytest.raises(ssl.SSLError, match="HANDSHAKE_FAILURE"):
+            await asyncio.open_connection(host, int(port), ssl=context)
+
     @staticmethod
     async def assert_refused(tls: StreamWire, reason: str) -> None:
         await tls.service("cloud", "b1").start(echo)
