@@ -21,10 +21,10 @@ from benchmarks.processes import ServiceProcess
 from benchmarks.report import Bar, Result, Table, milliseconds, paragraph
 from benchmarks.robots import configuration_for
 from benchmarks.turns import Asker, Turn, recorded_turns
-from holdfast.transport.key_ring import make_credentials
 from holdfast.runtime.robot_process import opening_of
 from holdfast.session.messages import Opening
 from holdfast.transport.endpoints import TlsFiles
+from holdfast.transport.key_ring import make_credentials
 
 __all__ = ["neighbours"]
 
