@@ -37,7 +37,6 @@ REAL = (
     "experiments/test_thesis_chapter_6.py::test_over_a_proxy",
     "experiments/test_thesis_chapter_6.py::test_really",
     "fuzz/test_fuzz_processes.py",
-    "unit/test_chaos_datagrams.py::TestDatagramProxy",
     "unit/test_chaos_namespace.py",
     "unit/test_chaos_processes.py",
     "unit/test_chaos_proxy.py",

@@ -28,6 +28,7 @@ KEYS = [
 ]
 # Where a value next to the default would not do.
 CHOSEN = {
+    "offload.name": "anna",
     "offload.services": ["tcp/127.0.0.1:7001"],
     "offload.decision_deadline_ms": 17,
     "offload.tls": "credentials",
