@@ -584,18 +584,19 @@ class TestOnRealLinks:
         assert right == [Replied(1, b"robot: cba"), Ended(1)]
 
 
-class TestCommand:
-    def run(self, *arguments: str) -> subprocess.CompletedProcess[str]:
-        return subprocess.run(
-            [sys.executable, "-m", "holdfast", "keys", *arguments],
-            capture_output=True,
-            text=True,
-            timeout=60,
-        )
+def run_keys(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "holdfast", "keys", *arguments],
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
 
+
+class TestCommand:
     def test_it_makes_keys_and_says_what_goes_where(self, tmp_path: Path) -> None:
         home = tmp_path / "keys"
-        done = self.run(str(home), "--host", "10.0.0.7", "--days", "30")
+        done = run_keys(str(home), "--host", "10.0.0.7", "--days", "30")
         assert (done.returncode, done.stderr) == (0, "")
         assert f"{home / 'authority' / 'authority.key'} stays here" in done.stdout
         assert f"--tls {home / 'service'}" in done.stdout
@@ -604,21 +605,21 @@ class TestCommand:
         load_credentials(home / "service", "service")
 
     def test_again_it_refuses_and_renews_if_told_to(self, tmp_path: Path) -> None:
-        assert self.run(str(tmp_path)).returncode == 0
-        done = self.run(str(tmp_path))
+        assert run_keys(str(tmp_path)).returncode == 0
+        done = run_keys(str(tmp_path))
         assert done.returncode == 2
         assert done.stderr.startswith("holdfast: error: ")
         assert "service/certificate.pem: exists already" in done.stderr
-        done = self.run(str(tmp_path), "--renew")
+        done = run_keys(str(tmp_path), "--renew")
         assert done.returncode == 0
         assert f"{tmp_path / 'robot' / 'certificate.pem'} for robot 'robot'" in done.stdout
 
     def test_names_are_repeated_options(self, tmp_path: Path) -> None:
-        done = self.run(str(tmp_path), "--robot", "a", "--robot", "b", "--service", "c")
+        done = run_keys(str(tmp_path), "--robot", "a", "--robot", "b", "--service", "c")
         assert done.returncode == 0
         assert {path.name for path in tmp_path.iterdir()} == {"authority", "a", "b", "c"}
 
     def test_the_default_of_days_is_the_librarys(self) -> None:
         from holdfast.transport.key_ring import DEFAULT_DAYS
 
-        assert f"[default: {DEFAULT_DAYS}]" in self.run("--help").stdout
+        assert f"[default: {DEFAULT_DAYS}]" in run_keys("--help").stdout

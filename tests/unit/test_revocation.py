@@ -5,8 +5,6 @@ from __future__ import annotations
 import base64
 import shutil
 import ssl
-import subprocess
-import sys
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -18,6 +16,7 @@ from cryptography.hazmat.primitives.serialization import Encoding
 from cryptography.x509.oid import NameOID
 from hypothesis import given
 from hypothesis import strategies as st
+from tests.unit.test_credentials import run_keys
 
 from holdfast.errors import TransportError
 from holdfast.transport.credentials import CredentialsError, Role, load_credentials
@@ -49,6 +48,15 @@ def contents_of(directory: Path) -> dict[str, bytes]:
 def home(tmp_path: Path) -> Path:
     make_credentials(tmp_path, robots=["anna", "berta"], services=["cloud"])
     return tmp_path
+
+
+@pytest.fixture(scope="module")
+def foreign_list(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The list of another authority."""
+    other = tmp_path_factory.mktemp("other")
+    make_credentials(other)
+    revoke_credentials(other, names=["robot"])
+    return other / "authority" / REVOKED_FILE
 
 
 class TestRevoking:
@@ -143,12 +151,9 @@ class TestRevoking:
             revoke_credentials(home, names=["anna"])
 
     def test_a_list_of_another_authority_is_not_gone_on_with(
-        self, home: Path, tmp_path_factory: pytest.TempPathFactory
+        self, home: Path, foreign_list: Path
     ) -> None:
-        other = tmp_path_factory.mktemp("other")
-        make_credentials(other)
-        revoke_credentials(other, names=["robot"])
-        shutil.copy(other / "authority" / REVOKED_FILE, home / "authority" / REVOKED_FILE)
+        shutil.copy(foreign_list, home / "authority" / REVOKED_FILE)
         with pytest.raises(CredentialsError, match=r"revoked\.pem: was not signed by"):
             revoke_credentials(home, names=["anna"])
 
@@ -274,13 +279,8 @@ class TestLoading:
         load_credentials(home / "berta", "robot")
         load_credentials(home / "cloud", "service")
 
-    def test_a_list_of_another_authority(
-        self, home: Path, tmp_path_factory: pytest.TempPathFactory
-    ) -> None:
-        other = tmp_path_factory.mktemp("other")
-        make_credentials(other)
-        revoke_credentials(other, names=["robot"])
-        shutil.copy(other / "robot" / REVOKED_FILE, home / "cloud" / REVOKED_FILE)
+    def test_a_list_of_another_authority(self, home: Path, foreign_list: Path) -> None:
+        shutil.copy(foreign_list, home / "cloud" / REVOKED_FILE)
         with pytest.raises(CredentialsError, match=r"revoked\.pem: is not of the authority"):
             load_credentials(home / "cloud", "service")
 
@@ -386,29 +386,21 @@ class TestReading:
 
 
 class TestCommand:
-    def run(self, *arguments: str) -> subprocess.CompletedProcess[str]:
-        return subprocess.run(
-            [sys.executable, "-m", "holdfast", "keys", *arguments],
-            capture_output=True,
-            text=True,
-            timeout=60,
-        )
-
     def test_it_revokes_and_makes_nothing(self, tmp_path: Path) -> None:
         make_credentials(tmp_path, robots=["anna"], services=["cloud"])
-        done = self.run(str(tmp_path), "--revoke", "anna")
+        done = run_keys(str(tmp_path), "--revoke", "anna")
         assert (done.returncode, done.stderr) == (0, "")
         assert f"revoked: {serial_of(tmp_path / 'anna'):040x}, robot 'anna'" in done.stdout
         assert "SIGHUP" in done.stdout
         assert {path.name for path in tmp_path.iterdir()} == {"authority", "anna", "cloud"}
-        again = self.run(str(tmp_path), "--revoke", "anna")
+        again = run_keys(str(tmp_path), "--revoke", "anna")
         assert again.returncode == 0
         assert "revoked already" in again.stdout
 
     def test_it_revokes_by_number_and_lists(self, tmp_path: Path) -> None:
         make_credentials(tmp_path, robots=["anna"], services=["cloud"])
         serial = f"{serial_of(tmp_path / 'anna'):x}"
-        done = self.run(str(tmp_path), "--revoke-serial", serial, "--list")
+        done = run_keys(str(tmp_path), "--revoke-serial", serial, "--list")
         assert done.returncode == 0
         lines = [line for line in done.stdout.splitlines() if ", valid until" in line]
         assert [("revoked on" in line, "'anna'" in line) for line in lines[-2:]] == [
@@ -419,7 +411,7 @@ class TestCommand:
     def test_rotating_and_revoking_at_once_revokes_the_old_one(self, tmp_path: Path) -> None:
         make_credentials(tmp_path, robots=["anna"], services=["cloud"])
         old = serial_of(tmp_path / "anna")
-        done = self.run(str(tmp_path), "--rotate", "--robot", "anna", "--revoke", "anna")
+        done = run_keys(str(tmp_path), "--rotate", "--robot", "anna", "--revoke", "anna")
         assert done.returncode == 0, done.stderr
         assert revoked_serials(tmp_path / "cloud" / REVOKED_FILE) == {old}
         load_credentials(tmp_path / "anna", "robot")
@@ -434,7 +426,7 @@ class TestCommand:
     )
     def test_what_cannot_be(self, tmp_path: Path, arguments: list[str], says: str) -> None:
         make_credentials(tmp_path, robots=["anna"], services=["cloud"])
-        done = self.run(str(tmp_path), *arguments)
+        done = run_keys(str(tmp_path), *arguments)
         assert done.returncode == 2
         assert done.stderr.startswith("holdfast: error: ")
         assert says in done.stderr
