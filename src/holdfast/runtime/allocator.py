@@ -17,7 +17,7 @@ import os
 __all__ = ["limit_arenas"]
 
 _ARENAS = 2
-"""One for whoever holds the interpreter, and one for those who compute or send without it."""
+"""One for whoever holds the interpreter, and one for those who compute without it."""
 
 _M_ARENA_MAX = -8
 """Of ``malloc.h``, the same on all platforms."""

@@ -1,8 +1,8 @@
 """Files and sockets that this process may have open at a time, and what it needs of them.
 
-The network library gives no error when there are too few: it ends the process with a traceback, or
-stays deaf to whoever connects. So the limit is looked at before anything is opened. What a process
-may allow itself (the hard limit), it takes.
+With too few, each part fails in its own way: no event loop, a journal that cannot be opened, a
+service to which nobody can connect. So the limit is looked at before anything is opened. What a
+process may allow itself (the hard limit), it takes.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from holdfast.errors import HoldfastError
 __all__ = ["NEEDED", "DescriptorError", "allow_descriptors"]
 
 NEEDED = 64
-"""For any command. A robot was seen to have 23 open at a time, a service 14 without its robots."""
+"""For any command. A robot was seen to have 21 open at a time, a service 9 without its robots."""
 
 
 class DescriptorError(HoldfastError):
