@@ -1439,7 +1439,6 @@ class TestCertificates:
         robot.call("cloud", 1, b"question")
         assert await inbox.of_call(1) == [Replied(1, b"question"), Ended(1)]
 
-
     async def test_a_robot_can_be_closed_amid_a_handshake(self, tls: StreamWire) -> None:
         host, _, port = tls.endpoint("cloud").removeprefix("tls/").rpartition(":")
         heard = asyncio.Event()
