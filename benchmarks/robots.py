@@ -227,7 +227,7 @@ def run_robot(
             configuration,
             links.services,
             links.recovery,
-            _NotedTransport(links.transport, notebook),
+            None if links.transport is None else _NotedTransport(links.transport, notebook),
             run.journal,
             load_environment(configuration),
             notebook,

@@ -22,6 +22,7 @@ INTERPRETED = {
     "simulation/schedule.py",
     # Nothing in them takes time.
     "session/__init__.py",
+    "session/decision_source.py",
     "simulation/__init__.py",
     "session/effects.py",
     "session/events.py",

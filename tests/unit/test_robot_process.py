@@ -15,23 +15,22 @@ from typing import Any
 import pytest
 
 from holdfast.configuration import Configuration, load
-from holdfast.errors import TrialError
+from holdfast.errors import ProblemError, TrialError
 from holdfast.outcome import TrialResult
+from holdfast.planning import Planner
 from holdfast.recording.run_directory import RunDirectory
-from holdfast.runtime import robot_process
+from holdfast.robot.own_planning import OwnPlanning
+from holdfast.runtime import own_planner, robot_process
 from holdfast.runtime.environment import EnvironmentMaker, load_environment
 from holdfast.runtime.links import Links, make_links
 from holdfast.runtime.logs import NullEventLog
+from holdfast.runtime.own_planner import OwnPlanner
 from holdfast.runtime.recovery_launcher import RecoveryExited
 from holdfast.runtime.robot_process import RobotProcess
 from holdfast.runtime.trial import run_trial
-from holdfast.service.shell import ServiceBrokenError
-from holdfast.session.effects import Effect, Paused, Report, Timing
-from holdfast.session.events import Acted, TransportEvent
+from holdfast.session.effects import Effect, Paused, Plan, Report, Timing
+from holdfast.session.events import Acted, Planned, TransportEvent
 from holdfast.session.records import PausedRecord
-from holdfast.session.service import Service
-from holdfast.session.service_effects import Effect as ServiceEffect
-from holdfast.session.service_jobs import Job, Outcome
 
 PATIENCE_S = 30.0
 """Longest wait for what is sure to come; nothing is measured by it."""
@@ -235,7 +234,7 @@ def test_the_loop_looks_at_the_wire_before_it_handles_more_than_some_events(
         if name == "first":
             # A simulated world of which each step takes long never lets the queue run empty.
             robot._on_loop().call_soon(machine.trace.append, "the wire")
-            clock.jump(0.01)
+            clock.jump(0.1)
             robot._happens(Acted(0, None, False))
             robot._happens(Acted(1, None, False))
 
@@ -367,17 +366,33 @@ def test_an_error_of_whatever_else_runs_on_the_loop_ends_the_run(robots: Robots)
         robot.run(())
 
 
-def test_a_defect_of_its_own_service_ends_the_run(
-    robots: Robots, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("part", ["task", "sensing"])
+def test_a_defect_of_its_own_planner_ends_the_run(
+    robots: Robots, monkeypatch: pytest.MonkeyPatch, part: str
 ) -> None:
     """It would wait for ever: nothing else can decide."""
+    answer = own_planner._answer
 
-    def fail(*_: object) -> None:
-        raise ZeroDivisionError("a defect")
+    def fail(planner: Planner, plan: Plan) -> Planned:
+        if plan.sensing == (part == "sensing"):
+            raise ZeroDivisionError("a defect")
+        return answer(planner, plan)
 
-    monkeypatch.setattr(Service, "finished", fail)
-    with pytest.raises(ServiceBrokenError, match="ZeroDivisionError: a defect"):
+    monkeypatch.setattr(own_planner, "_answer", fail)
+    with pytest.raises(TrialError, match=r"(?s)trial 0 .*ZeroDivisionError: a defect"):
         robots.run()
+
+
+def test_what_its_own_planner_refuses_is_said_and_ends_the_run(
+    robots: Robots, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(planner: Planner, plan: Plan) -> Planned:
+        raise ProblemError("policy gives nan")
+
+    monkeypatch.setattr(own_planner, "_answer", refuse)
+    with pytest.raises(ProblemError, match="policy gives nan"):
+        robots.run()
+    assert ("stopped", {"reason": "policy gives nan"}) in robots.told
 
 
 def test_a_problem_that_fails_is_named_with_the_step(
@@ -446,27 +461,76 @@ class TestSignals:
         assert not ends
 
 
+@pytest.mark.parametrize("brief", [True, False])
 def test_what_takes_long_is_computed_on_a_thread_while_the_robot_goes_on(
-    robots: Robots, monkeypatch: pytest.MonkeyPatch
+    robots: Robots, monkeypatch: pytest.MonkeyPatch, *, brief: bool
 ) -> None:
-    """Each first job of its kind does: nobody knows how long it takes."""
-    computed_on: set[str] = set()
+    """What is brief is not, but for the first of its kind: nobody knows how long that takes."""
+    computed_on: list[str] = []
     told_on: set[str] = set()
+    answer, handle = own_planner._answer, OwnPlanning.handle
 
-    class NotedJob(Job):
-        __slots__ = ()
+    def noted(planner: Planner, plan: Plan) -> Planned:
+        computed_on.append(threading.current_thread().name)
+        return answer(planner, plan)
 
-        def run(self) -> Outcome:
-            computed_on.add(threading.current_thread().name)
-            return super().run()
+    def told(self: OwnPlanning, event: TransportEvent | Planned, now: float) -> None:
+        told_on.add(threading.current_thread().name)
+        handle(self, event, now)
 
-    class NotedService(Service):
-        def finished(self, job: Job, outcome: Outcome, now: float) -> list[ServiceEffect]:
-            told_on.add(threading.current_thread().name)
-            return super().finished(job, outcome, now)
-
-    monkeypatch.setattr("holdfast.session.service.Job", NotedJob)
-    monkeypatch.setattr("holdfast.runtime.own_planner.Service", NotedService)
+    monkeypatch.setattr(own_planner, "_BRIEF_S", PATIENCE_S if brief else 0.0)
+    monkeypatch.setattr(own_planner, "_answer", noted)
+    monkeypatch.setattr(OwnPlanning, "handle", told)
     robots.run()
-    assert "holdfast-worker-0" in computed_on
-    assert told_on == {threading.current_thread().name}
+    here, thread = threading.current_thread().name, "holdfast-own-planner-0"
+    assert told_on == {here}
+    assert set(computed_on[:1]) == {thread}
+    assert set(computed_on[4:]) == ({here} if brief else {thread})
+    assert robots.digests == plain_digests(robots.configuration)
+
+
+class TestOwnPlanner:
+    @pytest.mark.parametrize("may_be_brief", [True, False])
+    def test_code_of_other_people_is_always_computed_on_a_thread(
+        self, configuration: Configuration, *, may_be_brief: bool
+    ) -> None:
+        """It may take any time at any call."""
+        planner = Planner(configuration.problem, configuration.planning)
+        state = planner.initial_state(3, 0)
+
+        async def ask() -> list[bool]:
+            come: asyncio.Queue[Planned] = asyncio.Queue()
+            own = OwnPlanner(
+                lambda: planner, come.put_nowait, come.put_nowait, may_be_brief=may_be_brief
+            )
+            on_loop = []
+            for number in range(3):
+                own.ask(Plan(number, state, sensing=True))
+                on_loop.append(own.compute_brief())
+                assert (await asyncio.wait_for(come.get(), PATIENCE_S)).number == number
+            own.close()
+            return on_loop
+
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(own_planner, "_BRIEF_S", PATIENCE_S)
+            assert asyncio.run(ask()) == [False, may_be_brief, may_be_brief]
+
+    def test_what_was_asked_before_and_not_begun_is_not_computed(
+        self, configuration: Configuration, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(own_planner, "_BRIEF_S", PATIENCE_S)
+        planner = Planner(configuration.problem, configuration.planning)
+        state = planner.initial_state(3, 0)
+        come: list[int] = []
+        own = OwnPlanner(
+            lambda: planner,
+            lambda planned: come.append(planned.number),
+            pytest.fail,  # type: ignore[arg-type]
+            may_be_brief=True,
+        )
+        own._expected_s = {True: 0.0, False: 0.0}
+        own.ask(Plan(1, state, sensing=True))
+        own.ask(Plan(2, state, sensing=True))
+        assert own.compute_brief()
+        assert not own.compute_brief()
+        assert come == [2]

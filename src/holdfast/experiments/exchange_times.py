@@ -30,7 +30,7 @@ from holdfast.experiments.trial_batches import problem_of
 from holdfast.planning import advance, choose_sensing_action, digest, initial_state, observe
 from holdfast.problems.registry import problem_class, problem_module
 from holdfast.runtime.leash import leash
-from holdfast.runtime.own_planner import OWN_PLANNER, OwnPlanner
+from holdfast.service.shell import ServiceShell
 from holdfast.session.events import Appeared, Ended, Replied, TransportEvent
 from holdfast.session.messages import (
     DIGEST_SIZE,
@@ -46,10 +46,12 @@ from holdfast.session.messages import (
     encode,
     numbers_to,
 )
+from holdfast.session.service import Service
 from holdfast.settings import ParticleFilterSettings, PlanningSettings, SelectorSettings
 from holdfast.source_digest import core_version, problem_digest
 from holdfast.transport.contract import RobotTransport
 from holdfast.transport.endpoints import ServiceAddress
+from holdfast.transport.in_process import InProcessNetwork
 from holdfast.transport.robot_end import StreamRobotTransport
 
 __all__ = ["COLUMNS", "Exchange", "measure_exchange"]
@@ -63,6 +65,8 @@ _PATIENCE_S = 20.0
 _READY_S = 20.0
 _END_S = 3.0
 _SWITCH_INTERVAL_S = 0.0005
+
+_IN_PROCESS = "in process"
 
 _LEASE_MS = 30_000.0
 """Of both ends: a machine that stands still for a moment does not end the study."""
@@ -254,11 +258,18 @@ class _Asking:
 
 @contextlib.asynccontextmanager
 async def _in_process(wanted: Exchange) -> AsyncIterator[tuple[str, RobotTransport]]:
-    planner = OwnPlanner(problem_of(wanted.problem, {}, {}))
+    problem = problem_of(wanted.problem, {}, {})
+    network = InProcessNetwork()
+    shell = ServiceShell(
+        Service(lambda _: problem, workers=1), network.service(_IN_PROCESS, "0"), workers=1
+    )
+    robot = network.robot([_IN_PROCESS])
+    await shell.start()
     try:
-        yield OWN_PLANNER, planner
+        yield _IN_PROCESS, robot
     finally:
-        await planner.close()
+        await robot.close()
+        await shell.close()
 
 
 @contextlib.asynccontextmanager

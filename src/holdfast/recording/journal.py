@@ -22,6 +22,7 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import functools
 import hashlib
 import os
 import shutil
@@ -72,7 +73,10 @@ _CHECKSUM_SIZE = 8
 _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 
 _BUSY_TIMEOUT_S = 1.0
-_MAX_LOG_PAGES = 4096
+_PAGE_BYTES = 1024
+"""A step writes whole pages; larger ones take longer to write and to sum up."""
+
+_MAX_LOG_PAGES = 16384
 """The log is moved into the main file beyond 16 MiB at the latest: read back after a crash in some
 10 ms, and reached only in trials of thousands of steps."""
 
@@ -85,6 +89,12 @@ _START_ANEW = "start anew in another directory (--out)"
 _RESULT_DECODER = msgspec.msgpack.Decoder(TrialResult)
 _DECISIONS_DECODER = msgspec.msgpack.Decoder(Decisions)
 _NUMBERS = struct.Struct("<qq")
+
+# Copied for each row: to make one takes longer than to sum up a step.
+_OF_META, _OF_STEPS, _OF_TRIALS = (
+    hashlib.blake2b(digest_size=_CHECKSUM_SIZE, person=person)
+    for person in (b"holdfast-meta", b"holdfast-step", b"holdfast-trial")
+)
 
 # Closing any descriptor of a file drops this process's locks on it, SQLite's too; so a journal that
 # is open here must be opened a second time by SQLite alone, which knows that.
@@ -580,7 +590,7 @@ class Journal:
         count = self._count_from(trial, steps.next_sequence) if first else self._count
         assert count is not None
         # One statement is a transaction by itself, in a fraction of the time.
-        insert = "INSERT INTO steps VALUES (?, ?, ?, ?)" + ", (?, ?, ?, ?)" * (len(records) - 1)
+        insert = _insert_steps(len(records))
         if first:
             with self._transaction():
                 self._note(
@@ -805,6 +815,11 @@ def require_writable(path: Path) -> None:
         raise OutputError(f"{path}: cannot be written: {error.strerror}") from error
 
 
+@functools.cache
+def _insert_steps(number: int) -> str:
+    return f"INSERT INTO steps VALUES {', '.join(['(?, ?, ?, ?)'] * number)}"
+
+
 class _Steps(NamedTuple):
     """The unfinished trial, and the number of its next record."""
 
@@ -877,23 +892,24 @@ def _first_rows(meta: dict[str, str]) -> dict[str, str]:
     }
 
 
-def _checksum(person: bytes, first: int, second: int, data: bytes) -> bytes:
+def _checksum(empty: hashlib.blake2b, first: int, second: int, data: bytes) -> bytes:
     # The numbers too, so that a row cannot pass for another.
-    numbered = _NUMBERS.pack(first, second) + data
-    return hashlib.blake2b(numbered, digest_size=_CHECKSUM_SIZE, person=person).digest()
+    checksum = empty.copy()
+    checksum.update(_NUMBERS.pack(first, second) + data)
+    return checksum.digest()
 
 
 def _meta_checksum(key: str, value: str) -> bytes:
     data = f"{key}={value}".encode()
-    return _checksum(b"holdfast-meta", len(key), len(value), data)
+    return _checksum(_OF_META, len(key), len(value), data)
 
 
 def _step_checksum(sequence: int, trial: int, data: bytes) -> bytes:
-    return _checksum(b"holdfast-step", sequence, trial, data)
+    return _checksum(_OF_STEPS, sequence, trial, data)
 
 
 def _trial_checksum(trial: int, column: int, data: bytes) -> bytes:
-    return _checksum(b"holdfast-trial", trial, column, data)
+    return _checksum(_OF_TRIALS, trial, column, data)
 
 
 def _is_intact(
@@ -978,6 +994,8 @@ def _connect(path: Path, *, create: bool) -> sqlite3.Connection:
         raise OutputError(f"{path}: cannot be opened: {error}") from error
     try:
         # Two runs in one directory would spoil each other, so the lock is held until the end.
+        if create:
+            connection.execute(f"PRAGMA page_size = {_PAGE_BYTES}")
         connection.execute("PRAGMA locking_mode = EXCLUSIVE")
         connection.execute("BEGIN EXCLUSIVE")
         connection.execute("COMMIT")

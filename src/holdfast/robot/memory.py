@@ -1,9 +1,9 @@
-"""States that are computed once, although a robot and its own service both come to them.
+"""States that are computed once, although a robot and its own planner both come to them.
 
-A robot without services asks a service in its own process. Both follow the same belief, so each
-state would be computed twice: when the service plans ahead, and when the robot gets there. The
-functions that lead from state to state are pure, so the second one is handed what the first one has
-come to, and from then on both hold the very same objects, which are therefore found by identity.
+A robot without services asks its own planner. Both follow the same belief, so each state would be
+computed twice: when the planner looks ahead, and when the robot gets there. The functions that lead
+from state to state are pure, so the second one is handed what the first one has come to, and from
+then on both hold the very same objects, which are therefore found by identity.
 
 Of large states nothing is remembered: to compute them takes long, but to keep some hundred of them
 takes more memory than that is worth.

@@ -14,22 +14,16 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-import msgspec
-
 from holdfast.configuration import Configuration
 from holdfast.planning import Planner
 from holdfast.problems.problem import Problem
 from holdfast.robot.memory import RememberingPlanner, StateMemory
 from holdfast.runtime.logs import EventSink
-from holdfast.runtime.own_planner import OWN_PLANNER, OwnPlanner
 from holdfast.runtime.recovery_launcher import RecoveryExited, RecoveryLauncher
 from holdfast.settings import OffloadSettings, PlanningSettings
 from holdfast.transport.contract import RobotTransport
-from holdfast.user_code import describe_problem_error
 
 __all__ = ["RECOVERY_SERVICE", "Links", "make_links"]
-
-_FOR_EVER_MS = 3_600_000.0  # the largest that the settings allow
 
 RECOVERY_SERVICE = "cloud_active_sensing_recovery"
 """The name of the local service (the thesis's)."""
@@ -40,8 +34,8 @@ class Links(NamedTuple):
 
     Attributes
     ----------
-    transport : RobotTransport
-        Not started yet.
+    transport : RobotTransport or None
+        Not started yet; None for a robot without services, which decides itself.
     services : tuple of str
         In order of preference.
     recovery : str or None
@@ -56,7 +50,7 @@ class Links(NamedTuple):
         Joins the robot's problem and settings to the functions that lead from state to state.
     """
 
-    transport: RobotTransport
+    transport: RobotTransport | None
     services: tuple[str, ...]
     recovery: str | None
     launcher: Callable[[Callable[[RecoveryExited], None]], RecoveryLauncher] | None
@@ -85,21 +79,9 @@ def make_links(configuration: Configuration, log_path: Path | None, events: Even
     """
     offload = configuration.offload
     if not offload.services:
-        # It cannot be lost, so it may be silent for as long as it computes.
-        patient = msgspec.structs.replace(
-            offload,
-            detection_timeout_ms=_FOR_EVER_MS,
-            decision_timeout_ms=_FOR_EVER_MS,
-            verify_share=0.0,
-        )
-        # The robot, and the service in its process, come to the same states.
+        # The robot and its own planner come to the same states.
         make_planner = functools.partial(RememberingPlanner, memory=StateMemory())
-        planner = OwnPlanner(
-            Configuration.from_plain(configuration.plain()).problem,
-            functools.partial(describe_problem_error, configuration.problem_name),
-            make_planner,
-        )
-        return Links(planner, (OWN_PLANNER,), None, None, patient, _nothing, make_planner)
+        return Links(None, (), None, None, offload, _nothing, make_planner)
     return _streams(configuration, log_path, events)
 
 

@@ -1,89 +1,121 @@
-"""The planner in the robot's own process, behind the same wire as any other service.
+"""The planner of a robot without services: on the robot's own loop, or on a thread.
 
-A robot that offloads nothing runs the same loop, with the same journal, as one that does; its only
-service is this one, on that loop. What takes long is computed on a thread, so that the next sensing
-action is computed while the robot moves here too. It cannot be lost: its process is the robot's.
+To hand something over to another thread takes longer than many a decision. So what is brief is
+computed on the loop, once nothing else has happened: the environment moves meanwhile, if it has a
+thread of its own. What takes long is computed on a thread, so that the robot goes on here too while
+the next sensing action is being computed.
 """
 
 from __future__ import annotations
 
-import asyncio
+import functools
+import math
 from collections.abc import Callable
+from time import perf_counter
 
-from holdfast.planning import Planner
-from holdfast.problems.problem import Problem
-from holdfast.protocol.verification import OWN_PLANNER
-from holdfast.service.shell import ServiceShell
-from holdfast.session.events import TransportEvent
-from holdfast.session.messages import Opening
-from holdfast.session.service import Service
-from holdfast.session.service_limits import ServiceLimits
-from holdfast.settings import PlanningSettings
-from holdfast.transport.in_process import InProcessNetwork
+from holdfast.errors import HoldfastError
+from holdfast.planning import Planner, choose_sensing_action
+from holdfast.service.pool import ThreadPool
+from holdfast.session.effects import Plan
+from holdfast.session.events import Planned
+from holdfast.session.messages import MAX_TASK_ACTIONS
 
-__all__ = ["OWN_PLANNER", "OwnPlanner"]
+__all__ = ["OwnPlanner"]
 
-# A robot is never too large for itself.
-_NO_LIMITS = ServiceLimits(max_particles=2**62, max_work=2**62, max_state_bytes=2**62)
-_ANY_SIZE = 2**62
+_BRIEF_S = 0.001
+"""What may take longer is computed on a thread: the loop hears nobody meanwhile."""
+
+_INERTIA = 8.0
+"""What is expected grows by one part in so many with each time that is longer."""
 
 
 class OwnPlanner:
-    """A :class:`~holdfast.transport.contract.RobotTransport` that leads nowhere else.
+    """Computes answers to the robot's questions; its methods are called on the loop's thread.
 
     Parameters
     ----------
-    problem : Problem
-        It answers for this one only. An instance of its own: the robot's is used at the same time
-        by another thread.
-    describe_error : callable
-        Puts an error that the problem raised into words.
     make_planner : callable
-        Joins the problem and the robot's settings to the functions that lead from state to state.
+        Builds the planner, with an instance of the problem of its own: the robot's is used at the
+        same time by another thread. It is called on a thread, with the first question.
+    deliver : callable
+        Takes the answers, on the loop's thread.
+    failed : callable
+        Takes an error of the problem's code, on the loop's thread.
+    may_be_brief : bool
+        Whether what was brief before is so again. Other people's code may take any time at any
+        call.
     """
 
     def __init__(
         self,
-        problem: Problem,
-        describe_error: Callable[[BaseException], str] = repr,
-        make_planner: Callable[[Problem, PlanningSettings], Planner] = Planner,
+        make_planner: Callable[[], Planner],
+        deliver: Callable[[Planned], None],
+        failed: Callable[[BaseException], None],
+        *,
+        may_be_brief: bool,
     ) -> None:
-        def make_problem(opening: Opening) -> Problem:
-            del opening
-            return problem
+        self._make_planner = make_planner
+        self._deliver = deliver
+        self._threads = ThreadPool(1, "holdfast-own-planner", failed)
+        self._may_be_brief = may_be_brief
+        self._planner: Planner | None = None
+        self._waiting: Plan | None = None
+        # By whether it is a sensing action; nothing is known of the first ones.
+        self._expected_s = {False: math.inf, True: math.inf}
 
-        network = InProcessNetwork(max_message_bytes=_ANY_SIZE)
-        self._robot_end = network.robot([OWN_PLANNER])
-        self._shell = ServiceShell(
-            Service(make_problem, 1, _NO_LIMITS, describe_error, make_planner),
-            network.service(OWN_PLANNER, "own"),
-            workers=1,
-        )
-        self._serving: asyncio.Task[None] | None = None
-        self.call = self._robot_end.call
-        self.abandon = self._robot_end.abandon
+    def ask(self, plan: Plan) -> None:
+        """Let a part of an answer be computed; what was asked before and not begun is forgotten."""
+        self._waiting = None
+        # Its problem is used by one thread at a time.
+        if self._expected_s[plan.sensing] <= _BRIEF_S and not self._threads.num_open:
+            self._waiting = plan
+        else:
+            self._threads.submit(functools.partial(self._computed, plan), self._finished)
 
-    def start(self, deliver: Callable[[TransportEvent], None]) -> None:
-        """Begin to answer; see :mod:`~holdfast.transport.contract`."""
-        self._robot_end.start(deliver)
-        self._serving = asyncio.get_running_loop().create_task(self._serve())
-        self._serving.add_done_callback(_raise_error)
+    def compute_brief(self) -> bool:
+        """Compute what is asked for and brief, and deliver it; tell whether there was any."""
+        plan, self._waiting = self._waiting, None
+        if plan is None:
+            return False
+        self._finished(self._computed(plan))
+        return True
 
-    async def close(self, timeout_s: float = 1.0) -> None:
-        """Answer no more; what is being computed is not waited for. May be repeated."""
-        serving, self._serving = self._serving, None
-        if serving is None:
-            return
-        serving.cancel()
-        await self._robot_end.close(timeout_s)
-        await self._shell.close(timeout_s)
+    def close(self) -> None:
+        """Compute nothing more; what is being computed is not waited for."""
+        self._waiting = None
+        self._threads.close()
 
-    async def _serve(self) -> None:
-        await self._shell.start()
-        await self._shell.wait()
+    def _computed(self, plan: Plan) -> tuple[Plan, Planned]:
+        """Return what was asked for and what it comes to."""
+        planner = self._planner
+        began = perf_counter()
+        try:
+            if planner is None:
+                planner = self._planner = self._make_planner()
+                # Building the problem is no measure of what comes next.
+                began = perf_counter()
+            planned = _answer(planner, plan)
+        except HoldfastError as error:
+            planned = Planned(plan.number, plan.state, error=error)
+        computed_s = perf_counter() - began
+        return plan, planned._replace(computed_s=computed_s)
+
+    def _finished(self, computed: tuple[Plan, Planned]) -> None:
+        plan, planned = computed
+        computed_s = planned.computed_s
+        if self._may_be_brief:
+            # Whoever else uses the processor only makes it longer, so the shorter counts for more.
+            expected_s = self._expected_s[plan.sensing]
+            if computed_s > expected_s:
+                computed_s = expected_s + (computed_s - expected_s) / _INERTIA
+            self._expected_s[plan.sensing] = computed_s
+        self._deliver(planned)
 
 
-def _raise_error(serving: asyncio.Task[None]) -> None:
-    """Let the loop hear of a defect of ours: the robot shall not wait for ever."""
-    if not serving.cancelled():
-        serving.result()
+def _answer(planner: Planner, plan: Plan) -> Planned:
+    number, state = plan.number, plan.state
+    if plan.sensing:
+        action, _ = choose_sensing_action(planner.problem, planner.settings, state)
+        return Planned(number, state, ahead_digest=planner.digest(state), sensing_action=action)
+    actions, ahead = planner.plan_until_sensing(state, MAX_TASK_ACTIONS)
+    return Planned(number, ahead, actions)

@@ -32,11 +32,14 @@ from holdfast.planning import Planner
 from holdfast.problems.problem import Problem
 from holdfast.problems.registry import problem_class, problem_module
 from holdfast.robot.own_decisions import OwnDecisions
+from holdfast.robot.own_planning import OwnPlanning
 from holdfast.runtime.diagnosis import MissingServices
 from holdfast.runtime.environment import EnvironmentMaker
 from holdfast.runtime.logs import EventSink
+from holdfast.runtime.own_planner import OwnPlanner
 from holdfast.runtime.performer import Performer, make_performer
 from holdfast.runtime.recovery_launcher import RecoveryExited
+from holdfast.session.decision_source import DecisionSource
 from holdfast.session.dispatcher import Dispatcher
 from holdfast.session.effects import (
     Abandon,
@@ -47,6 +50,7 @@ from holdfast.session.effects import (
     Journal,
     Launch,
     Paused,
+    Plan,
     Report,
     Send,
     Sense,
@@ -59,6 +63,7 @@ from holdfast.session.events import (
     Decided,
     EnvironmentEvent,
     EnvironmentFailed,
+    Planned,
     TransportEvent,
 )
 from holdfast.session.messages import Opening
@@ -79,6 +84,9 @@ _DEAF_S = 0.005
 
 _TURN_S = 0.001
 """After handling events for so long, the loop looks at the wire before it handles the next one."""
+
+_TURN_WITHOUT_WIRE_S = 0.02
+"""The same without services: nothing but a signal comes from outside, and to look is not free."""
 
 _SWITCH_INTERVAL_S = 0.0005
 """How long a thread may hold the interpreter while the one that has the answer waits for it."""
@@ -139,7 +147,9 @@ class _Interrupted(NamedTuple):
     number: int
 
 
-_Happening: TypeAlias = TransportEvent | EnvironmentEvent | Decided | RecoveryExited | _Interrupted
+_Happening: TypeAlias = (
+    TransportEvent | EnvironmentEvent | Decided | Planned | RecoveryExited | _Interrupted
+)
 
 
 def opening_of(configuration: Configuration) -> Opening:
@@ -166,8 +176,8 @@ class RobotProcess:
         Names of the services in order of preference, as the transport knows them.
     recovery : str or None
         Name of the local service; None if there is none.
-    transport : RobotTransport
-        Not started yet; it is closed at the end.
+    transport : RobotTransport or None
+        Not started yet; it is closed at the end. Without one the robot's own planner decides.
     journal : StepJournal
     maker : EnvironmentMaker
     events : EventSink
@@ -193,7 +203,7 @@ class RobotProcess:
         configuration: Configuration,
         services: Sequence[str],
         recovery: str | None,
-        transport: RobotTransport,
+        transport: RobotTransport | None,
         journal: StepJournal,
         maker: EnvironmentMaker,
         events: EventSink,
@@ -207,6 +217,7 @@ class RobotProcess:
     ) -> None:
         self._configuration = configuration
         self._transport = transport
+        self._turn_s = _TURN_WITHOUT_WIRE_S if transport is None else _TURN_S
         self._journal = journal
         self._maker = maker
         self._events = events
@@ -238,26 +249,39 @@ class RobotProcess:
         self._interrupted: int | None = None
         problem = configuration.problem
         simulator = configuration.simulator
-        dispatcher = Dispatcher(
-            services,
-            recovery,
-            offload or configuration.offload,
-            configuration.recovery,
-            journal.session(),
-            journal.raise_epoch(),
-            opening_of(configuration),
-            problem.action_size,
-            len(problem.sensing_actions),
-            functools.partial(contract.executed_action, problem),
-            os.urandom(32),
-            distrusted,
-        )
-        self._own = OwnDecisions(
-            lambda: Planner(
-                Configuration.from_plain(configuration.plain()).problem, configuration.planning
-            ),
+        epoch = journal.raise_epoch()
+        dispatcher: DecisionSource
+        if transport is None:
+            dispatcher = OwnPlanning()
+        else:
+            dispatcher = Dispatcher(
+                services,
+                recovery,
+                offload or configuration.offload,
+                configuration.recovery,
+                journal.session(),
+                epoch,
+                opening_of(configuration),
+                problem.action_size,
+                len(problem.sensing_actions),
+                functools.partial(contract.executed_action, problem),
+                os.urandom(32),
+                distrusted,
+            )
+
+        def another_problem() -> Problem:
+            return Configuration.from_plain(configuration.plain()).problem
+
+        self._verifier = OwnDecisions(
+            lambda: Planner(another_problem(), configuration.planning),
             functools.partial(describe_problem_error, configuration.problem_name),
             self.deliver,
+        )
+        self._own_planner = OwnPlanner(
+            lambda: make_planner(another_problem(), configuration.planning),
+            self._happens,
+            self._fail,
+            may_be_brief=":" not in configuration.problem_name,
         )
         self._planner = make_planner(problem, configuration.planning)
         self._robot = Robot(self._planner, simulator, dispatcher, rate_hz)
@@ -320,8 +344,10 @@ class RobotProcess:
             self._ended = self._closing = True
             if self._performer is not None:
                 self._performer.close()
-            loop.run_until_complete(self._transport.close())
-            self._own.close()
+            if self._transport is not None:
+                loop.run_until_complete(self._transport.close())
+            self._own_planner.close()
+            self._verifier.close()
             if launcher is not None:
                 launcher.close()
             loop.close()
@@ -346,7 +372,8 @@ class RobotProcess:
 
     def _start(self) -> None:
         with self._errors():
-            self._transport.start(self._happens)
+            if self._transport is not None:
+                self._transport.start(self._happens)
             self._now = monotonic()
             self._carry_out(self._robot.start(self._now))
             self._begin_next()
@@ -372,8 +399,8 @@ class RobotProcess:
             if wake and not self._ended:
                 self._now = max(self._now, now)
                 self._carry_out(self._robot.wake(self._now))
-            while self._happened and not self._ended:
-                if now - began > _TURN_S:
+            while not self._ended and (self._happened or self._own_planner.compute_brief()):
+                if now - began > self._turn_s:
                     self._on_loop().call_soon(self._go_on)
                     break
                 at, event = self._happened.popleft()
@@ -464,9 +491,7 @@ class RobotProcess:
 
     def _carry_out(self, effects: list[Effect]) -> None:
         for effect in effects:
-            if isinstance(effect, Send):
-                self._transport.call(effect.service, effect.call, effect.payload)
-            elif isinstance(effect, Journal):
+            if isinstance(effect, Journal):
                 self._journal.append(effect.trial, effect.records)
             elif isinstance(effect, Act):
                 assert self._performer is not None
@@ -476,11 +501,17 @@ class RobotProcess:
                 self._performer.sense(effect.step, effect.sensing_action)
             elif isinstance(effect, Timing):
                 self._on_timing(effect)
+            elif isinstance(effect, Plan):
+                self._own_planner.ask(effect)
+            elif isinstance(effect, Send):
+                assert self._transport is not None
+                self._transport.call(effect.service, effect.call, effect.payload)
             elif isinstance(effect, Decide):
-                self._own.ask(effect)
+                self._verifier.ask(effect)
             elif isinstance(effect, Verified):
                 self._on_verified(effect)
             elif isinstance(effect, Abandon):
+                assert self._transport is not None
                 self._transport.abandon(effect.call)
             elif isinstance(effect, Report):
                 self._events.event(effect.name, **effect.fields)

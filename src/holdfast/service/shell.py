@@ -10,7 +10,7 @@ results come back to the loop.
 A brief job cannot be interrupted, so a job counts as brief only if those before it of the same
 robot were, and if it is as usual (:class:`~holdfast.session.service_effects.Run`).
 
-Nothing here needs a socket: a robot without services runs the same shell on its own loop.
+Nothing here needs a socket.
 """
 
 from __future__ import annotations

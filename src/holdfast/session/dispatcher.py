@@ -32,7 +32,15 @@ from holdfast.errors import HoldfastError
 from holdfast.protocol.verification import OwnDecisionError, Verification
 from holdfast.session.calls import Call, Calls
 from holdfast.session.effects import Effect, Launch, Report, Stop
-from holdfast.session.events import Appeared, Decided, Ended, Replied, TransportEvent
+from holdfast.session.events import (
+    Appeared,
+    Decided,
+    Ended,
+    Planned,
+    Replied,
+    TransportEvent,
+    Vanished,
+)
 from holdfast.session.hedging import Hedging
 from holdfast.session.known_services import KnownService, KnownServices
 from holdfast.session.launches import Launches
@@ -195,7 +203,7 @@ class Dispatcher:
 
     # -- what happens ----------------------------------------------------------------------------
 
-    def handle(self, event: TransportEvent, now: float) -> None:
+    def handle(self, event: TransportEvent | Planned, now: float) -> None:
         """Take note of what a transport delivered."""
         if isinstance(event, Replied):
             call = self._calls.get(event.call)
@@ -207,7 +215,7 @@ class Dispatcher:
                 self._ended(call, now)
         elif isinstance(event, Appeared):
             self._appeared(self._services.get(event.service), event.boot, now)
-        else:
+        elif isinstance(event, Vanished):
             self._vanished(self._services.get(event.service), event.boot, now)
         self._work(now)
 

@@ -26,6 +26,7 @@ __all__ = [
     "Journal",
     "Launch",
     "Paused",
+    "Plan",
     "Report",
     "Send",
     "Sense",
@@ -92,6 +93,24 @@ class Decide(NamedTuple):
     state: PlanningState
     urgent: bool
     again: bool
+
+
+class Plan(NamedTuple):
+    """Let the planner of a robot without services compute a part of an answer.
+
+    Attributes
+    ----------
+    number : int
+        Of the question; in the :class:`~holdfast.session.events.Planned` that follows. What was
+        asked under another number is of no use any more.
+    state : PlanningState
+    sensing : bool
+        Whether it is the sensing action of this state; else the task actions from there on.
+    """
+
+    number: int
+    state: PlanningState
+    sensing: bool
 
 
 class Verified(NamedTuple):
@@ -196,6 +215,7 @@ Effect: TypeAlias = (
     | Sense
     | Act
     | Decide
+    | Plan
     | Launch
     | Report
     | Timing

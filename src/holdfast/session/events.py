@@ -7,12 +7,15 @@ may be a failure.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
+from holdfast.errors import HoldfastError
 from holdfast.outcome import Done
+from holdfast.planning import PlanningState
 
 __all__ = [
     "Acted",
@@ -22,6 +25,7 @@ __all__ = [
     "Ended",
     "EnvironmentEvent",
     "EnvironmentFailed",
+    "Planned",
     "Replied",
     "Sensed",
     "TransportEvent",
@@ -177,3 +181,33 @@ class Decided(NamedTuple):
     ahead_digest: bytes = b""
     computed_s: float = 0.0
     failure: str | None = None
+
+
+class Planned(NamedTuple):
+    """The planner of a robot without services has computed a part of an answer.
+
+    Attributes
+    ----------
+    number : int
+        Of its :class:`~holdfast.session.effects.Plan`.
+    ahead : PlanningState
+        To which the task actions lead, or in which the sensing action was chosen.
+    actions : sequence of array
+        Task actions up to the next sensing step.
+    ahead_digest : bytes
+        Of the state in which the sensing action was chosen.
+    sensing_action : int or None
+        None for task actions.
+    computed_s : float
+        How long the planner computed.
+    error : HoldfastError or None
+        Why there is nothing of it.
+    """
+
+    number: int
+    ahead: PlanningState
+    actions: Sequence[FloatArray] = ()
+    ahead_digest: bytes = b""
+    sensing_action: int | None = None
+    computed_s: float = 0.0
+    error: HoldfastError | None = None

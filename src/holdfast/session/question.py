@@ -117,7 +117,7 @@ class Question:
         Task actions that belong to the answer.
     sensing_step : int or None
         The sensing step that does; None if it is too far away.
-    tasks : list of array or None
+    tasks : sequence of array or None
     sensing : SensingAnswer or None
     task_source, sensing_source : Provenance or None
     given : list of Given
@@ -169,7 +169,7 @@ class Question:
         self.needed_at: float | None = None
         self.told_waiting = False
         self.times_asked = 0
-        self.tasks: list[FloatArray] | None = None
+        self.tasks: Sequence[FloatArray] | None = None
         self.sensing: SensingAnswer | None = None
         self.task_source: Provenance | None = None
         self.sensing_source: Provenance | None = None

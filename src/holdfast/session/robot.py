@@ -24,7 +24,7 @@ from holdfast.belief import UNEXPLAINED_DEVIATIONS_SQUARED
 from holdfast.errors import HoldfastError, InvalidValueError
 from holdfast.outcome import DecisionLog, Done, TrialResult, with_reward
 from holdfast.planning import ObservationInfo, Planner, PlanningState
-from holdfast.session.dispatcher import Dispatcher
+from holdfast.session.decision_source import DecisionSource
 from holdfast.session.effects import (
     Act,
     Effect,
@@ -42,6 +42,7 @@ from holdfast.session.events import (
     Decided,
     EnvironmentEvent,
     EnvironmentFailed,
+    Planned,
     Sensed,
     TransportEvent,
 )
@@ -243,8 +244,8 @@ class Robot:
     planner : Planner
     simulator : SimulatorSettings
         Seed, and the number of steps after which a trial has failed.
-    dispatcher : Dispatcher
-        Puts the questions to the services; it is this robot's alone.
+    dispatcher : DecisionSource
+        Gets the questions answered; it is this robot's alone.
     rate_hz : float or None
         Task actions a second; None acts as soon as it can.
 
@@ -258,7 +259,7 @@ class Robot:
         self,
         planner: Planner,
         simulator: SimulatorSettings,
-        dispatcher: Dispatcher,
+        dispatcher: DecisionSource,
         rate_hz: float | None = None,
     ) -> None:
         self._planner = planner
@@ -387,7 +388,7 @@ class Robot:
     # -- what happens ----------------------------------------------------------------------------
 
     def handle(
-        self, event: TransportEvent | EnvironmentEvent | Decided, now: float
+        self, event: TransportEvent | EnvironmentEvent | Decided | Planned, now: float
     ) -> list[Effect]:
         """Take note of what a transport, the environment or the robot's own planner delivered."""
         if isinstance(event, Decided):
