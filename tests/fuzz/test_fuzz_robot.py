@@ -18,6 +18,7 @@ from tests.fuzz.examples import always, examples
 from tests.fuzz.mutations import Mutator
 from tests.unit.test_session_robot import LOCAL, World
 
+from holdfast.session.dispatcher import Dispatcher
 from holdfast.session.effects import Effect, Send, Stop
 from holdfast.session.events import Appeared, Ended, Replied, Vanished
 from holdfast.session.messages import (
@@ -151,7 +152,9 @@ def test_whatever_comes_the_decisions_are_the_same(examples: int) -> None:
         world.run(until_s=600.0)
         assert world.stopped is None, world.stopped
         world.assert_same_as_without_faults()
-        calls = world.robot._dispatcher._calls._open
+        dispatcher = world.robot._dispatcher
+        assert isinstance(dispatcher, Dispatcher)
+        calls = dispatcher._calls._open
         assert len(calls) <= 4 * len(world.services)
 
     always(examples, check, st.integers(0, 2**48))

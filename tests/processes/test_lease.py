@@ -125,9 +125,9 @@ def test_the_local_service_is_told_the_robots_lease() -> None:
     overrides = {"offload.lease_ms": ROBOT_MS, "offload.services": ["tcp/127.0.0.1:1"]}
     links = make_links(load(EXAMPLE, overrides=overrides), None, NullEventLog())
     try:
-        assert links.launcher is not None
+        assert links.launcher is not None and links.transport is not None
         command = links.launcher(lambda _: None)._command
         assert command[command.index("--lease-ms") + 1] == str(ROBOT_MS)
-    finally:
         asyncio.run(links.transport.close())
+    finally:
         links.close()

@@ -489,6 +489,10 @@ def test_what_takes_long_is_computed_on_a_thread_while_the_robot_goes_on(
     assert robots.digests == plain_digests(robots.configuration)
 
 
+def _fail(error: BaseException) -> None:
+    raise error
+
+
 class TestOwnPlanner:
     @pytest.mark.parametrize("may_be_brief", [True, False])
     def test_code_of_other_people_is_always_computed_on_a_thread(
@@ -500,9 +504,7 @@ class TestOwnPlanner:
 
         async def ask() -> list[bool]:
             come: asyncio.Queue[Planned] = asyncio.Queue()
-            own = OwnPlanner(
-                lambda: planner, come.put_nowait, come.put_nowait, may_be_brief=may_be_brief
-            )
+            own = OwnPlanner(lambda: planner, come.put_nowait, _fail, may_be_brief=may_be_brief)
             on_loop = []
             for number in range(3):
                 own.ask(Plan(number, state, sensing=True))
@@ -525,7 +527,7 @@ class TestOwnPlanner:
         own = OwnPlanner(
             lambda: planner,
             lambda planned: come.append(planned.number),
-            pytest.fail,  # type: ignore[arg-type]
+            _fail,
             may_be_brief=True,
         )
         own._expected_s = {True: 0.0, False: 0.0}
