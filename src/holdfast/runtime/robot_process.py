@@ -611,7 +611,9 @@ class RobotProcess:
         def note(number: int, frame: object) -> None:
             del frame
             restore()
-            loop.call_soon_threadsafe(self._happens, _Interrupted(number))
+            # Here, not by the loop: its next turn may come when the run has ended.
+            self._happened.append((monotonic(), _Interrupted(number)))
+            loop.call_soon_threadsafe(self._go_on)
 
         # A signal that comes just before the loop sleeps wakes it by a byte in this pair.
         reader, writer = socket.socketpair()
