@@ -691,7 +691,7 @@ sys.exit(service_process.main(["--listen", "tcp/127.0.0.1:0", "--until-stdin-clo
     modules = set(json.loads(done.stdout.splitlines()[1]))
     assert "numpy" in modules
     for heavy in (
-        "cryptography", "holdfast.configuration", "holdfast.user_code",
+        "cryptography", "holdfast.configuration", "holdfast.service.health", "holdfast.user_code",
         "importlib.metadata", "matplotlib", "multiprocessing", "prometheus_client", "rich",
         "scipy", "sqlite3", "ssl", "typer", "yaml",
     ):  # fmt: skip

@@ -289,6 +289,9 @@ async def _watched(
     processes: Callable[[], Sequence[int]] = lambda: (os.getpid(),),
 ) -> AsyncIterator[dict[str, str]]:
     """Answer what --health and --metrics ask for; give where."""
+    if options.health is None and options.metrics is None:
+        yield {}
+        return
     from holdfast.service.health import Page, Watched
 
     async def alive() -> Page:
