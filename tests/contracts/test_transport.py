@@ -1351,7 +1351,8 @@ class TestPeers:
         )
         robot, inbox = wire.robot("cloud"), Inbox()
         robot.start(inbox)
-        with contextlib.ExitStack() as stack:
+        async with contextlib.AsyncExitStack() as stack:
+            stack.push_async_callback(wire.close_on_loop)
             for _ in range(200):
                 visitor = stack.enter_context(Visitor(wire.endpoint("cloud")))
                 visitor.socket.setblocking(True)
