@@ -37,7 +37,7 @@ from tests.processes.faults import PATIENT
 from holdfast.errors import InvalidValueError, TransportError
 from holdfast.session.events import Appeared, Ended, Replied, TransportEvent, Vanished
 from holdfast.session.messages import Refused, decode_reply
-from holdfast.transport import frames, links, listener, service_end
+from holdfast.transport import frames, links, listener, robot_end, service_end
 from holdfast.transport.contract import IncomingCall, RobotTransport, ServiceTransport
 from holdfast.transport.dialer import Dialer
 from holdfast.transport.endpoints import PrivateSocket, ServiceAddress, TlsFiles
@@ -1229,6 +1229,68 @@ class TestPeers:
             {"robot": "r", "reason": "was silent for 500 ms"},
         )
 
+    async def test_what_is_sent_at_once_holds_up_nobody_else(self, tcp: StreamWire) -> None:
+        number = 20_000  # calls of nine bytes: one look at a socket finds all of them
+        came: list[bytes] = []
+
+        def answer(call: IncomingCall) -> None:
+            came.append(call.payload)
+            if len(came) == 1:
+                robot.call("cloud", 1, b"question")
+            echo(call)
+
+        robot, inbox, _ = await connected(tcp, answer)
+        with await Visitor(tcp.endpoint("cloud")).connect() as visitor:
+            await visitor.say(HELLO + number * frames.encode_frame(frames.CALL, 1))
+            assert await inbox.of_call(1) == [Replied(1, b"question"), Ended(1)]
+            assert len(came) < number
+            await until(lambda: len(came) == number + 1, lambda: len(came))
+
+    async def test_who_does_not_read_is_not_heard_until_it_does(self, tcp: StreamWire) -> None:
+        reply, number = bytes(100_000), 1000  # more than may wait for anybody
+        came: list[IncomingCall] = []
+
+        def answer(call: IncomingCall) -> None:
+            came.append(call)
+            call.reply(reply)
+            call.end()
+
+        service = tcp.service("cloud", "b1")
+        await service.start(answer)
+        with await Visitor(tcp.endpoint("cloud")).connect() as visitor:
+            await visitor.say(HELLO + number * frames.encode_frame(frames.CALL, 1))
+            await until(lambda: bool(came))
+            (link,) = service._links
+            await until(lambda: link._waits_for_reader)
+            assert len(came) < number
+            decoder, replies = frames.FrameDecoder(MAX_BYTES), 0
+            async with asyncio.timeout(PATIENCE_S):
+                while replies < number:
+                    data = await asyncio.get_running_loop().sock_recv(visitor.socket, 1 << 20)
+                    replies += sum(frame.payload == reply for frame in decoder.feed(data))
+        assert len(came) == number
+
+    async def test_whoever_holds_the_most_half_received_messages_loses_one(
+        self, tcp: StreamWire
+    ) -> None:
+        robot, inbox, _ = await connected(tcp)
+        with contextlib.ExitStack() as stack:
+            small, *large = (stack.enter_context(Visitor(tcp.endpoint("cloud"))) for _ in range(4))
+            little = frames.encode_frame(frames.CALL, 1, bytes(100_000))
+            much = frames.encode_frame(frames.CALL, 1, bytes(MAX_BYTES))[:-1]
+            for visitor, begun in ((small, little[:1000]), *((each, much) for each in large)):
+                await visitor.connect()
+                await visitor.say(HELLO + begun)
+            lost = "has not finished a message, and others need the memory"
+            await until(lambda: tcp.told[-1][1].get("reason") == lost)
+            await large[0].hear()
+            # It began before all the others.
+            await small.say(little[1000:] + frames.encode_goodbye("done"))
+            decoder = frames.FrameDecoder(MAX_BYTES)
+            assert [frame.kind for frame in decoder.feed(await small.hear())][1] == frames.LAST
+        robot.call("cloud", 1, b"question")
+        assert await inbox.of_call(1) == [Replied(1, b"question"), Ended(1)]
+
     async def test_half_received_messages_share_a_bound(self, tcp: StreamWire) -> None:
         robot, inbox, _ = await connected(tcp)
         with contextlib.ExitStack() as stack:
@@ -1276,6 +1338,31 @@ class TestPeers:
         await until(lambda: bool(tcp.refusals))
         assert "which is one too many: 1 robots are connected" in tcp.refusals[0][1]
         assert inbox.events == []
+
+    async def test_connections_that_say_nothing_keep_no_service_out(
+        self, socket_directory: Path, robot_tls: TlsFiles, service_tls: TlsFiles
+    ) -> None:
+        wire = StreamWire(
+            "tls",
+            socket_directory,
+            robot_tls=robot_tls,
+            service_tls=service_tls,
+            robot_listens=True,
+        )
+        robot, inbox = wire.robot("cloud"), Inbox()
+        robot.start(inbox)
+        async with contextlib.AsyncExitStack() as stack:
+            stack.push_async_callback(wire.close_on_loop)
+            for _ in range(200):
+                visitor = stack.enter_context(Visitor(wire.endpoint("cloud")))
+                visitor.socket.setblocking(True)
+                visitor.socket.connect(visitor.address)
+            links_made = robot._services["cloud"]._made
+            for _ in range(100):
+                await asyncio.sleep(0)
+                assert sum(not link.ended for link in links_made) <= robot_end._MAX_UNGREETED
+            await wire.service("cloud", "b1").start(echo)
+            await inbox.wait_for(Appeared("cloud", "b1"))
 
 
 def assert_matches(text: str, pattern: str) -> None:
@@ -1410,6 +1497,27 @@ class TestCertificates:
             robot, _, _ = await connected(wire, calls)
             robot.call("cloud", 1, b"")
             assert (await calls.next()).robot == name
+
+    async def test_links_of_one_certificate_keep_no_other_out(
+        self, tls: StreamWire, authority: Authority, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(service_end, "MAX_LINKS", 3)
+        await tls.service("cloud", "b1").start(echo)
+        greedy = [(tls.robot("cloud"), Inbox()) for _ in range(3)]
+        for robot, inbox in greedy:
+            robot.start(inbox)
+            await inbox.wait_for(Appeared("cloud", "b1"))
+        tls.robot_tls = authority.issue("one of many", oid.ExtendedKeyUsageOID.CLIENT_AUTH)
+        other, other_inbox = tls.robot("cloud"), Inbox()
+        other.start(other_inbox)
+        await other_inbox.wait_for(Appeared("cloud", "b1"))
+        reason = "has 3 links, and another robot needs one of 3"
+        await until(lambda: tls.refusals[:1] == [("cloud", f"refuses this end, which {reason}")])
+        full = "refuses this end, which is one too many: 3 robots are connected"
+        await until(lambda: ("cloud", full) in tls.refusals)  # as it is back
+        other.call("cloud", 1, b"question")
+        assert await other_inbox.of_call(1) == [Replied(1, b"question"), Ended(1)]
+        assert Vanished("cloud", "b1") not in other_inbox
 
     async def test_links_of_some_certificates_can_be_ended(
         self, tls: StreamWire, authority: Authority

@@ -16,6 +16,7 @@ import contextlib
 import math
 import socket
 import time
+from collections import deque
 from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
 
 from holdfast.transport.frames import (
@@ -32,6 +33,7 @@ from holdfast.transport.frames import (
     encode_goodbye,
     read_goodbye,
 )
+from holdfast.transport.turns import TURN_S, Turns
 
 if TYPE_CHECKING:
     from holdfast.transport.tls import PeerCertificate, TlsStream
@@ -51,6 +53,10 @@ _UNSENT_IN_SYSTEM_BYTES: Final = 128 * 1024
 """May wait in the system: then even a slow link is seen to move every few seconds."""
 
 _RECEIVED_AT_ONCE_BYTES: Final = 256 * 1024
+
+_LOOKED_AT_ONCE_BYTES: Final = 16 * 1024
+"""Of what was received: thousands of frames, or of TLS's records, fit into more."""
+
 _PINGS_IN_LEASE: Final = 3
 _CLOSE_TIMEOUT_S: Final = 1.0
 _PING: Final = encode_frame(PING)
@@ -69,7 +75,8 @@ class HalfReceived:
     Parameters
     ----------
     max_bytes : int
-        When they take more, the link is ended whose message began first.
+        When they take more, a link of the owner that holds the most is ended: that whose message
+        began first. So whoever sends much, on many links, ends nobody else's.
     """
 
     def __init__(self, max_bytes: int) -> None:
@@ -86,7 +93,11 @@ class HalfReceived:
             del self._sizes[link]
         self._total += size_bytes - before
         while self._total > self._max_bytes:
-            oldest = next(iter(self._sizes))
+            held: dict[object, int] = {}
+            for each, its_bytes in self._sizes.items():
+                held[each.owner] = held.get(each.owner, 0) + its_bytes
+            most = max(held, key=held.__getitem__)
+            oldest = next(each for each in self._sizes if each.owner == most)
             self._total -= self._sizes.pop(oldest)
             oldest.end("has not finished a message, and others need the memory")
 
@@ -102,12 +113,17 @@ class LinkSettings(NamedTuple):
         This end lets itself be heard several times in this time.
     max_message_bytes : int
     half_received : HalfReceived
+    turns : Turns
+    must_read : bool
+        Whether nothing more is heard of an end that does not read what it is sent.
     """
 
     hello: bytes
     lease_ms: float
     max_message_bytes: int
     half_received: HalfReceived
+    turns: Turns
+    must_read: bool
 
 
 class LinkOwner(Protocol):
@@ -200,6 +216,10 @@ class Link(asyncio.BufferedProtocol):
         self._moved_at = now
         self._said_hello = False
         self._holds = False
+        # What has come and waits: bytes, from where on, and the frames that were in those before.
+        self._unread, self._unread_at = b"", 0
+        self._frames: deque[Frame] = deque()
+        self._waits_for_turn = self._waits_for_reader = False
         self._spoke = False
         self._handed_over_bytes = self._moved_bytes = 0
         self._timer = self._loop.call_at(self._silent_at, self._tick)
@@ -222,6 +242,16 @@ class Link(asyncio.BufferedProtocol):
     def ended(self) -> bool:
         """Whether nothing can be sent any more."""
         return self._ended
+
+    @property
+    def owner(self) -> object:
+        """With whom it shares its turns and its memory.
+
+        The name in the other end's certificate; None before there is one, and without TLS itself.
+        """
+        if self.tls is None:
+            return self
+        return None if self.peer is None else self.peer.name
 
     @property
     def sends_datagrams(self) -> bool:
@@ -292,6 +322,8 @@ class Link(asyncio.BufferedProtocol):
         self.reason = reason
         self.refused = refused
         self._timer.cancel()
+        self._unread = b""
+        self._frames.clear()
         self._settings.half_received.note(self, 0)
         self._loop.call_soon(self._tell)
         transport = self._transport
@@ -340,33 +372,27 @@ class Link(asyncio.BufferedProtocol):
         """Take what has come."""
         if self._ended:
             return
-        data = bytes(_received[:nbytes])
+        self._unread, self._unread_at = bytes(_received[:nbytes]), 0
+        now = self._loop.time()
         if self.hello is not None:
-            self._silent_at = self._loop.time() + self._patience_s
-        try:
-            tls = self.tls
-            if tls is not None:
-                data = self._decrypted(tls, data)
-                if self.ended:
-                    return
-            frames = self._decoder.feed(data)
-            held_bytes = self._decoder.held_bytes
-            if held_bytes or self._holds:
-                self._holds = held_bytes > 0
-                self._settings.half_received.note(self, held_bytes)
-            for frame in frames:
-                if self.ended:
-                    return
-                self._take(frame)
-            if self._decoder.error is not None:
-                raise self._decoder.error
-            if tls is not None and tls.ended:
-                self.end("")
-        except FrameError as error:
-            # Only one of our own kind is told why.
-            self.end(
-                str(error), goodbye=str(error) if self.hello is not None else None, refused=True
-            )
+            self._silent_at = now + self._patience_s
+        if self._settings.turns.may_go_on(self.owner, now):
+            self.go_on()
+        else:
+            self._wait_for_turn()
+
+    def pause_writing(self) -> None:
+        """Take note that the other end does not read as fast as it is sent to."""
+        if self._settings.must_read:
+            self._waits_for_reader = True
+            self._pause_reading()
+
+    def resume_writing(self) -> None:
+        """Take note that the other end has read."""
+        if self._waits_for_reader:
+            self._waits_for_reader = False
+            if not self._ended and not self._waits_for_turn:
+                self._wait_for_turn()
 
     def eof_received(self) -> None:
         """Let asyncio close this end, as the other one has."""
@@ -384,6 +410,73 @@ class Link(asyncio.BufferedProtocol):
             self.closed.set_result(None)
 
     # -- what comes ------------------------------------------------------------------------------
+
+    def go_on(self) -> None:
+        """Handle what has come, for one turn."""
+        self._waits_for_turn = False
+        if self._ended or self._waits_for_reader:
+            return
+        owner, began = self.owner, self._loop.time()
+        try:
+            while self._handle_next():
+                if self.ended or self._waits_for_reader:
+                    break
+                if self._loop.time() >= began + TURN_S and (self._frames or self._unread):
+                    self._wait_for_turn()
+                    break
+            else:
+                if self._transport is not None:
+                    self._transport.resume_reading()
+        except FrameError as error:
+            # Only one of our own kind is told why.
+            self.end(
+                str(error), goodbye=str(error) if self.hello is not None else None, refused=True
+            )
+        self._settings.turns.spend(owner, self._loop.time() - began)
+
+    def _handle_next(self) -> bool:
+        """Handle one frame, or look what frames have come; return whether there was anything."""
+        if self._frames:
+            self._take(self._frames.popleft())
+            return True
+        if self._decoder.error is not None:
+            raise self._decoder.error
+        tls, data, at = self.tls, self._unread, self._unread_at
+        if tls is not None and tls.ended:
+            self.end("")
+            return True
+        if not data:
+            return False
+        if len(data) > _LOOKED_AT_ONCE_BYTES:
+            self._unread_at = at + _LOOKED_AT_ONCE_BYTES
+            data = data[at : self._unread_at]
+        if self._unread_at == at or self._unread_at >= len(self._unread):
+            self._unread, self._unread_at = b"", 0
+        if tls is not None:
+            data = self._decrypted(tls, data)
+            if self.ended:
+                return True
+        self._frames.extend(self._decoder.feed(data))
+        self._note_what_is_held()
+        return True
+
+    def _note_what_is_held(self) -> None:
+        held_bytes = self._decoder.held_bytes
+        if self._waits_for_turn:
+            held_bytes += len(self._unread) - self._unread_at
+        if held_bytes or self._holds:
+            self._holds = held_bytes > 0
+            self._settings.half_received.note(self, held_bytes)
+
+    def _wait_for_turn(self) -> None:
+        self._waits_for_turn = True
+        self._pause_reading()
+        self._note_what_is_held()
+        self._settings.turns.wait(self)
+
+    def _pause_reading(self) -> None:
+        if self._transport is not None:
+            self._transport.pause_reading()
 
     def _decrypted(self, tls: TlsStream, data: bytes) -> bytes:
         was_established = tls.established
@@ -446,6 +539,7 @@ class Link(asyncio.BufferedProtocol):
     def _tick(self) -> None:
         """Look whether the other end lives and reads, and let it know that this one does."""
         now = self._loop.time()
+        self._excuse(now)
         if now >= self._silent_at:
             # If it is this process that stood still, what came meanwhile is still to be read.
             self._loop.call_soon(self._loop.call_soon, self._give_up_if_silent)
@@ -475,12 +569,18 @@ class Link(asyncio.BufferedProtocol):
     def _give_up_if_silent(self) -> None:
         if self._ended:
             return
+        self._excuse(self._loop.time())
         if self._loop.time() < self._silent_at:
             self._tick()
         elif self.hello is None:
             self.end(f"has said no hello within {OPENING_TIMEOUT_S:g} s", abort=True)
         else:
             self.end(f"was silent for {1e3 * self._patience_s:g} ms", abort=True)
+
+    def _excuse(self, now: float) -> None:
+        """Take nobody for silent who is not listened to."""
+        if self.hello is not None and (self._waits_for_turn or self._waits_for_reader):
+            self._silent_at = now + self._patience_s
 
 
 def _what_is_wrong(error: OSError) -> str:

@@ -40,10 +40,14 @@ from holdfast.transport.frames import (
 from holdfast.transport.links import HalfReceived, Link, LinkSettings
 from holdfast.transport.listener import Listener
 from holdfast.transport.tls import ClientCredentials, TlsStream
+from holdfast.transport.turns import Turns
 
 __all__ = ["StreamRobotTransport"]
 
 _CALL_NUMBERS = 1 << 32
+
+_MAX_UNGREETED = 64
+"""Connections to a robot that listens, of which nobody knows who they are."""
 
 
 class StreamRobotTransport:
@@ -97,6 +101,8 @@ class StreamRobotTransport:
             lease_ms,
             max_message_bytes,
             HalfReceived(2 * max_message_bytes),
+            Turns(),
+            must_read=False,
         )
         self.calls = CallTable()
         self.on_refused = on_refused
@@ -220,7 +226,8 @@ class _Service:
         # Those over which it is seen, with the boot that was told, the newest last. There are
         # several only where the robot listens.
         self._links: dict[Link, str] = {}
-        self._made: set[Link] = set()
+        # In the order of their beginning.
+        self._made: dict[Link, None] = {}
         self._calls: dict[Link, dict[int, PendingCall]] = {}
         self._numbers = count()
         # What the last hello said, under which boot that was told, and whether the handshake alone
@@ -295,10 +302,13 @@ class _Service:
                 speaks_first=tls is not None or not self._address.listens,
                 tls=tls,
             )
-        self._made.add(link)
+        self._made[link] = None
         return link
 
     def _accepted(self, connection: socket.socket) -> None:
+        unknown = [link for link in self._made if link.hello is None and not link.ended]
+        if len(unknown) >= _MAX_UNGREETED:
+            unknown[0].end("has said no hello, and others wait", abort=True)
         link = self._make_link()
         link.connecting = asyncio.get_running_loop().create_task(link.connect(connection))
 
@@ -386,7 +396,7 @@ class _Service:
 
     def lost(self, link: Link) -> None:
         """Take note that a link has ended."""
-        self._made.discard(link)
+        self._made.pop(link, None)
         self._calls.pop(link, None)
         was_current = next(reversed(self._links), None) is link
         boot = self._links.pop(link, None)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import socket
+from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Final
@@ -37,6 +38,7 @@ from holdfast.transport.frames import (
 from holdfast.transport.links import HalfReceived, Link, LinkSettings
 from holdfast.transport.listener import Listener
 from holdfast.transport.revocation import REVOKED_FILE, revoked_serials
+from holdfast.transport.turns import Turns
 
 if TYPE_CHECKING:
     import ssl
@@ -49,7 +51,7 @@ if TYPE_CHECKING:
 __all__ = ["MAX_LINKS", "StreamServiceTransport"]
 
 MAX_LINKS: Final = 4096
-"""Of robots, at the same time."""
+"""Of robots, at the same time. If there are more, who has the most loses one."""
 
 _REVOKED: Final = "has a certificate that has been revoked"
 
@@ -88,7 +90,7 @@ class _StreamCall:
         self._open = True
         self.is_being_delivered = False
         self.payload = payload
-        self.robot = None if link.peer is None else link.peer.name
+        self.robot = _certified(link)
 
     def reply(self, payload: bytes) -> None:
         """Send a reply. A robot that is gone is no error."""
@@ -193,6 +195,8 @@ class StreamServiceTransport:
             lease_ms,
             max_message_bytes,
             HalfReceived(2 * max_message_bytes),
+            Turns(),
+            must_read=True,
         )
         self._on_event = on_event
         self._deliver: Callable[[IncomingCall], None] | None = None
@@ -350,14 +354,31 @@ class StreamServiceTransport:
         """Nothing: a robot says who it is next."""
 
     def refusal(self, link: Link, hello: Hello) -> str | None:
-        """Refuse what is no robot or revoked, and more robots than there is room for."""
+        """Refuse what is no robot or revoked, and who would have more than a share of the room."""
         if hello.role != "robot":
             return "is a service, and a robot was expected"
         if link.peer is not None and self._is_revoked(link.peer):
             return _REVOKED
-        if len(self._links) >= MAX_LINKS:
+        if len(self._links) >= MAX_LINKS and not self._make_room(_certified(link)):
             return f"is one too many: {MAX_LINKS} robots are connected"
         return None
+
+    def _make_room(self, name: str | None) -> bool:
+        """End a link of whoever has the most, if that leaves them no fewer than this one then has.
+
+        So a certificate cannot keep others out, however many links are made with it.
+        """
+        standing = [link for link in self._links if not link.ended]
+        if len(standing) < MAX_LINKS:
+            return True
+        numbers = Counter(map(_certified, standing))
+        (most, number), *_ = numbers.most_common(1)
+        if number <= numbers[name] + 1:
+            return False
+        oldest = next(link for link in standing if _certified(link) == most)
+        reason = f"has {number} links, and another robot needs one of {MAX_LINKS}"
+        oldest.end(reason, goodbye=reason, refused=True)
+        return True
 
     def greeted(self, link: Link, hello: Hello) -> None:
         """Take note of a robot."""
@@ -415,6 +436,11 @@ class StreamServiceTransport:
     def _tell(self, name: str, **fields: object) -> None:
         if self._on_event is not None:
             self._on_event(name, **fields)
+
+
+def _certified(link: Link) -> str | None:
+    """Return the name in a robot's certificate; None without TLS."""
+    return None if link.peer is None else link.peer.name
 
 
 def _name(link: Link, hello: Hello) -> str:

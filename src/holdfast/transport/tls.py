@@ -32,7 +32,8 @@ _KEY_EXCHANGE = "X25519"
 """The only one: of those that OpenSSL offers, whoever asks for the largest (ffdhe8192) would have
 a service compute for two tenths of a second before it knows who asks."""
 
-_READ_BYTES = 256 * 1024
+_READ_BYTES = 16 * 1024
+"""The largest record."""
 
 
 class PeerCertificate(NamedTuple):
