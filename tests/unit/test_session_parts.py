@@ -207,3 +207,25 @@ class TestLines:
         self.finish(job)
         assert self.run_one()[0] == b"1"
         assert self.lines.num_waiting == 1
+
+
+class TestUsualTimes:
+    @pytest.mark.parametrize("task", [True, False])
+    def test_one_that_others_made_longer_counts_little_and_a_shorter_one_at_once(
+        self, *, task: bool
+    ) -> None:
+        times = ExpectedTimes(4.0, 1e-3, 1e-3)
+        assert times.known_s(task=task) == float("inf")
+        for computed_s in (0.004, 0.0003, 0.005):
+            times.learn(computed_s, task=task)
+        assert 0.0003 < times.known_s(task=task) < 0.001
+        times.learn(0.0002, task=task)
+        assert times.known_s(task=task) == 0.0002
+        assert times.known_s(task=not task) == float("inf")
+
+    def test_what_has_become_longer_is_known_to_be_after_a_while(self) -> None:
+        times = ExpectedTimes(4.0, 1e-3, 1e-3)
+        times.learn(0.0003, task=False)
+        for _ in range(20):
+            times.learn(0.004, task=False)
+        assert times.known_s(task=False) > 0.002

@@ -1384,3 +1384,13 @@ def test_what_may_be_of_few_steps_or_many_is_not_expected_to_be_brief() -> None:
         robot.act_until_sensing()
         robot.sense()
     assert expected[1] < math.inf  # the sensing part is of none
+
+
+def test_the_first_question_of_a_trial_is_as_brief_as_those_before() -> None:
+    service, robot = Service(make_problem, 1), Robot()
+    expected = []
+    for trial in range(3):
+        robot.begin(trial)
+        expected += runs_of(service, trial, robot.request(), trial)
+    # The first one also builds the problem.
+    assert expected == [math.inf, math.inf, pytest.approx(0.001)]

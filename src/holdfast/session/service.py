@@ -81,18 +81,18 @@ class _Fate(enum.Enum):
 def _takes_the_usual_time(work: Work, state: PlanningState | None) -> bool:
     """Tell whether a work is as most are, so that what those before took says what it will take.
 
-    It then comes one observation after the one before, and is of few steps, for a robot may choose
-    the number of steps anew with each request. It is of a problem of holdfast's own: other people's
-    code may take any time at any call.
+    It then comes one observation after the one before, or from a trial's beginning, and is of few
+    steps, for a robot may choose the number of steps anew with each request. It is of a problem of
+    holdfast's own: other people's code may take any time at any call.
     """
     request = work.request
-    if state is None or not work.session.built_in:
+    if not work.session.built_in:
         return False
     if request is None:
         return True
     if request.checkpoint is not None or len(request.observations) > 1:
         return False
-    num_steps = request.step - state.step
+    num_steps = request.step - (0 if state is None else state.step)
     if not work.sensing:
         num_steps += work.session.planning.sensing_interval
     return num_steps <= _USUAL_STEPS

@@ -77,6 +77,9 @@ class Part(NamedTuple):
     sensing_action: int = -1
 
 
+_INERTIA_OF_THE_USUAL = 16.0
+
+
 class ExpectedTimes:
     """How long parts of answers may take, by what they took before.
 
@@ -88,32 +91,29 @@ class ExpectedTimes:
         What is expected before anything was computed.
     """
 
-    __slots__ = ("_inertia", "_last_sensing_s", "_last_task_s", "sensing_s", "task_s")
+    __slots__ = ("_inertia", "_usual_sensing_s", "_usual_task_s", "sensing_s", "task_s")
 
     def __init__(self, inertia: float, task_s: float, sensing_s: float) -> None:
         self._inertia = inertia
-        self._last_task_s = self._last_sensing_s = math.inf
+        self._usual_task_s = self._usual_sensing_s = math.inf
         self.task_s = task_s
         self.sensing_s = sensing_s
 
     def known_s(self, *, task: bool) -> float:
-        """Return what a part usually takes; infinite if none was ever computed.
+        """Return what a part usually takes if nobody else has the core; infinite if unknown.
 
-        One that took long by chance (another process had the core) counts no more as soon as the
-        next one did not.
+        Others only make it longer, so a shorter time counts at once and a longer one little: else a
+        busy service would send each brief job to a thread, which keeps it busier still.
         """
-        last_s, mean_s = (
-            (self._last_task_s, self.task_s) if task else (self._last_sensing_s, self.sensing_s)
-        )
-        return last_s if last_s == math.inf else min(last_s, mean_s)
+        return self._usual_task_s if task else self._usual_sensing_s
 
     def learn(self, computed_s: float, *, task: bool) -> None:
         """Let a job's time count in what the next ones are expected to take."""
         if task:
-            self._last_task_s = computed_s
+            self._usual_task_s = _usual(self._usual_task_s, computed_s)
             self.task_s = self._moved(self.task_s, computed_s)
         else:
-            self._last_sensing_s = computed_s
+            self._usual_sensing_s = _usual(self._usual_sensing_s, computed_s)
             self.sensing_s = self._moved(self.sensing_s, computed_s)
 
     def _moved(self, mean_s: float, sample_s: float) -> float:
@@ -123,6 +123,12 @@ class ExpectedTimes:
         turned away for what happened once.
         """
         return mean_s + (min(sample_s, 4.0 * mean_s + 0.01) - mean_s) / self._inertia
+
+
+def _usual(usual_s: float, sample_s: float) -> float:
+    if sample_s <= usual_s:
+        return sample_s
+    return usual_s + (sample_s - usual_s) / _INERTIA_OF_THE_USUAL
 
 
 class WaitingCall:
