@@ -189,6 +189,32 @@ class TestStrangers:
         assert len(await inbox.of_call(5)) == 2
         await answers_of(other, other_inbox, calls)
 
+    async def test_who_sends_more_than_it_has_turns_loses_its_own_link(
+        self, udp: StreamWire
+    ) -> None:
+        calls: list[bytes] = []
+
+        def serve(call: IncomingCall) -> None:
+            calls.append(call.payload)
+            echo(call)
+
+        robot, inbox, service = await connected(udp, serve)
+        greedy, greedy_inbox = udp.robot("cloud", name="greedy"), Inbox()
+        greedy.start(greedy_inbox)
+        await until(lambda: greedy.sends_datagrams("cloud"))
+        ours, at_service = link_of(greedy), link_at(service, 1)
+        assert ours._sealing is not None
+        for k in range(1, 6001):
+            question = b"\1\0" + k.to_bytes(4, "big") * 2 + b"\0\0flood"
+            # As the system would hand them over, if it kept as many.
+            at_service.take_datagram(ours._sealing.seal(question), ("127.0.0.1", 9))
+        assert at_service.ended
+        assert at_service.reason == "sends more datagrams than can be heard beside those of others"
+        assert 0 < len(calls) < 6000 - 4096
+        await greedy_inbox.wait_for(Vanished("cloud", "b1"))
+        await answers(robot, inbox, 6)
+        assert Vanished("cloud", "b1") not in inbox
+
     async def test_what_was_recorded_leads_no_answer_elsewhere(
         self, udp: StreamWire, monkeypatch: pytest.MonkeyPatch
     ) -> None:

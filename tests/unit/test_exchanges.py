@@ -15,6 +15,7 @@ from holdfast.transport.exchanges import (
     KEEP_ALIVE_S,
     MAX_ANSWERS,
     MAX_DATAGRAM_BYTES,
+    MAX_EARLY_BYTES,
     MAX_PAYLOAD_BYTES,
     Answers,
     Part,
@@ -493,6 +494,17 @@ class TestBounds:
         late = b"\1\0" + b"\0\0\0\1" * 2 + b"\0\0" + bytes(75)
         assert network.answers.received(late, datagram=True) is None
         assert len(network.asked) == 5 * MAX_ANSWERS
+
+    def test_parts_without_those_before_them_take_no_more_memory_than_the_bound(self) -> None:
+        questions = Questions(Ways(lambda _: None, lambda _, __: None, lambda: 0))
+        questions.ask(7, bytes(2000), 0.0)
+        part = bytes(MAX_EARLY_BYTES // 4)
+        found = []
+        for index in range(1, 6):  # never the first
+            reply = b"\2\0" + (1).to_bytes(4, "big") + index.to_bytes(2, "big") + part
+            found.append(questions.received(reply, 0.0, datagram=False))
+        assert found == [[], [], [], [], [Part(7, None, True)]]
+        assert questions.calls == []
 
     def test_no_more_answers_are_kept_than_the_bound(self) -> None:
         answers = Answers(Ways(lambda _: None, lambda _n, _m: None, lambda: 0))

@@ -24,6 +24,7 @@ import contextlib
 import errno
 import socket
 import struct
+from collections import deque
 from typing import Any, Final
 
 from holdfast.transport.exchanges import MESSAGE_OVERHEAD, Answers, Part, Questions, Ways
@@ -43,6 +44,7 @@ from holdfast.transport.frames import (
 from holdfast.transport.links import Link, LinkOwner, LinkSettings
 from holdfast.transport.sealing import Keys, KeysExhaustedError, Sealing, association_of
 from holdfast.transport.tls import TlsStream
+from holdfast.transport.turns import TURN_S
 
 __all__ = ["DatagramSockets", "RobotDatagramLink", "ServiceDatagramLink"]
 
@@ -56,6 +58,15 @@ _DATAGRAMS_AT_ONCE: Final = 64
 _STREAM_PING_S: Final = 1.5
 """So often a stream shows that it lives, while datagrams show that its ends do."""
 
+_MAX_LATE: Final = 64
+"""Messages of a link that wait for its turn; what is beyond is lost, as any datagram may be."""
+
+_MAX_OVERRUN: Final = 4096
+"""Who has lost so many of them loses the link as well."""
+
+_WAITING_IN_SYSTEM_BYTES: Final = 1 << 20
+"""Asked for: what one robot sends too much of is to be read, not to be in the way of others'."""
+
 _STREAM_SILENT_S: Final = 5.0
 _STREAM_SILENT_LEASES: Final = 3.0
 """For so long, and so many leases, nothing may come on a stream while datagrams do."""
@@ -67,10 +78,28 @@ _PROBES_OF_DOUBT: Final = 3
 _PROBE_DISTANCE_S: Final = 0.003
 _PROBES_BEFORE_NEW_SOCKET: Final = 2
 
+_OVERRUN: Final = "sends more datagrams than can be heard beside those of others"
+
 _NO_WAY: Final = frozenset(
     {errno.EINVAL, errno.EADDRNOTAVAIL, errno.ENETUNREACH, errno.EHOSTUNREACH, errno.ENETDOWN}
 )
 """What the system says of a socket whose own address is gone."""
+
+
+class _Late:
+    """Messages of a link that came in datagrams and wait for its turn."""
+
+    def __init__(self, link: _DatagramLink) -> None:
+        self._link = link
+        self.messages: deque[bytes] = deque()
+        self.overrun = 0
+
+    @property
+    def owner(self) -> object:
+        return self._link.owner
+
+    def go_on(self) -> None:
+        self._link.take_late()
 
 
 class _DatagramLink(Link):
@@ -90,6 +119,7 @@ class _DatagramLink(Link):
         self._stream_heard_at = self._stream_spoke_at = self._loop.time()
         self._datagram_heard_at = self._datagram_sent_at = float("-inf")
         self._peer_address: Any = None
+        self._late = _Late(self)
         self._ways = Ways(self._send_datagram, self._send_on_stream, self._lost_of_theirs)
 
     # -- sending ---------------------------------------------------------------------------------
@@ -138,8 +168,37 @@ class _DatagramLink(Link):
         if sealing.window.newest > newest:
             # Of older ones, one that was held back could lead the answers to where nobody is.
             self._peer_address = address
-        self._datagram_heard_at = self._loop.time()
-        self._silent_at = max(self._silent_at, self._datagram_heard_at + self._patience_s)
+        now = self._datagram_heard_at = self._loop.time()
+        self._silent_at = max(self._silent_at, now + self._patience_s)
+        # Only now, for by what is forged nobody is to lose a turn.
+        late, turns = self._late, self._settings.turns
+        if not late.messages and turns.may_go_on(self.owner, now):
+            self._handle(message)
+            turns.spend(self.owner, self._loop.time() - now)
+        elif len(late.messages) < _MAX_LATE:
+            late.messages.append(message)
+            if len(late.messages) == 1:
+                turns.wait(late)
+        else:
+            late.overrun += 1
+            if late.overrun >= _MAX_OVERRUN:
+                self.end(_OVERRUN, goodbye=_OVERRUN, refused=True)
+
+    def take_late(self) -> None:
+        """Take the messages that have waited, for one turn."""
+        late, turns = self._late, self._settings.turns
+        began = now = self._loop.time()
+        while late.messages and not self._ended and now < began + TURN_S:
+            self._handle(late.messages[0])
+            late.messages.popleft()
+            now = self._loop.time()
+        turns.spend(self.owner, now - began)
+        if self._ended:
+            late.messages.clear()
+        elif late.messages:
+            turns.wait(late)
+
+    def _handle(self, message: bytes) -> None:
         try:
             self._received(message, datagram=True)
         except FrameError as error:
@@ -524,6 +583,7 @@ class _DatagramSocket:
         self._socket = socket.socket(family, socket.SOCK_DGRAM)
         try:
             self._socket.setblocking(False)
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _WAITING_IN_SYSTEM_BYTES)
             try:
                 self._socket.bind(address)
             except OSError:

@@ -48,6 +48,7 @@ __all__ = [
     "KEEP_ALIVE_S",
     "MAX_ANSWERS",
     "MAX_DATAGRAM_BYTES",
+    "MAX_EARLY_BYTES",
     "MAX_PAYLOAD_BYTES",
     "MESSAGE_OVERHEAD",
     "Answers",
@@ -85,6 +86,10 @@ addresses forget a way that is not used, after 30 s and more."""
 
 MAX_ANSWERS: Final = 1024
 """Bound on the questions of a robot whose answers are kept, and on parts that came too early."""
+
+MAX_EARLY_BYTES: Final = 16 << 20
+"""Bound on the parts of answers that came before others which are missing: few come so, but a
+service that means harm may send nothing else."""
 
 _EXTRA_SHARE: Final = 2
 """Bytes that may be sent again for each that was sent for the first time."""
@@ -463,6 +468,8 @@ class Questions:
         if not question.have <= index < question.have + MAX_ANSWERS:
             return []  # it is there already
         question.early[index] = (None if end_alone else payload, last)
+        if index > question.have and self._early_bytes > MAX_EARLY_BYTES:
+            return self.passed_over(question.number)
         parts = []
         while question.have in question.early:
             part = Part(question.call, *question.early.pop(question.have))
@@ -475,6 +482,14 @@ class Questions:
         if question.early and waited_s > self.round_trips.patience_s and not question.on_stream:
             self._ask_again(question, now)  # the one before it is lost, or late
         return parts
+
+    @property
+    def _early_bytes(self) -> int:
+        return sum(
+            len(payload or b"")
+            for question in self._questions.values()
+            for payload, _ in question.early.values()
+        )
 
     def _heard_of(self, question: _Question, now: float) -> None:
         if question.on_stream:
