@@ -28,67 +28,58 @@ crowd service=cloud-1 at=0.2 robots=200
    0.1738  robot    hears of call 3: TaskAnswer
    0.1738  robot    performs task actions 9 to 11
    0.2000  cloud-1  is asked by 200 other robots
-   0.2044  robot    performs task actions 12 to 13
-   0.2238  robot    hears of call 3: Progress
-   0.2248  robot    performs task actions 14 to 17
-   0.2738  robot    hears of call 3: Progress
-   0.3238  robot    hears of call 3: Progress
+   0.2044  robot    performs task actions 12 to 15
+   0.2371  robot    hears of call 3: Progress
+   0.2452  robot    performs task actions 16 to 17
+   0.3004  robot    hears of call 3: Progress
    0.3538  robot    hears of call 3: SensingAnswer
    0.3538  robot    performs sensing action 0 of step 18
    0.3538  robot    hears of call 3: its end
    0.3548  robot    asks cloud-1, call 4
-   0.4010  robot    hears of call 4: Progress
-   0.4510  robot    hears of call 4: Progress
-   0.5010  robot    hears of call 4: Progress
-   0.5510  robot    hears of call 4: Progress
-   0.6010  robot    hears of call 4: Progress
-   0.6510  robot    hears of call 4: Progress
-   0.7010  robot    hears of call 4: Progress
-   0.7510  robot    hears of call 4: Progress
+   0.4201  robot    hears of call 4: Progress
+   0.4834  robot    hears of call 4: Progress
+   0.5459  robot    hears of call 4: Progress
+   0.6084  robot    hears of call 4: Progress
+   0.6709  robot    hears of call 4: Progress
+   0.7326  robot    hears of call 4: Progress
    0.7738  robot    hears of call 4: TaskAnswer
-   0.7738  robot    performs task actions 18 to 22
-   0.8238  robot    hears of call 4: Progress
-   0.8248  robot    performs task actions 23 to 26
-   0.8738  robot    hears of call 4: Progress
-   0.9238  robot    hears of call 4: Progress
-   0.9738  robot    hears of call 4: Progress
-   1.0238  robot    hears of call 4: Progress
-   1.0738  robot    hears of call 4: Progress
-   1.1238  robot    hears of call 4: Progress
+   0.7738  robot    performs task actions 18 to 23
+   0.8283  robot    hears of call 4: Progress
+   0.8350  robot    performs task actions 24 to 26
+   0.8901  robot    hears of call 4: Progress
+   0.9518  robot    hears of call 4: Progress
+   1.0127  robot    hears of call 4: Progress
+   1.0737  robot    hears of call 4: Progress
    1.1338  robot    hears of call 4: SensingAnswer
    1.1338  robot    performs sensing action 0 of step 27
    1.1338  robot    hears of call 4: its end
    1.1348  robot    asks cloud-1, call 5
-   1.1868  robot    hears of call 5: Progress
-   1.2368  robot    hears of call 5: Progress
-   1.2868  robot    hears of call 5: Progress
-   1.3368  robot    hears of call 5: Progress
-   1.3868  robot    hears of call 5: Progress
-   1.4368  robot    hears of call 5: Progress
-   1.4868  robot    hears of call 5: Progress
-   1.5368  robot    hears of call 5: Progress
+   1.1948  robot    hears of call 5: Progress
+   1.2557  robot    hears of call 5: Progress
+   1.3158  robot    hears of call 5: Progress
+   1.3760  robot    hears of call 5: Progress
+   1.4362  robot    hears of call 5: Progress
+   1.4955  robot    hears of call 5: Progress
    1.5538  robot    hears of call 5: TaskAnswer
-   1.5538  robot    performs task actions 27 to 31
-   1.6010  robot    hears of call 5: Progress
-   1.6048  robot    performs task actions 32 to 35
-   1.6510  robot    hears of call 5: Progress
-   1.7010  robot    hears of call 5: Progress
-   1.7510  robot    hears of call 5: Progress
-   1.8010  robot    hears of call 5: Progress
-   1.8510  robot    hears of call 5: Progress
-   1.9010  robot    hears of call 5: Progress
+   1.5538  robot    performs task actions 27 to 32
+   1.6132  robot    hears of call 5: Progress
+   1.6150  robot    performs task actions 33 to 35
+   1.6725  robot    hears of call 5: Progress
+   1.7319  robot    hears of call 5: Progress
+   1.7905  robot    hears of call 5: Progress
+   1.8491  robot    hears of call 5: Progress
+   1.9077  robot    hears of call 5: Progress
    1.9138  robot    hears of call 5: SensingAnswer
    1.9138  robot    performs sensing action 0 of step 36
    1.9138  robot    hears of call 5: its end
    1.9148  robot    asks cloud-1, call 6
-   1.9668  robot    hears of call 6: Progress
-   2.0168  robot    hears of call 6: Progress
-   2.0668  robot    hears of call 6: Progress
-   2.1168  robot    hears of call 6: Progress
-   2.1668  robot    hears of call 6: Progress
-   2.2168  robot    hears of call 6: Progress
-   2.2668  robot    hears of call 6: Progress
-   2.3168  robot    hears of call 6: Progress
+   1.9663  robot    hears of call 6: Progress
+   2.0249  robot    hears of call 6: Progress
+   2.0835  robot    hears of call 6: Progress
+   2.1413  robot    hears of call 6: Progress
+   2.1991  robot    hears of call 6: Progress
+   2.2569  robot    hears of call 6: Progress
+   2.3140  robot    hears of call 6: Progress
    2.3338  robot    hears of call 6: TaskAnswer
    2.3338  robot    performs task actions 36 to 39
    2.3746  robot    ends trial 3 after 40 steps

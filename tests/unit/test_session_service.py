@@ -1257,6 +1257,19 @@ class TestProgress:
         bench.apply(bench.service.tick(due))
         assert all(len(replies) == 1 for replies in bench.replies.values())
 
+    @pytest.mark.parametrize(("count", "interval_s"), [(64, 0.05), (96, 0.075), (300, 0.1)])
+    def test_where_many_wait_each_is_told_less_often(self, count: int, interval_s: float) -> None:
+        bench = Bench(progress_interval_ms=50.0, max_wait_ms=1e6)
+        request = Robot().request()
+        for key in range(count):
+            session = (key + 1).to_bytes(16, "big")
+            bench.send(msgspec.structs.replace(request, session=session))
+        assert bench.service.next_wakeup() == pytest.approx(bench.now + interval_s)
+        for turn in range(1, 4):
+            bench.now += interval_s
+            bench.apply(bench.service.tick(bench.now))
+            assert {len(replies) for replies in bench.replies.values()} == {turn}
+
 
 class TestAnyOrder:
     @pytest.mark.parametrize("seed", range(12))

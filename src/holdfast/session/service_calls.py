@@ -35,6 +35,10 @@ _MAX_TEXT = 4000
 _PROGRESS_TOGETHER = 0.8
 """Calls this far into the interval are told with those that are due: fewer wake-ups."""
 
+_FEW_CALLS = 64
+"""When more wait, each is told less often, down to half as often: signs of life take their turn
+from the answers that the robots wait for."""
+
 _RETRY_SPREAD = 0.25
 """By up to this share robots are to come back later than they could, each by its own."""
 
@@ -108,7 +112,7 @@ class Calls:
         due_at = self.progress_at()
         if due_at is None or due_at > now:
             return
-        since = now - _PROGRESS_TOGETHER * self._progress_s
+        since = now - _PROGRESS_TOGETHER * self._interval_s()
         due = []
         for record in self._calls.values():
             if record.signed_at > since:
@@ -120,7 +124,11 @@ class Calls:
     def progress_at(self) -> float | None:
         """Return when the next call is to be told something; None if none waits."""
         first = next(iter(self._calls.values()), None)
-        return None if first is None else first.signed_at + self._progress_s
+        return None if first is None else first.signed_at + self._interval_s()
+
+    def _interval_s(self) -> float:
+        """Return how often a call is told that it still waits."""
+        return self._progress_s * min(2.0, max(1.0, len(self._calls) / _FEW_CALLS))
 
     def _reply(self, record: WaitingCall, payload: bytes, now: float) -> None:
         self._effects.append(Answer(record.call, payload))

@@ -45,7 +45,7 @@ class ServiceLimits(msgspec.Struct, frozen=True, kw_only=True):
     max_calls_per_request : int
         Calls that wait for the same answer; the oldest is ended.
     progress_interval_ms : float
-        A robot is told this often that its request is in work.
+        A robot is told this often that its request is in work; half as often where many wait.
     prefetch_patience_ms : float
         A sensing part that no robot stands still for lets others go first for this long.
     max_particles : int
