@@ -30,6 +30,8 @@ from holdfast.recording.journal import Journal
 
 PEG = "peg_in_hole_2d"
 SHORT = document_of(PEG, max_steps=40)
+LONG_STEPS = 400
+LONG = document_of(PEG, max_steps=LONG_STEPS)
 KILLED = sensing_steps(SHORT)[1]
 """Killed while it senses there, the robot leaves a journal without an action of unknown fate."""
 
@@ -63,7 +65,7 @@ READ_ONLY = 'mount --bind "$0" "$0" && mount -o remount,bind,ro "$0" && exec "$@
 
 # What is in it is gone with the namespace, so it is brought out.
 SMALL = """
-mount -t tmpfs -o size=160k tmpfs "$0" || exit 99
+mount -t tmpfs -o size=112k tmpfs "$0" || exit 99
 "$@"
 code=$?
 cp -a "$0" "$0-kept"
@@ -283,12 +285,12 @@ class TestCannotBeWritten:
 
     @needs_mounts
     def test_a_disk_that_fills_up(self, site: Site, references: References) -> None:
-        story = Story(site, references, SHORT)
+        story = Story(site, references, LONG)
         out = site.directory / "out"
         out.mkdir()
         robot = site.run(story.file, command=in_namespace(SMALL, out))
         assert robot.wait() == 2, robot.account()
         assert f"{journal_of(robot)}: database or disk is full" in robot.output
         assert "--resume" in robot.output
-        assert 0 < story.world.step < 40
+        assert 0 < story.world.step < LONG_STEPS
         story.finish(site.run(story.file, out="out-kept", resume=True))
