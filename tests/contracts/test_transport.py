@@ -1098,7 +1098,7 @@ class TestVisitors:
                 (place,) = service._listeners
                 for _ in range(100):
                     await asyncio.sleep(0)
-                    assert len(place._silent) <= listener._MAX_SILENT
+                    assert len(place._silent) <= listener.MAX_SILENT
                     assert len(service._ungreeted) <= service_end._MAX_UNGREETED
             robot, inbox = wire.robot("cloud"), Inbox()
             robot.start(inbox)

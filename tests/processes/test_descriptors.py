@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import resource
+from pathlib import Path
 
 import pytest
 from tests.ports import free_port
@@ -15,9 +17,11 @@ from tests.processes.faults import (
     Story,
     document_of,
 )
+from tests.processes.test_tls import secure
+from tests.wire import HELLO, RawLink, hello_of
 
 from holdfast.runtime.descriptors import NEEDED
-from holdfast.transport.service_end import MAX_LINKS
+from holdfast.transport.service_end import MAX_LINKS, MAX_UNKNOWN
 
 PEG = "peg_in_hole_2d"
 
@@ -63,8 +67,27 @@ def test_a_service_takes_what_it_is_allowed(site: Site, references: References) 
     cloud = site.service()
     cloud.command = limited("-S -n 12", *cloud.command)
     cloud.start()
-    wanted = NEEDED + MAX_LINKS
+    wanted = NEEDED + MAX_UNKNOWN + MAX_LINKS
     soft = wanted if hard == resource.RLIM_INFINITY else min(wanted, hard)
     assert resource.prlimit(cloud.process.pid, resource.RLIMIT_NOFILE) == (soft, hard)
     robot = Story(site, references, document_of(PEG)).run(cloud)
     assert robot.statuses() == []
+
+
+def test_one_certificate_does_not_take_them_all(site: Site, keys: Path) -> None:
+    made = site.holdfast("keys", keys / "ours", "--robot", "greedy")
+    assert made.process.returncode == 0, made.account()
+    cloud = secure(site, keys, "tls")
+    cloud.command = limited("-n 100", *cloud.command)
+    cloud.start()
+    with contextlib.ExitStack() as stack:
+        answers = []
+        for _ in range(60):
+            link = stack.enter_context(RawLink(cloud.endpoint, keys / "ours" / "greedy"))
+            link.say(hello_of())
+            answers.append(frame.kind if (frame := link.receive()) else None)
+        assert answers.count(HELLO) == 25  # a quarter
+        other = stack.enter_context(RawLink(cloud.endpoint, keys / "ours" / "robot"))
+        other.say(hello_of())
+        frame = other.receive()
+        assert frame is not None and frame.kind == HELLO

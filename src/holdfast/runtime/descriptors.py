@@ -21,13 +21,18 @@ class DescriptorError(HoldfastError):
     """Fewer files and sockets may be open at a time than the process needs."""
 
 
-def allow_descriptors(wanted: int = NEEDED) -> None:
+def allow_descriptors(wanted: int = NEEDED) -> int:
     """See to it that this process may have enough files and sockets open at a time.
 
     Parameters
     ----------
     wanted : int
         The limit is raised to so many, as far as the process is allowed to; it is never lowered.
+
+    Returns
+    -------
+    int
+        How many may be open now; ``wanted`` if there is no limit.
 
     Raises
     ------
@@ -37,7 +42,7 @@ def allow_descriptors(wanted: int = NEEDED) -> None:
     try:
         import resource
     except ImportError:
-        return  # no such limit on this system
+        return wanted  # no such limit on this system
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     unlimited = resource.RLIM_INFINITY
     possible = wanted if hard == unlimited else min(wanted, hard)
@@ -52,3 +57,4 @@ def allow_descriptors(wanted: int = NEEDED) -> None:
             f"needs {NEEDED}; raise the limit with 'ulimit -n {NEEDED}', for a service of systemd "
             f"with LimitNOFILE={NEEDED}"
         )
+    return wanted if soft == unlimited else soft

@@ -143,9 +143,10 @@ def _serve(options: Options, supervised: Supervised | None = None) -> int:
         _import_without_openssl()
 
     from holdfast.runtime.descriptors import NEEDED, allow_descriptors
-    from holdfast.transport.service_end import MAX_LINKS, StreamServiceTransport
+    from holdfast.transport.service_end import MAX_LINKS, MAX_UNKNOWN, StreamServiceTransport
 
-    allow_descriptors(NEEDED + MAX_LINKS)
+    beside = NEEDED + MAX_UNKNOWN
+    allowed = allow_descriptors(beside + MAX_LINKS)
     boot = os.urandom(8).hex()
     transport = StreamServiceTransport(
         options.name,
@@ -154,6 +155,8 @@ def _serve(options: Options, supervised: Supervised | None = None) -> int:
         connect=options.connect,
         listening=[socket.socket(fileno=each) for each in options.sockets],
         lease_ms=options.lease_ms,
+        # Else those who have the most links would leave no descriptor for anybody new.
+        max_links=min(MAX_LINKS, max(allowed // 4, allowed - beside)),
         tls=tls,
         on_event=lambda event, **fields: shell.note(event, **fields),
     )

@@ -21,7 +21,7 @@ from holdfast.errors import TransportError
 from holdfast.transport.endpoints import Endpoint
 from holdfast.transport.links import OPENING_TIMEOUT_S
 
-__all__ = ["BACKLOG", "Listener", "listen"]
+__all__ = ["BACKLOG", "MAX_SILENT", "Listener", "listen"]
 
 BACKLOG: Final = 1024
 """Connections that wait to be accepted."""
@@ -32,7 +32,7 @@ _ACCEPTED_AT_ONCE: Final = 32
 _PAUSE_S: Final = 0.1
 """After the system has refused to accept: no descriptor is free."""
 
-_MAX_SILENT: Final = 256
+MAX_SILENT: Final = 256
 """Connections of which no byte has come."""
 
 
@@ -123,7 +123,7 @@ class Listener:
             if self._speaks_first:
                 self._accepted(connection)
                 continue
-            if len(self._silent) >= _MAX_SILENT:
+            if len(self._silent) >= MAX_SILENT:
                 oldest = next(iter(self._silent))
                 self._forget(oldest)
                 oldest.close()

@@ -36,7 +36,7 @@ from holdfast.transport.frames import (
     encode_hello,
 )
 from holdfast.transport.links import HalfReceived, Link, LinkSettings
-from holdfast.transport.listener import Listener
+from holdfast.transport.listener import MAX_SILENT, Listener
 from holdfast.transport.revocation import REVOKED_FILE, revoked_serials
 from holdfast.transport.turns import Turns
 
@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 if TYPE_CHECKING:
     from holdfast.transport.datagrams import DatagramSockets
 
-__all__ = ["MAX_LINKS", "StreamServiceTransport"]
+__all__ = ["MAX_LINKS", "MAX_UNKNOWN", "StreamServiceTransport"]
 
 MAX_LINKS: Final = 4096
 """Of robots, at the same time. If there are more, who has the most loses one."""
@@ -57,6 +57,9 @@ _REVOKED: Final = "has a certificate that has been revoked"
 
 _MAX_UNGREETED: Final = 256
 """Connections that have sent something, but no hello yet."""
+
+MAX_UNKNOWN: Final = MAX_SILENT + _MAX_UNGREETED
+"""Connections of which nobody knows yet who they are: so many sockets more than links."""
 
 
 class _StreamCall:
@@ -140,6 +143,8 @@ class StreamServiceTransport:
         heard more often. How long a robot may be silent, the robot says.
     max_message_bytes : int
         A larger request is refused and not kept.
+    max_links : int or None
+        Of robots, at the same time; None: :data:`MAX_LINKS`.
     tls : TlsFiles or None
         The service's credentials, for ``tls``.
     on_event : callable or None
@@ -162,6 +167,7 @@ class StreamServiceTransport:
         listening: Sequence[socket.socket] = (),
         lease_ms: float = 400.0,
         max_message_bytes: int = DEFAULT_MAX_MESSAGE_BYTES,
+        max_links: int | None = None,
         tls: TlsFiles | None = None,
         on_event: Callable[..., None] | None = None,
     ) -> None:
@@ -186,6 +192,7 @@ class StreamServiceTransport:
             require_cryptography()
             self._sockets = DatagramSockets()
         self._boot = boot
+        self._max_links = MAX_LINKS if max_links is None else max_links
         self._tls = tls
         self._context = None if tls is None else self._make_context(tls)
         # Of the last list; a handshake looks into the one that was there when it began.
@@ -359,8 +366,8 @@ class StreamServiceTransport:
             return "is a service, and a robot was expected"
         if link.peer is not None and self._is_revoked(link.peer):
             return _REVOKED
-        if len(self._links) >= MAX_LINKS and not self._make_room(_certified(link)):
-            return f"is one too many: {MAX_LINKS} robots are connected"
+        if len(self._links) >= self._max_links and not self._make_room(_certified(link)):
+            return f"is one too many: {self._max_links} robots are connected"
         return None
 
     def _make_room(self, name: str | None) -> bool:
@@ -369,14 +376,14 @@ class StreamServiceTransport:
         So a certificate cannot keep others out, however many links are made with it.
         """
         standing = [link for link in self._links if not link.ended]
-        if len(standing) < MAX_LINKS:
+        if len(standing) < self._max_links:
             return True
         numbers = Counter(map(_certified, standing))
         (most, number), *_ = numbers.most_common(1)
         if number <= numbers[name] + 1:
             return False
         oldest = next(link for link in standing if _certified(link) == most)
-        reason = f"has {number} links, and another robot needs one of {MAX_LINKS}"
+        reason = f"has {number} links, and another robot needs one of {self._max_links}"
         oldest.end(reason, goodbye=reason, refused=True)
         return True
 
