@@ -215,6 +215,32 @@ class TestStrangers:
         await answers(robot, inbox, 6)
         assert Vanished("cloud", "b1") not in inbox
 
+    async def test_keys_are_of_no_use_once_the_certificate_is_revoked(
+        self, udp: StreamWire
+    ) -> None:
+        calls: list[bytes] = []
+
+        def serve(call: IncomingCall) -> None:
+            calls.append(call.payload)
+            echo(call)
+
+        robot, inbox, service = await connected(udp, serve)
+        kept, at_service = link_of(robot)._sealing, link_at(service)
+        assert kept is not None
+        assert service.end_links(lambda peer: peer.name == "robot", "is revoked") == 1
+        with stranger(place_of(udp)) as to_service:
+            for k in range(1, 200):
+                question = b"\1\0" + k.to_bytes(4, "big") * 2 + b"\0\0stolen"
+                at_service.take_datagram(kept.seal(question), ("127.0.0.1", 9))
+                to_service.send(kept.seal(question))
+            await inbox.wait_for(Vanished("cloud", "b1"))
+            await inbox.appeared(times=2)
+            await until(lambda: robot.sends_datagrams("cloud"))
+            await answers(robot, inbox, 1)  # over a new link, behind all of these
+            with pytest.raises(BlockingIOError):
+                to_service.recv(1)
+        assert calls == [b"question 1"]
+
     async def test_what_was_recorded_leads_no_answer_elsewhere(
         self, udp: StreamWire, monkeypatch: pytest.MonkeyPatch
     ) -> None:
