@@ -298,6 +298,54 @@ def test_large_requests_beyond_the_bound_are_turned_away_unread(
     on_a_loop(test)()
 
 
+class LargeCall:
+    """A large request of a robot with a certificate."""
+
+    payload = LARGE
+
+    def __init__(self, robot: str) -> None:
+        self.robot = robot
+        self.replies: list[bytes] = []
+        self.ended: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+
+    def reply(self, payload: bytes) -> None:
+        self.replies.append(payload)
+
+    def end(self) -> None:
+        self.ended.set_result(None)
+
+    async def answer(self) -> Reply:
+        async with asyncio.timeout(PATIENCE_S):
+            await self.ended
+        return decode_reply(self.replies[-1])
+
+
+def test_one_robot_takes_no_room_for_large_requests_from_another(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    let_go = threading.Event()
+
+    def decode(payload: bytes) -> Request:
+        assert let_go.wait(PATIENCE_S)
+        return decode_request(payload)
+
+    monkeypatch.setattr(shell, "decode_request", decode)
+
+    async def test() -> None:
+        async with joined(shell={"max_undecoded_bytes": 2 * len(LARGE)}) as both:
+            names = ["mallory"] * 3 + ["anna", "berta", "anna", "carla"]
+            calls = [LargeCall(name) for name in names]
+            for call in calls:
+                both.shell.deliver(call)
+            for index in (2, 5, 6):  # hers beyond the room, and all beyond twice the room
+                assert isinstance(await calls[index].answer(), Busy)
+            let_go.set()
+            for index in (0, 1, 3, 4):
+                assert isinstance(await calls[index].answer(), Refused)
+
+    on_a_loop(test)()
+
+
 @on_a_loop
 async def test_one_call_is_let_in_however_large_it_is() -> None:
     async with joined(shell={"max_undecoded_bytes": 10}) as both:

@@ -19,7 +19,7 @@ import asyncio
 import functools
 import itertools
 import traceback
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable
 from typing import Literal, TypeAlias
 
@@ -49,7 +49,8 @@ _MAX_UNDECODED = 4096
 """Large requests that wait to be decoded."""
 
 _MAX_UNDECODED_BYTES = 128 << 20
-"""Of these requests: two of the largest. One is let in, however large it is."""
+"""Of these requests: two of the largest. One is let in, however large it is; and where others have
+taken the room, one of each robot's as long as all do not take twice as much."""
 
 _UNREAD_BUSY = [encode(Busy(0, retry_after_ms)) for retry_after_ms in range(100, 126)]
 """Used in turn, so that robots that were turned away together do not come back together."""
@@ -106,6 +107,7 @@ class ServiceShell:
         self._numbers = itertools.count(1)
         self._undecoded = 0
         self._undecoded_bytes = 0
+        self._undecoded_of: Counter[str | None] = Counter()
         self._unread = 0
         self._rates = EventRates(burst=1)
         self._brief_jobs: deque[Job] = deque()
@@ -218,15 +220,21 @@ class ServiceShell:
         size = len(payload)
         if size <= _LARGE_BYTES:
             self._decoded(call, size, _decode(payload))
-        elif self._undecoded >= self._max_undecoded or (
-            self._undecoded and self._undecoded_bytes + size > self._max_undecoded_bytes
-        ):
+        elif self._undecoded >= self._max_undecoded or self._takes_too_much(call.robot, size):
             self._turn_away_unread(call)
         else:
             self._undecoded += 1
+            self._undecoded_of[call.robot] += 1
             self._undecoded_bytes += size
             done = functools.partial(self._guarded, self._large_one_decoded, call, size)
             self._decoder.submit(functools.partial(_decode, payload), done)
+
+    def _takes_too_much(self, robot: str | None, size: int) -> bool:
+        """Tell whether a large request is one too many."""
+        wanted_bytes = self._undecoded_bytes + size
+        if self._undecoded_of[robot]:
+            return wanted_bytes > self._max_undecoded_bytes
+        return self._undecoded > 0 and wanted_bytes > 2 * self._max_undecoded_bytes
 
     def _turn_away_unread(self, call: IncomingCall) -> None:
         self._unread += 1
@@ -238,6 +246,9 @@ class ServiceShell:
         self, call: IncomingCall, size: int, request: Request | MessageError
     ) -> None:
         self._undecoded -= 1
+        self._undecoded_of[call.robot] -= 1
+        if not self._undecoded_of[call.robot]:
+            del self._undecoded_of[call.robot]
         self._undecoded_bytes -= size
         self._decoded(call, size, request)
 
