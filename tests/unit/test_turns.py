@@ -60,3 +60,13 @@ async def test_nobody_overtakes_another_of_the_same_owner() -> None:
     assert turns.may_go_on("anna", 1.0)
     await asyncio.sleep(0)
     assert turns.may_go_on("mallory", 1.0)
+
+
+async def test_between_turns_there_may_be_a_pause() -> None:
+    taken: list[object] = []
+    for pause_s in (3600.0, 1e-4):
+        turns = Turns(pause_s)
+        turns.wait(Busy(turns, pause_s, 2, taken))
+    while len(taken) < 2:
+        await asyncio.sleep(0.001)
+    assert taken == [1e-4, 1e-4]

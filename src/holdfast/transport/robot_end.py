@@ -46,6 +46,9 @@ __all__ = ["StreamRobotTransport"]
 
 _CALL_NUMBERS = 1 << 32
 
+_PAUSE_S = 0.004
+"""Between turns of services that send more than anybody has asked for: a robot decides, too."""
+
 _MAX_UNGREETED = 64
 """Connections to a robot that listens, of which nobody knows who they are."""
 
@@ -101,7 +104,7 @@ class StreamRobotTransport:
             lease_ms,
             max_message_bytes,
             HalfReceived(2 * max_message_bytes),
-            Turns(),
+            Turns(_PAUSE_S),
             must_read=False,
         )
         self.calls = CallTable()

@@ -39,9 +39,16 @@ class Participant(Protocol):
 
 
 class Turns:
-    """Lets those that have more to do than fits into one turn go on one after another."""
+    """Lets those that have more to do than fits into one turn go on one after another.
 
-    def __init__(self) -> None:
+    Parameters
+    ----------
+    pause_s : float
+        Between such turns, for whoever has better to do with its time than to hear all of it.
+    """
+
+    def __init__(self, pause_s: float = 0.0) -> None:
+        self._pause_s = pause_s
         self._waiting: OrderedDict[object, deque[Participant]] = OrderedDict()
         self._spent_s: dict[object, float] = {}
         self._window_ends_at = float("-inf")
@@ -60,7 +67,7 @@ class Turns:
     def wait(self, participant: Participant) -> None:
         """Let somebody go on when it is its turn."""
         if not self._waiting:
-            asyncio.get_running_loop().call_soon(self._next)
+            self._plan()
         self._waiting.setdefault(participant.owner, deque()).append(participant)
 
     def _next(self) -> None:
@@ -69,5 +76,12 @@ class Turns:
         if participants:
             self._waiting[owner] = participants
         if self._waiting:
-            asyncio.get_running_loop().call_soon(self._next)
+            self._plan()
         participant.go_on()
+
+    def _plan(self) -> None:
+        loop = asyncio.get_running_loop()
+        if self._pause_s:
+            loop.call_later(self._pause_s, self._next)
+        else:
+            loop.call_soon(self._next)
