@@ -323,7 +323,12 @@ class Service:
                 # It is free once another robot has left, not once the next decision is computed.
                 self._sessions.note_epoch(key, request.epoch)
                 self._turn_away(
-                    call, request.number, key, now, _NO_ROOM_RETRY_MS, newcomer=newcomer
+                    call,
+                    request.number,
+                    key,
+                    now,
+                    newcomer=newcomer,
+                    least_ms=_NO_ROOM_RETRY_MS,
                 )
                 return None
             self._forget(unused, "room needed")
@@ -569,9 +574,9 @@ class Service:
         number: int,
         key: SessionKey,
         now: float,
-        least_ms: float = 1.0,
         *,
         newcomer: bool,
+        least_ms: float = 1.0,
     ) -> None:
         lines = self._lines
         owner, session = key
