@@ -147,6 +147,7 @@ def run_as_robot(
             rate_hz,
             links.offload,
             distrusted,
+            refusals=links.refusals,
             make_planner=links.make_planner,
         )
         launcher = None if links.launcher is None else links.launcher(robot.deliver)

@@ -107,7 +107,7 @@ class ServiceShell:
         self._undecoded = 0
         self._undecoded_bytes = 0
         self._unread = 0
-        self._rates = EventRates(burst=1)
+        self._rates = EventRates()
         self._brief_jobs: deque[Job] = deque()
         self._timer: asyncio.TimerHandle | None = None
         self._idle: asyncio.Future[None] | None = None
