@@ -49,7 +49,7 @@ class _Reasons:
         """Take an event."""
         if name == "refused" and fields["final"]:
             self.refusals[str(fields["service"])] = f"{fields['code']}: {fields['reason']}"
-        elif name == "unreachable":
+        elif name in ("unreachable", "link_refused"):
             self.unreachable[str(fields["service"])] = str(fields["reason"])
 
     def close(self) -> None:
