@@ -215,6 +215,10 @@ class StreamWire:
         """Return why links were refused, at the service's end."""
         return [str(fields["reason"]) for event, fields in self.told if event == "link_refused"]
 
+    def heard(self) -> list[tuple[str, object, object]]:
+        """Return the events of the service's end, with the robot and the reason of each."""
+        return [(event, each.get("robot"), each.get("reason")) for event, each in self.told]
+
     async def close_on_loop(self) -> None:
         for end in self.ends:
             await end.close()
@@ -1051,12 +1055,16 @@ class TestVisitors:
     @pytest.mark.parametrize(
         ("greeting", "plain", "over_tls"),
         [
-            (b"GET / HTTP/1.1\r\nHost: x\r\n\r\n", "speaks HTTP", "does not speak TLS at"),
-            (bytes.fromhex("16030100f8010000f40303"), "speaks TLS at an endpoint that", None),
+            (b"GET / HTTP/1.1\r\nHost: x\r\n\r\n", "speaks HTTP", "does not speak TLS, and"),
+            (bytes.fromhex("16030100f8010000f40303"), "speaks TLS, and this endpoint", None),
             (b"\x16\x03\x01\x00\x05hello", "speaks TLS", "does not speak TLS 1.3"),
-            (b"\0" * 64, "begins with b", "does not speak TLS at"),
+            (b"\0" * 64, "begins with b", "does not speak TLS, and"),
             (frames.MAGIC + b"\xff" * 9, "begins with a frame of kind 255", "does not speak TLS"),
-            (HELLO.replace(b"robot", b"human"), "sends a malformed hello", "does not speak TLS at"),
+            (
+                HELLO.replace(b"robot", b"human"),
+                "sends a malformed hello",
+                "does not speak TLS, and",
+            ),
             (
                 HELLO[:8] + frames.encode_frame(frames.HELLO, 0, bytes(4097)),
                 "frame of kind 1 with 4097 bytes",
@@ -1065,7 +1073,7 @@ class TestVisitors:
             (
                 frames.encode_hello("service", "cloud", "x", 400.0),
                 "is a service, and a robot was expected",
-                "does not speak TLS at",
+                "does not speak TLS, and",
             ),
         ],
     )
@@ -1193,14 +1201,12 @@ class TestPeers:
         ):
             for visitor in (first, second):
                 await visitor.say(HELLO + frames.encode_frame(frames.CALL, 1, b"much"))
-            there: tuple[str, dict[str, object]] = ("robot_connected", {"robot": ""})
-            await until(lambda: tcp.told.count(there) == 3)
+            await until(lambda: tcp.heard().count(("robot_connected", "", None)) == 3)
             for number in range(20):
                 robot.call("cloud", number, b"question")
                 assert await inbox.of_call(number) == [Replied(number, b"question"), Ended(number)]
-            reason: object = "does not read what it is sent"
-            lost = ("robot_disconnected", {"robot": "", "reason": reason})
-            await until(lambda: tcp.told.count(lost) == 2, lambda: tcp.told)
+            lost = ("robot_disconnected", "", "does not read what it is sent")
+            await until(lambda: tcp.heard().count(lost) == 2, lambda: tcp.told)
         assert Vanished("cloud", "b1") not in inbox
 
     async def test_what_waits_for_a_robot_has_a_bound(self, tcp: StreamWire) -> None:
@@ -1211,9 +1217,32 @@ class TestPeers:
         await tcp.service("cloud", "b1").start(answer)
         with await Visitor(tcp.endpoint("cloud")).connect() as visitor:
             await visitor.say(HELLO + frames.encode_frame(frames.CALL, 1))
-            reason: object = "does not read what it is sent"
-            lost = ("robot_disconnected", {"robot": "", "reason": reason})
-            await until(lambda: lost in tcp.told)
+            lost = ("robot_disconnected", "", "does not read what it is sent")
+            await until(lambda: lost in tcp.heard())
+
+    async def test_the_end_of_a_link_is_told_with_its_reason_and_the_address(
+        self, tcp: StreamWire
+    ) -> None:
+        service = tcp.service("cloud", "b1")
+        await service.start(echo)
+        goodbye, connected = frames.encode_goodbye(""), ("robot_connected", "", None)
+        for last, reason in ((goodbye, "said goodbye"), (b"", "closed the connection without")):
+            with await Visitor(tcp.endpoint("cloud")).connect() as visitor:
+                host, port = visitor.socket.getsockname()
+                await visitor.say(HELLO + last)
+                await until(lambda: connected in tcp.heard())
+            await until(lambda: len(tcp.told) == 2)
+            (_, first), (name, fields) = tcp.told
+            assert name == "robot_disconnected"
+            assert str(fields["reason"]).startswith(reason)
+            assert first["address"] == fields["address"] == f"{host}:{port}"
+            tcp.told.clear()
+        with await Visitor(tcp.endpoint("cloud")).connect() as visitor:
+            await visitor.say(HELLO)
+            await until(lambda: connected in tcp.heard())
+            await service.close()
+            await until(lambda: len(tcp.told) == 2)
+        assert tcp.heard()[-1] == ("robot_disconnected", "", "this service ends")
 
     async def test_half_a_message_and_silence_costs_the_link_after_the_lease(
         self, tcp: StreamWire
@@ -1224,10 +1253,7 @@ class TestPeers:
             await visitor.say(hello + frames.encode_frame(frames.CALL, 1, bytes(1000))[:500])
             await visitor.hear()
         await until(lambda: len(tcp.told) == 2)
-        assert tcp.told[-1] == (
-            "robot_disconnected",
-            {"robot": "r", "reason": "was silent for 500 ms"},
-        )
+        assert tcp.heard()[-1] == ("robot_disconnected", "r", "was silent for 500 ms")
 
     async def test_what_is_sent_at_once_holds_up_nobody_else(self, tcp: StreamWire) -> None:
         number = 20_000  # calls of nine bytes: one look at a socket finds all of them
@@ -1324,7 +1350,7 @@ class TestPeers:
         with await Visitor(tcp.endpoint("cloud")).connect() as visitor:
             await visitor.say(HELLO + frame)
             heard = await visitor.hear()
-        assert tcp.told[-1] == ("robot_disconnected", {"robot": "", "reason": reason})
+        assert tcp.heard()[-1] == ("robot_disconnected", "", reason)
         last = frames.FrameDecoder(MAX_BYTES).feed(heard)[-1]
         assert (last.kind, frames.read_goodbye(last.payload)) == (frames.GOODBYE, reason)
 

@@ -257,6 +257,18 @@ class TestMissingServices:
         assert "does not answer as a holdfast service" in str(fields["reason"])
         assert "tls/..." in str(fields["reason"])
 
+    def test_a_link_that_was_refused_says_more_than_a_look_from_outside(self) -> None:
+        notes = Notes()
+        with listening(void) as port:
+            service = f"tcp/127.0.0.1:{port}"
+            refusals = {service: "is at a udp/... endpoint, which goes with udp/... at both ends"}
+            missing = MissingServices((service,), None, notes, refusals)
+            missing.heard("holding", {"step": 0})
+            missing.wait(TIMEOUT_S)
+        ((name, fields),) = notes.events
+        assert name == "unreachable"
+        assert str(fields["reason"]).endswith(f"it {refusals[service]}")
+
     def test_nothing_is_examined_while_the_cloud_decides(self) -> None:
         notes = Notes()
         missing = MissingServices((f"tcp/127.0.0.1:{free_port()}",), None, notes)

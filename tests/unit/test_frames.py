@@ -118,7 +118,7 @@ def test_frames_before_an_error_are_frames() -> None:
         (GREETING + encode_frame(GOODBYE, 0, bytes(2000)), "of kind 7 with 2000 bytes"),
         (b"HTTP/1.1 400 Bad Request", "speaks HTTP"),
         (b"PRI * HTTP/2.0", "speaks HTTP"),
-        (b"\x16\x03\x01\x02\x00\x01", "speaks TLS at an endpoint that does not"),
+        (b"\x16\x03\x01\x02\x00\x01", "speaks TLS, and this endpoint does not"),
     ],
 )
 def test_what_is_no_frame_of_ours_is_refused_before_it_is_kept(stream: bytes, error: str) -> None:

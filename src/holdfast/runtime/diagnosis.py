@@ -15,6 +15,7 @@ import threading
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from time import monotonic
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from holdfast.errors import HoldfastError
@@ -103,10 +104,17 @@ class MissingServices:
         With the robot's credentials.
     events : EventSink
         Gets the findings.
+    refusals : mapping
+        From services to why the last link to them was refused that was, as the rest of a sentence
+        about the service. A look from outside does not find all of these reasons.
     """
 
     def __init__(
-        self, services: Sequence[str], tls_directory: Path | None, events: EventSink
+        self,
+        services: Sequence[str],
+        tls_directory: Path | None,
+        events: EventSink,
+        refusals: Mapping[str, str] = MappingProxyType({}),
     ) -> None:
         self._absent = set(services)
         self._services = tuple(services)
@@ -114,6 +122,7 @@ class MissingServices:
         self._events = events
         self._threads: dict[str, threading.Thread] = {}
         self._examined_at: dict[str, float] = {}
+        self._refusals = refusals
 
     def heard(self, name: str, fields: Mapping[str, object]) -> None:
         """Take note of what the robot reports; returns at once.
@@ -160,19 +169,23 @@ class MissingServices:
         tls_files = None
         if self._tls_directory is not None:
             tls_files = TlsFiles.of(self._tls_directory)
-        reason = why_unreachable(service, tls_files, _TIMEOUT_S) or _unexplained(service)
+        reason = why_unreachable(service, tls_files, _TIMEOUT_S) or _unexplained(
+            service, self._refusals.get(service)
+        )
         # It may have come meanwhile.
         if service in self._absent:
             self._events.event("unreachable", service=service, reason=reason)
 
 
-def _unexplained(service: str) -> str:
+def _unexplained(service: str, refusal: str | None) -> str:
     """Say what is known of a service that is missed although nothing wrong was found."""
+    if refusal is not None:
+        return f"accepts connections; of the last link that was refused: it {refusal}"
     protocol = service.partition("/")[0]
-    or_tls = ", or speaks TLS (tls/...)" if protocol == "tcp" else ""
+    or_else = "hangs, or speaks TLS (tls/...)" if protocol == "tcp" else "or hangs"
     return (
         "accepts connections, but does not answer as a holdfast service: it is none, is just "
-        f"starting, hangs{or_tls}"
+        f"starting, {or_else}"
     )
 
 

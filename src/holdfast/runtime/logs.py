@@ -12,17 +12,19 @@ a number, a text of a megabyte or with control characters in it cost at most the
 
 Names of events in use. By the robot: status, launch, launched, launch_failed, recovery_exited,
 retry, hedge, restore, restored, state_diverged, service_appeared, service_vanished,
-service_suspected, unreachable,
+service_suspected, unreachable, link_refused, no_datagrams, insecure, credentials,
 late_replies, waiting, holding, resumed, busy, refused, malformed_reply, disagreement,
 wrong_answer, not_deterministic, verification_failed, distrusted,
 limits_unknown, verifying, prefetch_unused, unexplained, filter_diverged,
 resumed_trial, performed_unseen, trial, missed_ticks, stopped, note, interrupted.
 By a service: ready, session_opened, session_taken_over, restored, state_diverged, refused, busy,
-evicted, credentials, credentials_reloaded, stopping, process_ended, process_started.
+evicted, robot_connected, robot_disconnected, link_refused, credentials, credentials_reloaded,
+stopping, process_ended, process_started.
 By ``holdfast chaos``: chaos_trial, left_out, note, interrupted. By a command that ends with an
 error: error. Fields with a place of their own in the text form: ``from`` and ``to`` (of a change),
-``service``, ``reason``, ``duration_ms``. Events that may come very often are written about once a
-second; the next such line then says how many were left out, as ``similar_lines_omitted``.
+``service``, ``robot``, ``reason``, ``duration_ms``. Of events that may come very often twenty of a
+kind are written at once and then one a second, which says how many were left out, as
+``similar_lines_omitted``.
 """
 
 from __future__ import annotations
@@ -75,7 +77,7 @@ _REPEATED_S = 1.0
 """Repeated events of one kind are told this often."""
 
 _BURST = 20
-"""So many of one kind, about one service, are told at once: more than an honest service causes."""
+"""So many of one kind, about one service, are told at once: more than honest peers cause."""
 
 _ROBOT = "robot"
 _COMPONENT_WIDTH = 8
@@ -151,26 +153,20 @@ class _Rate:
 
     __slots__ = ("allowance", "last", "omitted", "updated_at")
 
-    def __init__(self, burst: int, now: float) -> None:
-        self.allowance = float(burst)
+    def __init__(self, now: float) -> None:
+        self.allowance = float(_BURST)
         self.updated_at = now
         self.omitted = 0
         self.last: tuple[str, Mapping[str, object]] | None = None
 
 
 class EventRates:
-    """Lets events of one kind through about once a second, and counts those in between.
+    """Lets a few events of one kind through at once, then one a second, and counts the others.
 
     What another machine can bring about, it can bring about a thousand times a second.
-
-    Parameters
-    ----------
-    burst : int
-        So many of a kind may come at once.
     """
 
-    def __init__(self, burst: int) -> None:
-        self._burst = burst
+    def __init__(self) -> None:
         self._rates: dict[Hashable, _Rate] = {}
 
     def admit(
@@ -194,9 +190,9 @@ class EventRates:
         """
         rate = self._rates.get(kind)
         if rate is None:
-            rate = self._rates[kind] = _Rate(self._burst, now)
+            rate = self._rates[kind] = _Rate(now)
         earned = (now - rate.updated_at) / _REPEATED_S
-        rate.allowance = min(float(self._burst), rate.allowance + earned)
+        rate.allowance = min(float(_BURST), rate.allowance + earned)
         rate.updated_at = now
         if rate.allowance < 1.0:
             rate.omitted += 1
@@ -249,7 +245,7 @@ class BoundedEventLog:
         self._clock = clock
         # Taken again by the same thread if a signal's handler reports an event.
         self._lock = threading.RLock()
-        self._rates = EventRates(_BURST)
+        self._rates = EventRates()
 
     def event(self, name: str, /, **fields: object) -> None:
         """Hand an event on, or count it."""
@@ -568,8 +564,7 @@ def _sentence(fields: Mapping[str, object]) -> str:
     head = []
     if "from" in rest and "to" in rest:
         head.append(f"{_value(rest.pop('from'))} -> {_value(rest.pop('to'))}")
-    if "service" in rest:
-        head.append(_value(rest.pop("service")))
+    head += [_value(rest.pop(key)) for key in ("service", "robot") if key in rest]
     parts = [", ".join(head)] if head else []
     if "reason" in rest:
         why = _value(rest.pop("reason"))

@@ -19,9 +19,10 @@ import socket
 import sys
 import threading
 from collections import deque
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from time import monotonic
+from types import MappingProxyType
 from typing import Any, NamedTuple, Protocol, TypeAlias
 
 from holdfast import contract
@@ -194,6 +195,8 @@ class RobotProcess:
         Instead of the configuration's.
     distrusted : collection of str
         Services that have answered wrongly in an earlier part of the run.
+    refusals : mapping
+        From services to why the last link to them was refused that was.
     make_planner : callable
         Joins the problem and the settings to the functions that lead from state to state.
     """
@@ -213,6 +216,7 @@ class RobotProcess:
         rate_hz: float | None = None,
         offload: OffloadSettings | None = None,
         distrusted: Collection[str] = (),
+        refusals: Mapping[str, str] = MappingProxyType({}),
         make_planner: Callable[[Problem, PlanningSettings], Planner] = Planner,
     ) -> None:
         self._configuration = configuration
@@ -223,7 +227,7 @@ class RobotProcess:
         self._events = events
         tls = configuration.offload.tls
         self._missing = MissingServices(
-            configuration.offload.services, None if tls is None else Path(tls), events
+            configuration.offload.services, None if tls is None else Path(tls), events, refusals
         )
         self._on_result = on_result
         self._on_timing = on_timing

@@ -109,7 +109,7 @@ class ServiceShell:
         self._undecoded_bytes = 0
         self._undecoded_of: Counter[str | None] = Counter()
         self._unread = 0
-        self._rates = EventRates(burst=1)
+        self._rates = EventRates()
         self._brief_jobs: deque[Job] = deque()
         self._timer: asyncio.TimerHandle | None = None
         self._idle: asyncio.Future[None] | None = None

@@ -484,7 +484,9 @@ class ServiceDatagramLink(_DatagramLink):
                 self._received(frame.payload, datagram=False)
             elif self._answers.passed_over(frame.call):
                 self._owner.received(self, Frame(CALL, frame.call, b"", frame.passed_over_bytes))
-        elif frame.kind in (KEYS, CALL):
+        elif frame.kind == CALL:
+            raise FrameError("is at a tls/... endpoint, which goes with tls/... at both ends")
+        elif frame.kind == KEYS:
             raise FrameError(f"is a robot and sends a frame of kind {frame.kind}")
         else:
             super()._take(frame)

@@ -296,7 +296,7 @@ class FrameDecoder:
 def _what_speaks(first: bytes) -> str:
     """Say what it may be that does not begin with the magic word."""
     if first[:2] == b"\x16\x03":
-        return "speaks TLS at an endpoint that does not (tls/... goes with tls/...)"
+        return "speaks TLS, and this endpoint does not (tls/... goes with tls/...)"
     if re.match(rb"(GET|HEAD|POST|PUT|OPTIONS|CONNECT|PRI|HTTP)\b", first):
         return "speaks HTTP"
     return f"does not speak holdfast: it begins with {first!r}"

@@ -183,9 +183,13 @@ class Link(asyncio.BufferedProtocol):
         The other end's, once it has come.
     peer : PeerCertificate or None
         The other end's, once TLS is established.
+    address : str or None
+        The other end's, HOST:PORT; None over a local socket, or not connected yet.
     reason : str
         Why the link has ended, as the rest of a sentence about the other end; empty if that has
         simply closed.
+    said_goodbye : bool
+        Whether the other end has said that it ends the link; one that is killed does not.
     refused : bool
         Whether it has ended because one of the ends does not want the other, so that to try again
         at once is of no use.
@@ -229,7 +233,9 @@ class Link(asyncio.BufferedProtocol):
         self.connecting: asyncio.Task[object] | None = None
         self.hello: Hello | None = None
         self.peer: PeerCertificate | None = None
+        self.address: str | None = None
         self.reason = ""
+        self.said_goodbye = False
         self.refused = False
         self.adrift = False
 
@@ -350,6 +356,7 @@ class Link(asyncio.BufferedProtocol):
         self._transport = transport
         stream = transport.get_extra_info("socket")
         if stream is not None and stream.family != socket.AF_UNIX:
+            self.address = _address(transport.get_extra_info("peername"))
             with contextlib.suppress(OSError):
                 # What is sent is meant to arrive now, although more may follow.
                 stream.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -403,7 +410,9 @@ class Link(asyncio.BufferedProtocol):
         self._timer.cancel()
         if not self._ended:
             self._ended = True
-            self.reason = str(exc) if exc is not None else ""
+            # One that dies resets the connection if there is something that it has not read.
+            if exc is not None and not isinstance(exc, (ConnectionResetError, BrokenPipeError)):
+                self.reason = getattr(exc, "strerror", None) or str(exc)
             self._settings.half_received.note(self, 0)
         self._tell()
         if not self.closed.done():
@@ -521,6 +530,7 @@ class Link(asyncio.BufferedProtocol):
             self._owner.greeted(self, hello)
         elif kind == GOODBYE:
             reason = read_goodbye(frame.payload)
+            self.said_goodbye = True
             self.end(f"refuses this end, which {reason}" if reason else "", refused=reason != "")
         else:
             self._owner.received(self, frame)
@@ -581,6 +591,14 @@ class Link(asyncio.BufferedProtocol):
         """Take nobody for silent who is not listened to."""
         if self.hello is not None and (self._waits_for_turn or self._waits_for_reader):
             self._silent_at = now + self._patience_s
+
+
+def _address(found: object) -> str | None:
+    """Write the address of a socket as in an endpoint."""
+    if not isinstance(found, tuple):
+        return None
+    host, port = str(found[0]), found[1]
+    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
 
 
 def _what_is_wrong(error: OSError) -> str:

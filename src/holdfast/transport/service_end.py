@@ -53,6 +53,9 @@ __all__ = ["MAX_LINKS", "MAX_UNKNOWN", "StreamServiceTransport"]
 MAX_LINKS: Final = 4096
 """Of robots, at the same time. If there are more, who has the most loses one."""
 
+_SAID_GOODBYE: Final = "said goodbye"
+_NO_GOODBYE: Final = "closed the connection without a goodbye, as one that is killed does"
+_SERVICE_ENDS: Final = "this service ends"
 _REVOKED: Final = "has a certificate that has been revoked"
 
 _MAX_UNGREETED: Final = 256
@@ -149,7 +152,8 @@ class StreamServiceTransport:
         The service's credentials, for ``tls``.
     on_event : callable or None
         Is told what is worth a line of a log: ``link_refused`` with ``reason`` and, if it is known,
-        ``robot``; ``robot_connected`` and ``robot_disconnected`` with ``robot``.
+        ``robot``; ``robot_connected`` with ``robot``; ``robot_disconnected`` with ``robot`` and
+        ``reason``. Each has the robot's ``address``, None over a local socket.
 
     Raises
     ------
@@ -262,7 +266,7 @@ class StreamServiceTransport:
         for link, calls in list(self._links.items()):
             for call in list(calls):
                 call.end()
-            link.end("", goodbye="")
+            link.end(_SERVICE_ENDS, goodbye="")
         for link in list(self._ungreeted):
             link.end("")
         if self._closing:
@@ -395,7 +399,7 @@ class StreamServiceTransport:
         if dialer is not None:
             dialer.succeeded()
             dialer.won(link)
-        self._tell("robot_connected", robot=_name(link, hello))
+        self._tell("robot_connected", robot=_name(link, hello), address=link.address)
 
     def received(self, link: Link, frame: Frame) -> None:
         """Take a request."""
@@ -430,10 +434,12 @@ class StreamServiceTransport:
         self._ungreeted.pop(link, None)
         was_there = self._links.pop(link, None) is not None
         if was_there and link.hello is not None:
-            self._tell("robot_disconnected", robot=_name(link, link.hello), reason=link.reason)
+            reason = link.reason or (_SAID_GOODBYE if link.said_goodbye else _NO_GOODBYE)
+            robot = _name(link, link.hello)
+            self._tell("robot_disconnected", robot=robot, reason=reason, address=link.address)
         elif link.reason:
             fields = {"robot": link.peer.name} if link.peer is not None else {}
-            self._tell("link_refused", reason=link.reason, **fields)
+            self._tell("link_refused", reason=link.reason, address=link.address, **fields)
         dialer = self._dialled.pop(link, None)
         if dialer is not None:
             dialer.ended(link)

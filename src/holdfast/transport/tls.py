@@ -206,7 +206,7 @@ class TlsStream:
         if not self._has_first_byte:
             self._has_first_byte = True
             if self._is_server and data[:1] != b"\x16":
-                raise FrameError("does not speak TLS at an endpoint that does")
+                raise FrameError("does not speak TLS, and this endpoint does")
         self._incoming.write(data)
         if not self.established:
             self._shake_hands()
