@@ -75,8 +75,9 @@ class HalfReceived:
     Parameters
     ----------
     max_bytes : int
-        When they take more, a link of the owner that holds the most is ended: that whose message
-        began first. So whoever sends much, on many links, ends nobody else's.
+        When they take more, a link is ended: of the owners that hold the most, or half of that, the
+        one whose message began first. So whoever sends much, on many links, ends nobody's that
+        holds little.
     """
 
     def __init__(self, max_bytes: int) -> None:
@@ -96,8 +97,8 @@ class HalfReceived:
             held: dict[object, int] = {}
             for each, its_bytes in self._sizes.items():
                 held[each.owner] = held.get(each.owner, 0) + its_bytes
-            most = max(held, key=held.__getitem__)
-            oldest = next(each for each in self._sizes if each.owner == most)
+            least = max(held.values()) / 2
+            oldest = next(each for each in self._sizes if held[each.owner] >= least)
             self._total -= self._sizes.pop(oldest)
             oldest.end("has not finished a message, and others need the memory")
 
