@@ -88,12 +88,9 @@ def test_a_robot_whose_address_changes(
         before = datagrams.carried
         story.at("perform", steps[3] + 1, lambda: before.update(datagrams.carried))
         story.at("perform", steps[4] + 1, lambda: healed.pop()())
-        story.at(
-            "perform",
-            steps[5] + 1,
-            lambda: cloud.process.wait_for("robot_connected", 2),
-            move,
-        )
+        story.at("perform", steps[5] + 1, lambda: cloud.process.wait_for("robot_connected", 2))
+        # Two answers later the robot has the keys of the new link, too.
+        story.at("perform", steps[7] + 1, move)
         robot = story.run(f"udp/127.0.0.1:{entry}", options=credentials)
         assert datagrams.addresses == 3
     assert robot.statuses() == []
