@@ -508,6 +508,16 @@ class TestErrors:
         assert expected in self.fails(workplace, "run", *arguments)
         assert not (workplace / "out").exists()
 
+    def test_a_service_in_the_file_that_cannot_be_one_is_named_with_its_key(
+        self, workplace: Path
+    ) -> None:
+        peg = (workplace / "peg.yaml").read_text()
+        services = "[tcp/127.0.0.1:7447, quic/10.0.0.7:7447]"
+        (workplace / "old.yaml").write_text(f"{peg}\noffload: {{services: {services}}}\n")
+        error = self.fails(workplace, "run", "old.yaml", "--out", "out")
+        assert "old.yaml: offload.services[1]: endpoint 'quic/10.0.0.7:7447'" in error
+        assert not (workplace / "out").exists()
+
     @pytest.mark.parametrize(
         ("command", "expected"),
         [

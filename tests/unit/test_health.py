@@ -177,6 +177,15 @@ class TestAddresses:
         with pytest.raises(HealthError, match=f"'{text}'"):
             parse_http_address(text)
 
+    def test_an_address_of_another_machine_is_named_once(self) -> None:
+        async def main() -> None:
+            text = r"health or metrics at 192\.0\.2\.1:8080: Cannot assign requested address"
+            with pytest.raises(HealthError, match=f"^{text}$"):
+                async with serving("192.0.2.1", 8080):
+                    pass
+
+        asyncio.run(main())
+
     def test_a_port_that_is_taken_is_named(self) -> None:
         async def main() -> None:
             with socket.socket() as other:

@@ -24,7 +24,7 @@ from holdfast.cli.endings import (
 from holdfast.cli.options import MAX_SEED, MAX_TRIALS, location, number, whole_number
 from holdfast.cli.overrides import Override, combined, parse_assignment
 from holdfast.cli.terminal import counted, duration, print_files, print_summary, run_display
-from holdfast.errors import HoldfastError, InvalidValueError
+from holdfast.errors import HoldfastError, InvalidValueError, TransportError
 from holdfast.printable import printable
 from holdfast.runtime.command_line import MAX_JOBS
 
@@ -471,19 +471,7 @@ def _require_effect(options: _Options, configuration: Configuration, *, as_robot
             "environment.object)"
         )
     if configuration.offload.services:
-        # Before a directory is claimed: a mistyped one shall leave nothing behind.
-        from holdfast.transport.endpoints import check_credentials, parse_endpoint
-
-        endpoints = [parse_endpoint(service) for service in configuration.offload.services]
-        tls = None
-        if configuration.offload.tls is not None:
-            from holdfast.transport.credentials import load_credentials
-
-            # What is only to be warned of is told when the run begins.
-            directory = Path(configuration.offload.tls)
-            tls = load_credentials(directory, "robot", warn=lambda _: None)
-        for endpoint in endpoints:
-            check_credentials(endpoint, tls)
+        _check_services(options, configuration)
     for given in options.overrides():
         if given.key in _OF_SERVICES and given.value and not configuration.offload.services:
             raise InvalidValueError(
@@ -500,6 +488,33 @@ def _require_effect(options: _Options, configuration: Configuration, *, as_robot
             "--log json needs --service, --environment or --rate (or offload.services or "
             f"environment.object in {options.configuration_path}): without them there are no events"
         )
+
+
+def _check_services(options: _Options, configuration: Configuration) -> None:
+    """Check where the services are, before a directory is claimed: a mistyped one claims none."""
+    from holdfast.transport.endpoints import check_credentials, parse_endpoint
+
+    offload = configuration.offload
+    tls = None
+    if offload.tls is not None:
+        from holdfast.transport.credentials import load_credentials
+
+        # What is only to be warned of is told when the run begins.
+        tls = load_credentials(Path(offload.tls), "robot", warn=lambda _: None)
+    on_command_line = any(given.key == "offload.services" for given in options.overrides())
+    for index, service in enumerate(offload.services):
+        try:
+            endpoint = parse_endpoint(service)
+            check_credentials(endpoint, tls)
+            if endpoint.protocol == "udp":
+                from holdfast.transport.sealing import require_cryptography
+
+                require_cryptography()
+        except TransportError as error:
+            if on_command_line:
+                raise
+            key = f"{options.configuration_path}: offload.services[{index}]"
+            raise TransportError(f"{key}: {error}") from error
 
 
 class _Notes:

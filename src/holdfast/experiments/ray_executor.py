@@ -140,7 +140,7 @@ def _imported() -> ModuleType:
     except ImportError as error:
         raise HoldfastError(
             f"--executor ray needs Ray, which cannot be imported ({_line_of(error)}): "
-            "pip install 'holdfast[cluster]'"
+            "pip install 'ray[client]'"
         ) from error
 
 

@@ -203,7 +203,7 @@ def check_packages() -> None:
     if missing:
         raise HoldfastError(
             f"experiments need {' and '.join(missing)}, not installed here: pip install "
-            "'holdfast[experiments]'"
+            f"{' '.join(missing)}"
         )
 
 

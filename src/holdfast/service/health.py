@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import asyncio
 import errno
+import os
 import re
 import socket
 from collections.abc import Awaitable, Callable, Mapping
@@ -146,8 +147,12 @@ class HttpServer:
                 lambda: _Connection(self), str(where[0]), self._address.port, family=family
             )
         except OSError as error:
-            taken = error.errno == errno.EADDRINUSE
-            reason = "another program listens there" if taken else error.strerror or str(error)
+            if error.errno == errno.EADDRINUSE:
+                reason = "another program listens there"
+            elif error.errno is not None and error.errno > 0:
+                reason = os.strerror(error.errno)  # asyncio's own text names the address again
+            else:
+                reason = error.strerror or str(error)
             raise HealthError(f"health or metrics at {self._address}: {reason}") from error
         return self._address._replace(port=self._server.sockets[0].getsockname()[1])
 

@@ -177,7 +177,7 @@ class Exposition:
             import prometheus_client
         except ImportError as error:
             raise MetricsError(
-                'metrics need the package prometheus-client: pip install "holdfast[service]"'
+                "metrics need the package prometheus-client: pip install prometheus-client"
             ) from error
         del prometheus_client
         self._name = name

@@ -55,7 +55,7 @@ try:
     from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 except ImportError as error:
     raise CredentialsError(
-        'making keys needs the package cryptography: pip install "holdfast[service]"'
+        "making keys needs the package cryptography: pip install cryptography"
     ) from error
 
 __all__ = [

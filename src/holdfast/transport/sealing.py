@@ -112,7 +112,7 @@ def require_cryptography() -> type[AESGCM]:
     except ImportError as error:
         raise TransportError(
             "udp/... needs the package cryptography, which is not installed: "
-            "pip install 'holdfast[udp]'; or use tls/..."
+            "pip install cryptography; or use tls/..."
         ) from error
     return AESGCM
 
