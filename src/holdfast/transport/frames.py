@@ -25,6 +25,7 @@ __all__ = [
     "CALL",
     "END",
     "GOODBYE",
+    "HEADER_BYTES",
     "HELLO",
     "KEYS",
     "LAST",
@@ -70,6 +71,9 @@ _MAX_GOODBYE_BYTES: Final = 1024
 _LARGE_BYTES: Final = 1 << 20
 
 _HEADER: Final = struct.Struct("<IBI")  # bytes that follow it, kind, call
+
+HEADER_BYTES: Final = _HEADER.size
+"""Of each frame."""
 
 
 class FrameError(TransportError):

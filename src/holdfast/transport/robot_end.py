@@ -30,6 +30,7 @@ from holdfast.transport.endpoints import (
 from holdfast.transport.frames import (
     CALL,
     END,
+    HEADER_BYTES,
     LAST,
     REPLY,
     Frame,
@@ -103,7 +104,7 @@ class StreamRobotTransport:
             encode_hello("robot", name, incarnation, lease_ms),
             lease_ms,
             max_message_bytes,
-            HalfReceived(2 * max_message_bytes),
+            HalfReceived(2 * (max_message_bytes + HEADER_BYTES)),
             Turns(_PAUSE_S),
             must_read=False,
         )

@@ -28,6 +28,7 @@ from holdfast.transport.endpoints import (
 from holdfast.transport.frames import (
     CALL,
     END,
+    HEADER_BYTES,
     LAST,
     REPLY,
     Frame,
@@ -205,7 +206,7 @@ class StreamServiceTransport:
             encode_hello("service", name, boot, lease_ms),
             lease_ms,
             max_message_bytes,
-            HalfReceived(2 * max_message_bytes),
+            HalfReceived(2 * (max_message_bytes + HEADER_BYTES)),
             Turns(),
             must_read=True,
         )
