@@ -38,7 +38,7 @@ from holdfast.transport.turns import TURN_S, Turns
 if TYPE_CHECKING:
     from holdfast.transport.tls import PeerCertificate, TlsStream
 
-__all__ = ["HalfReceived", "Link", "LinkOwner", "LinkSettings"]
+__all__ = ["HalfReceived", "Link", "LinkOwner", "LinkSettings", "receive_buffer"]
 
 OPENING_TIMEOUT_S: Final = 5.0
 """For a connection to become a link: the handshake and the other end's hello."""
@@ -64,9 +64,14 @@ _PING: Final = encode_frame(PING)
 _EXPIRED: Final = "has a certificate that has expired"
 
 
-# What a link receives is copied out of it before anything else happens, so all share one: to
-# allocate as much each time takes longer than all else that is done about a small message.
-_received = memoryview(bytearray(_RECEIVED_AT_ONCE_BYTES))
+def receive_buffer() -> memoryview:
+    """Return what all links of one end receive into, by turns.
+
+    What has come is copied out before anything else happens on the loop. To allocate as much for
+    each message takes longer than all else that is done about a small one. Ends on loops of
+    different threads must not share one.
+    """
+    return memoryview(bytearray(_RECEIVED_AT_ONCE_BYTES))
 
 
 class HalfReceived:
@@ -115,6 +120,8 @@ class LinkSettings(NamedTuple):
     max_message_bytes : int
     half_received : HalfReceived
     turns : Turns
+    buffer : memoryview
+        From :func:`receive_buffer`.
     must_read : bool
         Whether nothing more is heard of an end that does not read what it is sent.
     """
@@ -124,6 +131,7 @@ class LinkSettings(NamedTuple):
     max_message_bytes: int
     half_received: HalfReceived
     turns: Turns
+    buffer: memoryview
     must_read: bool
 
 
@@ -374,13 +382,13 @@ class Link(asyncio.BufferedProtocol):
     def get_buffer(self, sizehint: int) -> memoryview:
         """Return where asyncio puts what comes next."""
         del sizehint
-        return _received
+        return self._settings.buffer
 
     def buffer_updated(self, nbytes: int) -> None:
         """Take what has come."""
         if self._ended:
             return
-        self._unread, self._unread_at = bytes(_received[:nbytes]), 0
+        self._unread, self._unread_at = bytes(self._settings.buffer[:nbytes]), 0
         now = self._loop.time()
         if self.hello is not None:
             self._silent_at = now + self._patience_s

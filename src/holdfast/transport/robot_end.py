@@ -38,7 +38,7 @@ from holdfast.transport.frames import (
     Hello,
     encode_hello,
 )
-from holdfast.transport.links import HalfReceived, Link, LinkSettings
+from holdfast.transport.links import HalfReceived, Link, LinkSettings, receive_buffer
 from holdfast.transport.listener import Listener
 from holdfast.transport.tls import ClientCredentials, TlsStream
 from holdfast.transport.turns import Turns
@@ -106,6 +106,7 @@ class StreamRobotTransport:
             max_message_bytes,
             HalfReceived(2 * (max_message_bytes + HEADER_BYTES)),
             Turns(_PAUSE_S),
+            receive_buffer(),
             must_read=False,
         )
         self.calls = CallTable()

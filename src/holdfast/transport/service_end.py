@@ -36,7 +36,7 @@ from holdfast.transport.frames import (
     Hello,
     encode_hello,
 )
-from holdfast.transport.links import HalfReceived, Link, LinkSettings
+from holdfast.transport.links import HalfReceived, Link, LinkSettings, receive_buffer
 from holdfast.transport.listener import MAX_SILENT, Listener
 from holdfast.transport.revocation import REVOKED_FILE, revoked_serials
 from holdfast.transport.turns import Turns
@@ -208,6 +208,7 @@ class StreamServiceTransport:
             max_message_bytes,
             HalfReceived(2 * (max_message_bytes + HEADER_BYTES)),
             Turns(),
+            receive_buffer(),
             must_read=True,
         )
         self._on_event = on_event
