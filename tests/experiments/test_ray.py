@@ -229,7 +229,7 @@ def test_no_cluster(how: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 
 def test_without_ray(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
-    with pytest.raises(HoldfastError, match=r"needs Ray.*: pip install 'holdfast\[cluster\]'"):
+    with pytest.raises(HoldfastError, match=r"needs Ray.*: pip install 'ray\[client\]'"):
         RayExecutor(None).run(tasks(), lambda *_: None)
     # Where nothing is to be computed, nothing is needed.
     RayExecutor(None).run([], lambda *_: None)
