@@ -235,7 +235,7 @@ class RobotProcess:
         self._loop: asyncio.AbstractEventLoop | None = None
         # What has happened and is not handled yet, with the time at which it happened.
         self._happened: deque[tuple[float, _Happening]] = deque()
-        self._handling = False
+        self._handling = self._goes_on_soon = False
         self._now = monotonic()
         self._wake_at: float | None = None
         self._listens_since = self._now
@@ -377,7 +377,7 @@ class RobotProcess:
     def _start(self) -> None:
         with self._errors():
             if self._transport is not None:
-                self._transport.start(self._happens)
+                self._transport.start(self._hear)
             self._now = monotonic()
             self._carry_out(self._robot.start(self._now))
             self._begin_next()
@@ -389,12 +389,23 @@ class RobotProcess:
         if not self._handling:
             self._go_on()
 
+    def _hear(self, event: TransportEvent) -> None:
+        """Take an event of the wire; it is handled when the link is done with what has come.
+
+        A link's turn is short, and what the robot does with an answer is no part of it.
+        """
+        self._happened.append((monotonic(), event))
+        if not self._handling and not self._goes_on_soon:
+            self._goes_on_soon = True
+            self._on_loop().call_soon(self._go_on)
+
     def _wake(self) -> None:
         self._timer = None
         self._go_on(wake=self._wake_at is not None and monotonic() >= self._wake_at)
 
     def _go_on(self, *, wake: bool = False) -> None:
         """Handle what has happened, and have the loop wake up when the machine asks for it."""
+        self._goes_on_soon = False
         began = now = monotonic()
         if self._wake_at is not None:
             # This process was stopped, or another one had its core: nobody is blamed for that.
@@ -405,6 +416,7 @@ class RobotProcess:
                 self._carry_out(self._robot.wake(self._now))
             while not self._ended and (self._happened or self._own_planner.compute_brief()):
                 if now - began > self._turn_s:
+                    self._goes_on_soon = True
                     self._on_loop().call_soon(self._go_on)
                     break
                 at, event = self._happened.popleft()
