@@ -1947,30 +1947,119 @@ async def test_what_came_while_a_robot_stood_still_is_read_before_anybody_is_giv
         assert Vanished("cloud", "b1") not in inbox
 
 
-async def test_a_service_that_comes_and_goes_is_not_dialled_without_a_pause(
-    tcp: StreamWire, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    dialled: list[float] = []
-    connect = Dialer._connect
+def let_time_fly(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have the loop's time pass at once whenever nothing is left to do."""
+    loop: Any = asyncio.get_running_loop()
+    look = loop._selector.select
+    now = [loop.time()]
 
-    def note(self: Dialer, *arguments: Any) -> None:
-        dialled.append(asyncio.get_running_loop().time())
-        connect(self, *arguments)
+    def select(timeout: float | None = None) -> object:
+        if timeout is None:
+            return look(None)
+        found = look(min(timeout, 0.002))  # what was just sent may still be on its way
+        if not found:
+            now[0] += timeout
+        return found
 
-    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        writer.write(frames.encode_hello("service", "cloud", f"b{len(dialled)}", 30_000.0))
-        await reader.read(1)
-        writer.close()
+    monkeypatch.setattr(loop, "time", lambda: now[0])
+    monkeypatch.setattr(loop._selector, "select", select)
 
-    monkeypatch.setattr(Dialer, "_connect", note)
-    port = int(tcp.endpoint("cloud").rpartition(":")[2])
-    async with await asyncio.start_server(serve, "127.0.0.1", port):
-        robot, inbox = tcp.robot("cloud"), Inbox()
+
+class TestRedialling:
+    @pytest.fixture
+    def dialled(self, monkeypatch: pytest.MonkeyPatch) -> list[float]:
+        """When a connection was tried, by the loop's clock."""
+        times: list[float] = []
+        connect = Dialer._connect
+
+        def note(self: Dialer, *arguments: Any) -> None:
+            times.append(asyncio.get_running_loop().time())
+            connect(self, *arguments)
+
+        monkeypatch.setattr(Dialer, "_connect", note)
+        return times
+
+    @staticmethod
+    @contextlib.asynccontextmanager
+    async def coming_and_going(wire: StreamWire, *lasts_s: float) -> AsyncIterator[None]:
+        """Serve links that end by themselves: so long after the greeting, and then at once."""
+        lasting = iter(lasts_s)
+        serving: list[asyncio.Task[None] | None] = []
+
+        async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+            boot = f"b{len(serving)}"
+            serving.append(asyncio.current_task())
+            with contextlib.suppress(ConnectionError):
+                writer.write(frames.encode_hello("service", "cloud", boot, 30_000.0))
+                await asyncio.sleep(next(lasting, 0.0))
+                await reader.read(1)
+                writer.close()
+                await writer.wait_closed()
+
+        port = int(wire.endpoint("cloud").rpartition(":")[2])
+        async with await asyncio.start_server(serve, "127.0.0.1", port):
+            yield
+            await asyncio.wait([task for task in serving if task is not None])
+
+    async def test_a_service_that_comes_and_goes_is_dialled_ever_less_often(
+        self, tcp: StreamWire, dialled: list[float], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        let_time_fly(monkeypatch)
+        async with self.coming_and_going(tcp):
+            robot, inbox = tcp.robot("cloud"), Inbox()
+            robot.start(inbox)
+            await asyncio.sleep(60.0)
+            await robot.close()
+        # Soon at first, in the end once a second.
+        assert 55 < len(dialled) < 75
+        pauses = [after - before for before, after in itertools.pairwise(dialled)]
+        assert 0.019 < pauses[0] < 0.1
+        assert min(pauses[-40:]) > 0.99
+        assert len(inbox.boots()) == len(dialled)
+
+    async def test_after_a_link_that_has_lasted_it_is_dialled_soon_again(
+        self, tcp: StreamWire, dialled: list[float], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        let_time_fly(monkeypatch)
+        async with self.coming_and_going(tcp, *([0.0] * 12), 30.0):
+            robot, inbox = tcp.robot("cloud"), Inbox()
+            robot.start(inbox)
+            await asyncio.sleep(60.0)
+            await robot.close()
+        pauses = [after - before for before, after in itertools.pairwise(dialled)]
+        assert pauses[11] > 0.99
+        assert 30.0 <= pauses[12] < 30.1
+        assert pauses[13] < 0.1
+
+    @pytest.mark.parametrize(("robots", "services"), [("tcp", "tls"), ("tls", "tcp")])
+    async def test_an_end_that_speaks_no_tls_is_not_dialled_all_the_time(
+        self,
+        tls: StreamWire,
+        dialled: list[float],
+        monkeypatch: pytest.MonkeyPatch,
+        robots: str,
+        services: str,
+    ) -> None:
+        place = tls.endpoint("cloud").partition("/")[2]
+        let_time_fly(monkeypatch)
+        service = StreamServiceTransport(
+            "cloud",
+            boot="b1",
+            listen=[f"{services}/{place}"],
+            tls=tls.service_tls if services == "tls" else None,
+        )
+        robot = StreamRobotTransport(
+            {"cloud": ServiceAddress(f"{robots}/{place}")},
+            tls=tls.robot_tls if robots == "tls" else None,
+        )
+        inbox = Inbox()
+        await service.start(echo)
         robot.start(inbox)
-        await inbox.appeared(times=8)
+        await asyncio.sleep(60.0)
         await robot.close()
-    pauses = [after - before for before, after in itertools.pairwise(dialled)]
-    assert min(pauses) > 0.019
+        await service.close()
+        assert 55 < len(dialled) < 75
+        assert inbox.events == []
 
 
 ROBOT_THAT_ENDS = """

@@ -184,6 +184,8 @@ class Link(asyncio.BufferedProtocol):
     Attributes
     ----------
     tls : TlsStream or None
+    began_at : float
+        By the loop's clock.
     connecting : Task or None
         Of an accepted connection, which asyncio needs somebody to hold.
     closed : Future
@@ -223,7 +225,7 @@ class Link(asyncio.BufferedProtocol):
         self._decoder = FrameDecoder(settings.max_message_bytes)
         self._max_unsent_bytes = max(2 * settings.max_message_bytes, _UNSENT_BYTES_AT_LEAST)
         self._ping_interval_s = 1e-3 * settings.lease_ms / _PINGS_IN_LEASE
-        now = self._loop.time()
+        self.began_at = now = self._loop.time()
         self._silent_at = now + OPENING_TIMEOUT_S
         self._patience_s = 0.0
         self._moved_at = now
