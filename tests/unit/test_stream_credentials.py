@@ -26,6 +26,7 @@ from holdfast.transport.tls import TlsStream, client_context
 PATIENCE_S = 60.0
 LEASE_MS = PATIENT["lease_ms"]
 REVOKED = "has a certificate that has been revoked"
+FOREIGN = "has a certificate of an authority that is not believed any more"
 
 
 async def until(condition: Callable[[], bool], what: object = None) -> None:
@@ -190,8 +191,51 @@ def test_a_robot_believes_no_service_that_is_revoked(tmp_path: Path) -> None:
     asyncio.run(run())
 
 
-def test_who_shook_hands_before_the_list_came_is_not_let_in_after_it(tmp_path: Path) -> None:
+def put(directory: Path, other: Path, *, believing: list[Path]) -> None:
+    """Give a service other credentials, and the authorities of these directories."""
+    for name in ("certificate.pem", "key.pem"):
+        (directory / name).write_bytes((other / name).read_bytes())
+    authorities = [(each / "authority.pem").read_bytes() for each in believing]
+    (directory / "authority.pem").write_bytes(b"".join(authorities))
+
+
+def test_links_end_whose_authority_is_replaced_and_no_others(tmp_path: Path) -> None:
+    old, new, cloud_directory = (tmp_path / name for name in ("old", "new", "cloud"))
+    make_credentials(old, robots=["anna"], services=["cloud"])
+    make_credentials(new, robots=["berta"], services=["cloud"])
+    cloud_directory.mkdir()
+    put(cloud_directory, old / "cloud", believing=[old / "cloud"])
+
+    async def run() -> None:
+        cloud = Cloud(cloud_directory)
+        endpoint = await cloud.start()
+        anna = Robot(old / "anna", endpoint)
+        await anna.connected()
+        # Both are believed while robots move from one to the other.
+        put(cloud_directory, new / "cloud", believing=[old / "cloud", new / "cloud"])
+        assert cloud.transport.reload_credentials() == 0
+        berta = Robot(new / "berta", endpoint)
+        await berta.connected()
+        put(cloud_directory, new / "cloud", believing=[new / "cloud"])
+        assert cloud.transport.reload_credentials() == 1
+        await until(lambda: f"refuses this end, which {FOREIGN}" in anna.refusals, anna.refusals)
+        assert anna.vanished == anna.boots == ["b1"]
+        assert await berta.ask(1) == [b"berta"]
+        assert berta.boots == ["b1"]
+        told = [fields for name, fields in cloud.told if name == "robot_disconnected"]
+        assert [(each["robot"], each["reason"]) for each in told] == [("anna", FOREIGN)]
+        for end in (anna.transport, berta.transport, cloud.transport):
+            await end.close()
+
+    asyncio.run(run())
+
+
+@pytest.mark.parametrize("reason", [REVOKED, FOREIGN])
+def test_who_shook_hands_before_the_files_came_is_not_let_in_after_them(
+    tmp_path: Path, reason: str
+) -> None:
     make_credentials(tmp_path, robots=["anna"], services=["cloud"])
+    make_credentials(tmp_path / "other", services=["cloud"])
 
     async def run() -> None:
         cloud = Cloud(tmp_path / "cloud")
@@ -205,7 +249,11 @@ def test_who_shook_hands_before_the_list_came_is_not_let_in_after_it(tmp_path: P
             await loop.sock_sendall(connection, tls.take())
             while not tls.established:
                 tls.receive(await loop.sock_recv(connection, 65536))
-            revoke_credentials(tmp_path, names=["anna"])
+            if reason == REVOKED:
+                revoke_credentials(tmp_path, names=["anna"])
+            else:
+                other = tmp_path / "other" / "cloud"
+                put(tmp_path / "cloud", other, believing=[other])
             assert cloud.transport.reload_credentials() == 0, "it has not shown a certificate yet"
             tls.send(encode_hello("robot", "anna", "0", LEASE_MS))
             await loop.sock_sendall(connection, tls.take())
@@ -214,7 +262,7 @@ def test_who_shook_hands_before_the_list_came_is_not_let_in_after_it(tmp_path: P
                 told += tls.receive(data)
         last = list(FrameDecoder(1000).feed(told))[-1]
         assert last.kind == GOODBYE
-        assert read_goodbye(last.payload) == REVOKED
+        assert read_goodbye(last.payload) == reason
         assert [name for name, _ in cloud.told] == ["link_refused"]
         await cloud.transport.close()
 

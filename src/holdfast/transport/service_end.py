@@ -58,6 +58,7 @@ _SAID_GOODBYE: Final = "said goodbye"
 _NO_GOODBYE: Final = "closed the connection without a goodbye, as one that is killed does"
 _SERVICE_ENDS: Final = "this service ends"
 _REVOKED: Final = "has a certificate that has been revoked"
+_FOREIGN: Final = "has a certificate of an authority that is not believed any more"
 
 _MAX_UNGREETED: Final = 256
 """Connections that have sent something, but no hello yet."""
@@ -200,8 +201,10 @@ class StreamServiceTransport:
         self._max_links = MAX_LINKS if max_links is None else max_links
         self._tls = tls
         self._context = None if tls is None else self._make_context(tls)
-        # Of the last list; a handshake looks into the one that was there when it began.
+        # Of the last list, and the authorities that are believed since then (None: those of the
+        # start); a handshake looks into what was there when it began.
         self._revoked: frozenset[int] = frozenset()
+        self._believed: frozenset[bytes] | None = None
         self._settings = LinkSettings(
             encode_hello("service", name, boot, lease_ms),
             lease_ms,
@@ -293,14 +296,17 @@ class StreamServiceTransport:
         links = [
             link
             for link in (*self._links, *self._ungreeted)
-            if link.peer is not None and condition(link.peer)
+            if link.peer is not None and not link.ended and condition(link.peer)
         ]
         for link in links:
             link.end(reason, goodbye=reason, refused=True)
         return len(links)
 
     def reload_credentials(self) -> int:
-        """Read the credentials anew, and end the links of robots that are revoked now.
+        """Read the credentials anew, and end the links of robots that are not believed any more.
+
+        They are those that are revoked now, and those that an authority has signed which was
+        replaced.
 
         Returns
         -------
@@ -316,11 +322,18 @@ class StreamServiceTransport:
             return 0
         context = self._make_context(self._tls)
         self._revoked = revoked_serials(self._tls.authority.with_name(REVOKED_FILE))
+        self._believed = frozenset(context.get_ca_certs(binary_form=True))
         self._context = context
-        return self.end_links(self._is_revoked, _REVOKED)
+        ended = self.end_links(lambda peer: self._objection(peer) == _REVOKED, _REVOKED)
+        return ended + self.end_links(lambda peer: self._objection(peer) == _FOREIGN, _FOREIGN)
 
-    def _is_revoked(self, peer: PeerCertificate) -> bool:
-        return peer.serial_number in self._revoked
+    def _objection(self, peer: PeerCertificate) -> str | None:
+        """Return why a certificate is believed no more, as the rest of a sentence about a robot."""
+        if peer.serial_number in self._revoked:
+            return _REVOKED
+        if self._believed is not None and not peer.authorities <= self._believed:
+            return _FOREIGN
+        return None
 
     # -- links -----------------------------------------------------------------------------------
 
@@ -367,11 +380,12 @@ class StreamServiceTransport:
         """Nothing: a robot says who it is next."""
 
     def refusal(self, link: Link, hello: Hello) -> str | None:
-        """Refuse what is no robot or revoked, and who would have more than a share of the room."""
+        """Refuse what is no robot or not believed, and who would have more than a share of room."""
         if hello.role != "robot":
             return "is a service, and a robot was expected"
-        if link.peer is not None and self._is_revoked(link.peer):
-            return _REVOKED
+        objection = None if link.peer is None else self._objection(link.peer)
+        if objection is not None:
+            return objection
         if len(self._links) >= self._max_links and not self._make_room(_certified(link)):
             return f"is one too many: {self._max_links} robots are connected"
         return None

@@ -48,12 +48,15 @@ class PeerCertificate(NamedTuple):
         In seconds since 1970.
     der : bytes
         The whole of it.
+    authorities : frozenset of bytes
+        The one whose signature was believed, as DER; several if some have the same name.
     """
 
     name: str
     serial_number: int
     expires_at: float
     der: bytes
+    authorities: frozenset[bytes]
 
 
 def client_context(files: TlsFiles) -> ssl.SSLContext:
@@ -253,7 +256,16 @@ class TlsStream:
             int(str(shown.get("serialNumber", "0")), 16),
             float(ssl.cert_time_to_seconds(str(shown["notAfter"]))) if shown else 0.0,
             der,
+            self._authorities(shown.get("issuer")),
         )
+
+    def _authorities(self, name: object) -> frozenset[bytes]:
+        context = self._tls.context
+        named = context.get_ca_certs()
+        known = context.get_ca_certs(binary_form=True)
+        found = [der for read, der in zip(named, known, strict=True) if read["subject"] == name]
+        # There may be another certificate between the two, which only the handshake has seen.
+        return frozenset(found or known)
 
     def _shake_hands(self) -> None:
         try:
