@@ -28,6 +28,7 @@ __all__ = [
     "read_bounded",
     "remove_unfinished",
     "replace_directory",
+    "restore_directory",
     "write_atomically",
 ]
 
@@ -216,16 +217,16 @@ def create_directory_atomically(path: Path, files: Mapping[str, NewFile]) -> Non
 def replace_directory(path: Path, files: Mapping[str, NewFile]) -> None:
     """Put a new directory in the place of one that is there, which is removed.
 
-    No reader ever sees files of both. A process that is killed on the way may leave none there.
+    No reader ever sees files of both. A process that is killed on the way may leave none there,
+    until :func:`restore_directory` is called.
 
     Raises
     ------
     OutputError
         If it cannot be written.
     """
-    new, old = path.with_name(f".{path.name}.new"), path.with_name(f".{path.name}.old")
-    for left in (new, old):
-        _remove_tree(left)
+    restore_directory(path)
+    new, old = _beside(path)
     create_directory_atomically(new, files)
     try:
         path.rename(old)
@@ -233,6 +234,34 @@ def replace_directory(path: Path, files: Mapping[str, NewFile]) -> None:
     except OSError as error:
         raise OutputError(f"{path}: cannot be replaced: {error.strerror}") from error
     _remove_tree(old)
+
+
+def restore_directory(path: Path) -> None:
+    """Finish a replacement during which a process was killed, and remove what such ones left.
+
+    Nobody may be at it meanwhile.
+
+    Raises
+    ------
+    OutputError
+        If it cannot be put in its place.
+    """
+    new, old = _beside(path)
+    if old.exists() and not path.exists():
+        try:
+            (new if new.exists() else old).rename(path)
+        except OSError as error:
+            raise OutputError(f"{path}: cannot be restored: {error.strerror}") from error
+    for name in (path.name, new.name):
+        for unfinished in path.parent.glob(f".{name}.*.tmp"):
+            _remove_tree(unfinished)
+    for left in (new, old):
+        _remove_tree(left)
+
+
+def _beside(path: Path) -> tuple[Path, Path]:
+    """Return where a directory waits for its place, and where the one before it goes."""
+    return path.with_name(f".{path.name}.new"), path.with_name(f".{path.name}.old")
 
 
 def claim_directory(out: Path | None, parent: Path, name: str) -> Path:

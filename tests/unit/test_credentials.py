@@ -34,7 +34,7 @@ from holdfast.transport.credentials import (
     load_credentials,
 )
 from holdfast.transport.endpoints import ServiceAddress, TlsFiles
-from holdfast.transport.key_ring import make_credentials
+from holdfast.transport.key_ring import list_credentials, make_credentials
 from holdfast.transport.robot_end import StreamRobotTransport
 from holdfast.transport.service_end import StreamServiceTransport
 
@@ -593,7 +593,118 @@ def run_keys(*arguments: str) -> subprocess.CompletedProcess[str]:
     )
 
 
+KILLED_AT_EACH_MOMENT = """
+import os, shutil, signal, sys
+from pathlib import Path
+import holdfast.cli
+import holdfast.transport.key_ring
+
+home, copies = Path(sys.argv[1]), Path(sys.argv[2])
+
+def run(moment, *arguments):
+    child = os.fork()
+    if child == 0:
+        left = [moment]
+        def dying(change):
+            def call(*arguments, **options):
+                if left[0] == 0:
+                    os.kill(os.getpid(), signal.SIGKILL)
+                left[0] -= 1
+                return change(*arguments, **options)
+            return call
+        for name in ("rename", "replace", "unlink", "rmdir"):
+            setattr(os, name, dying(getattr(os, name)))
+        sys.argv[1:] = ["keys", *arguments]
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        holdfast.cli.main()
+        os._exit(0)
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+
+for moment in range(100):
+    copy = copies / str(moment)
+    shutil.copytree(home, copy)
+    status = run(moment, str(copy), "--rotate")
+    if status != -signal.SIGKILL:
+        sys.exit(status)
+    if status := run(-1, str(copy), "--list"):
+        sys.exit(status)
+"""
+
+
+WORKS_FOR_A_WHILE = """
+import sys
+from pathlib import Path
+from holdfast.transport import key_ring
+
+write = key_ring._write_issued
+
+def wait_and_write(*arguments):
+    print("has read the record", flush=True)
+    sys.stdin.readline()
+    write(*arguments)
+
+key_ring._write_issued = wait_and_write
+with key_ring.alone_in(Path(sys.argv[1])):
+    key_ring.make_credentials(Path(sys.argv[1]), robots=["anna"], rotate=True)
+"""
+
+
 class TestCommand:
+    def test_whoever_is_killed_in_a_rotation_leaves_what_the_next_one_finishes(
+        self, tmp_path: Path
+    ) -> None:
+        home, copies = tmp_path / "home", tmp_path / "copies"
+        make_credentials(home, robots=["anna"], services=["cloud"], hosts=["10.0.0.7"])
+        hosts = hosts_of(certificate_of(home / "cloud"))
+        copies.mkdir()
+        program = [sys.executable, "-c", KILLED_AT_EACH_MOMENT, str(home), str(copies)]
+        done = subprocess.run(program, capture_output=True, text=True, timeout=120)
+        assert (done.returncode, done.stderr) == (0, "")
+        moments = sorted(copies.iterdir(), key=lambda path: int(path.name))
+        assert len(moments) > 15
+        for copy in moments:
+            for rotates in (False, True):
+                if rotates:
+                    make_credentials(copy, rotate=True)
+                load_credentials(copy / "anna", "robot")
+                load_credentials(copy / "cloud", "service")
+                assert hosts_of(certificate_of(copy / "cloud")) == hosts
+                # No key of before is left.
+                assert {path.name for path in copy.iterdir()} == {"authority", "anna", "cloud"}
+
+    def test_what_was_broken_off_is_said_to_whoever_needs_it(self, tmp_path: Path) -> None:
+        make_credentials(tmp_path, robots=["anna"])
+        (tmp_path / "anna").rename(tmp_path / ".anna.old")
+        with pytest.raises(
+            CredentialsError, match=f'"holdfast keys {tmp_path} --list" brings back'
+        ):
+            load_credentials(tmp_path / "anna", "robot")
+        assert run_keys(str(tmp_path), "--list").returncode == 0
+        load_credentials(tmp_path / "anna", "robot")
+
+    def test_two_at_once_work_one_after_the_other(self, tmp_path: Path) -> None:
+        make_credentials(tmp_path, robots=["anna"])
+        before = certificate_of(tmp_path / "anna").serial_number
+        command = [sys.executable, "-c", WORKS_FOR_A_WHILE, str(tmp_path)]
+        pipe = subprocess.PIPE
+        with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True) as first:
+            assert first.stdin is not None
+            assert first.stdout is not None
+            assert first.stdout.readline() == "has read the record\n"
+            command = [sys.executable, "-m", "holdfast", "keys", str(tmp_path), "--rotate"]
+            with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True) as second:
+                assert second.stderr is not None
+                assert "another 'holdfast keys' is at work" in second.stderr.readline()
+                first.stdin.write("go on\n")
+                first.stdin.flush()
+                _, errors = second.communicate(timeout=60)
+            assert (first.wait(60), second.returncode, errors) == (0, 0, "")
+        load_credentials(tmp_path / "anna", "robot")
+        serials = [each.serial for each in list_credentials(tmp_path)]
+        assert len(serials) == 3
+        assert serials[0] == before
+        assert serials[2] == certificate_of(tmp_path / "anna").serial_number
+
     def test_it_makes_keys_and_says_what_goes_where(self, tmp_path: Path) -> None:
         home = tmp_path / "keys"
         done = run_keys(str(home), "--host", "10.0.0.7", "--days", "30")
@@ -618,6 +729,13 @@ class TestCommand:
         done = run_keys(str(tmp_path), "--robot", "a", "--robot", "b", "--service", "c")
         assert done.returncode == 0
         assert {path.name for path in tmp_path.iterdir()} == {"authority", "a", "b", "c"}
+        # Each has its own command.
+        commands = [line.split() for line in done.stdout.splitlines() if "--tls" in line]
+        assert [(each[1], each[-1]) for each in commands] == [
+            ("serve", str(tmp_path / "c")),
+            ("run", str(tmp_path / "a")),
+            ("run", str(tmp_path / "b")),
+        ]
 
     def test_the_default_of_days_is_the_librarys(self) -> None:
         from holdfast.transport.key_ring import DEFAULT_DAYS

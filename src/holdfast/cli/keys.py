@@ -93,31 +93,38 @@ def keys(
     signal SIGHUP, copied to a robot with its next run. Together with --rotate, what is revoked are
     the certificates of before.
     """
-    from holdfast.transport.key_ring import list_credentials, make_credentials, revoke_credentials
+    from holdfast.transport.key_ring import (
+        alone_in,
+        list_credentials,
+        make_credentials,
+        revoke_credentials,
+    )
 
     def warn(text: str) -> None:
         typer.echo(f"warning: {printable(text)}", err=True)
 
     revokes = bool(revoke or revoke_serial)
-    if revokes:
-        done = revoke_credentials(
-            directory, names=revoke or (), serials=_numbers(revoke_serial or ()), warn=warn
-        )
-        sys.stdout.write(_account_of_revocation(directory, done))
-    if robot or service or renew or rotate or not (revokes or list_):
-        ring = make_credentials(
-            directory,
-            robots=robot or (),
-            services=service or (),
-            hosts=host or (),
-            days=days,
-            renew=renew,
-            rotate=rotate,
-            warn=warn,
-        )
-        sys.stdout.write(_account(ring))
-    if list_:
-        sys.stdout.write("".join(f"{_line_of(each)}\n" for each in list_credentials(directory)))
+    with alone_in(directory, warn=warn):
+        if revokes:
+            done = revoke_credentials(
+                directory, names=revoke or (), serials=_numbers(revoke_serial or ()), warn=warn
+            )
+            sys.stdout.write(_account_of_revocation(directory, done))
+        if robot or service or renew or rotate or not (revokes or list_):
+            ring = make_credentials(
+                directory,
+                robots=robot or (),
+                services=service or (),
+                hosts=host or (),
+                days=days,
+                renew=renew,
+                rotate=rotate,
+                warn=warn,
+            )
+            sys.stdout.write(_account(ring))
+        if list_:
+            listed = list_credentials(directory)
+            sys.stdout.write("".join(f"{_line_of(each)}\n" for each in listed))
 
 
 def _numbers(texts: Sequence[str]) -> list[int]:
@@ -173,16 +180,19 @@ def _account(ring: KeyRing) -> str:
             "Copy each certificate.pem over the old one. Services read it when they start, and "
             "with the signal SIGHUP.",
         ]
-    examples = {made.role: made.directory for made in ring.made if not made.renewed}
-    if examples:
+    commands = [
+        f"  holdfast serve --listen tls/0.0.0.0:7447 --tls {made.directory}"
+        if made.role == "service"
+        else f"  holdfast run CONFIG --service tls/HOST:7447 --tls {made.directory}"
+        for made in ring.made
+        if not made.renewed
+    ]
+    if commands:
         lines += [
             "",
             "Copy each directory to its machine, where only its owner can read it. There:",
+            *commands,
         ]
-    if "service" in examples:
-        lines.append(f"  holdfast serve --listen tls/0.0.0.0:7447 --tls {examples['service']}")
-    if "robot" in examples:
-        lines.append(f"  holdfast run CONFIG --service tls/HOST:7447 --tls {examples['robot']}")
     until = ring.authority_expires.strftime("%Y-%m-%d")
     lines += [
         "",

@@ -100,6 +100,8 @@ def _unreadable(directory: Path, path: Path, role: Role, error: OSError) -> str:
     text = f"{path}: cannot be read: {error.strerror}"
     if TlsFiles.of(directory / role).certificate.exists():
         return f"{text}; did you mean {directory / role}?"
+    if directory.with_name(f".{directory.name}.old").exists():
+        return f'{text}; "holdfast keys {directory.parent} --list" brings back what was broken off'
     if isinstance(error, FileNotFoundError):
         return f'{text}; "holdfast keys DIR" makes such files'
     return text

@@ -17,9 +17,11 @@ from __future__ import annotations
 
 import contextlib
 import csv
+import fcntl
+import os
 import re
 import socket
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from datetime import UTC, datetime, timedelta
 from ipaddress import ip_address
 from pathlib import Path
@@ -29,6 +31,7 @@ from holdfast.files import (
     NewFile,
     create_directory_atomically,
     replace_directory,
+    restore_directory,
     write_atomically,
 )
 from holdfast.transport.credentials import (
@@ -65,6 +68,7 @@ __all__ = [
     "KeyRing",
     "MadeCredentials",
     "Revocation",
+    "alone_in",
     "list_credentials",
     "make_credentials",
     "revoke_credentials",
@@ -177,6 +181,51 @@ class KeyRing(NamedTuple):
     made: tuple[MadeCredentials, ...]
 
 
+@contextlib.contextmanager
+def alone_in(directory: Path, *, warn: Callable[[str], None] | None = None) -> Iterator[None]:
+    """Keep others out of a directory meanwhile, and first finish what a killed one began.
+
+    Parameters
+    ----------
+    directory : Path
+        As for :func:`make_credentials`.
+    warn : callable or None
+        As for :func:`make_credentials`; told if somebody has to be waited for.
+
+    Raises
+    ------
+    CredentialsError
+        If it cannot be made or opened, or the record in it is malformed.
+    OutputError
+        If a file cannot be written.
+    """
+    warn = warn or give_to_warnings
+    is_new = not directory.exists()
+    try:
+        directory.mkdir(mode=0o700, parents=True, exist_ok=True)
+        lock = os.open(directory, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    except OSError as error:
+        what = "created" if is_new else "opened"
+        raise CredentialsError(f"{directory}: cannot be {what}: {error.strerror}") from error
+    try:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            warn(f"{directory}: another 'holdfast keys' is at work; waiting until it has ended")
+            fcntl.flock(lock, fcntl.LOCK_EX)
+        except OSError as error:  # on some file systems of a network
+            warn(f"{directory}: cannot be locked: {error.strerror}; run one command at a time")
+        names = {each.name for each in _written_down(directory).values()}
+        for name in filter(_NAME.fullmatch, names - {_AUTHORITY}):
+            restore_directory(directory / name)
+        yield
+    finally:
+        if is_new:
+            with contextlib.suppress(OSError):
+                directory.rmdir()  # if all was refused, and so it is empty
+        os.close(lock)
+
+
 def make_credentials(
     directory: Path,
     *,
@@ -195,7 +244,8 @@ def make_credentials(
     which appears whole or not at all. Another call adds keys of the same authority. Nothing that
     exists is changed, unless ``renew`` or ``rotate`` is set: then a new certificate replaces the
     old one, for the same key or a new one, and for at least the same hosts. The old one stays valid
-    until its time is up or it is revoked (:func:`revoke_credentials`).
+    until its time is up or it is revoked (:func:`revoke_credentials`). Nobody else may be at work
+    in the directory meanwhile (:func:`alone_in`).
 
     Parameters
     ----------
@@ -601,6 +651,18 @@ def _issued(certificate: x509.Certificate) -> Issued:
 
 def _read_issued(directory: Path, authority: x509.Certificate) -> list[Issued]:
     """Return what was signed: what is written down, and what is there besides."""
+    issued = _written_down(directory)
+    for place in _certificates_in(directory):
+        # Anything may lie here; what our authority has not signed is no certificate of ours.
+        with contextlib.suppress(CredentialsError, ValueError, TypeError, InvalidSignature):
+            certificate = _read_certificate(place)
+            certificate.verify_directly_issued_by(authority)
+            issued.setdefault(certificate.serial_number, _issued(certificate))
+    return list(issued.values())
+
+
+def _written_down(directory: Path) -> dict[int, Issued]:
+    """Return the record of what was signed, by serial number."""
     path = directory / _AUTHORITY / _ISSUED
     issued: dict[int, Issued] = {}
     if path.exists():
@@ -611,13 +673,7 @@ def _read_issued(directory: Path, authority: x509.Certificate) -> list[Issued]:
                 issued[int(serial, 16)] = Issued(int(serial, 16), name, known, end)
         except ValueError as error:
             raise CredentialsError(f"{path}: is no record of certificates: {error}") from error
-    for place in _certificates_in(directory):
-        # Anything may lie here; what our authority has not signed is no certificate of ours.
-        with contextlib.suppress(CredentialsError, ValueError, TypeError, InvalidSignature):
-            certificate = _read_certificate(place)
-            certificate.verify_directly_issued_by(authority)
-            issued.setdefault(certificate.serial_number, _issued(certificate))
-    return list(issued.values())
+    return issued
 
 
 def _rows_of(text: str) -> list[list[str]]:
