@@ -98,23 +98,30 @@ def checked_endpoints(options: Options) -> list[Endpoint]:
     Raises
     ------
     TransportError
-        If an endpoint is malformed, or is one that other machines can reach although they do not
-        have to prove who they are.
+        If an endpoint is malformed or cannot be used so, or is one that other machines can reach
+        although they do not have to prove who they are; the message names the option.
     """
-    from holdfast.transport.endpoints import parse_endpoint
+    from holdfast.transport.endpoints import check_direction, check_endpoint
 
-    listen, connect = (
-        [parse_endpoint(text) for text in texts] for texts in (options.listen, options.connect)
-    )
-    for endpoint in (*listen, *connect):
-        # Of an encrypted one without credentials the transport says that they are missing.
-        if not (endpoint.is_loopback or options.insecure or endpoint.is_encrypted):
-            raise TransportError(
-                f"endpoint {endpoint}: other machines can reach it, and nobody there has to prove "
-                f"who he is; use tls/... or udp/... with --tls DIR ('holdfast keys DIR' makes the "
-                f"credentials), an address of this machine alone, as in tcp/{_DEFAULT_PLACE}, or "
-                f"say --insecure"
-            )
+    listen = []
+    for option, texts in (("--listen", options.listen), ("--connect", options.connect)):
+        listens = option == "--listen"
+        for text in texts:
+            try:
+                endpoint = check_endpoint(text, listens=listens)
+                check_direction(endpoint, service_listens=listens)
+            except TransportError as error:
+                raise TransportError(f"{option}: {error}") from None
+            # Of an encrypted one without credentials the transport says that they are missing.
+            if not (endpoint.is_loopback or options.insecure or endpoint.is_encrypted):
+                raise TransportError(
+                    f"{option}: endpoint {endpoint}: other machines can reach it, and nobody there "
+                    f"has to prove who he is; use tls/... or udp/... with --tls DIR ('holdfast "
+                    f"keys DIR' makes the credentials), an address of this machine alone, as in "
+                    f"tcp/{_DEFAULT_PLACE}, or say --insecure"
+                )
+            if listens:
+                listen.append(endpoint)
     return listen
 
 
