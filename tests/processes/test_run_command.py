@@ -528,7 +528,7 @@ class TestErrors:
                 "environment.object, given instead of",
             ),
             (["run", "peg.yaml"], "--log json needs --service, --environment or --rate"),
-            (["serve", "--listen", "tcp/nowhere"], "endpoint 'tcp/nowhere'"),
+            (["serve", "--listen", "tcp/nowhere"], "--listen: endpoint 'tcp/nowhere'"),
             (["serve", "--lease-ms", "1"], "--lease-ms: '1' is not a number from 50"),
         ],
     )
