@@ -247,6 +247,13 @@ class TestOutput:
         assert decided == {"cloud_active_sensing_recovery": found["sensing_decisions"]}
         assert "decided by" in done.stdout
 
+    def test_a_robot_without_services_tells_of_none(self, workplace: Path) -> None:
+        options = ("--trials", "1", "--rate", "10000", "--log", "json")
+        done = holdfast(workplace, "run", "peg.yaml", "--out", "out", *options)
+        told = [json.loads(line) for line in done.stderr.splitlines()]
+        assert "trial" in [each["event"] for each in told]
+        assert not [each for each in told if "service" in each]
+
     @pytest.mark.parametrize(
         "options", [(), ("--rate", "10000"), ("--rate", "10000", "--log", "json")]
     )

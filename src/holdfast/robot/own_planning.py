@@ -8,7 +8,7 @@ nobody who could be lost, slow or wrong: so there is nothing to time, to check o
 from __future__ import annotations
 
 from holdfast.protocol.verification import OWN_PLANNER
-from holdfast.session.effects import Effect, Plan, Report, Stop
+from holdfast.session.effects import Effect, Plan, Stop
 from holdfast.session.events import Decided, Planned, TransportEvent
 from holdfast.session.messages import DIGEST_SIZE, SensingAnswer
 from holdfast.session.question import Provenance, Question
@@ -37,8 +37,6 @@ class OwnPlanning:
 
     def ask(self, question: Question, now: float) -> None:
         """Ask a new question; the one before is forgotten."""
-        if not self._number:
-            self.effects.append(Report("service_appeared", {"service": OWN_PLANNER}))
         self.question = question
         self._number += 1
         self._asked_at = now
