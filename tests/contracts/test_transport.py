@@ -2031,6 +2031,25 @@ class TestRedialling:
         assert 30.0 <= pauses[12] < 30.1
         assert pauses[13] < 0.1
 
+    async def test_a_service_that_answers_and_dies_is_dialled_soon_each_time(
+        self, tcp: StreamWire, dialled: list[float], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        let_time_fly(monkeypatch)
+        robot, inbox = tcp.robot("cloud"), Inbox()
+        robot.start(inbox)
+        for number in range(8):
+            service = tcp.service("cloud", f"b{number}")
+            await service.start(echo)
+            await inbox.appeared(times=number + 1)
+            before = len(dialled)
+            robot.call("cloud", number, b"hello")
+            await inbox.wait_for(Ended(number))
+            await service.close()
+            await asyncio.sleep(1.0)
+            # Every few hundredths of a second, as often as after the first one.
+            assert len(dialled) - before > 30
+        await robot.close()
+
     @pytest.mark.parametrize(("robots", "services"), [("tcp", "tls"), ("tls", "tcp")])
     async def test_an_end_that_speaks_no_tls_is_not_dialled_all_the_time(
         self,

@@ -6,8 +6,8 @@ that is cut or on a process that stands still. The longer nobody is there, the l
 in proportion, so that waiting for the next attempt adds two per cent to any outage.
 
 Somebody who takes a connection and ends it soon again, hello or not, is asked less often: the pause
-doubles with each such link, up to a second. A link that has lasted makes it short again, so a
-service that dies and is started again is found as fast as ever.
+doubles with each such link, up to a second. A link that has brought an answer, or has lasted, makes
+it short again: so a service that dies and is started again is found as fast as ever.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _LAST_PAUSE_S: Final = 1.0
 _SHARE_OF_OUTAGE: Final = 0.02
 
 _LASTING_S: Final = 1.0
-"""A link that ends sooner has come to nothing."""
+"""A link that ends sooner, and has brought no answer, has come to nothing."""
 
 _CONNECT_TIMEOUT_S: Final = 2.0
 """For the answer to an attempt; the next ones have long begun."""
@@ -122,9 +122,10 @@ class Dialer:
         if link not in self._links and link is not self._winner:
             return  # it was not needed
         now = self._loop.time()
-        lasted = now >= link.began_at + _LASTING_S
-        longer_s = min(2.0 * self._least_pause_s, _LAST_PAUSE_S)
-        self._least_pause_s = _FIRST_PAUSE_S if lasted else longer_s
+        if link.has_answered or now >= link.began_at + _LASTING_S:
+            self._least_pause_s = _FIRST_PAUSE_S
+        else:
+            self._least_pause_s = min(2.0 * self._least_pause_s, _LAST_PAUSE_S)
         if link in self._links:
             self._links.discard(link)
             if not self._links:

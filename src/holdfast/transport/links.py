@@ -186,6 +186,8 @@ class Link(asyncio.BufferedProtocol):
     tls : TlsStream or None
     began_at : float
         By the loop's clock.
+    has_answered : bool
+        Whether an answer came over it that was waited for; the owner notes that.
     connecting : Task or None
         Of an accepted connection, which asyncio needs somebody to hold.
     closed : Future
@@ -249,6 +251,7 @@ class Link(asyncio.BufferedProtocol):
         self.said_goodbye = False
         self.refused = False
         self.adrift = False
+        self.has_answered = False
 
     @property
     def max_message_bytes(self) -> int:

@@ -379,6 +379,7 @@ class _Service:
         if call is None:
             return  # it has ended
         if frame.kind != END and not frame.passed_over_bytes:
+            link.has_answered = True
             self._robot.calls.replied(call, frame.payload)
         if frame.kind != REPLY:
             calls.pop(frame.call, None)
