@@ -44,7 +44,7 @@ from holdfast.transport.endpoints import PrivateSocket, ServiceAddress, TlsFiles
 from holdfast.transport.in_process import InProcessNetwork
 from holdfast.transport.robot_end import StreamRobotTransport
 from holdfast.transport.service_end import StreamServiceTransport
-from holdfast.transport.tls import client_context, server_context
+from holdfast.transport.tls import TlsStream, client_context, server_context
 
 PATIENCE_S = 30.0
 LEASE_MS = 2000.0
@@ -1141,6 +1141,87 @@ class TestVisitors:
         robot, inbox = wire.robot("cloud"), Inbox()
         robot.start(inbox)
         await inbox.wait_for(Appeared("cloud", "b1"))
+
+
+class TestManyFromOneAddress:
+    """Whoever opens more connections than there is room for loses its own, and nobody else."""
+
+    MANY = 600
+
+    @classmethod
+    def flood(cls, stack: contextlib.ExitStack, endpoint: str, said: bytes) -> list[socket.socket]:
+        visitors = [stack.enter_context(Visitor(endpoint)) for _ in range(cls.MANY)]
+        for visitor in visitors:
+            visitor.socket.bind(("127.0.0.2", 0))
+            visitor.socket.setblocking(True)
+            visitor.socket.connect(visitor.address)
+            visitor.socket.sendall(said)
+            visitor.socket.setblocking(False)
+        return [visitor.socket for visitor in visitors]
+
+    @staticmethod
+    def is_open(stream: socket.socket) -> bool:
+        """Whether nothing but bytes has come; those are lost."""
+        try:
+            while stream.recv(65536):
+                pass
+        except BlockingIOError:
+            return True
+        except ConnectionError:
+            pass
+        return False
+
+    @classmethod
+    async def until_closed(cls, streams: list[socket.socket], least: int) -> None:
+        await until(lambda: sum(not cls.is_open(each) for each in streams) >= least)
+
+    @pytest.mark.parametrize("begun", [0, 3], ids=["silent", "in_the_handshake"])
+    async def test_a_robot_that_is_slow_is_let_in(
+        self, tls: StreamWire, robot_tls: TlsFiles, begun: int
+    ) -> None:
+        await tls.service("cloud", "b1").start(echo)
+        stream = TlsStream(client_context(robot_tls), "127.0.0.1")
+        stream.begin()
+        opening = stream.take()
+        with contextlib.ExitStack() as stack:
+            robot = stack.enter_context(Visitor(tls.endpoint("cloud")))
+            await robot.connect()
+            await robot.say(opening[:begun])
+            others = self.flood(stack, tls.endpoint("cloud"), opening[:begun])
+            await self.until_closed(others, self.MANY - listener.MAX_SILENT)
+            assert self.is_open(robot.socket)
+            await robot.say(opening[begun:])
+            loop, heard = asyncio.get_running_loop(), b""
+            async with asyncio.timeout(PATIENCE_S):
+                while not heard:
+                    came = await loop.sock_recv(robot.socket, 65536)
+                    assert came, "the service has hung up"
+                    was_established = stream.established
+                    heard = stream.receive(came)
+                    if stream.established and not was_established:
+                        stream.send(HELLO)
+                        await robot.say(stream.take())
+        assert heard.startswith(frames.MAGIC)
+
+    async def test_a_service_that_is_slow_is_not_hung_up_on(self, tls: StreamWire) -> None:
+        tls.robot_listens = True
+        tls.robot("cloud").start(Inbox())
+        with contextlib.ExitStack() as stack:
+            service = stack.enter_context(Visitor(tls.endpoint("cloud")))
+            await service.connect()
+            others = self.flood(stack, tls.endpoint("cloud"), b"")
+            await self.until_closed(others, self.MANY - robot_end._MAX_UNGREETED)
+            assert self.is_open(service.socket)
+
+    def test_an_owner_of_many_addresses_of_ipv6_is_one(self) -> None:
+        def network(address: str) -> bytes:
+            return listener._network_of(socket.AF_INET6, (address, 1, 0, 0))
+
+        assert network("2001:db8::1") == network("2001:db8::ffff:2")
+        assert network("2001:db8::1") != network("2001:db8:0:1::1")
+        assert network("fe80::1%lo") == network("fe80::2")
+        assert network("::ffff:10.0.0.1") == listener._network_of(socket.AF_INET, ("10.0.0.1", 1))
+        assert network("::ffff:10.0.0.1") != network("::ffff:10.0.0.2")
 
 
 class TestPeers:

@@ -2,7 +2,7 @@
 
 Anybody can open a connection, and most that are opened to a port of the internet say nothing or
 nonsense. So a connection costs next to nothing until its first byte has come; those that say
-nothing are closed after a while, and when there are too many the oldest goes.
+nothing are closed after a while, and when there are too many, one of whoever has the most goes.
 """
 
 from __future__ import annotations
@@ -13,15 +13,16 @@ import errno
 import os
 import socket
 import stat
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Final
+from typing import Any, Final, TypeVar
 
 from holdfast.errors import TransportError
 from holdfast.transport.endpoints import Endpoint
 from holdfast.transport.links import OPENING_TIMEOUT_S
 
-__all__ = ["BACKLOG", "MAX_SILENT", "Listener", "listen"]
+__all__ = ["BACKLOG", "MAX_SILENT", "Listener", "listen", "one_too_many"]
 
 BACKLOG: Final = 1024
 """Connections that wait to be accepted."""
@@ -35,6 +36,11 @@ _PAUSE_S: Final = 0.1
 MAX_SILENT: Final = 256
 """Connections of which no byte has come."""
 
+_MAPPED = b"\0" * 10 + b"\xff\xff"
+"""Before an IPv4 address that is written as one of IPv6."""
+
+_T = TypeVar("_T")
+
 
 class Listener:
     """Accepts connections, and hands over those of which a first byte has come.
@@ -44,7 +50,7 @@ class Listener:
     endpoint : Endpoint
         Port 0 takes a free one.
     accepted : callable
-        Gets the socket of such a connection.
+        Gets the socket of such a connection, and from which network it came.
     speaks_first : bool
         Whether it is this end that has to speak first: then connections are handed over at once.
     listening : socket or None
@@ -64,7 +70,7 @@ class Listener:
     def __init__(
         self,
         endpoint: Endpoint,
-        accepted: Callable[[socket.socket], None],
+        accepted: Callable[[socket.socket, bytes], None],
         *,
         speaks_first: bool = False,
         listening: socket.socket | None = None,
@@ -86,7 +92,8 @@ class Listener:
             self.endpoint = endpoint
         else:
             self.endpoint = endpoint.with_port(self._socket.getsockname()[1])
-        self._silent: dict[socket.socket, asyncio.TimerHandle] = {}
+        self._silent: dict[socket.socket, bytes] = {}
+        self._timers: dict[socket.socket, asyncio.TimerHandle] = {}
         self._pause: asyncio.TimerHandle | None = None
         self._loop.add_reader(self._socket, self._accept)
 
@@ -111,7 +118,7 @@ class Listener:
     def _accept(self) -> None:
         for _ in range(_ACCEPTED_AT_ONCE):
             try:
-                connection, _ = self._socket.accept()
+                connection, address = self._socket.accept()
             except (BlockingIOError, InterruptedError):
                 return
             except OSError as error:
@@ -120,14 +127,16 @@ class Listener:
                     self._pause = self._loop.call_later(_PAUSE_S, self._go_on)
                 return  # else it was gone before it was accepted
             connection.setblocking(False)
+            network = _network_of(connection.family, address)
             if self._speaks_first:
-                self._accepted(connection)
+                self._accepted(connection, network)
                 continue
             if len(self._silent) >= MAX_SILENT:
-                oldest = next(iter(self._silent))
-                self._forget(oldest)
-                oldest.close()
-            self._silent[connection] = self._loop.call_later(
+                other = one_too_many(self._silent)
+                self._forget(other)
+                other.close()
+            self._silent[connection] = network
+            self._timers[connection] = self._loop.call_later(
                 OPENING_TIMEOUT_S, self._look, connection
             )
             self._loop.add_reader(connection, self._look, connection)
@@ -137,19 +146,44 @@ class Listener:
 
     def _look(self, connection: socket.socket) -> None:
         """Hand a connection over if something has come, else close it."""
-        self._forget(connection)
+        network = self._forget(connection)
         try:
             first = connection.recv(1, socket.MSG_PEEK)
         except OSError:
             first = b""
         if first:
-            self._accepted(connection)
+            self._accepted(connection, network)
         else:
             connection.close()
 
-    def _forget(self, connection: socket.socket) -> None:
-        self._silent.pop(connection).cancel()
+    def _forget(self, connection: socket.socket) -> bytes:
+        self._timers.pop(connection).cancel()
         self._loop.remove_reader(connection)
+        return self._silent.pop(connection)
+
+
+def one_too_many(networks: Mapping[_T, bytes]) -> _T:
+    """Return which of some connections is to go: the oldest of the network with the most.
+
+    So whoever opens a thousand a second keeps out nobody who needs half a second to say hello.
+
+    Parameters
+    ----------
+    networks : mapping
+        From which network each came, the oldest first.
+    """
+    most, _ = Counter(networks.values()).most_common(1)[0]
+    return next(each for each, network in networks.items() if network == most)
+
+
+def _network_of(family: int, address: Any) -> bytes:
+    """Return what one owner has of addresses: a host's own one, or 64 bits of IPv6."""
+    if family == socket.AF_INET:
+        return socket.inet_pton(family, address[0])
+    if family == socket.AF_INET6:
+        packed = socket.inet_pton(family, address[0].partition("%")[0])
+        return packed[12:] if packed.startswith(_MAPPED) else packed[:8]
+    return b""
 
 
 def listen(endpoint: Endpoint) -> socket.socket:

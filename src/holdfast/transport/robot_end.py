@@ -39,7 +39,7 @@ from holdfast.transport.frames import (
     encode_hello,
 )
 from holdfast.transport.links import HalfReceived, Link, LinkSettings, receive_buffer
-from holdfast.transport.listener import Listener
+from holdfast.transport.listener import Listener, one_too_many
 from holdfast.transport.tls import ClientCredentials, TlsStream
 from holdfast.transport.turns import Turns
 
@@ -231,8 +231,8 @@ class _Service:
         # Those over which it is seen, with the boot that was told, the newest last. There are
         # several only where the robot listens.
         self._links: dict[Link, str] = {}
-        # In the order of their beginning.
-        self._made: dict[Link, None] = {}
+        # In the order of their beginning, with the network from which each came.
+        self._made: dict[Link, bytes] = {}
         self._calls: dict[Link, dict[int, PendingCall]] = {}
         self._numbers = count()
         # What the last hello said, under which boot that was told, and whether the handshake alone
@@ -289,7 +289,7 @@ class _Service:
 
     # -- links -----------------------------------------------------------------------------------
 
-    def _make_link(self) -> Link:
+    def _make_link(self, network: bytes = b"") -> Link:
         tls = None
         if self._credentials is not None:
             host = None if self._address.listens else self.endpoint.host
@@ -307,14 +307,18 @@ class _Service:
                 speaks_first=tls is not None or not self._address.listens,
                 tls=tls,
             )
-        self._made[link] = None
+        self._made[link] = network
         return link
 
-    def _accepted(self, connection: socket.socket) -> None:
-        unknown = [link for link in self._made if link.hello is None and not link.ended]
+    def _accepted(self, connection: socket.socket, network: bytes) -> None:
+        unknown = {
+            link: its_network
+            for link, its_network in self._made.items()
+            if link.hello is None and not link.ended
+        }
         if len(unknown) >= _MAX_UNGREETED:
-            unknown[0].end("has said no hello, and others wait", abort=True)
-        link = self._make_link()
+            one_too_many(unknown).end("has said no hello, and others wait", abort=True)
+        link = self._make_link(network)
         link.connecting = asyncio.get_running_loop().create_task(link.connect(connection))
 
     def established(self, link: Link) -> None:

@@ -37,7 +37,7 @@ from holdfast.transport.frames import (
     encode_hello,
 )
 from holdfast.transport.links import HalfReceived, Link, LinkSettings, receive_buffer
-from holdfast.transport.listener import MAX_SILENT, Listener
+from holdfast.transport.listener import MAX_SILENT, Listener, one_too_many
 from holdfast.transport.revocation import REVOKED_FILE, revoked_serials
 from holdfast.transport.turns import Turns
 
@@ -221,7 +221,7 @@ class StreamServiceTransport:
         self._listeners: list[Listener] = []
         self._dialers: dict[Endpoint, Dialer] = {}
         self._dialled: dict[Link, Dialer] = {}
-        self._ungreeted: dict[Link, None] = {}
+        self._ungreeted: dict[Link, bytes] = {}
         self._links: dict[Link, set[_StreamCall]] = {}
         self._closing: set[asyncio.Future[None]] = set()
 
@@ -343,7 +343,7 @@ class StreamServiceTransport:
 
         return server_context(tls, self._boot)
 
-    def _make_link(self, endpoint: Endpoint, *, dialled: bool) -> Link:
+    def _make_link(self, endpoint: Endpoint, network: bytes = b"", *, dialled: bool) -> Link:
         tls = None
         if endpoint.is_encrypted:
             from holdfast.transport.tls import TlsStream
@@ -359,10 +359,10 @@ class StreamServiceTransport:
         else:
             link = Link(self, self._settings, speaks_first=dialled and tls is None, tls=tls)
         if len(self._ungreeted) >= _MAX_UNGREETED:
-            oldest = next(iter(self._ungreeted))
-            del self._ungreeted[oldest]
-            oldest.end("has said no hello, and others wait", abort=True)
-        self._ungreeted[link] = None
+            other = one_too_many(self._ungreeted)
+            del self._ungreeted[other]
+            other.end("has said no hello, and others wait", abort=True)
+        self._ungreeted[link] = network
         self._closing.add(link.closed)
         link.closed.add_done_callback(self._closing.discard)
         return link
@@ -372,8 +372,8 @@ class StreamServiceTransport:
         self._dialled[link] = self._dialers[endpoint]
         return link
 
-    def _accepted(self, endpoint: Endpoint, connection: socket.socket) -> None:
-        link = self._make_link(endpoint, dialled=False)
+    def _accepted(self, endpoint: Endpoint, connection: socket.socket, network: bytes) -> None:
+        link = self._make_link(endpoint, network, dialled=False)
         link.connecting = asyncio.get_running_loop().create_task(link.connect(connection))
 
     def established(self, link: Link) -> None:
