@@ -6,8 +6,9 @@ that is cut or on a process that stands still. The longer nobody is there, the l
 in proportion, so that waiting for the next attempt adds two per cent to any outage.
 
 Somebody who takes a connection and ends it soon again, hello or not, is asked less often: the pause
-doubles with each such link, up to a second. A link that has brought an answer, or has lasted, makes
-it short again: so a service that dies and is started again is found as fast as ever.
+doubles with each such link, up to a fifth of a second. (It may be a proxy that accepts while its
+service is being started.) A link that has brought an answer, or has lasted, makes it short again:
+so a service that dies and is started again is found as fast as ever.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ _FIRST_PAUSE_S: Final = 0.02
 _LAST_PAUSE_S: Final = 1.0
 _SHARE_OF_OUTAGE: Final = 0.02
 
+_LAST_PAUSE_AFTER_NOTHING_S: Final = 0.2
 _LASTING_S: Final = 1.0
 """A link that ends sooner, and has brought no answer, has come to nothing."""
 
@@ -125,7 +127,7 @@ class Dialer:
         if link.has_answered or now >= link.began_at + _LASTING_S:
             self._least_pause_s = _FIRST_PAUSE_S
         else:
-            self._least_pause_s = min(2.0 * self._least_pause_s, _LAST_PAUSE_S)
+            self._least_pause_s = min(2.0 * self._least_pause_s, _LAST_PAUSE_AFTER_NOTHING_S)
         if link in self._links:
             self._links.discard(link)
             if not self._links:
