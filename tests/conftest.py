@@ -43,7 +43,6 @@ REAL = (
     "unit/test_chaos_wide_area.py",
     "unit/test_credentials.py::TestNothingIsOverwritten",
     "unit/test_credentials.py::TestOnRealLinks",
-    "unit/test_diagnosis.py",
     "unit/test_endpoints.py::test_loopback_is_what_only_this_machine_can_reach",
     "unit/test_files.py::test_what_is_no_file_is_refused",
     "unit/test_health.py",

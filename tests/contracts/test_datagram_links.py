@@ -6,8 +6,9 @@ import asyncio
 import contextlib
 import socket
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 from hypothesis import given, settings
@@ -25,7 +26,7 @@ from tests.contracts.test_transport import (
     until,
 )
 from tests.ports import free_port
-from tests.relay import relay
+from tests.relay import Relay, relay
 
 from holdfast.chaos.proxy import Direction, Impairment, Proxy
 from holdfast.errors import TransportError
@@ -315,6 +316,32 @@ class TestStrangers:
         asyncio.run(run())
 
 
+class Line(NamedTuple):
+    """A robot and its service, and what carries the stream and the datagrams between them."""
+
+    robot: StreamRobotTransport
+    inbox: Inbox
+    stream: Proxy
+    datagrams: Relay
+
+
+@contextlib.asynccontextmanager
+async def on_a_line(
+    wire: StreamWire, serve: Callable[[IncomingCall], None] = echo
+) -> AsyncIterator[Line]:
+    """Connect them over a line on which streams and datagrams can be disturbed apart."""
+    await wire.service("cloud", "b1").start(serve)
+    _, target = place_of(wire)
+    entry = free_port()
+    wire._endpoints["cloud"] = f"udp/127.0.0.1:{entry}"
+    with Proxy(entry, target, "seed") as stream, relay(entry, target) as datagrams:
+        robot, inbox = wire.robot("cloud"), Inbox()
+        robot.start(inbox)
+        await until(lambda: robot.sends_datagrams("cloud"))
+        yield Line(robot, inbox, stream, datagrams)
+        await robot.close()
+
+
 async def answers_of(robot: StreamRobotTransport, inbox: Inbox, calls: Received) -> None:
     robot.call("cloud", 1, b"other")
     call = await calls.next()
@@ -325,21 +352,10 @@ async def answers_of(robot: StreamRobotTransport, inbox: Inbox, calls: Received)
 
 class TestEnds:
     async def test_a_stream_that_breaks_ends_nothing_while_datagrams_come(
-        self, udp: StreamWire, robot_tls: TlsFiles
+        self, udp: StreamWire
     ) -> None:
         calls = Received()
-        service = udp.service("cloud", "b1")
-        await service.start(calls)
-        _, target = place_of(udp)
-        entry = free_port()
-        with Proxy(entry, target, "seed") as stream, relay(entry, target):
-            robot = StreamRobotTransport(
-                {"cloud": ServiceAddress(f"udp/127.0.0.1:{entry}")}, tls=robot_tls
-            )
-            udp.ends.insert(0, robot)
-            inbox = Inbox()
-            robot.start(inbox)
-            await until(lambda: robot.sends_datagrams("cloud"))
+        async with on_a_line(udp, calls) as (robot, inbox, stream, _):
             link = link_of(robot)
             robot.call("cloud", 1, b"in the middle")
             first = await calls.next()
@@ -360,87 +376,45 @@ class TestEnds:
             assert [e for e in inbox.events if isinstance(e, Appeared | Vanished)] == [
                 Appeared("cloud", "b1")
             ]
-            await robot.close()
 
     @pytest.mark.parametrize("direction", ["both", "to_service", "to_robot"])
     async def test_a_stream_that_is_held_up_ends_nothing(
-        self, direction: Direction, udp: StreamWire, robot_tls: TlsFiles
+        self, direction: Direction, udp: StreamWire
     ) -> None:
         """For several leases neither end hears the other one on the stream, and nobody asks."""
-        udp.lease_ms = 1000.0
-        await udp.service("cloud", "b1").start(echo)
-        _, target = place_of(udp)
-        entry = free_port()
-        with Proxy(entry, target, "seed") as stream, relay(entry, target):
-            robot = StreamRobotTransport(
-                {"cloud": ServiceAddress(f"udp/127.0.0.1:{entry}")}, tls=robot_tls, lease_ms=1000.0
-            )
-            udp.ends.insert(0, robot)
-            inbox = Inbox()
-            robot.start(inbox)
-            await until(lambda: robot.sends_datagrams("cloud"))
+        udp.lease_ms = 500.0
+        async with on_a_line(udp) as (robot, inbox, stream, _):
             link = link_of(robot)
             silent = Impairment(direction=direction, silent=True)
             heal = await asyncio.to_thread(stream.impair, silent)
-            await asyncio.sleep(3.0)
+            await asyncio.sleep(1.5)
             await answers(robot, inbox, 1)
             await asyncio.to_thread(heal)
             robot.call("cloud", 2, bytes(100_000))
             assert len(await inbox.of_call(2)) == 2
             assert link_of(robot) is link
             assert [event for event, _ in udp.told if event == "robot_disconnected"] == []
-            await robot.close()
 
-    async def test_adrift_it_is_lost_when_nothing_comes(
-        self, udp: StreamWire, robot_tls: TlsFiles
-    ) -> None:
+    async def test_adrift_it_is_lost_when_nothing_comes(self, udp: StreamWire) -> None:
         udp.lease_ms = LEASE_MS
-        service = udp.service("cloud", "b1")
-        await service.start(echo)
-        _, target = place_of(udp)
-        entry = free_port()
-        with Proxy(entry, target, "seed") as stream, relay(entry, target) as line:
-            robot = StreamRobotTransport(
-                {"cloud": ServiceAddress(f"udp/127.0.0.1:{entry}")}, tls=robot_tls
-            )
-            udp.ends.insert(0, robot)
-            inbox = Inbox()
-            robot.start(inbox)
-            await until(lambda: robot.sends_datagrams("cloud"))
+        async with on_a_line(udp) as (robot, inbox, stream, datagrams):
             link = link_of(robot)
             await asyncio.to_thread(stream.impair, Impairment(cut=True))
             await until(lambda: link.adrift)
             await answers(robot, inbox, 1)
-            line.close()
+            datagrams.close()
             await inbox.wait_for(Vanished("cloud", "b1"))
             robot.call("cloud", 2, b"nobody is there")
             assert await inbox.of_call(2) == [Ended(2)]
-            await robot.close()
 
-    async def test_a_port_that_is_closed_is_a_service_that_is_gone(
-        self, udp: StreamWire, robot_tls: TlsFiles
-    ) -> None:
+    async def test_a_port_that_is_closed_is_a_service_that_is_gone(self, udp: StreamWire) -> None:
         """Although its stream, held open by a line that has fallen silent, says nothing."""
         udp.lease_ms = 3.6e6
-        service = udp.service("cloud", "b1")
-        await service.start(echo)
-        _, target = place_of(udp)
-        entry = free_port()
-        with Proxy(entry, target, "seed") as stream, relay(entry, target) as line:
-            robot = StreamRobotTransport(
-                {"cloud": ServiceAddress(f"udp/127.0.0.1:{entry}")},
-                tls=robot_tls,
-                lease_ms=3.6e6,
-            )
-            udp.ends.insert(0, robot)
-            inbox = Inbox()
-            robot.start(inbox)
-            await until(lambda: robot.sends_datagrams("cloud"))
+        async with on_a_line(udp) as (robot, inbox, stream, datagrams):
             await asyncio.to_thread(stream.impair, Impairment(silent=True))
-            line.close()  # from now on the system answers
+            datagrams.close()  # from now on the system answers
             robot.call("cloud", 1, b"question")
             await inbox.wait_for(Vanished("cloud", "b1"), Ended(1))
-            await robot.close()
 
     async def test_what_the_system_says_of_a_port_is_not_believed_while_datagrams_are_answered(
         self, udp: StreamWire
@@ -488,7 +462,7 @@ class TestWhatGoesTogether:
         robot = StreamRobotTransport(
             {"cloud": ServiceAddress(udp.endpoint("cloud").replace("udp", "tls"))},
             tls=robot_tls,
-            on_refused=lambda _, reason: refusals.append(reason),
+            on_unreachable=lambda _, reason: refusals.append(reason),
         )
         robot.start(Inbox())
         await until(lambda: bool(refusals))

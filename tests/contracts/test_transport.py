@@ -37,6 +37,7 @@ from tests.processes.faults import PATIENT
 from holdfast.errors import InvalidValueError, TransportError
 from holdfast.session.events import Appeared, Ended, Replied, TransportEvent, Vanished
 from holdfast.session.messages import Refused, decode_reply
+from holdfast.transport import dialer as dialer_module
 from holdfast.transport import frames, links, listener, robot_end, service_end
 from holdfast.transport.contract import IncomingCall, RobotTransport, ServiceTransport
 from holdfast.transport.dialer import Dialer
@@ -191,7 +192,7 @@ class StreamWire:
             lease_ms=self.lease_ms,
             max_message_bytes=max_message_bytes,
             tls=self.robot_tls,
-            on_refused=lambda *refusal: self.refusals.append(refusal),
+            on_unreachable=lambda *refusal: self.refusals.append(refusal),
         )
         self.ends.append(robot)
         return robot
@@ -822,16 +823,6 @@ class TestStreams:
         await robot.close()
         await service.close()
 
-    async def test_a_listening_robot_knows_its_port_once_it_has_started(self) -> None:
-        robot = StreamRobotTransport({"local": ServiceAddress("tcp/127.0.0.1:0", listens=True)})
-        inbox = Inbox()
-        robot.start(inbox)
-        service = StreamServiceTransport("r", boot="b1", connect=[robot.endpoint_of("local")])
-        await service.start(echo)
-        await inbox.wait_for(Appeared("local", "b1"))
-        await service.close()
-        await robot.close()
-
     async def test_a_service_that_takes_no_more_links_does_not_look_for_robots(
         self, socket_directory: Path
     ) -> None:
@@ -864,7 +855,7 @@ class TestStreams:
                 "right": ServiceAddress(endpoint, name="cloud"),
                 "wrong": ServiceAddress(endpoint, name="other"),
             },
-            on_refused=lambda *refusal: refusals.append(refusal),
+            on_unreachable=lambda *refusal: refusals.append(refusal),
         )
         tcp.ends.append(robot)
         inbox = Inbox()
@@ -1472,6 +1463,132 @@ class TestPeers:
             await inbox.wait_for(Appeared("cloud", "b1"))
 
 
+class TestUnreachable:
+    """Why a robot misses a service is told, in words for whoever has to mend it."""
+
+    @staticmethod
+    async def told(wire: StreamWire) -> str:
+        """Return the first reason why a robot does not reach its service."""
+        wire.robot("cloud").start(Inbox())
+        await until(lambda: bool(wire.refusals))
+        service, reason = wire.refusals[0]
+        assert service == "cloud"
+        return reason
+
+    @staticmethod
+    @contextlib.asynccontextmanager
+    async def listening(
+        wire: StreamWire, answer: Callable[[asyncio.StreamReader, asyncio.StreamWriter], Any]
+    ) -> AsyncIterator[None]:
+        """Put something there that is no service."""
+
+        async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+            await answer(reader, writer)
+            writer.close()
+
+        port = int(wire.endpoint("cloud").rpartition(":")[2])
+        async with await asyncio.start_server(serve, "127.0.0.1", port):
+            yield
+
+    @pytest.mark.parametrize(
+        ("protocol", "reason"),
+        [
+            ("tcp", "connection refused"),
+            ("tls", "connection refused"),
+            ("udp", "connection refused"),
+            ("unix", "no such file or directory"),
+        ],
+    )
+    async def test_nobody_listens_which_is_told_once_in_each_absence(
+        self,
+        socket_directory: Path,
+        robot_tls: TlsFiles,
+        service_tls: TlsFiles,
+        protocol: str,
+        reason: str,
+    ) -> None:
+        keys = (robot_tls, service_tls) if protocol in ("tls", "udp") else (None, None)
+        wire = StreamWire(protocol, socket_directory, robot_tls=keys[0], service_tls=keys[1])
+        robot, inbox = wire.robot("cloud"), Inbox()
+        async with contextlib.AsyncExitStack() as stack:
+            stack.push_async_callback(wire.close_on_loop)
+            robot.start(inbox)
+            await until(lambda: bool(wire.refusals))
+            dialer = robot._services["cloud"]._dialer
+            assert dialer is not None
+            turn = dialer._turn
+            await until(lambda: dialer._turn > turn + 3)
+            assert wire.refusals == [("cloud", reason)]
+            service = wire.service("cloud", "b1")
+            await service.start(echo)
+            await inbox.wait_for(Appeared("cloud", "b1"))
+            await service.close()
+            await until(lambda: len(wire.refusals) == 2)
+            assert wire.refusals[1] == ("cloud", reason)
+
+    async def test_a_name_that_nobody_has(self, tcp: StreamWire) -> None:
+        # A label this long exists nowhere, and no server need be asked to know it.
+        host = "a" * 70 + ".invalid"
+        tcp._endpoints["cloud"] = f"tcp/{host}:7447"
+        assert await self.told(tcp) == f"host name not found: {host}"
+
+    async def test_of_a_host_one_of_whose_addresses_answers_nothing_is_told(
+        self, tcp: StreamWire, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        port = int(tcp.endpoint("cloud").rpartition(":")[2])
+        found = [
+            (socket.AF_INET, socket.SOCK_STREAM, 6, "", (host, port))
+            for host in ("127.0.0.2", "127.0.0.1")
+        ]
+        await tcp.service("cloud", "b1").start(echo)
+        monkeypatch.setattr(socket, "getaddrinfo", lambda *_, **__: found)
+        tcp._endpoints["cloud"] = f"tcp/robot.example:{port}"
+        robot, inbox = tcp.robot("cloud"), Inbox()
+        robot.start(inbox)
+        await inbox.appeared()
+        dialer = robot._services["cloud"]._dialer
+        assert dialer is not None
+        assert dialer._turn >= 2
+        assert tcp.refusals == []
+
+    async def test_nothing_answers(self, tcp: StreamWire, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(dialer_module, "_CONNECT_TIMEOUT_S", 0.2)
+        place = tcp.endpoint("cloud")
+        with contextlib.ExitStack() as stack:
+            address = ("127.0.0.1", int(place.rpartition(":")[2]))
+            stack.enter_context(socket.create_server(address, backlog=0))
+            for _ in range(4):  # they fill its queue
+                stack.enter_context(Visitor(place)).socket.connect_ex(address)
+            assert await self.told(tcp) == "nothing answers"
+
+    async def test_it_closes_each_connection(self, tcp: StreamWire) -> None:
+        async with self.listening(tcp, lambda *_: asyncio.sleep(0)):
+            assert (await self.told(tcp)).startswith("closes connections without a hello")
+
+    async def test_it_says_nothing(self, tcp: StreamWire, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(links, "OPENING_TIMEOUT_S", 0.2)
+        async with self.listening(tcp, lambda reader, _: reader.read()):
+            assert await self.told(tcp) == "has said no hello within 0.2 s"
+
+    async def test_it_does_not_speak_tls(self, tls: StreamWire) -> None:
+        async def answer(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+            writer.write(b"SSH-2.0-anything\r\n")
+            await reader.read()
+
+        async with self.listening(tls, answer):
+            assert (await self.told(tls)).startswith("does not speak TLS 1.3 as expected")
+
+    @pytest.mark.parametrize(("at", "asked"), [("tls", "tcp"), ("tcp", "tls")])
+    async def test_a_service_at_another_kind_of_endpoint(
+        self, tcp: StreamWire, tls: StreamWire, at: str, asked: str
+    ) -> None:
+        wires = {"tcp": tcp, "tls": tls}
+        await wires[at].service("cloud", "b1").start(echo)
+        place = wires[at].endpoint("cloud").partition("/")[2]
+        wires[asked]._endpoints["cloud"] = f"{asked}/{place}"
+        assert "one of the ends speaks TLS" in await self.told(wires[asked])
+
+
 def assert_matches(text: str, pattern: str) -> None:
     import re
 
@@ -1497,7 +1614,7 @@ class TestCertificates:
         refusals: list[tuple[str, str]] = []
         for files in (foreign, stranger):
             outsider = StreamRobotTransport(
-                {"cloud": address}, tls=files, on_refused=lambda *told: refusals.append(told)
+                {"cloud": address}, tls=files, on_unreachable=lambda *told: refusals.append(told)
             )
             tls.ends.append(outsider)
             inbox = Inbox()
@@ -1508,7 +1625,7 @@ class TestCertificates:
             assert await inbox.of_call(1) == [Ended(1)]
             assert inbox.events == [Ended(1)]
             expected = (
-                "has a certificate that is" if files is foreign else "refuses this end's cert"
+                "has a certificate that was" if files is foreign else "refuses this end's cert"
             )
             assert expected in refusals[0][1]
         bare = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
@@ -1534,20 +1651,20 @@ class TestCertificates:
     ) -> None:
         usage = oid.ExtendedKeyUsageOID.SERVER_AUTH
         tls.service_tls = Authority(tmp_path / "foreign").issue("service", usage)
-        await self.assert_refused(tls, "has a certificate that is refused")
+        await self.assert_refused(tls, "has a certificate that was not signed by the authority")
 
     async def test_a_robot_s_certificate_does_not_make_a_service(
         self, tls: StreamWire, robot_tls: TlsFiles
     ) -> None:
         tls.service_tls = robot_tls
-        await self.assert_refused(tls, "has a certificate that is refused: unsuitable certificate")
+        await self.assert_refused(tls, "has a certificate that is not for a service")
 
     async def test_a_service_s_certificate_does_not_make_a_robot(
         self, tls: StreamWire, service_tls: TlsFiles
     ) -> None:
         tls.robot_tls = service_tls
         await self.assert_refused(tls, "refuses this end's certificate")
-        assert "unsuitable certificate purpose" in tls.reasons()[0]
+        assert tls.reasons()[0] == "has a certificate that is not for a robot"
 
     async def test_a_certificate_must_name_the_host(
         self, tls: StreamWire, authority: Authority
@@ -1561,7 +1678,7 @@ class TestCertificates:
         robot, inbox = tls.robot("cloud"), Inbox()
         robot.start(inbox)
         await until(lambda: bool(tls.refusals))
-        assert "IP address mismatch" in tls.refusals[0][1]
+        assert "does not name this host" in tls.refusals[0][1]
         assert inbox.events == []
 
     async def test_an_old_version_of_tls_is_refused(self, tls: StreamWire) -> None:

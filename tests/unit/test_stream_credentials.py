@@ -47,7 +47,7 @@ class Robot:
             {"cloud": ServiceAddress(endpoint)},
             lease_ms=LEASE_MS,
             tls=TlsFiles.of(directory),
-            on_refused=lambda _, reason: self.refusals.append(reason),
+            on_unreachable=lambda _, reason: self.refusals.append(reason),
         )
         self.transport.start(self.events.append)
 
@@ -178,7 +178,7 @@ def test_a_robot_believes_no_service_that_is_revoked(tmp_path: Path) -> None:
         # The robot has the list now; the thief who has the service's key has none.
         (tmp_path / "cloud" / "revoked.pem").unlink()
         second = Robot(tmp_path / "anna", endpoint)
-        wanted = "has a certificate that is refused: certificate revoked"
+        wanted = "has a certificate that has been revoked"
         await until(lambda: wanted in second.refusals, second.refusals)
         assert second.boots == []
         # One that runs already finds the list when it connects again.

@@ -49,7 +49,7 @@ class _Reasons:
         """Take an event."""
         if name == "refused" and fields["final"]:
             self.refusals[str(fields["service"])] = f"{fields['code']}: {fields['reason']}"
-        elif name in ("unreachable", "link_refused"):
+        elif name == "unreachable":
             self.unreachable[str(fields["service"])] = str(fields["reason"])
 
     def close(self) -> None:
@@ -147,7 +147,6 @@ def run_as_robot(
             rate_hz,
             links.offload,
             distrusted,
-            refusals=links.refusals,
             make_planner=links.make_planner,
         )
         launcher = None if links.launcher is None else links.launcher(robot.deliver)

@@ -10,7 +10,7 @@ import functools
 import os
 import re
 import socket
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -46,8 +46,6 @@ class Links(NamedTuple):
         For the dispatcher.
     close : callable
         Releases what was made here; after the transport is closed.
-    refusals : mapping
-        From services to why the last link to them was refused that was.
     make_planner : callable
         Joins the robot's problem and settings to the functions that lead from state to state.
     """
@@ -58,7 +56,6 @@ class Links(NamedTuple):
     launcher: Callable[[Callable[[RecoveryExited], None]], RecoveryLauncher] | None
     offload: OffloadSettings
     close: Callable[[], None]
-    refusals: Mapping[str, str]
     make_planner: Callable[[Problem, PlanningSettings], Planner] = Planner
 
 
@@ -84,7 +81,7 @@ def make_links(configuration: Configuration, log_path: Path | None, events: Even
     if not offload.services:
         # The robot and its own planner come to the same states.
         make_planner = functools.partial(RememberingPlanner, memory=StateMemory())
-        return Links(None, (), None, None, offload, _nothing, {}, make_planner)
+        return Links(None, (), None, None, offload, _nothing, make_planner)
     return _streams(configuration, log_path, events)
 
 
@@ -141,12 +138,6 @@ def _streams(configuration: Configuration, log_path: Path | None, events: EventS
         def launcher(deliver: Callable[[RecoveryExited], None]) -> RecoveryLauncher:
             return RecoveryLauncher(arguments, deliver, log_path)
 
-    refusals: dict[str, str] = {}
-
-    def refused(service: str, reason: str) -> None:
-        refusals[service] = reason
-        events.event("link_refused", service=service, reason=reason)
-
     try:
         transport = StreamRobotTransport(
             addresses,
@@ -154,7 +145,9 @@ def _streams(configuration: Configuration, log_path: Path | None, events: EventS
             incarnation=os.urandom(8).hex(),
             lease_ms=offload.lease_ms,
             tls=tls,
-            on_refused=refused,
+            on_unreachable=lambda service, reason: events.event(
+                "unreachable", service=service, reason=reason
+            ),
             on_closed_to_datagrams=lambda service: events.event(
                 "no_datagrams",
                 service=service,
@@ -164,7 +157,7 @@ def _streams(configuration: Configuration, log_path: Path | None, events: EventS
     except BaseException:
         close()
         raise
-    return Links(transport, offload.services, recovery, launcher, offload, close, refusals)
+    return Links(transport, offload.services, recovery, launcher, offload, close)
 
 
 def _problem_arguments(configuration: Configuration) -> list[str]:

@@ -12,7 +12,7 @@ a number, a text of a megabyte or with control characters in it cost at most the
 
 Names of events in use. By the robot: status, launch, launched, launch_failed, recovery_exited,
 retry, hedge, restore, restored, state_diverged, service_appeared, service_vanished,
-service_suspected, unreachable, link_refused, no_datagrams, insecure, credentials,
+service_suspected, unreachable, no_datagrams, insecure, credentials,
 late_replies, waiting, holding, resumed, busy, refused, malformed_reply, disagreement,
 wrong_answer, not_deterministic, verification_failed, distrusted,
 limits_unknown, verifying, prefetch_unused, unexplained, filter_diverged,

@@ -19,10 +19,8 @@ import socket
 import sys
 import threading
 from collections import deque
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Callable, Collection, Iterator, Sequence
 from time import monotonic
-from types import MappingProxyType
 from typing import Any, NamedTuple, Protocol, TypeAlias
 
 from holdfast import contract
@@ -34,7 +32,6 @@ from holdfast.problems.problem import Problem
 from holdfast.problems.registry import problem_class, problem_module
 from holdfast.robot.own_decisions import OwnDecisions
 from holdfast.robot.own_planning import OwnPlanning
-from holdfast.runtime.diagnosis import MissingServices
 from holdfast.runtime.environment import EnvironmentMaker
 from holdfast.runtime.logs import EventSink
 from holdfast.runtime.own_planner import OwnPlanner
@@ -195,8 +192,6 @@ class RobotProcess:
         Instead of the configuration's.
     distrusted : collection of str
         Services that have answered wrongly in an earlier part of the run.
-    refusals : mapping
-        From services to why the last link to them was refused that was.
     make_planner : callable
         Joins the problem and the settings to the functions that lead from state to state.
     """
@@ -216,7 +211,6 @@ class RobotProcess:
         rate_hz: float | None = None,
         offload: OffloadSettings | None = None,
         distrusted: Collection[str] = (),
-        refusals: Mapping[str, str] = MappingProxyType({}),
         make_planner: Callable[[Problem, PlanningSettings], Planner] = Planner,
     ) -> None:
         self._configuration = configuration
@@ -225,10 +219,6 @@ class RobotProcess:
         self._journal = journal
         self._maker = maker
         self._events = events
-        tls = configuration.offload.tls
-        self._missing = MissingServices(
-            configuration.offload.services, None if tls is None else Path(tls), events, refusals
-        )
         self._on_result = on_result
         self._on_timing = on_timing
         self._on_verified = on_verified
@@ -531,7 +521,6 @@ class RobotProcess:
                 self._transport.abandon(effect.call)
             elif isinstance(effect, Report):
                 self._events.event(effect.name, **effect.fields)
-                self._missing.heard(effect.name, effect.fields)
             elif isinstance(effect, Launch):
                 self._launch(effect)
             elif isinstance(effect, EndTrial):

@@ -118,6 +118,8 @@ def _rehearse(files: TlsFiles, role: Role) -> float:
     """Let both ends of a link shake hands in memory; return when the certificate expires."""
     import ssl
 
+    from holdfast.transport.tls import fault_of_certificate
+
     authority, certificate, key = files.authority, files.certificate, files.key
     serving = role == "service"
     ours = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER if serving else ssl.PROTOCOL_TLS_CLIENT)
@@ -158,8 +160,10 @@ def _rehearse(files: TlsFiles, role: Role) -> float:
         if error.verify_code in _LIST_IS_WRONG:
             reason = _LIST_IS_WRONG[error.verify_code]
             raise CredentialsError(f"{authority.with_name(REVOKED_FILE)}: {reason}") from error
-        reason = _refusal(certificate, role, error)
-        raise CredentialsError(f"{certificate}: {reason}") from error
+        reason = fault_of_certificate(error, role)
+        raise CredentialsError(
+            f"{certificate}: {reason}{_more_of(certificate, error.verify_code)}"
+        ) from error
     except (ssl.SSLError, ValueError) as error:
         raise CredentialsError(f"{certificate}: does not work for TLS: {error}") from error
     return float(ssl.cert_time_to_seconds(str(shown["notAfter"]))) if shown else 0.0
@@ -186,26 +190,12 @@ _LIST_IS_WRONG = {
 """By OpenSSL's numbers: what can be wrong with a revocation list."""
 
 
-def _refusal(certificate: Path, role: Role, error: ssl.SSLCertVerificationError) -> str:
-    """Say why the other end refuses the certificate, by OpenSSL's number of the reason."""
-    other: Role = "robot" if role == "service" else "service"
-    match error.verify_code:
-        case 9:
-            return f"is not valid yet{_validity(certificate)}; is this machine's clock right?"
-        case 10:
-            return f"has expired{_validity(certificate)}"
-        case 23:
-            return "has been revoked; 'holdfast keys DIR --rotate' makes new ones"
-        case 26:
-            return f"is not for a {role} but for a {other}"
-        case 7 | 18 | 19 | 20 | 21:
-            return f"was not signed by the authority beside it, {AUTHORITY_FILE}"
-        case _:
-            return f"is refused: {error.verify_message}"
-
-
-def _validity(certificate: Path) -> str:
-    """Return when a certificate is valid, if the package that can read it is installed."""
+def _more_of(certificate: Path, verify_code: int) -> str:
+    """Return when a certificate is valid that is not so now, or how to get another one."""
+    if verify_code == 23:
+        return "; 'holdfast keys DIR --rotate' makes new ones"
+    if verify_code not in (9, 10):
+        return ""
     try:
         from cryptography import x509
     except ImportError:

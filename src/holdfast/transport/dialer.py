@@ -9,6 +9,8 @@ Somebody who takes a connection and ends it soon again, hello or not, is asked l
 doubles with each such link, up to a fifth of a second. (It may be a proxy that accepts while its
 service is being started.) A link that has brought an answer, or has lasted, makes it short again:
 so a service that dies and is started again is found as fast as ever.
+
+Why attempts fail is told, for whoever has to mend it.
 """
 
 from __future__ import annotations
@@ -17,6 +19,7 @@ import asyncio
 import contextlib
 import errno
 import ipaddress
+import os
 import socket
 import threading
 from collections.abc import Callable
@@ -57,13 +60,24 @@ class Dialer:
     endpoint : Endpoint
     make_link : callable
         Makes the link of a new connection.
+    on_failed : callable
+        Is told why no connection comes about, each time that an attempt has failed and all of the
+        endpoint's addresses have.
     """
 
-    def __init__(self, endpoint: Endpoint, make_link: Callable[[], Link]) -> None:
+    def __init__(
+        self,
+        endpoint: Endpoint,
+        make_link: Callable[[], Link],
+        on_failed: Callable[[str], None] = lambda _: None,
+    ) -> None:
         self._endpoint = endpoint
         self._make_link = make_link
+        self._on_failed = on_failed
+        # Since somebody was there, why the last attempt at each address came to nothing.
+        self._failures: dict[_Address, str] = {}
         self._loop = asyncio.get_running_loop()
-        self._attempts: dict[socket.socket, asyncio.TimerHandle] = {}
+        self._attempts: dict[socket.socket, tuple[_Address, asyncio.TimerHandle]] = {}
         self._links: set[Link] = set()
         self._winner: Link | None = None
         self._least_pause_s = _FIRST_PAUSE_S
@@ -113,11 +127,13 @@ class Dialer:
             self._next.cancel()
             self._next = None
         for stream in list(self._attempts):
-            self._give_up(stream)
+            self._forget(stream)
+            stream.close()
 
     def succeeded(self) -> None:
         """Take note that somebody is there who is what was looked for."""
         self._absent_since = None
+        self._failures.clear()
 
     def ended(self, link: Link) -> None:
         """Take note that a link has ended."""
@@ -160,27 +176,26 @@ class Dialer:
     def _connect(self, family: socket.AddressFamily, address: _Address) -> None:
         try:
             stream = socket.socket(family, socket.SOCK_STREAM)
-        except OSError:
-            return  # no descriptor is free
+        except OSError as error:  # no descriptor is free
+            self._failed(address, error.errno)
+            return
         stream.setblocking(False)
-        try:
-            stream.connect(address)
-        except BlockingIOError as error:
-            if error.errno == errno.EINPROGRESS:
-                timeout = self._loop.call_later(_CONNECT_TIMEOUT_S, self._give_up, stream)
-                self._attempts[stream] = timeout
-                self._loop.add_writer(stream, self._look, stream)
-            else:
-                stream.close()  # the queue of a local socket is full
-        except OSError:
-            stream.close()
+        number = stream.connect_ex(address)
+        if number == errno.EINPROGRESS:
+            timeout = self._loop.call_later(_CONNECT_TIMEOUT_S, self._give_up, stream)
+            self._attempts[stream] = address, timeout
+            self._loop.add_writer(stream, self._look, stream)
         else:
-            self._connected(stream)
+            self._connected_or_failed(stream, address, number)
 
     def _look(self, stream: socket.socket) -> None:
-        self._forget(stream)
-        if stream.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR):
+        number = stream.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
+        self._connected_or_failed(stream, self._forget(stream), number)
+
+    def _connected_or_failed(self, stream: socket.socket, address: _Address, number: int) -> None:
+        if number:
             stream.close()
+            self._failed(address, number)
         else:
             self._connected(stream)
 
@@ -195,12 +210,22 @@ class Dialer:
         link.connecting = self._loop.create_task(link.connect(stream))
 
     def _give_up(self, stream: socket.socket) -> None:
-        self._forget(stream)
+        address = self._forget(stream)
         stream.close()
+        self._failed(address, errno.ETIMEDOUT)
 
-    def _forget(self, stream: socket.socket) -> None:
-        self._attempts.pop(stream).cancel()
+    def _forget(self, stream: socket.socket) -> _Address:
+        address, timeout = self._attempts.pop(stream)
+        timeout.cancel()
         self._loop.remove_writer(stream)
+        return address
+
+    def _failed(self, address: _Address, number: int | None) -> None:
+        # A host may have addresses of two kinds, and be reached over one alone.
+        self._failures[address] = _reason(number)
+        reasons = [self._failures.get(address) for _, address in self._addresses]
+        if None not in reasons:
+            self._on_failed("; ".join(dict.fromkeys(filter(None, reasons))))
 
     def _resolve(self) -> None:
         """Look up the host's addresses; on a thread of its own."""
@@ -208,16 +233,27 @@ class Dialer:
         try:
             found = socket.getaddrinfo(endpoint.host, endpoint.port, type=socket.SOCK_STREAM)
         except (OSError, UnicodeError):
-            return  # those of before may still be right
+            found = []
         addresses: list[tuple[socket.AddressFamily, _Address]] = [
             (entry[0], entry[4]) for entry in found
         ]
 
         def take() -> None:
-            self._addresses = addresses
-            if self._next is not None and not self._attempts and not self._links:
+            # Without new ones, those of before may still be right.
+            self._addresses = addresses or self._addresses
+            if not self._addresses:
+                self._on_failed(f"host name not found: {endpoint.host}")
+            elif self._next is not None and not self._attempts and not self._links:
                 self._next.cancel()
                 self._attempt()
 
         with contextlib.suppress(RuntimeError):  # the loop is closed
             self._loop.call_soon_threadsafe(take)
+
+
+def _reason(number: int | None) -> str:
+    """Write the system's own words as the rest of a sentence."""
+    if number == errno.ETIMEDOUT:
+        return "nothing answers"
+    text = os.strerror(number or 0)
+    return text[:1].lower() + text[1:]

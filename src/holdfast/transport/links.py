@@ -508,7 +508,7 @@ class Link(asyncio.BufferedProtocol):
         except OSError as error:  # OpenSSL's: it is not imported here, for it takes long
             assert self._transport is not None
             self._transport.write(tls.take())  # it is told, in an alert
-            self.end(_what_is_wrong(error), refused=True)
+            self.end(tls.what_is_wrong(error), refused=True)
             return b""
         if was_established:
             return data
@@ -613,20 +613,3 @@ def _address(found: object) -> str | None:
         return None
     host, port = str(found[0]), found[1]
     return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
-
-
-def _what_is_wrong(error: OSError) -> str:
-    """Say what OpenSSL's error means, as the rest of a sentence about the other end."""
-    import ssl
-
-    assert isinstance(error, ssl.SSLError)
-    if isinstance(error, ssl.SSLCertVerificationError):
-        return f"has a certificate that is refused: {error.verify_message}"
-    reason = error.reason or ""
-    alert = reason.partition("_ALERT_")[2]
-    if alert:
-        return f"refuses this end's certificate ({alert.lower().replace('_', ' ')})"
-    if "PEER_DID_NOT_RETURN_A_CERTIFICATE" in reason:
-        return "shows no certificate"
-    text = reason.lower().replace("_", " ") if reason else str(error.args[-1])
-    return f"does not speak TLS 1.3 as expected: {text}"

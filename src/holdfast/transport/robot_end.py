@@ -50,6 +50,11 @@ _CALL_NUMBERS = 1 << 32
 _PAUSE_S = 0.004
 """Between turns of services that send more than anybody has asked for: a robot decides, too."""
 
+_SAYS_NO_HELLO = (
+    "closes connections without a hello: it is no holdfast service, is just ending, or one of the "
+    "ends speaks TLS (tls/..., udp/...) and the other does not (tcp/...)"
+)
+
 _MAX_UNGREETED = 64
 """Connections to a robot that listens, of which nobody knows who they are."""
 
@@ -72,9 +77,10 @@ class StreamRobotTransport:
         A larger request is refused here, a larger reply is dropped.
     tls : TlsFiles or None
         The robot's credentials, for ``tls``.
-    on_refused : callable or None
-        Is told the service and the reason when a service refuses this robot or is not what the
-        robot looks for; each reason once until the service is there again.
+    on_unreachable : callable or None
+        Is told the service and the reason, as the rest of a sentence about it, when it cannot be
+        connected to, refuses this robot or is not what the robot looks for; each reason once until
+        the service is there again.
     on_closed_to_datagrams : callable or None
         Is told, once, of a service at ``udp`` to which no datagram gets through, so that the
         stream carries all.
@@ -94,7 +100,7 @@ class StreamRobotTransport:
         lease_ms: float = 400.0,
         max_message_bytes: int = DEFAULT_MAX_MESSAGE_BYTES,
         tls: TlsFiles | None = None,
-        on_refused: Callable[[str, str], None] | None = None,
+        on_unreachable: Callable[[str, str], None] | None = None,
         on_closed_to_datagrams: Callable[[str], None] | None = None,
     ) -> None:
         if name:
@@ -110,7 +116,7 @@ class StreamRobotTransport:
             must_read=False,
         )
         self.calls = CallTable()
-        self.on_refused = on_refused
+        self.on_unreachable = on_unreachable
         self.on_closed_to_datagrams = on_closed_to_datagrams
         self._services: dict[str, _Service] = {}
         credentials: ClientCredentials | None = None
@@ -130,13 +136,6 @@ class StreamRobotTransport:
             self._services[service] = _Service(self, service, address, endpoint, own)
         self._started = False
         self._closed = False
-
-    def endpoint_of(self, service: str) -> str:
-        """Return the endpoint of a service.
-
-        For one that the robot listens for, where to connect; port 0 is replaced by the start.
-        """
-        return str(self._service(service).endpoint)
 
     def sends_datagrams(self, service: str) -> bool:
         """Whether short messages to a service go as datagrams now."""
@@ -257,9 +256,8 @@ class _Service:
             self._listener = Listener(
                 self.endpoint, self._accepted, speaks_first=self._credentials is not None
             )
-            self.endpoint = self._listener.endpoint
         else:
-            self._dialer = Dialer(self.endpoint, self._make_link)
+            self._dialer = Dialer(self.endpoint, self._make_link, self._tell_unreachable)
             self._dialer.start()
 
     def stop(self) -> list[asyncio.Future[None]]:
@@ -417,10 +415,10 @@ class _Service:
             dialer.ended(link)
         if self._stopped:
             return
-        on_refused = self._robot.on_refused
-        if link.refused and on_refused is not None and link.reason not in self._told_reasons:
-            self._told_reasons.add(link.reason)
-            on_refused(self._name, link.reason)
+        if link.refused:
+            self._tell_unreachable(link.reason)
+        elif link.hello is None and dialer is not None and not self._links:
+            self._tell_unreachable(link.reason or _SAYS_NO_HELLO)
         if boot is not None and boot in self._links.values():
             self._robot.calls.lost(link)  # it goes on over another link
         elif boot is not None:
@@ -431,3 +429,9 @@ class _Service:
                 self._robot.calls.appeared(self._name, self._links[older])
         if dialer is not None and not self._links and (boot is not None or link.refused):
             dialer.start(refused=link.refused)
+
+    def _tell_unreachable(self, reason: str) -> None:
+        on_unreachable = self._robot.on_unreachable
+        if on_unreachable is not None and reason not in self._told_reasons:
+            self._told_reasons.add(reason)
+            on_unreachable(self._name, reason)

@@ -20,11 +20,18 @@ import ssl
 from typing import Any, NamedTuple
 
 from holdfast.errors import TransportError
-from holdfast.transport.endpoints import TlsFiles
+from holdfast.transport.endpoints import AUTHORITY_FILE, TlsFiles
 from holdfast.transport.frames import FrameError
 from holdfast.transport.revocation import REVOKED_FILE, refuse_revoked
 
-__all__ = ["ClientCredentials", "PeerCertificate", "TlsStream", "client_context", "server_context"]
+__all__ = [
+    "ClientCredentials",
+    "PeerCertificate",
+    "TlsStream",
+    "client_context",
+    "fault_of_certificate",
+    "server_context",
+]
 
 _ANY_INCARNATION = "holdfast"
 
@@ -267,9 +274,50 @@ class TlsStream:
         # There may be another certificate between the two, which only the handshake has seen.
         return frozenset(found or known)
 
+    def what_is_wrong(self, error: OSError) -> str:
+        """Return what OpenSSL's error means, as the rest of a sentence about the other end."""
+        assert isinstance(error, ssl.SSLError)
+        if isinstance(error, ssl.SSLCertVerificationError):
+            role = "robot" if self._is_server else "service"
+            return f"has a certificate that {fault_of_certificate(error, role)}"
+        reason = error.reason or ""
+        alert = reason.partition("_ALERT_")[2]
+        if alert:
+            return f"refuses this end's certificate ({alert.lower().replace('_', ' ')})"
+        if "PEER_DID_NOT_RETURN_A_CERTIFICATE" in reason:
+            return "shows no certificate"
+        text = reason.lower().replace("_", " ") if reason else str(error.args[-1])
+        return f"does not speak TLS 1.3 as expected: {text}"
+
     def _shake_hands(self) -> None:
         try:
             self._tls.do_handshake()
         except ssl.SSLWantReadError:
             return
         self.established = True
+
+
+def fault_of_certificate(error: ssl.SSLCertVerificationError, role: str) -> str:
+    """Return why a certificate is refused, as the rest of a sentence about it.
+
+    Parameters
+    ----------
+    error : SSLCertVerificationError
+    role : {"robot", "service"}
+        Whose it should be.
+    """
+    match error.verify_code:  # OpenSSL's numbers
+        case 9:
+            return "is not valid yet; is a clock wrong?"
+        case 10:
+            return "has expired"
+        case 23:
+            return "has been revoked"
+        case 26:
+            return f"is not for a {role}"
+        case 7 | 18 | 19 | 20 | 21:
+            return f"was not signed by the authority in {AUTHORITY_FILE}"
+        case 62 | 64:
+            return f"does not name this host ({error.verify_message})"
+        case _:
+            return f"is refused: {error.verify_message}"
