@@ -530,7 +530,7 @@ class TestOwnPlanner:
             _fail,
             may_be_brief=True,
         )
-        own._expected_s = {True: 0.0, False: 0.0}
+        own._usual[True].learn(0.0)
         own.ask(Plan(1, state, sensing=True))
         own.ask(Plan(2, state, sensing=True))
         assert own.compute_brief()

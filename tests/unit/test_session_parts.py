@@ -14,6 +14,7 @@ from holdfast.session.service_jobs import Job
 from holdfast.session.service_limits import ServiceLimits
 from holdfast.session.service_lines import Lines
 from holdfast.session.service_sessions import ExpectedTimes, Session, Work
+from holdfast.session.usual_time import UsualTime
 from holdfast.settings import RecoverySettings
 
 
@@ -210,22 +211,26 @@ class TestLines:
 
 
 class TestUsualTimes:
-    @pytest.mark.parametrize("task", [True, False])
-    def test_one_that_others_made_longer_counts_little_and_a_shorter_one_at_once(
-        self, *, task: bool
-    ) -> None:
-        times = ExpectedTimes(4.0, 1e-3, 1e-3)
-        assert times.known_s(task=task) == float("inf")
+    def test_one_that_others_made_longer_counts_little_and_a_shorter_one_at_once(self) -> None:
+        usual = UsualTime()
+        assert usual.seconds == float("inf")
         for computed_s in (0.004, 0.0003, 0.005):
-            times.learn(computed_s, task=task)
-        assert 0.0003 < times.known_s(task=task) < 0.001
-        times.learn(0.0002, task=task)
-        assert times.known_s(task=task) == 0.0002
-        assert times.known_s(task=not task) == float("inf")
+            usual.learn(computed_s)
+        assert 0.0003 < usual.seconds < 0.001
+        usual.learn(0.0002)
+        assert usual.seconds == 0.0002
 
     def test_what_has_become_longer_is_known_to_be_after_a_while(self) -> None:
-        times = ExpectedTimes(4.0, 1e-3, 1e-3)
-        times.learn(0.0003, task=False)
+        usual = UsualTime()
+        usual.learn(0.0003)
         for _ in range(20):
-            times.learn(0.004, task=False)
-        assert times.known_s(task=False) > 0.002
+            usual.learn(0.004)
+        assert usual.seconds > 0.002
+
+    @pytest.mark.parametrize("task", [True, False])
+    def test_the_two_parts_of_an_answer_are_apart(self, *, task: bool) -> None:
+        times = ExpectedTimes(4.0, 1e-3, 1e-3)
+        times.learn(0.0003, task=task)
+        usual = (times.usual_task, times.usual_sensing)
+        assert {each.seconds for each in usual} == {0.0003, float("inf")}
+        assert (times.usual_task.seconds == 0.0003) is task

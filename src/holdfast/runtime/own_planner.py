@@ -9,7 +9,6 @@ the next sensing action is being computed.
 from __future__ import annotations
 
 import functools
-import math
 from collections.abc import Callable
 from time import perf_counter
 
@@ -19,14 +18,12 @@ from holdfast.service.pool import ThreadPool
 from holdfast.session.effects import Plan
 from holdfast.session.events import Planned
 from holdfast.session.messages import MAX_TASK_ACTIONS
+from holdfast.session.usual_time import UsualTime
 
 __all__ = ["OwnPlanner"]
 
 _BRIEF_S = 0.001
 """What may take longer is computed on a thread: the loop hears nobody meanwhile."""
-
-_INERTIA = 8.0
-"""What is expected grows by one part in so many with each time that is longer."""
 
 
 class OwnPlanner:
@@ -60,14 +57,14 @@ class OwnPlanner:
         self._may_be_brief = may_be_brief
         self._planner: Planner | None = None
         self._waiting: Plan | None = None
-        # By whether it is a sensing action; nothing is known of the first ones.
-        self._expected_s = {False: math.inf, True: math.inf}
+        # By whether it is a sensing action.
+        self._usual = {False: UsualTime(), True: UsualTime()}
 
     def ask(self, plan: Plan) -> None:
         """Let a part of an answer be computed; what was asked before and not begun is forgotten."""
         self._waiting = None
         # Its problem is used by one thread at a time.
-        if self._expected_s[plan.sensing] <= _BRIEF_S and not self._threads.num_open:
+        if self._usual[plan.sensing].seconds <= _BRIEF_S and not self._threads.num_open:
             self._waiting = plan
         else:
             self._threads.submit(functools.partial(self._computed, plan), self._finished)
@@ -102,13 +99,8 @@ class OwnPlanner:
 
     def _finished(self, computed: tuple[Plan, Planned]) -> None:
         plan, planned = computed
-        computed_s = planned.computed_s
         if self._may_be_brief:
-            # Whoever else uses the processor only makes it longer, so the shorter counts for more.
-            expected_s = self._expected_s[plan.sensing]
-            if computed_s > expected_s:
-                computed_s = expected_s + (computed_s - expected_s) / _INERTIA
-            self._expected_s[plan.sensing] = computed_s
+            self._usual[plan.sensing].learn(planned.computed_s)
         self._deliver(planned)
 
 

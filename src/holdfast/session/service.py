@@ -494,7 +494,8 @@ class Service:
         self._lines.begin(work, job, now)
         expected_s = math.inf
         if problem is not None and _takes_the_usual_time(work, state):
-            expected_s = session.times.known_s(task=not work.sensing)
+            times = session.times
+            expected_s = (times.usual_sensing if work.sensing else times.usual_task).seconds
         self._effects.append(Run(job, expected_s))
 
     # -- outcomes --------------------------------------------------------------------------------

@@ -19,7 +19,6 @@ the same work, however often it comes.
 from __future__ import annotations
 
 import hashlib
-import math
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from functools import lru_cache
@@ -31,6 +30,7 @@ from holdfast.planning import PlanningState
 from holdfast.problems.registry import BUILT_IN
 from holdfast.session.messages import Opening, Request, pack_opening
 from holdfast.session.service_limits import ServiceLimits
+from holdfast.session.usual_time import UsualTime
 from holdfast.settings import PlanningSettings
 
 __all__ = [
@@ -77,9 +77,6 @@ class Part(NamedTuple):
     sensing_action: int = -1
 
 
-_INERTIA_OF_THE_USUAL = 16.0
-
-
 class ExpectedTimes:
     """How long parts of answers may take, by what they took before.
 
@@ -89,31 +86,28 @@ class ExpectedTimes:
         A sample moves a mean by its distance divided by this.
     task_s, sensing_s : float
         What is expected before anything was computed.
+
+    Attributes
+    ----------
+    usual_task, usual_sensing : UsualTime
     """
 
-    __slots__ = ("_inertia", "_usual_sensing_s", "_usual_task_s", "sensing_s", "task_s")
+    __slots__ = ("_inertia", "sensing_s", "task_s", "usual_sensing", "usual_task")
 
     def __init__(self, inertia: float, task_s: float, sensing_s: float) -> None:
         self._inertia = inertia
-        self._usual_task_s = self._usual_sensing_s = math.inf
+        self.usual_task = UsualTime()
+        self.usual_sensing = UsualTime()
         self.task_s = task_s
         self.sensing_s = sensing_s
-
-    def known_s(self, *, task: bool) -> float:
-        """Return what a part usually takes if nobody else has the core; infinite if unknown.
-
-        Others only make it longer, so a shorter time counts at once and a longer one little: else a
-        busy service would send each brief job to a thread, which keeps it busier still.
-        """
-        return self._usual_task_s if task else self._usual_sensing_s
 
     def learn(self, computed_s: float, *, task: bool) -> None:
         """Let a job's time count in what the next ones are expected to take."""
         if task:
-            self._usual_task_s = _usual(self._usual_task_s, computed_s)
+            self.usual_task.learn(computed_s)
             self.task_s = self._moved(self.task_s, computed_s)
         else:
-            self._usual_sensing_s = _usual(self._usual_sensing_s, computed_s)
+            self.usual_sensing.learn(computed_s)
             self.sensing_s = self._moved(self.sensing_s, computed_s)
 
     def _moved(self, mean_s: float, sample_s: float) -> float:
@@ -123,12 +117,6 @@ class ExpectedTimes:
         turned away for what happened once.
         """
         return mean_s + (min(sample_s, 4.0 * mean_s + 0.01) - mean_s) / self._inertia
-
-
-def _usual(usual_s: float, sample_s: float) -> float:
-    if sample_s <= usual_s:
-        return sample_s
-    return usual_s + (sample_s - usual_s) / _INERTIA_OF_THE_USUAL
 
 
 class WaitingCall:
