@@ -30,14 +30,6 @@ def test_csv_gives_the_same_numbers_back() -> None:
     assert rows[2]["reward"] == ""
 
 
-def test_markdown_aligns_numbers_to_the_right() -> None:
-    lines = table().to_markdown({"reward": "reward per trial"}).splitlines()
-    assert lines[0] == "| name | success | reward per trial |"
-    assert lines[1] == "|---|---:|---:|"
-    assert lines[2] == "| a | yes | -0.1 |"
-    assert lines[4] == "| d | yes |  |"
-
-
 def test_rows_of_another_length_are_refused() -> None:
     with pytest.raises(InvalidValueError, match="2 cells for 3 columns"):
         Table.of_rows(("a", "b", "c"), [(1, 2)])

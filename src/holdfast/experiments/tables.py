@@ -95,29 +95,6 @@ class Table(msgspec.Struct):
             writer.writerow([_plain(cell) for cell in row])
         return text.getvalue()
 
-    def to_markdown(self, headings: Mapping[str, str] | None = None) -> str:
-        """Return the table as it stands in a page of the documentation.
-
-        Parameters
-        ----------
-        headings : mapping of str to str, optional
-            What is shown instead of a column's name.
-        """
-        headings = headings or {}
-        numeric = {
-            name: all(isinstance(cell, int | float | None) for cell in cells)
-            for name, cells in self.columns.items()
-        }
-        lines = [
-            "| " + " | ".join(headings.get(name, name) for name in self.columns) + " |",
-            "|" + "|".join("---:" if numeric[name] else "---" for name in self.columns) + "|",
-        ]
-        lines += [
-            "| " + " | ".join(map(_shown, row)) + " |"
-            for row in zip(*self.columns.values(), strict=True)
-        ]
-        return "\n".join(lines) + "\n"
-
 
 def number_of(cell: Cell) -> float:
     """Return a cell as a number; NaN where there is nothing."""
@@ -126,11 +103,3 @@ def number_of(cell: Cell) -> float:
 
 def _plain(cell: Cell) -> Cell:
     return int(cell) if isinstance(cell, bool) else cell
-
-
-def _shown(cell: Cell) -> str:
-    if cell is None:
-        return ""
-    if isinstance(cell, bool):
-        return "yes" if cell else "no"
-    return f"{cell:.4g}" if isinstance(cell, float) else str(cell)

@@ -46,11 +46,6 @@ class RecoveryLauncher:
         called from a thread.
     log_path : Path or None
         Gets what the service writes; None for nowhere.
-
-    Attributes
-    ----------
-    process_id : int or None
-        Of the process that was started last; None if it has ended.
     """
 
     def __init__(
@@ -65,12 +60,6 @@ class RecoveryLauncher:
         self._log_path = log_path
         self._process: subprocess.Popen[bytes] | None = None
         self._lock = threading.Lock()
-
-    @property
-    def process_id(self) -> int | None:
-        """Of the process that was started last; None if it has ended."""
-        process = self._process
-        return process.pid if process is not None and process.poll() is None else None
 
     def launch(self, number: int) -> None:
         """Start a process, and end the one before; whatever goes wrong is delivered."""

@@ -100,8 +100,6 @@ class Outcome(NamedTuple):
         Of the run, in virtual time.
     recovery_s : float
         From the end of the last fault until the end of the run.
-    standstill_s : float
-        Longest time that the robot stood still for a decision after the last fault.
     messages : int
     faults : dict of str to int
         By kind, how many have happened.
@@ -116,7 +114,6 @@ class Outcome(NamedTuple):
     held: str | None
     duration_s: float
     recovery_s: float
-    standstill_s: float
     messages: int
     faults: dict[str, int]
     story: list[Told]
@@ -202,7 +199,6 @@ class _World:
         self._slownesses: dict[str, list[float]] = {}
         self._decided_by = ""
         self._status = ""
-        self._longest_standstill_s = 0.0
         self._down_s = 0.0
         self._faults_end_at = 0.0
         self._arrange(schedule)
@@ -235,7 +231,6 @@ class _World:
             None if held is None or violation is not None else str(held),
             now,
             now - min(now, self._faults_end_at),
-            self._longest_standstill_s,
             self._network.messages,
             self._faults,
             self._story,
@@ -578,7 +573,6 @@ class _World:
         now = self._agenda.now
         self._decided_by, self._status = service, status
         since = max(now - waited_s / self._run.robot_clock_rate, self._faults_end_at)
-        self._longest_standstill_s = max(self._longest_standstill_s, now - since)
         # Or the local service is launched first.
         allowed_s = STANDSTILL_S + self._run.launch_s
         if now - since > allowed_s:
