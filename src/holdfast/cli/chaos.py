@@ -134,7 +134,7 @@ def chaos(
         bool, typer.Option("--list", help="List the kinds of fault, and which can be done here.")
     ] = False,
 ) -> None:
-    """Kill, stop, delay and cut real processes, and compare each run with its fault-free twin.
+    """Kill, stop, delay and cut real processes, and compare each run with one without faults.
 
     A trial is one robot (holdfast run) and one or two services (holdfast serve), to which things
     happen that are drawn from the seed and the trial's number. Afterwards every decision must be
@@ -145,8 +145,8 @@ def chaos(
     each trial, as it ends) and two figures: how soon a loss is found and the local service
     launched, and how soon the cloud is used again. The files of a trial that went wrong are kept.
 
-    Exit code 0: every trial was identical with its twin. 1: one was not. Ctrl-C ends all processes;
-    the same command with --resume goes on.
+    Exit code 0: every trial was identical with the run without faults. 1: one was not. Ctrl-C ends
+    all processes; the same command with --resume goes on.
     """
     if log not in ("text", "json"):
         raise InvalidValueError(f"--log is {log!r}; allowed are text and json")
@@ -488,7 +488,7 @@ def _print_table(summary: ChaosSummary, console: Console) -> None:
     units = "" if wide else "Times in milliseconds. "
     console.print(
         f"\n{units}{verdict}, over {_counted_wires(summary.wires)}; {summary.steps:,} task actions "
-        f"and {summary.sensing_actions:,} sensing actions are those of the fault-free twins",
+        f"and {summary.sensing_actions:,} sensing actions are those of the runs without faults",
         style="bold red" if bad else "",
     )
 

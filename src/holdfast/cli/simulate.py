@@ -68,7 +68,7 @@ def simulate(
 ) -> None:
     """Run a robot and its services through faults that are drawn by seed, and check what they do.
 
-    The machines are those of production, with the clock, the wire and the disk played: messages are
+    The machines are those of production, with a simulated clock, wire and disk: messages are
     lost, late, doubled, damaged and misrouted, links are cut, services and the robot itself are
     stopped, slowed down, killed and started again. Every run must decide what the run without
     faults decides, perform each action once and in order, and come to an end.
