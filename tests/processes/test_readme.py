@@ -189,7 +189,7 @@ def test_the_comparison_of_two_runs_leaves_out_trials_without_a_step(tmp_path: P
     varied.write_text(varied.read_text().replace(",80,", ",82,"))
     done = run([sys.executable, "-W", "error", "-c", program], tmp_path)
     assert done.returncode == 0, done.stderr
-    assert done.stdout == "0.50 [0.49, 0.52] times the steps of random looks\n"
+    assert done.stdout == "0.50 [0.49, 0.52] times the steps of random sensing\n"
 
 
 @pytest.mark.parametrize("program", ALONE, ids=[f"program-{i}" for i in range(len(ALONE))])

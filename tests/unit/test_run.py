@@ -1,0 +1,351 @@
+"""``holdfast run`` in the test's own process: what it writes and says, and what it refuses.
+
+``tests/processes/test_run_command.py`` has what only a process of its own can show.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import pytest
+from tests.command_line import Said, run_here
+
+PEG = """
+problem: peg_in_hole_2d
+particle_filter: {num_particles: 40}
+active_sensing: {num_observation_samples: 3, num_cores: 1}
+simulator: {num_trials: 6, max_steps: 80, seed: 3}
+"""
+
+
+class Workplace:
+    """A directory in which commands are run."""
+
+    def __init__(self, directory: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        self.directory = directory
+        self._capsys = capsys
+        self.write("peg.yaml", PEG)
+
+    def write(self, name: str, text: str) -> None:
+        (self.directory / name).write_text(text)
+
+    def names(self) -> set[str]:
+        return {path.name for path in self.directory.iterdir()} - {"__pycache__"}
+
+    def run(self, *arguments: str, figures: bool = False) -> Said:
+        return run_here(self._capsys, self.directory, *arguments, figures=figures)
+
+    def runs(self, *arguments: str, figures: bool = False) -> Said:
+        """Run a command that is to come to its end; return what it says."""
+        said = self.run(*arguments, figures=figures)
+        assert said.code == 0, said
+        return said
+
+    def decided(self, out: str) -> list[tuple[str, ...]]:
+        """Return the table of trials, without the times."""
+        with (self.directory / out / "trials.csv").open() as file:
+            return [
+                tuple(value for key, value in row.items() if key != "mean_sensing_ms")
+                for row in csv.DictReader(file)
+            ]
+
+    def summary(self, out: str) -> dict[str, object]:
+        found: dict[str, object] = json.loads((self.directory / out / "summary.json").read_text())
+        return found
+
+    def fails(self, *arguments: str) -> str:
+        """Run a command that is to be refused; return what it says."""
+        said = self.run(*arguments)
+        assert (said.code, said.stdout) == (2, "")
+        assert said.stderr.startswith("holdfast: error: ")
+        assert "Traceback" not in said.stderr
+        return said.stderr
+
+
+@pytest.fixture
+def workplace(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Workplace:
+    return Workplace(tmp_path, capsys)
+
+
+def test_the_resolved_configuration_runs_again_to_the_same(workplace: Workplace) -> None:
+    one = ("--jobs", "1", "--quiet", "--out")
+    workplace.runs("run", "peg.yaml", "--seed", "8", "--trials", "3", *one, "first")
+    said = workplace.runs("run", "first/config.yaml", *one, "second")
+    assert (said.stdout, said.stderr) == ("", "")  # as it was told to be quiet
+    assert workplace.decided("second") == workplace.decided("first")
+    assert workplace.summary("second")["digest"] == workplace.summary("first")["digest"]
+    assert workplace.summary("second")["seed"] == 8
+
+
+def test_without_out_directories_are_numbered(workplace: Workplace) -> None:
+    for name in ("peg-seed3", "peg-seed3-2"):
+        workplace.runs("run", "peg.yaml", "--trials", "1")
+        assert (workplace.directory / "runs" / name / "trials.csv").is_file()
+
+
+def test_without_matplotlib_there_is_no_figure_but_all_else(workplace: Workplace) -> None:
+    said = workplace.runs("run", "peg.yaml", "--trials", "1", "--out", "out")
+    assert "pip install matplotlib" in said.stderr
+    assert not (workplace.directory / "out" / "trial.png").exists()
+    assert (workplace.directory / "out" / "summary.json").exists()
+
+
+def test_a_run_can_be_extended(workplace: Workplace) -> None:
+    arguments = ("run", "peg.yaml", "--jobs", "1", "--out")
+    workplace.runs(*arguments, "out", "--trials", "2")
+    said = workplace.runs(*arguments, "out", "--trials", "5", "--resume")
+    assert "2 finished before" in said.stderr
+    workplace.runs(*arguments, "whole", "--trials", "5")
+    assert workplace.decided("out") == workplace.decided("whole")
+    out, whole = (workplace.directory / name / "config.yaml" for name in ("out", "whole"))
+    assert out.read_text() == whole.read_text()
+
+
+def test_a_robot_without_services_tells_of_none(workplace: Workplace) -> None:
+    options = ("--trials", "1", "--rate", "10000", "--log", "json")
+    said = workplace.runs("run", "peg.yaml", "--out", "out", *options)
+    told = [json.loads(line) for line in said.stderr.splitlines()]
+    assert "trial" in [each["event"] for each in told]
+    assert not [each for each in told if "service" in each]
+
+
+MY_WORLD = """
+from holdfast.runtime.environment import SimulatedEnvironment
+
+
+class MyWorld:
+    def __init__(self, problem, seed, trial):
+        self.world = SimulatedEnvironment(problem, seed, trial)
+
+    def perform_sensing(self, sensing_action):
+        return self.world.perform_sensing(sensing_action)
+
+    def perform(self, task_action):
+        self.world.perform(task_action)  # and no reward
+
+    def is_done(self):
+        return self.world.is_done()
+"""
+
+
+def test_a_world_of_ones_own_has_a_figure_of_the_belief(workplace: Workplace) -> None:
+    workplace.write("my_world.py", MY_WORLD)
+    arguments = ("run", "peg.yaml", "--environment", "my_world:MyWorld", "--out", "out")
+    said = workplace.runs(*arguments, "--trials", "1", figures=True)
+    assert "figure" not in said.stderr
+    # It reports no reward, which is not a reward of 0.
+    assert "reward" not in said.stdout
+    assert workplace.summary("out")["mean_reward"] is None
+    assert workplace.summary("out")["mean_reward_of_successes"] is None
+    with (workplace.directory / "out" / "trials.csv").open() as table:
+        assert [row["reward"] for row in csv.DictReader(table)] == [""]
+    figure = workplace.directory / "out" / "trial.png"
+    assert figure.read_bytes().startswith(b"\x89PNG\r\n")
+    # Of an earlier part of the run there are no observations: the figure stays as it is.
+    before = figure.stat().st_mtime_ns
+    said = workplace.runs(*arguments, "--trials", "2", "--resume", figures=True)
+    assert "figure" not in said.stderr
+    assert figure.stat().st_mtime_ns == before
+    figure.unlink()
+    said = workplace.runs(*arguments, "--trials", "2", "--resume", figures=True)
+    assert "note: no figure, because trial 0 ended in an earlier part of the run" in said.stderr
+
+
+def test_a_figure_that_a_problem_fails_to_describe(workplace: Workplace) -> None:
+    workplace.write(
+        "unseen.py",
+        "from holdfast.problems.peg_in_hole_2d import PegInHole2D\n"
+        "class Unseen(PegInHole2D):\n"
+        "    def scene(self):\n"
+        "        return {}['scene']\n",
+    )
+    arguments = ("peg.yaml", "--problem", "unseen:Unseen", "--out", "out", "--jobs", "1")
+    said = workplace.run("run", *arguments, "--quiet", figures=True)
+    assert said.code == 2
+    assert "the figure of trial 0: unseen:Unseen raised KeyError: 'scene'" in said.stderr
+    assert workplace.summary("out")["finished"] == 6
+
+
+def test_a_directory_that_cannot_be_made(workplace: Workplace) -> None:
+    assert "is a file" in workplace.fails("run", "peg.yaml", "--out", "peg.yaml")
+
+
+def test_a_directory_that_holds_a_run(workplace: Workplace) -> None:
+    one = ("run", "peg.yaml", "--jobs", "1", "--trials", "1", "--out", "out")
+    assert workplace.run(*one, "--quiet").code == 0
+    summary = workplace.directory / "out" / "summary.json"
+    before = summary.read_bytes()
+    assert "--resume" in workplace.fails(*one)
+    error = workplace.fails(*one, "--seed", "4", "--resume")
+    assert "simulator.seed is 3 there and 4 here" in error
+    assert summary.read_bytes() == before
+    error = workplace.fails("compare", "out", "out/trials.csv")
+    assert "out/trials.csv: is not a journal" in error
+
+
+def test_values_instead_of_the_files_are_a_part_of_what_must_be_the_same_to_go_on(
+    workplace: Workplace,
+) -> None:
+    run = ("run", "peg.yaml", "--jobs", "1", "--trials", "1", "--out", "random")
+    chosen = ["--set", "selector.method=random", "--set", "model.init_mean=[3, 1, 0]"]
+    assert workplace.run(*run, "--quiet", *chosen).code == 0
+    assert workplace.run(*run, "--quiet", "--resume", *chosen).code == 0
+    error = workplace.fails(*run, "--resume")
+    assert "model.init_mean[0] is 3.0 there and 4.0 here" in error
+
+
+def test_nothing_to_resume(workplace: Workplace) -> None:
+    assert "no run to resume" in workplace.fails("run", "peg.yaml", "--resume")
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "expected"),
+    [
+        ("my_robot:Robot", "class MyRobot: pass\n", "did you mean MyRobot?"),
+        ("my_robt:MyRobot", "class MyRobot: pass\n", "there is no module my_robt"),
+        ("my_robot:MyRobot", "import no_such_library\n", "No module named 'no_such_library'"),
+        ("my_robot:MyRobot", "import math\nmath.sqrt(-1)\n", 'my_robot.py", line 2'),
+        ("my_robot:MyRobot", "import sys\nsys.exit(0)\n", "raised SystemExit: 0"),
+        ("my_robot:MyRobot", "class MyRobot\n", 'my_robot.py", line 1'),
+    ],
+)
+@pytest.mark.parametrize("out", [("--out", "out"), ()])
+def test_an_environment_that_is_not_there_claims_no_directory(
+    workplace: Workplace, name: str, text: str, expected: str, out: tuple[str, ...]
+) -> None:
+    workplace.write("my_robot.py", text)
+    assert expected in workplace.fails("run", "peg.yaml", "--environment", name, *out)
+    assert workplace.names() == {"peg.yaml", "my_robot.py"}
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        (("--tls", "nowhere"), "nowhere/authority.pem: cannot be read"),
+        ((), "tls needs credentials"),
+    ],
+)
+def test_credentials_that_are_not_there_claim_no_directory(
+    workplace: Workplace, options: tuple[str, ...], expected: str
+) -> None:
+    arguments = ("peg.yaml", "--service", "tls/127.0.0.1:7", "--out", "out", *options)
+    assert expected in workplace.fails("run", *arguments)
+    assert workplace.names() == {"peg.yaml"}
+
+
+def test_a_service_in_the_file_that_cannot_be_one_is_named_with_its_key(
+    workplace: Workplace,
+) -> None:
+    services = "[tcp/127.0.0.1:7447, quic/10.0.0.7:7447]"
+    workplace.write("old.yaml", f"{PEG}\noffload: {{services: {services}}}\n")
+    error = workplace.fails("run", "old.yaml", "--out", "out")
+    assert "old.yaml: offload.services[1]: endpoint 'quic/10.0.0.7:7447'" in error
+    assert workplace.names() == {"peg.yaml", "old.yaml"}
+
+
+@pytest.mark.parametrize(
+    ("command", "expected"),
+    [
+        (["run", "missing.yaml"], "missing.yaml: there is no such file"),
+        (["run", "peg.yaml", "--trials", "x"], "--trials is 'x'; allowed are"),
+        (
+            ["run", "peg.yaml", "--environment", "my_robt:MyRobot"],
+            "environment.object, given instead of",
+        ),
+        (["run", "peg.yaml"], "--log json needs --service, --environment or --rate"),
+        (["serve", "--listen", "tcp/nowhere"], "--listen: endpoint 'tcp/nowhere'"),
+        (["serve", "--lease-ms", "1"], "--lease-ms: '1' is not a number from 50"),
+    ],
+)
+@pytest.mark.parametrize("log", [("--log", "json"), ("--log=json",)])
+def test_with_log_json_the_error_is_an_event(
+    workplace: Workplace, command: list[str], expected: str, log: tuple[str, ...]
+) -> None:
+    said = workplace.run(*command, *log)
+    assert said.code == 2
+    (event,) = map(json.loads, said.stderr.splitlines())
+    assert event["event"] == "error"
+    assert event["reason"].startswith(expected), event
+    assert event["component"] == ("service" if command[0] == "serve" else "robot")
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        (("--recovery", "at_start"), "--recovery at_start needs --service (or "),
+        (("--tls", "keys"), "--tls keys needs --service (or "),
+        (("--problem", "held_problem"), "did you mean held_problem:Held?"),
+    ],
+)
+def test_what_would_do_nothing_is_refused(
+    workplace: Workplace, options: tuple[str, str], expected: str
+) -> None:
+    (workplace.directory / "keys").mkdir()
+    workplace.write(
+        "held_problem.py",
+        "from holdfast.problems.peg_in_hole_2d import PegInHole2D\n"
+        "class Held(PegInHole2D): name = 'held'\n",
+    )
+    assert expected in workplace.fails("run", "peg.yaml", "--out", "out", *options)
+
+
+def test_a_configuration_without_a_command(workplace: Workplace) -> None:
+    error = workplace.fails("peg.yaml", "--jobs", "2")
+    assert error.endswith("did you mean: holdfast run peg.yaml --jobs 2\n")
+
+
+@pytest.mark.parametrize(
+    ("assignment", "message"),
+    [
+        ("selector=random", "--set selector=random: must be SECTION.KEY=VALUE, such as"),
+        ("selector.method", "--set selector.method: must be SECTION.KEY=VALUE, such as"),
+        (".method=random", "must be SECTION.KEY=VALUE"),
+        ("selector.resolution=", "--set selector.resolution=: has no value"),
+        ("simulator.seed={", "--set simulator.seed, line 1, column 2: not YAML"),
+        (
+            "selector.method=dance",
+            'selector.method, given instead of what peg.yaml says, is "dance',
+        ),
+        ("selektor.method=random", "selektor is not a known section; did you mean selector?"),
+        (
+            "simulator.max_step=9",
+            "holdfast: error: simulator.max_step is not a known key; did you mean max_steps?",
+        ),
+        ("selector.method=entropy", "did you mean action_entropy or state_entropy?"),
+        (
+            "environment.arguments.noise=0.2",
+            "write --set 'environment.arguments={noise: 0.2}'",
+        ),
+    ],
+)
+def test_a_wrong_value_instead_of_the_files(
+    workplace: Workplace, assignment: str, message: str
+) -> None:
+    error = workplace.fails("run", "peg.yaml", "--out", "wrong", "--set", assignment)
+    assert message in error
+    assert workplace.names() == {"peg.yaml"}
+
+
+def test_what_a_problem_raises_is_shown_without_our_frames(workplace: Workplace) -> None:
+    workplace.write(
+        "broken.py",
+        "from holdfast.problems.peg_in_hole_2d import PegInHole2D\n"
+        "class Broken(PegInHole2D):\n"
+        "    def policy(self, states, stage):\n"
+        "        return states + 'one'\n",
+    )
+    arguments = ("run", "peg.yaml", "--problem", "broken:Broken", "--out", "out", "--jobs", "1")
+    error = workplace.fails(*arguments, "--quiet")
+    assert "trial 0 (seed 3): broken:Broken raised " in error
+    assert f'File "{workplace.directory / "broken.py"}", line 4, in policy' in error
+    assert "return states + 'one'" in error
+    assert error.count("  File ") == 1
+    # Nothing is finished, so the mended problem may have the same directory.
+    workplace.write(
+        "broken.py",
+        "from holdfast.problems.peg_in_hole_2d import PegInHole2D\n"
+        "class Broken(PegInHole2D): pass\n",
+    )
+    assert workplace.run(*arguments, "--quiet", "--trials", "1").code == 0
