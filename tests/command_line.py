@@ -34,7 +34,7 @@ def run_here(
         patch.setattr(sys, "argv", ["holdfast", *arguments])
         patch.setattr(sys, "excepthook", sys.excepthook)
         if not figures:
-            patch.setitem(sys.modules, "matplotlib", None)  # type: ignore[misc]
+            patch.setitem(sys.modules, "matplotlib", None)
             patch.delitem(sys.modules, "holdfast.recording.figure", raising=False)
         os.chdir(directory)
         try:

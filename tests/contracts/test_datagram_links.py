@@ -31,6 +31,7 @@ from tests.relay import Relay, relay
 from holdfast.chaos.proxy import Direction, Impairment, Proxy
 from holdfast.errors import TransportError
 from holdfast.session.events import Appeared, Ended, Replied, Vanished
+from holdfast.transport import datagrams as datagram_links
 from holdfast.transport import sealing
 from holdfast.transport.contract import IncomingCall
 from holdfast.transport.datagrams import RobotDatagramLink, ServiceDatagramLink
@@ -394,6 +395,29 @@ class TestEnds:
             assert len(await inbox.of_call(2)) == 2
             assert link_of(robot) is link
             assert [event for event, _ in udp.told if event == "robot_disconnected"] == []
+
+    async def test_where_no_datagram_gets_through_it_is_told_and_all_goes_on_the_stream(
+        self, udp: StreamWire, robot_tls: TlsFiles, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(datagram_links, "_CLOSED_TO_DATAGRAMS_S", 0.1)
+        await udp.service("cloud", "b1").start(echo)
+        _, target = place_of(udp)
+        entry = free_port()
+        closed: list[str] = []
+        with Proxy(entry, target, "filtered"):
+            robot = StreamRobotTransport(
+                {"cloud": ServiceAddress(f"udp/127.0.0.1:{entry}")},
+                tls=robot_tls,
+                on_closed_to_datagrams=closed.append,
+            )
+            inbox = Inbox()
+            robot.start(inbox)
+            await inbox.appeared()
+            await until(lambda: bool(closed))
+            await answers(robot, inbox, 1)
+            assert not robot.sends_datagrams("cloud")
+            assert closed == ["cloud"]
+            await robot.close()
 
     async def test_adrift_it_is_lost_when_nothing_comes(self, udp: StreamWire) -> None:
         udp.lease_ms = LEASE_MS

@@ -1012,12 +1012,12 @@ class TestStreams:
 
     async def test_a_large_request_gets_through_a_slow_link(self, tcp: StreamWire) -> None:
         """Although it takes several leases; a link that carries it is no broken one."""
-        tcp.lease_ms = LEASE_MS
+        tcp.lease_ms = 600.0
         await tcp.service("cloud", "b1").start(echo_of_size)
         port = int(tcp.endpoint("cloud").rpartition(":")[2])
-        with slow_proxy(port, bytes_per_second=40_000) as slow_port:
+        with slow_proxy(port, bytes_per_second=100_000) as slow_port:
             address = ServiceAddress(f"tcp/127.0.0.1:{slow_port}")
-            robot = StreamRobotTransport({"cloud": address}, lease_ms=LEASE_MS)
+            robot = StreamRobotTransport({"cloud": address}, lease_ms=600.0)
             inbox = Inbox()
             robot.start(inbox)
             await inbox.wait_for(Appeared("cloud", "b1"))
@@ -2137,8 +2137,8 @@ async def test_what_came_while_a_robot_stood_still_is_read_before_anybody_is_giv
         robot.start(inbox)
         await inbox.wait_for(Appeared("cloud", "b1"))
         monkeypatch.setattr(selector, "select", select)
-        for number in range(3):
-            still_s[0] = 1.0
+        for number in range(2):
+            still_s[0] = 0.6
             await until(lambda: still_s[0] == 0.0)
             robot.call("cloud", number, b"echo")
             assert await inbox.of_call(number) == [Replied(number, b"echo"), Ended(number)]

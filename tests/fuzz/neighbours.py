@@ -2,7 +2,7 @@
 
     python -m tests.fuzz.neighbours scanner tcp/127.0.0.1:7447 --seconds 5
 
-It prints a line when it has begun, and how often it did what it does when it ends.
+It prints a line when it has begun, and how often it did what it does when it ends; SIGTERM ends it.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import argparse
 import contextlib
 import itertools
 import select
+import signal
 import socket
 import struct
 import time
@@ -39,6 +40,9 @@ class _Visit:
         self.keys = keys
         self._until = time.monotonic() + seconds
         self.done = 0
+
+    def end(self) -> None:
+        self._until = 0.0
 
     @property
     def goes_on(self) -> bool:
@@ -169,6 +173,7 @@ def main() -> None:
     options = parser.parse_args()
     corpus.requests()
     visit = _Visit(options.endpoint, options.tls, options.seconds)
+    signal.signal(signal.SIGTERM, lambda *_: visit.end())
     print("begins", flush=True)
     KINDS[options.kind](visit)
     print(visit.done, flush=True)

@@ -39,7 +39,11 @@ DOCUMENT = {
     ("error", "code", "text"),
     [
         ("ValueError", "failed", "ValueError: the map ends here"),
-        ("MemoryError", "out_of_memory", "MemoryError: Unable to allocate 7 GiB"),
+        # Of the machines: unit/test_session_robot.py.
+        pytest.param(
+            *("MemoryError", "out_of_memory", "MemoryError: Unable to allocate 7 GiB"),
+            marks=pytest.mark.slow,
+        ),
     ],
 )
 def test_sensing_part_that_fails_after_its_task_part_ends_the_run_resumably(

@@ -191,7 +191,8 @@ class TestCloud:
         assert robot.statuses() == [LOST]
         assert not robot.matching("refused")
 
-    @pytest.mark.parametrize("problem", PEG_AND_SLOWLY_ALL)
+    @pytest.mark.slow  # at a gate, and so for certain: the test above
+    @pytest.mark.parametrize("problem", PROBLEMS)
     def test_killed_during_a_long_computation(
         self, problem: str, site: Site, references: References
     ) -> None:
@@ -358,7 +359,9 @@ class TestRecovery:
     @pytest.mark.parametrize(
         ("program", "reason"),
         [
-            (None, "cannot be started: No such file or directory"),
+            pytest.param(
+                *(None, "cannot be started: No such file or directory"), marks=pytest.mark.slow
+            ),
             ("exit 3", "ended with exit code 3; see "),
             pytest.param("exec sleep 1000", "not seen after ", marks=pytest.mark.slow),
         ],
@@ -528,6 +531,7 @@ class TestReplicas:
         deciding = services_in_order(robot)
         assert deciding == [first.endpoint, second.endpoint, first.endpoint, second.endpoint]
 
+    @pytest.mark.slow  # one after the other: the test above; together: the simulator
     def test_both_at_once(self, site: Site, references: References) -> None:
         document = document_of(PEG)
         steps = sensing_steps(document)

@@ -9,16 +9,15 @@ import contextlib
 import importlib
 import json
 import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from tests.ports import free_port
+from tests.processes.faults import COMMAND
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 PROBLEM = "corridor_doors:CorridorDoors"
-COMMAND = [sys.executable, "-c", "from holdfast.cli import main; main()"]
 
 
 def holdfast(directory: Path, *arguments: str) -> subprocess.CompletedProcess[str]:

@@ -24,7 +24,7 @@ from tests.processes.faults import (
 from holdfast.session.messages import sealed
 from holdfast.transport.frames import CALL, LAST, FrameDecoder, encode_frame, encode_hello
 
-FLAPS = 300
+FLAPS = 80
 BURST = 20
 
 

@@ -99,6 +99,7 @@ def test_a_revoked_robot_is_cut_off_and_no_other(
     assert ended["reason"] == "has a certificate that has been revoked"
 
 
+@pytest.mark.slow  # without a run, both ends: unit/test_stream_credentials.py
 def test_a_robot_whose_certificate_expires_is_cut_off_and_no_other(
     home: Path, site: Site, elsewhere: Site, references: References
 ) -> None:

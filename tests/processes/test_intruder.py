@@ -40,7 +40,8 @@ def stolen(keys: Path) -> Path:
     return keys / "ours" / "stolen"
 
 
-@pytest.fixture(params=["tcp", "tls", "udp"])
+# Over udp it also says everything that can be said over tls.
+@pytest.fixture(params=["tcp", pytest.param("tls", marks=pytest.mark.slow), "udp"])
 def protocol(request: pytest.FixtureRequest) -> str:
     return str(request.param)
 

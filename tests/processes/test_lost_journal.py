@@ -99,7 +99,9 @@ def replace(out: Path) -> None:
 
 
 class TestTakenAwayInMidRun:
-    @pytest.mark.parametrize("take", [remove_journal, shutil.rmtree, replace])
+    @pytest.mark.parametrize(
+        "take", [remove_journal, replace, pytest.param(shutil.rmtree, marks=pytest.mark.slow)]
+    )
     def test_the_robot_holds_still(
         self, take: Callable[[Path], None], site: Site, references: References
     ) -> None:
@@ -135,7 +137,9 @@ class TestTakenAwayInMidRun:
         assert story.world.step == 13
         story.finish(site.run(story.file, resume=True))
 
-    @pytest.mark.parametrize("take", [remove_journal, shutil.rmtree])
+    @pytest.mark.parametrize(
+        "take", [shutil.rmtree, pytest.param(remove_journal, marks=pytest.mark.slow)]
+    )
     def test_a_batch_ends(self, take: Callable[[Path], None], site: Site) -> None:
         """Its own problem takes the files away, in its last trial."""
         (site.directory / "thief.py").write_text(THIEF)
@@ -170,14 +174,18 @@ class Thief(PegInHole2D):
 
 
 class TestLogTakenAwayAfterAKill:
-    @pytest.mark.parametrize("world", ["PlainWorldClient", "WorldClient"])
     @pytest.mark.parametrize(
-        "lost",
+        ("world", "lost"),
         [
-            ("journal.sqlite-wal",),
-            ("journal.sqlite-wal", "journal.sqlite-count"),
+            ("PlainWorldClient", ("journal.sqlite-wal", "journal.sqlite-count")),
+            ("WorldClient", ("journal.sqlite-wal",)),
+            pytest.param("PlainWorldClient", ("journal.sqlite-wal",), marks=pytest.mark.slow),
+            pytest.param(
+                "WorldClient",
+                ("journal.sqlite-wal", "journal.sqlite-count"),
+                marks=pytest.mark.slow,
+            ),
         ],
-        ids="+".join,
     )
     def test_nothing_is_performed_twice(
         self, world: str, lost: tuple[str, ...], site: Site, references: References
@@ -247,7 +255,11 @@ class TestLogTakenAwayAfterAKill:
 
 class TestCannotBeWritten:
     @needs_mounts
-    @pytest.mark.parametrize("killed", [True, False], ids=["killed", "ended"])
+    @pytest.mark.parametrize(
+        "killed",
+        [True, pytest.param(False, marks=pytest.mark.slow)],
+        ids=["killed", "ended"],
+    )
     def test_a_read_only_file_system(
         self, killed: bool, site: Site, references: References
     ) -> None:

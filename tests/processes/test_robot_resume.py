@@ -332,7 +332,12 @@ class TestEndedInOrder:
         assert story.world.step == 30
         story.finish(site.run(story.file, services=[cloud], resume=True))
 
-    @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP], ids=["ctrl_c", "closed"])
+    @pytest.mark.parametrize(
+        "number",
+        # Its handler is that of SIGTERM, above; of Ctrl-C at a batch: test_run_command.py.
+        [pytest.param(signal.SIGINT, marks=pytest.mark.slow), signal.SIGHUP],
+        ids=["ctrl_c", "closed"],
+    )
     def test_by_its_terminal(
         self, number: signal.Signals, site: Site, references: References
     ) -> None:

@@ -301,8 +301,15 @@ class TestInterruption:
         assert decided(workplace / "out") == decided(workplace / "whole")
         assert len(decided(workplace / "out")) == 16
 
-    @pytest.mark.parametrize("ending", [signal.SIGTERM, signal.SIGHUP])
-    @pytest.mark.parametrize("group", [False, True], ids=["parent", "group"])
+    @pytest.mark.parametrize(
+        ("ending", "group"),
+        [
+            (signal.SIGTERM, False),
+            (signal.SIGHUP, True),
+            pytest.param(signal.SIGTERM, True, marks=pytest.mark.slow),
+            pytest.param(signal.SIGHUP, False, marks=pytest.mark.slow),
+        ],
+    )
     def test_other_signals_end_a_run_in_order(
         self, workplace: Path, held_run: HeldRun, ending: signal.Signals, group: bool
     ) -> None:

@@ -152,7 +152,7 @@ def usual(run: Run) -> Report:
     return report
 
 
-@pytest.mark.parametrize("cores", [0, 3])
+@pytest.mark.parametrize("cores", [3, pytest.param(0, marks=pytest.mark.slow)])
 def test_threads(run: Run, usual: Report, cores: int) -> None:
     """With helpers that take their part of all work, however small."""
     report = report_of(run(cores=cores))
@@ -160,7 +160,7 @@ def test_threads(run: Run, usual: Report, cores: int) -> None:
     assert report["digests"] == usual["digests"]
 
 
-@pytest.mark.parametrize("cores", [1, 2])
+@pytest.mark.parametrize("cores", [2, pytest.param(1, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", ["more particles", "many particles"])
 def test_helpers_take_part(run: Run, usual: Report, name: str, cores: int) -> None:
     """In these very trials: the others have not woken the helpers before."""
@@ -197,6 +197,7 @@ def test_numpy_without_its_instruction_sets(run: Run, usual: Report) -> None:
     assert report["digests"] == usual["digests"]
 
 
+@pytest.mark.slow  # test_all_at_once has one of them, too
 @pytest.mark.skipif(platform.machine() != "x86_64", reason="names of x86 processors")
 @pytest.mark.parametrize("core", ["Prescott", "Haswell"])
 def test_openblas_for_another_processor(run: Run, usual: Report, core: str) -> None:
@@ -217,7 +218,7 @@ def test_all_at_once(run: Run, usual: Report) -> None:
     assert report["digests"] == usual["digests"]
 
 
-@pytest.mark.parametrize("jobs", ["1", "2"])
+@pytest.mark.parametrize("jobs", ["2", pytest.param("1", marks=pytest.mark.slow)])
 def test_the_command(tmp_path: Path, usual: Report, jobs: str) -> None:
     """``holdfast run`` on the example itself, which leaves the number of threads open."""
     command = [sys.executable, "-c", "from holdfast.cli import main; main()", "run"]

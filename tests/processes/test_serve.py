@@ -488,25 +488,15 @@ class TestEnding:
 
 
 class TestRefusing:
-    @pytest.mark.parametrize("address", ["0.0.0.0:0", "[::]:0", "192.0.2.1:7447", "robot.test:1"])
-    def test_address_that_others_can_reach(self, address: str) -> None:
-        text = refused_to_start("--listen", f"tcp/{address}")
-        assert f"tcp/{address}" in text
-        assert "--tls" in text
-        assert "--insecure" in text
+    """What is refused before anything is opened: unit/test_serve_refusals.py."""
 
-    def test_robot_that_others_can_reach(self) -> None:
-        assert "--insecure" in refused_to_start("--connect", "tcp/192.0.2.1:7447")
-
-    def test_unless_it_is_said(self) -> None:
+    def test_an_address_that_others_can_reach_unless_it_is_said(self) -> None:
+        assert "--insecure" in refused_to_start("--listen", "tcp/0.0.0.0:0")
         with served("--listen", "tcp/0.0.0.0:0", "--insecure") as service:
             port = service.endpoint.rpartition(":")[2]
             with robots_end(f"tcp/127.0.0.1:{port}") as end:
                 end.appeared()
                 run_turns(end, Robot(), 1)
-
-    def test_encryption_without_credentials(self) -> None:
-        assert "--tls DIR" in refused_to_start("--listen", "tls/127.0.0.1:0")
 
     def test_port_that_is_taken(self) -> None:
         with socket.socket() as taken:
@@ -514,25 +504,6 @@ class TestRefusing:
             taken.listen()
             endpoint = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
             assert endpoint in refused_to_start("--listen", endpoint)
-
-    @pytest.mark.parametrize(
-        ("arguments", "text"),
-        [
-            (["--listen", "quic/127.0.0.1:0"], "quic"),
-            (["--listen", "tcp/127.0.0.1"], "no port"),
-            (["--lease-ms", "1"], "from 50 to 60000"),
-            (["--lease-ms", "nan"], "from 50 to 60000"),
-            (["--workers", "0"], "from 1 to 256"),
-            (["--max-sessions", "many"], "from 1 to"),
-            (["--metrics", "65536"], "from 0 to 65535"),
-            (["--name", "a b"], "a b"),
-            (["--problem", "nix"], "nix"),
-            (["--tls", "/nowhere"], "/nowhere"),
-            (["--lis", "tcp/127.0.0.1:0"], "--lis"),
-        ],
-    )
-    def test_option_that_cannot_be_used(self, arguments: list[str], text: str) -> None:
-        assert text in refused_to_start(*arguments)
 
     def test_no_standard_input_to_wait_for(self) -> None:
         command = [*COMMAND, *ANYWHERE, "--until-stdin-closes"]
@@ -556,11 +527,6 @@ class TestTls:
                 end.appeared()
                 run_turns(end, Robot(), 2)
             assert service.end()[0] == 0
-
-    def test_credentials_that_would_not_be_used(self, tmp_path: Path) -> None:
-        make_credentials(tmp_path)
-        text = refused_to_start("--listen", "tcp/127.0.0.1:0", "--tls", str(tmp_path / "service"))
-        assert "tcp does not use the credentials" in text
 
 
 class TestTelling:

@@ -99,6 +99,7 @@ def test_a_robot_whose_address_changes(
     assert len(cloud.process.matching("session_opened")) == 1
 
 
+@pytest.mark.slow  # without a run: contracts/test_datagram_links.py
 def test_where_no_datagram_gets_through(
     site: Site, references: References, cloud: Service, credentials: tuple[str, str]
 ) -> None:

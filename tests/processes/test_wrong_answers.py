@@ -69,7 +69,10 @@ def test_an_action_beyond_the_limits_is_not_performed(site: Site, references: Re
     assert (cloud.endpoint, "task", "different") in verdicts_of(robot)
 
 
-@pytest.mark.parametrize(("what", "kind"), [("half", "task"), ("sensing", "sensing")])
+@pytest.mark.parametrize(
+    ("what", "kind"),
+    [("half", "task"), pytest.param("sensing", "sensing", marks=pytest.mark.slow)],
+)
 def test_a_lie_within_the_limits_is_found_among_the_answers_computed_again(
     what: str, kind: str, site: Site
 ) -> None:
@@ -147,8 +150,8 @@ def test_what_is_not_computed_again_in_time_is_said(site: Site, references: Refe
 @pytest.mark.parametrize(
     ("what", "kind", "simulated"),
     [
-        ("half", "task", True),
         ("sensing", "sensing", False),
+        pytest.param("half", "task", True, marks=pytest.mark.slow),
         pytest.param("half", "task", False, marks=pytest.mark.slow),
         pytest.param("sensing", "sensing", True, marks=pytest.mark.slow),
     ],

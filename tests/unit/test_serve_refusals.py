@@ -1,0 +1,49 @@
+"""What ``holdfast serve`` refuses before it listens: in words, with exit code 2."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from tests.command_line import run_here
+
+from holdfast.transport.key_ring import make_credentials
+
+
+@pytest.mark.parametrize(
+    ("arguments", "texts"),
+    [
+        *(
+            (["--listen", f"tcp/{address}"], [f"tcp/{address}", "--tls", "--insecure"])
+            for address in ("0.0.0.0:0", "[::]:0", "192.0.2.1:7447")
+        ),
+        (["--connect", "tcp/192.0.2.1:7447"], ["--insecure"]),
+        (["--listen", "tls/127.0.0.1:0"], ["--tls DIR"]),
+        (["--listen", "tcp/127.0.0.1:0", "--tls", "keys/service"], ["tcp does not use the cred"]),
+        (["--listen", "quic/127.0.0.1:0"], ["quic"]),
+        (["--listen", "tcp/127.0.0.1"], ["no port"]),
+        (["--lease-ms", "1"], ["from 50 to 60000"]),
+        (["--lease-ms", "nan"], ["from 50 to 60000"]),
+        (["--workers", "0"], ["from 1 to 256"]),
+        (["--max-sessions", "many"], ["from 1 to"]),
+        (["--metrics", "65536"], ["from 0 to 65535"]),
+        (["--name", "a b"], ["a b"]),
+        (["--problem", "nix"], ["nix"]),
+        (["--tls", "/nowhere"], ["/nowhere"]),
+        (["--lis", "tcp/127.0.0.1:0"], ["--lis"]),
+        (["--processes", "2", "--connect", "tcp/127.0.0.1:1"], ["--connect"]),
+        (["--processes", "2", "--until-stdin-closes"], ["--until-stdin-closes"]),
+        (["--processes", "2", "--health", "here"], ["here"]),
+    ],
+)
+def test_it_says_why(
+    arguments: list[str], texts: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    if "keys/service" in arguments:
+        make_credentials(tmp_path / "keys")
+    said = run_here(capsys, tmp_path, "serve", *arguments)
+    assert (said.code, said.stdout) == (2, "")
+    assert "Traceback" not in said.stderr
+    assert said.stderr.startswith("holdfast: error: ")
+    for text in texts:
+        assert text in said.stderr
