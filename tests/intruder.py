@@ -211,9 +211,11 @@ class Intruder:
             hello = msgspec.msgpack.decode(frame.payload)
         self._messages = messages(questions, hello["name"], hello["incarnation"], self._call)
 
-    def run(self) -> None:
-        """Say all messages at all moments, once."""
+    def run(self, enough: Callable[[], bool]) -> None:
+        """Say all messages at all moments, once, or until it is enough."""
         for moment, message in itertools.product(MOMENTS, self._messages):
+            if enough():
+                return
             if moment == "before the handshake" and self._keys is None:
                 continue
             self._say(moment, message)

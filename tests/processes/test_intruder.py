@@ -102,7 +102,7 @@ class Raid:
         assert self.intruder is not None
         try:
             while not self._stopped.is_set():
-                self.intruder.run()
+                self.intruder.run(self._stopped.is_set)
                 self._round.set()
         except BaseException as error:  # noqa: BLE001 - raised where it is waited for
             self._failure = error

@@ -202,7 +202,7 @@ class TestOutput:
     def test_with_log_json_the_standard_error_has_nothing_else(self, workplace: Path) -> None:
         service = f"tcp/127.0.0.1:{free_port()}"
         arguments = ("run", "peg.yaml", "--trials", "1", "--log", "json", "--service", service)
-        done = holdfast(workplace, *arguments, "--out", "out", command=WITH_FIGURES)
+        done = holdfast(workplace, *arguments, "--out", "out")
         assert done.returncode == 0, done.stderr
         events = [json.loads(line) for line in done.stderr.splitlines()]
         assert [event["reason"] for event in events if event["event"] == "unreachable"] == [
@@ -210,8 +210,8 @@ class TestOutput:
         ]
         (status,) = [event for event in events if event["event"] == "status"]
         assert status["reason"] == f"{service} has not appeared"
-        (note,) = [event for event in events if event["event"] == "note"]
-        assert note["reason"] == f"{service} decided nothing: connection refused"
+        notes = [event["reason"] for event in events if event["event"] == "note"]
+        assert f"{service} decided nothing: connection refused" in notes
         found = summary(workplace / "out")
         decided = found["sensing_decisions_by_service"]
         assert decided == {"cloud_active_sensing_recovery": found["sensing_decisions"]}

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import os
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
-
-COMMAND = (sys.executable, "-m", "holdfast")
+from tests.processes.faults import COMMAND
 
 CONFIGURATION = """
 problem: capsule_robot
@@ -42,8 +40,8 @@ def unread(directory: Path, *arguments: str) -> subprocess.CompletedProcess[str]
     [
         ("simulate", "--story", "--seeds", "0:1000"),  # which takes minutes if it goes on
         ("simulate", "--seeds", "0:2", "--jobs", "1"),
-        ("chaos", "--list"),
-        ("chaos", "--help"),
+        pytest.param(("chaos", "--list"), marks=pytest.mark.slow),
+        pytest.param(("chaos", "--help"), marks=pytest.mark.slow),
         ("--version",),
     ],
     ids=" ".join,
