@@ -105,8 +105,6 @@ class KnownService:
     backoff_s : float
         The next delay.
     num_busy : int
-    tell_busy_at : float
-        When it is to be said again that it is busy.
     """
 
     __slots__ = (
@@ -129,7 +127,6 @@ class KnownService:
         "retry_at",
         "sensing_refusals",
         "task_refusals",
-        "tell_busy_at",
     )
 
     def __init__(
@@ -157,7 +154,6 @@ class KnownService:
         self.retry_at = 0.0
         self.backoff_s = _FIRST_RETRY_S
         self.num_busy = 0
-        self.tell_busy_at = 0.0
 
     @property
     def reliable(self) -> bool:

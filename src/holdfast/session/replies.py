@@ -35,9 +35,6 @@ from holdfast.session.question import Provenance
 
 __all__ = ["News", "Replies", "StaleEpochError"]
 
-_TELLING_INTERVAL_S = 1.0
-"""What may happen many times a second is told this often, with a count."""
-
 
 class StaleEpochError(HoldfastError):
     """Another process has taken this run over: this robot must not go on."""
@@ -228,14 +225,10 @@ class Replies:
 
     def _was_busy(self, service: KnownService, reply: Busy, now: float) -> None:
         after_s = service.note_busy(1e-3 * reply.retry_after_ms, now)
-        if now >= service.tell_busy_at:
-            service.tell_busy_at = now + _TELLING_INTERVAL_S
-            self._report(
-                "busy",
-                service=service.name,
-                retry_after_ms=1e3 * after_s,
-                times=service.num_busy,
-            )
+        # However often: whoever writes a log bounds it.
+        self._report(
+            "busy", service=service.name, retry_after_ms=1e3 * after_s, times=service.num_busy
+        )
 
     def _was_refused(self, call: Call, reply: Refused, now: float) -> None:
         service = call.service
