@@ -6,8 +6,8 @@ as not to miss the turn. The robot steers by via points, one after the other.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, ClassVar, Literal, Self
+from collections.abc import Sequence
+from typing import Annotated, ClassVar, Literal
 
 import msgspec
 import numpy as np
@@ -213,16 +213,6 @@ class CapsuleRobot(RigidBodyProblem):
         self._gains = constant([gains if target.axis == 0 else gains[::-1] for target in targets])
         self._step_size = planner.step_size
         self._observation_variances = [constant(variances) for variances in model.sensing_covs]
-
-    @classmethod
-    def from_settings(
-        cls, model: Mapping[str, Any], state_space_planner: Mapping[str, Any]
-    ) -> Self:
-        """Build the problem from plain data; ``msgspec.ValidationError`` if it does not fit."""
-        return cls(
-            msgspec.convert(model, CapsuleRobotModel),
-            msgspec.convert(state_space_planner, CapsuleRobotPlanner),
-        )
 
     def observation_mean(self, states: FloatArray, sensing_action: int) -> FloatArray:
         """Return the positions: every sensing action observes both coordinates."""

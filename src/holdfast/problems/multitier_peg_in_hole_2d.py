@@ -6,8 +6,8 @@ task's stage, and the robot must notice from its estimate alone that it has pass
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, ClassVar, Self
+from collections.abc import Sequence
+from typing import Annotated, ClassVar
 
 import msgspec
 import numpy as np
@@ -179,16 +179,6 @@ class MultitierPegInHole2D(PegProblem):
         )
         self._upright_limits = constant(
             [upright_limit(hole.tol, 0.5 * height) for hole in model.holes]
-        )
-
-    @classmethod
-    def from_settings(
-        cls, model: Mapping[str, Any], state_space_planner: Mapping[str, Any]
-    ) -> Self:
-        """Build the problem from plain data; ``msgspec.ValidationError`` if it does not fit."""
-        return cls(
-            msgspec.convert(model, MultitierPegInHole2DModel),
-            msgspec.convert(state_space_planner, MultitierPegInHole2DPlanner),
         )
 
     def policy(self, states: FloatArray, stage: int | IntArray) -> FloatArray:

@@ -7,8 +7,8 @@ only x matters to the next action; above it, the angle; when the peg goes in, th
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, Literal, Self
+from collections.abc import Sequence
+from typing import ClassVar, Literal
 
 import msgspec
 import numpy as np
@@ -140,16 +140,6 @@ class PegInHole2D(PegProblem):
         self._half_width = 0.5 * model.peg_width
         self._tolerance = model.hole_tolerance
         self._upright_limit = upright_limit(model.hole_tolerance, 0.5 * model.peg_height)
-
-    @classmethod
-    def from_settings(
-        cls, model: Mapping[str, Any], state_space_planner: Mapping[str, Any]
-    ) -> Self:
-        """Build the problem from plain data; ``msgspec.ValidationError`` if it does not fit."""
-        return cls(
-            msgspec.convert(model, PegInHole2DModel),
-            msgspec.convert(state_space_planner, PegInHole2DPlanner),
-        )
 
     def policy(self, states: FloatArray, stage: int | IntArray) -> FloatArray:
         """Go to x = 0; near it also turn upright; once upright also go down to y = 0."""

@@ -6,8 +6,8 @@ about, and so six sensing actions to choose from.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, Self
+from collections.abc import Sequence
+from typing import ClassVar
 
 import msgspec
 import numpy as np
@@ -151,16 +151,6 @@ class PegInHole3D(PegProblem):
         self._tolerance = model.hole_tolerance
         self._half_width = 0.5 * min(model.peg_dim[0], model.peg_dim[1])
         self._upright_limit = upright_limit(model.hole_tolerance, 0.5 * model.peg_dim[2])
-
-    @classmethod
-    def from_settings(
-        cls, model: Mapping[str, Any], state_space_planner: Mapping[str, Any]
-    ) -> Self:
-        """Build the problem from plain data; ``msgspec.ValidationError`` if it does not fit."""
-        return cls(
-            msgspec.convert(model, PegInHole3DModel),
-            msgspec.convert(state_space_planner, PegInHole3DPlanner),
-        )
 
     def policy(self, states: FloatArray, stage: int | IntArray) -> FloatArray:
         """Go to the axis; near it also turn upright; once upright also go down to z = 0."""

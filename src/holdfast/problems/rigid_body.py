@@ -8,9 +8,10 @@ one coordinate at a time, limit each component of an action on its own, and pay 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import ClassVar
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, ClassVar, Self
 
+import msgspec
 import numpy as np
 
 from holdfast import numerics
@@ -50,7 +51,26 @@ class RigidBodyProblem(ProblemBase):
         Variances of the motion noise.
     collision_tol : float
         Fraction of an action to which contact is located.
+
+    Attributes
+    ----------
+    Model, StateSpacePlanner : type
+        Of the problem's settings: it is built of one of each.
     """
+
+    Model: ClassVar[type[Any]]
+    StateSpacePlanner: ClassVar[type[Any]]
+
+    @classmethod
+    def from_settings(
+        cls, model: Mapping[str, Any], state_space_planner: Mapping[str, Any]
+    ) -> Self:
+        """Build the problem from plain data; ``msgspec.ValidationError`` if it does not fit."""
+        make: Callable[..., Self] = cls
+        return make(
+            msgspec.convert(model, cls.Model),
+            msgspec.convert(state_space_planner, cls.StateSpacePlanner),
+        )
 
     def __init__(
         self,
