@@ -306,6 +306,7 @@ def fault_of_certificate(error: ssl.SSLCertVerificationError, role: str) -> str:
     role : {"robot", "service"}
         Whose it should be.
     """
+    message = error.verify_message.rstrip(".")
     match error.verify_code:  # OpenSSL's numbers
         case 9:
             return "is not valid yet; is a clock wrong?"
@@ -318,6 +319,6 @@ def fault_of_certificate(error: ssl.SSLCertVerificationError, role: str) -> str:
         case 7 | 18 | 19 | 20 | 21:
             return f"was not signed by the authority in {AUTHORITY_FILE}"
         case 62 | 64:
-            return f"does not name this host ({error.verify_message})"
+            return f"does not name this host ({message})"
         case _:
-            return f"is refused: {error.verify_message}"
+            return f"is refused: {message}"
