@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import select
 import socket
 import sys
 from collections.abc import Callable, Iterator
@@ -436,23 +437,48 @@ class TestEnds:
             inbox = Inbox()
             robot.start(inbox)
             await until(lambda: robot.sends_datagrams("cloud"))
+            await until(lambda: link_of(robot)._questions._first_probes == 0)
             await asyncio.to_thread(stream.impair, Impairment(silent=True))
-            line.close()  # from now on the system answers
+            await asyncio.to_thread(line.close)  # from now on the system answers
+            sealing = link_of(robot)._sealing
+            assert sealing is not None
+            before = sealing._counter
             robot.call("cloud", 1, b"question")
             await inbox.wait_for(Vanished("cloud", "b1"), Ended(1))
+            assert sealing._counter == before + 1  # the question was enough
             await robot.close()
 
-    async def test_what_the_system_says_of_a_port_is_not_believed_while_datagrams_are_answered(
-        self, udp: StreamWire
+    async def test_who_cannot_quote_what_was_sent_is_not_believed(
+        self, udp: StreamWire, robot_tls: TlsFiles
     ) -> None:
-        robot, inbox, _ = await connected(udp)
-        link = link_of(robot)
-        for call in range(20):
-            link._refused()  # anybody can send such a message
-            await answers(robot, inbox, call)
-            await asyncio.sleep(0.02)
-        assert link_of(robot) is link
-        assert Vanished("cloud", "b1") not in inbox
+        """Anybody may write in the name of a host that a port of it is closed."""
+        await udp.service("cloud", "b1").start(echo)
+        _, target = place_of(udp)
+        entry = free_port()
+        with Proxy(entry, target, "seed"), contextlib.ExitStack() as lines:
+            line = lines.enter_context(relay(entry, target))
+            robot = StreamRobotTransport(
+                {"cloud": ServiceAddress(f"udp/127.0.0.1:{entry}")}, tls=robot_tls, lease_ms=3.6e6
+            )
+            udp.ends.insert(0, robot)
+            inbox = Inbox()
+            robot.start(inbox)
+            await until(lambda: robot.sends_datagrams("cloud"))
+            link = link_of(robot)
+            await until(lambda: link._questions._first_probes == 0)
+            await answers(robot, inbox, 1)
+            ours = link._socket
+            assert ours is not None
+            await asyncio.to_thread(line.close)
+            header = link._sent[-1][:8]
+            for unlike in (b"", header, header + bytes(24), bytes(1200)):
+                ours.send(unlike)  # the system's answer quotes it
+                await until(lambda: not select.select([ours], [], [], 0.0)[0])
+            lines.enter_context(relay(entry, target))
+            await answers(robot, inbox, 2)
+            assert link_of(robot) is link
+            assert Vanished("cloud", "b1") not in inbox
+            await robot.close()
 
     async def test_a_service_that_closes_has_answered_before(
         self, udp: StreamWire, monkeypatch: pytest.MonkeyPatch
