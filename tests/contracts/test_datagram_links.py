@@ -167,6 +167,16 @@ class TestStrangers:
         assert received == [b"question %d" % k for k in range(50)]
         assert Vanished("cloud", "b1") not in inbox
 
+    async def test_associations_cannot_be_guessed(self, udp: StreamWire) -> None:
+        """Whoever does not see a robot's datagrams makes none that have to be deciphered."""
+        _, _, service = await connected(udp)
+        other = udp.robot("cloud")
+        other.start(Inbox())
+        await until(lambda: other.sends_datagrams("cloud"))
+        sealings = [link_at(service, number)._sealing for number in range(2)]
+        first, second = (each.association for each in sealings if each is not None)
+        assert abs(first - second) > 1  # unless two draws of 32 bits are as near as that
+
     async def test_a_robot_cannot_use_the_keys_of_another(self, udp: StreamWire) -> None:
         calls = Received()
         robot, inbox, service = await connected(udp, calls)
@@ -287,6 +297,31 @@ class TestStrangers:
             assert link_at(service)._peer_address == before
             with pytest.raises(BlockingIOError):
                 to_service.recv(1)
+
+    async def test_a_robot_whose_answers_are_led_elsewhere_is_answered_all_the_same(
+        self, udp: StreamWire, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """Each datagram of the robot comes first from somebody who has copied it on its way."""
+        robot, inbox, service = await connected(udp)
+        link, at_service = link_of(robot), link_at(service)
+        assert link._socket is not None
+        ours, put = link._socket.getsockname(), link._put
+        await answers(robot, inbox, 0)
+        with stranger(place_of(udp)) as to_service:
+
+            def race(datagram: bytes) -> None:
+                to_service.send(datagram)
+                put(datagram)
+
+            monkeypatch.setattr(link, "_put", race)
+            for call in range(1, 30):
+                await answers(robot, inbox, call)
+            assert at_service._peer_address == to_service.getsockname()
+            monkeypatch.undo()
+            await answers(robot, inbox, 30)
+            await until(lambda: at_service._peer_address == ours)
+        assert link_of(robot) is link
+        assert Vanished("cloud", "b1") not in inbox
 
     @given(data=st.lists(st.binary(max_size=80), max_size=5), tail=st.binary(max_size=40))
     @settings(max_examples=30, deadline=None)

@@ -23,6 +23,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import errno
+import os
 import socket
 import struct
 from collections import deque
@@ -162,7 +163,7 @@ class _DatagramLink(Link):
         raise NotImplementedError
 
     def _lost_of_theirs(self) -> int:
-        return 0 if self._sealing is None else self._sealing.window.lost
+        return 1 if self._sealing is None else self._sealing.window.lost  # 1: nobody knows
 
     # -- receiving -------------------------------------------------------------------------------
 
@@ -607,7 +608,6 @@ class _DatagramSocket:
     def __init__(self, address: Any) -> None:
         self._loop = asyncio.get_running_loop()
         self._links: dict[int, ServiceDatagramLink] = {}
-        self._next = 0
         family = socket.AF_INET6 if len(address) == 4 else socket.AF_INET
         self._socket = socket.socket(family, socket.SOCK_DGRAM)
         try:
@@ -625,12 +625,11 @@ class _DatagramSocket:
 
     def add(self, link: ServiceDatagramLink) -> Keys:
         """Draw keys for a link."""
-        while self._next in self._links:
-            self._next = (self._next + 1) % (1 << 32)
-        keys = Keys.draw(self._next)
-        self._links[self._next] = link
-        self._next = (self._next + 1) % (1 << 32)
-        return keys
+        # Whoever sees no datagram cannot name one: what is forged blindly is not even deciphered.
+        while (association := int.from_bytes(os.urandom(4))) in self._links:
+            pass
+        self._links[association] = link
+        return Keys.draw(association)
 
     def remove(self, association: int) -> None:
         """Take no more datagrams of an association."""
