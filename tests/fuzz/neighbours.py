@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import itertools
+import random
 import select
 import socket
 import struct
@@ -148,6 +149,19 @@ def _silent(visit: _Visit) -> None:
         time.sleep(0.0005)
 
 
+def _flood(visit: _Visit) -> None:
+    """Datagrams to a port for udp as fast as they go: nonsense, and some in a robot's name."""
+    host, _, port = visit.endpoint.partition("/")[2].rpartition(":")
+    with socket.socket(type=socket.SOCK_DGRAM) as sender:
+        sender.connect((host, int(port)))
+        content = random.Random(1).randbytes(100)
+        while visit.goes_on:
+            for association in range(256):
+                with contextlib.suppress(OSError):
+                    sender.send(association.to_bytes(4, "big") + content)
+                visit.done += 1
+
+
 KINDS: dict[str, Callable[[_Visit], None]] = {
     "deaf": _deaf,
     "slow": _slow,
@@ -156,6 +170,7 @@ KINDS: dict[str, Callable[[_Visit], None]] = {
     "silent": _silent,
     "hasty": _hasty,
     "trickle": _trickle,
+    "flood": _flood,
 }
 
 
