@@ -5,8 +5,9 @@ import itertools
 import math
 import random
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -473,6 +474,14 @@ class TestTheStream:
         answers = [sent.datagram for sent in network.sent["service"] if sent.kind == 2]
         assert answers == [True] * 3 + [False] * 3
         assert network.parts_of[2] == network.expected(2)
+
+    def test_a_large_question_is_not_copied(self) -> None:
+        """Nobody else is heard meanwhile."""
+        answers = Answers(Ways(lambda _: None, lambda _n, _m: None, lambda: 0))
+        message = bytearray(b"\1\0" + (1).to_bytes(4, "big") * 2 + b"\0\0" + bytes(2_000_000))
+        arrived = answers.received(cast(bytes, message), datagram=False)
+        assert arrived is not None and len(arrived.payload) == 2_000_000
+        assert np.shares_memory(np.frombuffer(arrived.payload, np.uint8), message)
 
     def test_a_large_part_among_small_ones(self) -> None:
         network = Network(parts=3)

@@ -45,7 +45,7 @@ import heapq
 import math
 import struct
 from collections.abc import Callable
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, cast
 
 from holdfast.transport.sealing import KNOWN_AFTER, LOSS_SAMPLE, OVERHEAD
 
@@ -110,6 +110,8 @@ _SILENCE_IN_PATIENCES: Final = 2.9
 heard; then they take the stream."""
 
 _PROBES_BEFORE_SILENCE: Final = 3
+
+_LARGE_BYTES: Final = 1 << 20
 
 _HEDGED_LOSS: Final = LOSS_SAMPLE // 4
 _ASKED_BEFORE_HEDGE: Final = 2
@@ -197,7 +199,7 @@ class Part(NamedTuple):
 
 
 class Arrived(NamedTuple):
-    """A question, as it arrives at the service."""
+    """A question, as it arrives at the service; the payload of a large one is a view of it."""
 
     number: int
     payload: bytes
@@ -589,7 +591,9 @@ class Answers:
         if len(message) < 2:
             return None
         self._sender.lost_of_ours = message[1]
-        kind, body = message[0], message[2:]
+        # A copy of a large one would hold up all others.
+        view = message if len(message) < _LARGE_BYTES else cast(bytes, memoryview(message))
+        kind, body = message[0], view[2:]
         if kind == _PROBE and len(body) == _PROBE_HEAD.size and datagram:
             self._sender.small(_ECHO, body)
         hedge = kind == _HEDGE and not datagram
