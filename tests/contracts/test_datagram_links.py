@@ -66,6 +66,12 @@ def link_of(robot: StreamRobotTransport) -> RobotDatagramLink:
     return link
 
 
+async def at_rest(link: RobotDatagramLink) -> None:
+    """Wait until a link has no datagram to send for a while, unless it is asked."""
+    loop = asyncio.get_running_loop()
+    await until(lambda: link._questions.due > loop.time() + 1.0)
+
+
 def link_at(service: StreamServiceTransport, number: int = 0) -> ServiceDatagramLink:
     link = list(service._links)[number]
     assert isinstance(link, ServiceDatagramLink)
@@ -472,7 +478,7 @@ class TestEnds:
             inbox = Inbox()
             robot.start(inbox)
             await until(lambda: robot.sends_datagrams("cloud"))
-            await until(lambda: link_of(robot)._questions._first_probes == 0)
+            await at_rest(link_of(robot))
             await asyncio.to_thread(stream.impair, Impairment(silent=True))
             await asyncio.to_thread(line.close)  # from now on the system answers
             sealing = link_of(robot)._sealing
@@ -500,8 +506,9 @@ class TestEnds:
             robot.start(inbox)
             await until(lambda: robot.sends_datagrams("cloud"))
             link = link_of(robot)
-            await until(lambda: link._questions._first_probes == 0)
+            await at_rest(link)
             await answers(robot, inbox, 1)
+            await at_rest(link)
             ours = link._socket
             assert ours is not None
             await asyncio.to_thread(line.close)
