@@ -41,6 +41,7 @@ _AT_WORK = {
     "slow": "200 connections that say a byte every 0.1 s",
     "scanner": "500 connections a second, closed at once",
     "greetings": "200 greetings of HTTP or TLS a second",
+    "large": "a robot that hands over a belief of 61 MB again and again",
 }
 _NEW = {
     "": "nobody",

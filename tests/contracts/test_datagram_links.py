@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import select
 import socket
 import sys
 from collections.abc import AsyncIterator, Callable, Iterator
@@ -65,6 +66,12 @@ def link_of(robot: StreamRobotTransport) -> RobotDatagramLink:
     link = robot._services["cloud"].current
     assert isinstance(link, RobotDatagramLink)
     return link
+
+
+async def at_rest(link: RobotDatagramLink) -> None:
+    """Wait until a link has no datagram to send for a while, unless it is asked."""
+    loop = asyncio.get_running_loop()
+    await until(lambda: link._questions.due > loop.time() + 1.0)
 
 
 def link_at(service: StreamServiceTransport, number: int = 0) -> ServiceDatagramLink:
@@ -167,6 +174,16 @@ class TestStrangers:
                 to_service.recv(1)
         assert received == [b"question %d" % k for k in range(50)]
         assert Vanished("cloud", "b1") not in inbox
+
+    async def test_associations_cannot_be_guessed(self, udp: StreamWire) -> None:
+        """Whoever does not see a robot's datagrams makes none that have to be deciphered."""
+        _, _, service = await connected(udp)
+        other = udp.robot("cloud")
+        other.start(Inbox())
+        await until(lambda: other.sends_datagrams("cloud"))
+        sealings = [link_at(service, number)._sealing for number in range(2)]
+        first, second = (each.association for each in sealings if each is not None)
+        assert abs(first - second) > 1  # unless two draws of 32 bits are as near as that
 
     async def test_a_robot_cannot_use_the_keys_of_another(self, udp: StreamWire) -> None:
         calls = Received()
@@ -288,6 +305,31 @@ class TestStrangers:
             assert link_at(service)._peer_address == before
             with pytest.raises(BlockingIOError):
                 to_service.recv(1)
+
+    async def test_a_robot_whose_answers_are_led_elsewhere_is_answered_all_the_same(
+        self, udp: StreamWire, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """Each datagram of the robot comes first from somebody who has copied it on its way."""
+        robot, inbox, service = await connected(udp)
+        link, at_service = link_of(robot), link_at(service)
+        assert link._socket is not None
+        ours, put = link._socket.getsockname(), link._put
+        await answers(robot, inbox, 0)
+        with stranger(place_of(udp)) as to_service:
+
+            def race(datagram: bytes) -> None:
+                to_service.send(datagram)
+                put(datagram)
+
+            monkeypatch.setattr(link, "_put", race)
+            for call in range(1, 30):
+                await answers(robot, inbox, call)
+            assert at_service._peer_address == to_service.getsockname()
+            monkeypatch.undo()
+            await answers(robot, inbox, 30)
+            await until(lambda: at_service._peer_address == ours)
+        assert link_of(robot) is link
+        assert Vanished("cloud", "b1") not in inbox
 
     @given(data=st.lists(st.binary(max_size=80), max_size=5), tail=st.binary(max_size=40))
     @settings(max_examples=30, deadline=None)
@@ -435,22 +477,48 @@ class TestEnds:
         """Although its stream, held open by a line that has fallen silent, says nothing."""
         udp.lease_ms = 3.6e6
         async with on_a_line(udp) as (robot, inbox, stream, datagrams):
+            await at_rest(link_of(robot))
             await asyncio.to_thread(stream.impair, Impairment(silent=True))
-            datagrams.close()  # from now on the system answers
+            await asyncio.to_thread(datagrams.close)  # from now on the system answers
+            sealing = link_of(robot)._sealing
+            assert sealing is not None
+            before = sealing._counter
             robot.call("cloud", 1, b"question")
             await inbox.wait_for(Vanished("cloud", "b1"), Ended(1))
+            assert sealing._counter == before + 1  # the question was enough
 
-    async def test_what_the_system_says_of_a_port_is_not_believed_while_datagrams_are_answered(
-        self, udp: StreamWire
+    async def test_who_cannot_quote_what_was_sent_is_not_believed(
+        self, udp: StreamWire, robot_tls: TlsFiles
     ) -> None:
-        robot, inbox, _ = await connected(udp)
-        link = link_of(robot)
-        for call in range(20):
-            link._refused()  # anybody can send such a message
-            await answers(robot, inbox, call)
-            await asyncio.sleep(0.02)
-        assert link_of(robot) is link
-        assert Vanished("cloud", "b1") not in inbox
+        """Anybody may write in the name of a host that a port of it is closed."""
+        await udp.service("cloud", "b1").start(echo)
+        _, target = place_of(udp)
+        entry = free_port()
+        with Proxy(entry, target, "seed"), contextlib.ExitStack() as lines:
+            line = lines.enter_context(relay(entry, target))
+            robot = StreamRobotTransport(
+                {"cloud": ServiceAddress(f"udp/127.0.0.1:{entry}")}, tls=robot_tls, lease_ms=3.6e6
+            )
+            udp.ends.insert(0, robot)
+            inbox = Inbox()
+            robot.start(inbox)
+            await until(lambda: robot.sends_datagrams("cloud"))
+            link = link_of(robot)
+            await at_rest(link)
+            await answers(robot, inbox, 1)
+            await at_rest(link)
+            ours = link._socket
+            assert ours is not None
+            await asyncio.to_thread(line.close)
+            header = link._sent[-1][:8]
+            for unlike in (b"", header, header + bytes(24), bytes(1200)):
+                ours.send(unlike)  # the system's answer quotes it
+                await until(lambda: not select.select([ours], [], [], 0.0)[0])
+            lines.enter_context(relay(entry, target))
+            await answers(robot, inbox, 2)
+            assert link_of(robot) is link
+            assert Vanished("cloud", "b1") not in inbox
+            await robot.close()
 
     async def test_a_service_that_closes_has_answered_before(
         self, udp: StreamWire, monkeypatch: pytest.MonkeyPatch

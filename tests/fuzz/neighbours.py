@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import itertools
+import random
 import select
 import signal
 import socket
@@ -19,9 +20,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 import msgspec
+import numpy as np
 from tests.fuzz import corpus
-from tests.wire import CALL, RawLink, frame_of, hello_of
+from tests.wire import CALL, RawClient, RawLink, frame_of, hello_of
 
+from holdfast.belief import Belief
+from holdfast.planning import PlanningState, encode_checkpoint
 from holdfast.session.messages import encode
 
 __all__ = ["KINDS", "main"]
@@ -30,6 +34,7 @@ _RESET = struct.pack("ii", 1, 0)
 _HTTP = b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n"
 _TLS = b"\x16\x03\x01\x00\xf4\x01\x00\x00\xf0\x03\x03" + bytes(244)
 _OPEN = 200
+_PARTICLES = 1_900_000
 
 
 class _Visit:
@@ -152,6 +157,34 @@ def _silent(visit: _Visit) -> None:
         time.sleep(0.0005)
 
 
+def _large(visit: _Visit) -> None:
+    """A robot that hands over a belief as large as a message can be, again and again."""
+    belief = Belief(np.zeros((_PARTICLES, 3)), np.full(_PARTICLES, 1.0 / _PARTICLES))
+    request = next(each for each in corpus.requests() if each.opening and each.checkpoint)
+    state = PlanningState(request.opening.seed, 0, 0, 0, False, belief)  # type: ignore[union-attr]
+    request = msgspec.structs.replace(
+        request, session=b"has a large one.", checkpoint=encode_checkpoint(state)
+    )
+    with RawClient(visit.endpoint, visit.keys) as client:
+        while visit.goes_on:
+            asked = msgspec.structs.replace(request, number=request.number + visit.done)
+            client.replies_to(client.send_call(encode(asked)))
+            visit.done += 1
+
+
+def _flood(visit: _Visit) -> None:
+    """Datagrams to a port for udp as fast as they go: nonsense, and some in a robot's name."""
+    host, _, port = visit.endpoint.partition("/")[2].rpartition(":")
+    with socket.socket(type=socket.SOCK_DGRAM) as sender:
+        sender.connect((host, int(port)))
+        content = random.Random(1).randbytes(100)
+        while visit.goes_on:
+            for association in range(256):
+                with contextlib.suppress(OSError):
+                    sender.send(association.to_bytes(4, "big") + content)
+                visit.done += 1
+
+
 KINDS: dict[str, Callable[[_Visit], None]] = {
     "deaf": _deaf,
     "slow": _slow,
@@ -160,6 +193,8 @@ KINDS: dict[str, Callable[[_Visit], None]] = {
     "silent": _silent,
     "hasty": _hasty,
     "trickle": _trickle,
+    "large": _large,
+    "flood": _flood,
 }
 
 

@@ -50,6 +50,26 @@ def test_a_robot_at_work_notices_nothing(kind: str, site: Site, references: Refe
     assert "Traceback" not in cloud.process.output
 
 
+def test_a_robot_over_udp_is_answered_in_a_flood_of_datagrams(
+    keys: Path, site: Site, references: References
+) -> None:
+    """Most of its own are dropped by the system; it is answered over the stream."""
+    cloud = secure(site, keys, "udp").start()
+    story = Story(site, references, DOCUMENT)
+    floods: list[Process] = []
+    story.at(
+        "perform",
+        10,
+        lambda: floods.append(neighbour(site, "flood", cloud.endpoint, "--seconds", "3")),
+    )
+    story.at("perform", 78, lambda: floods[0].wait())
+    robot = story.run(cloud, options=("--tls", str(keys / "ours" / "robot")))
+    assert done_by(floods[0]) > 10_000
+    assert robot.statuses() == []
+    assert len(robot.matching("service_appeared", service=cloud.endpoint)) == 1
+    assert not robot.matching("service_vanished")
+
+
 @pytest.mark.parametrize("kind", ["hasty", "trickle", "silent"])
 def test_a_new_robot_is_let_in(kind: str, keys: Path, site: Site, references: References) -> None:
     """However many connections to a service with TLS never come to their handshakes."""

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import asyncio
+import socket
 from pathlib import Path
 
 import pytest
+from tests.contracts.test_datagram_links import at_rest
+from tests.contracts.test_transport import Inbox, until
 from tests.ports import free_port
 from tests.processes.faults import (
     References,
@@ -17,6 +21,11 @@ from tests.processes.faults import (
 from tests.relay import relay
 
 from holdfast.chaos.proxy import Impairment, Proxy
+from holdfast.session.events import Ended, Vanished
+from holdfast.transport.credentials import load_credentials
+from holdfast.transport.datagrams import RobotDatagramLink
+from holdfast.transport.endpoints import ServiceAddress
+from holdfast.transport.robot_end import StreamRobotTransport
 
 PEG = "peg_in_hole_2d"
 
@@ -111,3 +120,34 @@ def test_where_no_datagram_gets_through(
     assert robot.statuses() == []
     (told,) = robot.matching("no_datagrams")
     assert told["service"] == f"udp/127.0.0.1:{entry}"
+
+
+async def test_a_killed_service_is_known_by_its_closed_port(site: Site, keys: Path) -> None:
+    """The end of its stream gets lost, and the first datagram to its port is enough."""
+    target, entry = free_port(), free_port()
+    with socket.socket(type=socket.SOCK_DGRAM) as somebody:
+        # So the service takes another port for datagrams, to which there is no proxy.
+        somebody.bind(("127.0.0.1", target))
+        cloud = site.service(
+            *("--tls", str(keys / "ours" / "service")), endpoint=f"udp/127.0.0.1:{target}"
+        ).start()
+        with Proxy(entry, target, "held open") as stream:
+            robot = StreamRobotTransport(
+                {"cloud": ServiceAddress(f"udp/127.0.0.1:{entry}")},
+                tls=load_credentials(keys / "ours" / "robot", "robot"),
+                lease_ms=3.6e6,
+            )
+            inbox = Inbox()
+            robot.start(inbox)
+            await until(lambda: robot.sends_datagrams("cloud"))
+            link = robot._services["cloud"].current
+            assert isinstance(link, RobotDatagramLink) and link._sealing is not None
+            await at_rest(link)
+            sealing, before = link._sealing, link._sealing._counter
+            await asyncio.to_thread(stream.impair, Impairment(silent=True))
+            await asyncio.to_thread(cloud.kill)
+            robot.call("cloud", 1, b"is anybody there?")
+            await inbox.wait_for(Vanished("cloud", inbox.boots()[0]), Ended(1))
+            assert link.reason == "is gone: nobody has its port any more"
+            assert sealing._counter == before + 1
+            await robot.close()

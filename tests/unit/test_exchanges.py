@@ -5,8 +5,9 @@ import itertools
 import math
 import random
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -354,6 +355,74 @@ class TestLoss:
         assert network.questions.calls == []
 
 
+class TestManyAreLost:
+    """As while somebody floods the service's port: what comes from there is not lost."""
+
+    @staticmethod
+    def flooded(seed: int, loss: float = 0.5, delay_s: float = 0.0005) -> Network:
+        network = Network(delay_s=delay_s, seed=seed)
+        network.begin()
+        for call in range(-100, 0):
+            network.ask(call)
+        chance = random.Random(seed)
+        network.drop = lambda who, _kind: who == "robot" and chance.random() < loss
+        return network
+
+    @pytest.mark.parametrize("loss", [0.3, 0.5, 0.7, 0.9, 1.0])
+    @pytest.mark.parametrize("seed", range(3))
+    def test_a_question_is_lost_no_more_than_twice(self, seed: int, loss: float) -> None:
+        network = self.flooded(seed, loss)
+        times = []
+        for call in range(150):
+            times.append(network.ask(call))
+            network.wait(0.02)
+        # After 10 ms, the least margin, and twice as many it goes on the stream as well.
+        assert max(times) <= 0.04
+        # Once it is known that many are lost, it does so at once.
+        assert sum(each > 0.0011 for each in times[100:]) <= (10 if loss < 0.5 else 1)
+        for call in range(150):
+            assert network.parts_of[call] == network.expected(call)
+        assert len(network.asked) == 250
+
+    def test_the_stream_takes_the_place_of_the_copy(self) -> None:
+        network = self.flooded(5)
+        for call in range(150):
+            network.ask(call)
+        before = {who: len(sent) for who, sent in network.sent.items()}
+        for call in range(150, 250):
+            network.ask(call)
+        for who, of_each in (("robot", 1), ("service", 3)):
+            sent = [each for each in network.sent[who][before[who] :] if each.kind in (1, 2, 6)]
+            assert len(sent) == 2 * of_each * 100
+            assert sum(each.datagram for each in sent) == of_each * 100
+
+    def test_what_is_hedged_is_answered_by_datagrams_where_the_stream_is_held_up(self) -> None:
+        network = self.flooded(6)
+        for call in range(150):
+            network.ask(call)
+        # What the service sends there does not come; what the robot sends comes first.
+        ways = network.answers._sender.ways
+        network.answers._sender.ways = ways._replace(stream=lambda _number, _message: None)
+        for call in range(150, 200):
+            network.ask(call)
+            assert network.parts_of[call] == network.expected(call)
+
+    def test_nothing_goes_there_any_more_when_the_flood_is_over(self) -> None:
+        network = self.flooded(7)
+        for call in range(150):
+            network.ask(call)
+        network.drop = lambda _who, _kind: False
+        for call in range(150, 300):
+            network.ask(call)
+        network.wait(2.0 * KEEP_ALIVE_S)  # a probe comes back
+        before = len(network.sent["robot"])
+        for call in range(300, 400):
+            network.ask(call)
+        asked = network.sent["robot"][before:]
+        assert len(asked) == 100
+        assert all(each.datagram for each in asked)
+
+
 class TestBudget:
     def test_a_way_that_loses_nearly_all_is_given_no_more_than_three_times_the_load(self) -> None:
         network = Network(delay_s=0.04)
@@ -405,6 +474,14 @@ class TestTheStream:
         answers = [sent.datagram for sent in network.sent["service"] if sent.kind == 2]
         assert answers == [True] * 3 + [False] * 3
         assert network.parts_of[2] == network.expected(2)
+
+    def test_a_large_question_is_not_copied(self) -> None:
+        """Nobody else is heard meanwhile."""
+        answers = Answers(Ways(lambda _: None, lambda _n, _m: None, lambda: 0))
+        message = bytearray(b"\1\0" + (1).to_bytes(4, "big") * 2 + b"\0\0" + bytes(2_000_000))
+        arrived = answers.received(cast(bytes, message), datagram=False)
+        assert arrived is not None and len(arrived.payload) == 2_000_000
+        assert np.shares_memory(np.frombuffer(arrived.payload, np.uint8), message)
 
     def test_a_large_part_among_small_ones(self) -> None:
         network = Network(parts=3)

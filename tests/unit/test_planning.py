@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -394,6 +395,19 @@ class TestDigest:
 
 
 class TestCheckpoint:
+    def test_its_arrays_are_copied_once(self) -> None:
+        """And that by NumPy, which lets other threads go on meanwhile."""
+        count = 100_000
+        belief = Belief(np.zeros((count, 3)), np.full(count, 1.0 / count))
+        data = encode_checkpoint(PlanningState(0, 0, 0, 0, False, belief))
+        tracemalloc.start()
+        try:
+            decode_checkpoint(data)
+            _, peak = tracemalloc.get_traced_memory()
+        finally:
+            tracemalloc.stop()
+        assert peak < 1.5 * len(data)
+
     def test_round_trip(self, problem: Problem) -> None:
         configured = planning_settings(resampling_threshold=0.0)
         state = planning.initial_state(problem, configured, SEED, TRIAL)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tracemalloc
+from typing import cast
 
 import msgspec
 import numpy as np
@@ -269,6 +270,16 @@ def test_an_opening_has_a_bounded_size() -> None:
     with pytest.raises(MessageError, match=f"at most {MAX_OPENING_BYTES} are") as raised:
         decode_request(encode(request))
     assert raised.value.code == "too_large"
+
+
+def test_a_checkpoint_is_not_copied() -> None:
+    """To copy a large one would hold up all other threads."""
+    request = msgspec.structs.replace(REQUEST, observations=(), checkpoint=bytes(100_000))
+    payload = bytearray(encode(request))
+    decoded = decode_request(cast(bytes, payload))
+    assert decoded == request
+    assert decoded.checkpoint is not None
+    assert np.shares_memory(np.frombuffer(decoded.checkpoint, np.uint8), payload)
 
 
 @pytest.mark.parametrize("version", [0, 1, 127, 128, 255, 256, 65535, 65536, 2**32 - 1])

@@ -275,7 +275,9 @@ class Job:
             state = planner.advance(state, planner.choose_task_action(state))
         return state
 
-    def _restored(self, planner: Planner, request: Request, checkpoint: bytes) -> PlanningState:
+    def _restored(
+        self, planner: Planner, request: Request, checkpoint: bytes | memoryview
+    ) -> PlanningState:
         state = decode_checkpoint(checkpoint)
         check_state(planner.problem, planner.settings, state)
         for name, came, asked in (

@@ -8,8 +8,9 @@ The link is what its owner knows from streams: it takes frames of calls, hands o
 and is lost once. It is lost
 
 - at once when the other end closes the stream, which the system does for a process that dies;
-- when the system says that nobody has the service's port any more, and nobody answers a datagram
-  that is sent then: the first by itself could be said by anyone;
+- when the service's host says that nobody has its port any more, and quotes a datagram that was
+  sent there lately. Anybody can say the first (ICMP has no keys), but only who has seen the
+  datagram can quote what was sealed; and who sees what is sent can reset a stream as well;
 - when nothing comes for the lease, neither on the stream nor beside it.
 
 It is not lost when the stream breaks in any other way while datagrams come: a robot's address has
@@ -22,6 +23,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import errno
+import os
 import socket
 import struct
 from collections import deque
@@ -77,6 +79,20 @@ _CLOSED_TO_DATAGRAMS_S: Final = 3.0
 _PROBES_OF_DOUBT: Final = 3
 _PROBE_DISTANCE_S: Final = 0.003
 _PROBES_BEFORE_NEW_SOCKET: Final = 2
+
+_REPORTS_ERRORS: Final = {
+    socket.AF_INET: (socket.IPPROTO_IP, 11),
+    socket.AF_INET6: (socket.IPPROTO_IPV6, 25),
+}
+"""Linux's IP_RECVERR and IPV6_RECVERR: errors are kept with what they quote."""
+
+_ERROR: Final = struct.Struct("=I")
+_ERROR_BYTES: Final = 512
+_QUOTED_BYTES: Final = 32
+"""Of a datagram: eight that can be guessed, and 24 sealed ones. None of ours is shorter."""
+
+_QUOTABLE: Final = 64
+"""The last datagrams, more than are on their way at a time."""
 
 _OVERRUN: Final = "sends more datagrams than can be heard beside those of others"
 
@@ -147,7 +163,7 @@ class _DatagramLink(Link):
         raise NotImplementedError
 
     def _lost_of_theirs(self) -> int:
-        return 0 if self._sealing is None else self._sealing.window.lost
+        return 1 if self._sealing is None else self._sealing.window.lost  # 1: nobody knows
 
     # -- receiving -------------------------------------------------------------------------------
 
@@ -280,7 +296,7 @@ class RobotDatagramLink(_DatagramLink):
         super().__init__(owner, settings, speaks_first=True, tls=tls)
         self._questions = Questions(self._ways)
         self._socket: socket.socket | None = None
-        self._doubting = False
+        self._sent: deque[bytes] = deque(maxlen=_QUOTABLE)
         self._closed_since: float | None = None
         self._told_closed = False
 
@@ -335,6 +351,7 @@ class RobotDatagramLink(_DatagramLink):
             opened.setblocking(False)
             # Connected, it hears from nobody else, and hears when nobody has the service's port.
             opened.connect(self._peer_address)
+            opened.setsockopt(*_REPORTS_ERRORS[family], 1)
         except OSError:
             opened.close()
             return  # it is tried again with the next probe
@@ -348,16 +365,17 @@ class RobotDatagramLink(_DatagramLink):
             self._socket = None
 
     def _put(self, datagram: bytes) -> None:
-        if self._socket is None:
-            return
-        try:
-            self._socket.send(datagram)
-        except ConnectionRefusedError:
-            self._refused()
-        except OSError as error:
-            # It is lost, as any datagram may be.
-            if error.errno in _NO_WAY:
-                self._close_socket()
+        self._sent.append(datagram[:_QUOTED_BYTES])
+        for _ in range(2):
+            if self._socket is None:
+                return
+            try:
+                self._socket.send(datagram)
+            except OSError as error:
+                # What became of an earlier one is told instead of sending this one.
+                if self._failed(error):
+                    continue
+            return  # else it is lost, as any datagram may be
 
     def _readable(self, opened: socket.socket) -> None:
         for _ in range(_DATAGRAMS_AT_ONCE):
@@ -367,14 +385,32 @@ class RobotDatagramLink(_DatagramLink):
                 datagram = opened.recv(_LARGEST_DATAGRAM)
             except (BlockingIOError, InterruptedError):
                 break
-            except ConnectionRefusedError:
-                self._refused()
-                continue
             except OSError as error:
-                if error.errno in _NO_WAY:
-                    self._close_socket()
+                if self._failed(error):
+                    continue
                 return
             self.take_datagram(datagram, self._peer_address)
+
+    def _failed(self, error: OSError) -> bool:
+        """Find out what an error is about; return whether it is about a datagram of before."""
+        about_earlier = False
+        for _ in range(_DATAGRAMS_AT_ONCE):
+            if self._socket is None:
+                return False
+            try:
+                quoted, told, _, _ = self._socket.recvmsg(
+                    _QUOTED_BYTES, _ERROR_BYTES, socket.MSG_ERRQUEUE
+                )
+            except OSError:
+                break
+            about_earlier = True
+            refused = any(_ERROR.unpack_from(each)[0] == errno.ECONNREFUSED for *_, each in told)
+            if refused and quoted in self._sent and self._questions.open:
+                self.end("is gone: nobody has its port any more", abort=True)
+                return False
+        if not about_earlier and error.errno in _NO_WAY:
+            self._close_socket()
+        return about_earlier
 
     def _received(self, message: bytes, *, datagram: bool) -> None:
         self._hand_over(self._questions.received(message, self._loop.time(), datagram=datagram))
@@ -389,14 +425,8 @@ class RobotDatagramLink(_DatagramLink):
             else:
                 self._owner.received(self, Frame(LAST if last else REPLY, call, payload))
 
-    def _refused(self) -> None:
-        """Find out whether the service is gone, as the system says."""
-        if self._questions.open and not self._doubting:
-            self._doubt("is gone: nobody has its port any more")
-
-    def _doubt(self, reason: str) -> None:
+    def _doubt(self) -> None:
         """End the link if no datagram is answered now."""
-        self._doubting = True
         now = self._loop.time()
         for k in range(_PROBES_OF_DOUBT):
             self._loop.call_later(k * _PROBE_DISTANCE_S, self._probe)
@@ -404,24 +434,22 @@ class RobotDatagramLink(_DatagramLink):
             self._questions.round_trips.patience_s + _PROBES_OF_DOUBT * _PROBE_DISTANCE_S,
             self._decide,
             now,
-            reason,
         )
 
     def _probe(self) -> None:
         if not self._ended:
             self._questions.probe(self._loop.time())
 
-    def _decide(self, since: float, reason: str) -> None:
-        self._doubting = False
+    def _decide(self, since: float) -> None:
         if not self._ended and self._datagram_heard_at <= since:
-            self.end(reason, abort=True)
+            self.end("has broken the connection, and answers no datagram", abort=True)
 
     # -- the stream breaks -----------------------------------------------------------------------
 
     def _drift(self) -> bool:
         if not self._questions.open or not super()._drift():
             return False
-        self._doubt("has broken the connection, and answers no datagram")
+        self._doubt()
         self._owner.went_adrift(self)
         return True
 
@@ -580,7 +608,6 @@ class _DatagramSocket:
     def __init__(self, address: Any) -> None:
         self._loop = asyncio.get_running_loop()
         self._links: dict[int, ServiceDatagramLink] = {}
-        self._next = 0
         family = socket.AF_INET6 if len(address) == 4 else socket.AF_INET
         self._socket = socket.socket(family, socket.SOCK_DGRAM)
         try:
@@ -598,12 +625,11 @@ class _DatagramSocket:
 
     def add(self, link: ServiceDatagramLink) -> Keys:
         """Draw keys for a link."""
-        while self._next in self._links:
-            self._next = (self._next + 1) % (1 << 32)
-        keys = Keys.draw(self._next)
-        self._links[self._next] = link
-        self._next = (self._next + 1) % (1 << 32)
-        return keys
+        # Whoever sees no datagram cannot name one: what is forged blindly is not even deciphered.
+        while (association := int.from_bytes(os.urandom(4))) in self._links:
+            pass
+        self._links[association] = link
+        return Keys.draw(association)
 
     def remove(self, association: int) -> None:
         """Take no more datagrams of an association."""

@@ -21,12 +21,18 @@ dozen probes, and as if some were lost. All that is sent again is paid for from 
 the bytes that were sent for the first time, so a way in trouble is never given more than three
 times the load.
 
+Where many are lost, as while somebody floods the service's port, the copy goes on the stream
+instead, and so do those of the answer (a *hedge*): when a question has been asked twice and nothing
+was heard of it; at once if a quarter of the last datagrams did not come, and after such a question
+until a probe comes back. Whichever comes first counts.
+
 A message is::
 
     kind       1 byte
     lost       1 byte: of the last 128 datagrams of the other end, how many did not come
     question:  number (4), settled (4): all below it are answered, have (2): parts of the answer
                that the robot has, then the payload
+    hedge:     a question that was sent as a datagram, too
     reply:     number (4), index (2): of the part, with two bits that say whether it is the last,
                and the end alone, then the payload
     working:   number (4): the question has come, and there is no part yet that the robot lacks
@@ -39,9 +45,9 @@ import heapq
 import math
 import struct
 from collections.abc import Callable
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, cast
 
-from holdfast.transport.sealing import KNOWN_AFTER, OVERHEAD
+from holdfast.transport.sealing import KNOWN_AFTER, LOSS_SAMPLE, OVERHEAD
 
 __all__ = [
     "COPY_DELAY_S",
@@ -59,7 +65,7 @@ __all__ = [
     "Ways",
 ]
 
-_QUESTION, _REPLY, _WORKING, _PROBE, _ECHO = range(1, 6)
+_QUESTION, _REPLY, _WORKING, _PROBE, _ECHO, _HEDGE = range(1, 7)
 
 _QUESTION_HEAD: Final = struct.Struct(">IIH")
 _REPLY_HEAD: Final = struct.Struct(">IH")
@@ -104,6 +110,11 @@ _SILENCE_IN_PATIENCES: Final = 2.9
 heard; then they take the stream."""
 
 _PROBES_BEFORE_SILENCE: Final = 3
+
+_LARGE_BYTES: Final = 1 << 20
+
+_HEDGED_LOSS: Final = LOSS_SAMPLE // 4
+_ASKED_BEFORE_HEDGE: Final = 2
 
 _NEWEST: Final = 4
 _FIRST_PROBES_S: Final = 0.005
@@ -188,7 +199,7 @@ class Part(NamedTuple):
 
 
 class Arrived(NamedTuple):
-    """A question, as it arrives at the service."""
+    """A question, as it arrives at the service; the payload of a large one is a view of it."""
 
     number: int
     payload: bytes
@@ -209,7 +220,7 @@ class _Sender:
         return self._copies[0][0] if self._copies else math.inf
 
     def stream(self, number: int, kind: int, body: bytes) -> None:
-        self.ways.stream(number, bytes((kind, 0)) + body)
+        self.ways.stream(number, bytes((kind, min(255, self.ways.lost()))) + body)
 
     def first(self, kind: int, body: bytes, now: float, wanted: Callable[[], bool]) -> None:
         """Send a datagram for the first time, and plan a copy while the way loses some."""
@@ -220,6 +231,11 @@ class _Sender:
             self._num_copies += 1
             copy = (now + COPY_DELAY_S, self._num_copies, kind, body, wanted)
             heapq.heappush(self._copies, copy)
+
+    def hedge(self, number: int, kind: int, body: bytes) -> None:
+        """Send on the stream what was sent as a datagram; it is paid for as a copy is."""
+        self._budget_bytes -= _size(body)
+        self.stream(number, kind, body)
 
     def again(self, kind: int, body: bytes) -> None:
         """Send a datagram again, if the budget allows it."""
@@ -255,6 +271,7 @@ class _Question:
         "early",
         "have",
         "heard",
+        "hedged",
         "number",
         "on_stream",
         "payload",
@@ -272,7 +289,7 @@ class _Question:
         self.have = 0
         self.heard = False
         self.early: dict[int, tuple[bytes | None, bool]] = {}
-        self.on_stream = False
+        self.on_stream = self.hedged = False
         self.wait_s = 0.0
         self.due_at = math.inf
 
@@ -306,6 +323,7 @@ class Questions:
         self._first_probes = 0
         self._unheard = 0
         self._unheard_since = math.inf
+        self._hedges = False
         self.open = False
         self.round_trips = RoundTrips()
         self.heard_at = -math.inf
@@ -361,8 +379,10 @@ class Questions:
             _QUESTION,
             self._body(question),
             now,
-            lambda: question.number in self._questions and not question.heard,
+            lambda: question.number in self._questions and not (question.heard or question.hedged),
         )
+        if self._hedges or self._sender.lost_of_ours >= _HEDGED_LOSS:
+            self._hedge(question)
 
     def forget(self, call: int) -> None:
         """Ask no more for what is still to come of a call."""
@@ -400,7 +420,7 @@ class Questions:
             self._probes = self._unheard = 0
             if not self._first_probes:
                 self._probe_at = now + KEEP_ALIVE_S
-            self._sender.lost_of_ours = message[1]
+        self._sender.lost_of_ours = message[1]
         kind, body = message[0], message[2:]
         if kind == _REPLY and len(body) >= _REPLY_HEAD.size:
             number, index = _REPLY_HEAD.unpack_from(body)
@@ -414,6 +434,7 @@ class Questions:
                 question.wait_s = max(question.wait_s, _SIGNS_S)
                 question.due_at = now + question.wait_s
         elif kind == _ECHO and len(body) == _PROBE_HEAD.size:
+            self._hedges = False
             round_trip_s = now - _PROBE_HEAD.unpack(body)[0]
             if self.round_trips.smoothed_s is None and 0.0 <= round_trip_s <= 60.0:
                 self.round_trips.add(round_trip_s)
@@ -435,6 +456,9 @@ class Questions:
                 self._fall_silent(now)
                 return
             question.wait_s = min(_LONGEST_WAIT_S, 2.0 * question.wait_s)
+            if question.times >= _ASKED_BEFORE_HEDGE and not question.heard:
+                self._hedges = True
+                self._hedge(question)
             self._ask_again(question, now)
         if self._probe_at <= now:
             if self.open and self._probes >= _PROBES_BEFORE_SILENCE:
@@ -454,6 +478,12 @@ class Questions:
                 self._put_on_stream(question)
         self._probes = self._unheard = 0
         self.probe(now)
+
+    def _hedge(self, question: _Question) -> None:
+        """Ask on the stream as well, once."""
+        if not question.hedged:
+            question.hedged = True
+            self._sender.hedge(question.number, _HEDGE, self._body(question))
 
     def _put_on_stream(self, question: _Question) -> None:
         question.on_stream = True
@@ -521,10 +551,11 @@ class Questions:
 class _Answer:
     """What a service has answered so far."""
 
-    __slots__ = ("done", "on_stream", "parts")
+    __slots__ = ("done", "hedged", "on_stream", "parts")
 
     def __init__(self, on_stream: bool) -> None:
         self.on_stream = on_stream
+        self.hedged = False
         self.parts: list[bytes | None] = []
         self.done = False
 
@@ -559,21 +590,27 @@ class Answers:
         """
         if len(message) < 2:
             return None
-        if datagram:
-            self._sender.lost_of_ours = message[1]
-        kind, body = message[0], message[2:]
+        self._sender.lost_of_ours = message[1]
+        # A copy of a large one would hold up all others.
+        view = message if len(message) < _LARGE_BYTES else cast(bytes, memoryview(message))
+        kind, body = message[0], view[2:]
         if kind == _PROBE and len(body) == _PROBE_HEAD.size and datagram:
             self._sender.small(_ECHO, body)
-        if kind != _QUESTION or len(body) < _QUESTION_HEAD.size:
+        hedge = kind == _HEDGE and not datagram
+        if not (hedge or kind == _QUESTION) or len(body) < _QUESTION_HEAD.size:
             return None
         number, settled, have = _QUESTION_HEAD.unpack_from(body)
         self._settle(min(settled, number))
         answer = self._answers.get(number)
         if answer is not None:
-            self._asked_again(number, answer, have, datagram=datagram)
+            if hedge:
+                self._hedge(number, answer, have)
+            else:
+                self._asked_again(number, answer, have, datagram=datagram)
             return None
-        if not self._enter(number, on_stream=not datagram):
+        if not self._enter(number, on_stream=not (datagram or hedge)):
             return None
+        self._answers[number].hedged = hedge
         return Arrived(number, body[_QUESTION_HEAD.size :])
 
     def passed_over(self, number: int) -> bool:
@@ -618,11 +655,20 @@ class Answers:
             self._sender.stream(number, _REPLY, body)
             return
         answer.parts.append(body)
-        self._sender.first(_REPLY, body, now, lambda: number in self._answers)
+        self._sender.first(_REPLY, body, now, lambda: number in self._answers and not answer.hedged)
+        if answer.hedged:
+            self._sender.hedge(number, _REPLY, body)
 
     def expire(self, now: float) -> None:
         """Do what is due."""
         self._sender.expire(now)
+
+    def _hedge(self, number: int, answer: _Answer, have: int) -> None:
+        """Answer on the stream as well, and go on so."""
+        answer.hedged = True
+        for body in answer.parts[have:]:
+            if body is not None:
+                self._sender.hedge(number, _REPLY, body)
 
     def _asked_again(self, number: int, answer: _Answer, have: int, *, datagram: bool) -> None:
         lacks = [part for part in answer.parts[have:] if part is not None]
