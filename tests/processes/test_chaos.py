@@ -1,15 +1,16 @@
-"""``holdfast chaos`` with real processes: what it finds, what it leaves, and how it ends."""
+"""``holdfast chaos`` with real processes: what it finds, what it leaves, and how it ends.
+
+What it makes of two runs: unit/test_chaos_verdicts.py.
+"""
 
 from __future__ import annotations
 
-import contextlib
 import csv
 import json
 import os
 import re
 import shlex
 import signal
-import sqlite3
 import subprocess
 import sys
 import threading
@@ -31,14 +32,11 @@ from holdfast.chaos.schedule import (
     kinds_over,
 )
 from holdfast.chaos.trial import Pace, TrialOutcome, run_chaos_trial
-from holdfast.chaos.twin import keep_undisturbed
 from holdfast.chaos.world import performances
-from holdfast.configuration import Configuration, load
 
 PATIENCE_S = 240.0
 COMMAND = (sys.executable, "-m", "holdfast", "chaos")
 BRIEF = Pace(min_steps=60, rate_hz=60.0)
-UNDISTURBED = Pace(min_steps=20, rate_hz=1000.0)
 
 
 def schedule_of(
@@ -86,49 +84,6 @@ def test_a_cloud_and_a_robot_are_killed(tmp_path: Path, wire: Wire) -> None:
     performed = list(performances(tmp_path / "performed-disturbed.txt"))
     assert len(performed) == outcome.steps
     assert len({each.process for each in performed}) == 2
-
-
-def test_what_the_world_tells_is_believed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The twin is made to do one step less: so the robot has done one too many."""
-
-    def shorten(path: Path, *arguments: object) -> None:
-        keep_undisturbed(path, *arguments)  # type: ignore[arg-type]
-        performed = tmp_path / "performed-undisturbed.txt"
-        lines = performed.read_text().splitlines(keepends=True)
-        performed.write_text("".join(lines[:-1]))
-
-    monkeypatch.setattr("holdfast.chaos.trial.keep_undisturbed", shorten)
-    outcome = run(schedule_of(kind=FaultKind.COMBINATION), tmp_path, UNDISTURBED)
-    assert outcome.verdict == "diverged"
-    assert "the world was acted on otherwise" in outcome.reason
-    assert "expected nothing, found trial" in outcome.reason
-
-
-def test_what_the_journals_tell_is_believed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def keep_another(path: Path, configuration: Configuration, *arguments: object) -> None:
-        other = load(configuration.path, seed=12)
-        keep_undisturbed(path, other, *arguments)  # type: ignore[arg-type]
-
-    monkeypatch.setattr("holdfast.chaos.trial.keep_undisturbed", keep_another)
-    outcome = run(schedule_of(kind=FaultKind.COMBINATION), tmp_path, UNDISTURBED)
-    assert outcome.verdict == "diverged"
-    assert outcome.reason.startswith("different: seed")
-
-
-def test_a_journal_that_is_damaged_has_failed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def damage(path: Path, *arguments: object) -> None:
-        keep_undisturbed(path, *arguments)  # type: ignore[arg-type]
-        with contextlib.closing(sqlite3.connect(path / "journal.sqlite")) as journal, journal:
-            journal.execute("UPDATE meta SET value = value || ' ' WHERE key = 'configuration'")
-
-    monkeypatch.setattr("holdfast.chaos.trial.keep_undisturbed", damage)
-    outcome = run(schedule_of(kind=FaultKind.COMBINATION), tmp_path, UNDISTURBED)
-    assert outcome.verdict == "failed"
-    assert "journal.sqlite: the journal is damaged" in outcome.reason
 
 
 def test_a_robot_that_ends_by_itself_has_failed(tmp_path: Path) -> None:

@@ -31,7 +31,10 @@ def limited(limits: str, *command: str) -> tuple[str, ...]:
     return ("sh", "-c", f'ulimit {limits} && exec "$@"', "sh", *command)
 
 
-@pytest.mark.parametrize("number", [8, 9, 10, 12, NEEDED - 1])
+@pytest.mark.parametrize(
+    "number",
+    [8, NEEDED - 1, *(pytest.param(number, marks=pytest.mark.slow) for number in (9, 10, 12))],
+)
 @pytest.mark.parametrize("command", ["run", "serve"])
 def test_too_few_are_refused_in_one_line(site: Site, command: str, number: int) -> None:
     port = free_port()
