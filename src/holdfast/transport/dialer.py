@@ -222,8 +222,10 @@ class Dialer:
 
     def _failed(self, address: _Address, number: int | None) -> None:
         # A host may have addresses of two kinds, and be reached over one alone.
-        self._failures[address] = _reason(number)
-        reasons = [self._failures.get(address) for _, address in self._addresses]
+        failures = {**self._failures, address: _reason(number)}
+        reasons = [failures.get(address) for _, address in self._addresses]
+        # A name may lead to other addresses each time that it is looked up.
+        self._failures = {each: failures[each] for _, each in self._addresses if each in failures}
         if None not in reasons:
             self._on_failed("; ".join(dict.fromkeys(filter(None, reasons))))
 
