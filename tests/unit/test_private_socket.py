@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
@@ -80,3 +81,37 @@ def test_too_long_a_path_is_said(temporary: Path, monkeypatch: pytest.MonkeyPatc
     with pytest.raises(TransportError, match="TMPDIR"):
         PrivateSocket()
     assert list(long.iterdir()) == []
+
+
+def test_a_link_to_a_directory_is_not_followed(temporary: Path) -> None:
+    victim = temporary / "victim"
+    victim.mkdir(mode=0o700)
+    for name in ("s", "lock"):
+        (victim / name).touch()
+    before = sorted(victim.iterdir())
+    (temporary / f"holdfast-{os.getuid()}-planted").symlink_to(victim)
+    with PrivateSocket():
+        pass
+    assert sorted(victim.iterdir()) == before
+
+
+def test_a_directory_that_others_can_enter_is_none_of_ours(temporary: Path) -> None:
+    other = temporary / f"holdfast-{os.getuid()}-other"
+    other.mkdir()
+    other.chmod(0o755)
+    for name in ("s", "lock"):
+        (other / name).touch()
+    with PrivateSocket():
+        pass
+    assert sorted(file.name for file in other.iterdir()) == ["lock", "s"]
+
+
+def test_files_of_another_name_are_kept(temporary: Path) -> None:
+    abandoned = temporary / f"holdfast-{os.getuid()}-abandoned"
+    abandoned.mkdir(mode=0o700)
+    for name in ("s", "lock", "notes"):
+        (abandoned / name).touch()
+    with PrivateSocket() as local:
+        (directory_of(local.endpoint) / "notes").touch()
+    assert [file.name for file in abandoned.iterdir()] == ["notes"]
+    assert [file.name for file in directory_of(local.endpoint).iterdir()] == ["notes"]

@@ -8,11 +8,14 @@ anything is opened, and what cannot work is refused with the reason.
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
 import ipaddress
 import os
 import re
 import socket
+import stat
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple, Self
 
@@ -58,7 +61,9 @@ _RENAMED = {
 }
 """Protocols of earlier releases, and what to write instead."""
 
-_LOCK = "lock"
+_SOCKET, _LOCK = "s", "lock"
+"""What a local socket's directory contains."""
+
 _HOST_NAME = re.compile(
     r"(?=.{1,253}\Z)[A-Za-z0-9_]([A-Za-z0-9_-]*[A-Za-z0-9_])?(\.[A-Za-z0-9_-]+)*"
 )
@@ -195,7 +200,7 @@ class PrivateSocket:
         while self._lock < 0:
             self._directory = Path(tempfile.mkdtemp(prefix=prefix))  # made with mode 0700
             self._lock = _locked(self._directory)
-        self.endpoint = f"{_UNIX}/{self._directory / 's'}"
+        self.endpoint = f"{_UNIX}/{self._directory / _SOCKET}"
         try:
             parse_endpoint(self.endpoint)
         except TransportError as error:
@@ -205,9 +210,10 @@ class PrivateSocket:
             ) from None
 
     def remove(self) -> None:
-        """Remove the directory with what is left in it. May be repeated."""
-        _remove_directory(self._directory)
+        """Remove the socket and its directory. May be repeated."""
         if self._lock >= 0:
+            with contextlib.suppress(OSError), _opened(self._directory) as opened:
+                _remove_directory(self._directory, opened)
             os.close(self._lock)
             self._lock = -1
 
@@ -231,25 +237,43 @@ def _locked(directory: Path) -> int:
     return -1
 
 
+@contextlib.contextmanager
+def _opened(directory: Path) -> Iterator[int]:
+    """Open a directory of ours, never one that somebody else's link leads to.
+
+    Raises
+    ------
+    OSError
+        If it is none, or others can enter it.
+    """
+    opened = os.open(directory, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
+    try:
+        found = os.fstat(opened)
+        if found.st_uid != os.getuid() or stat.S_IMODE(found.st_mode) != 0o700:
+            raise PermissionError(errno.EPERM, os.strerror(errno.EPERM), str(directory))
+        yield opened
+    finally:
+        os.close(opened)
+
+
 def _remove_abandoned(parent: Path, prefix: str) -> None:
     """Remove the directories of sockets whose processes are gone."""
     for directory in parent.glob(f"{prefix}*"):
         # Of somebody else, just being made, or gone meanwhile: then it is not ours to remove.
-        with contextlib.suppress(OSError):
-            lock = os.open(directory / _LOCK, os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW)
+        with contextlib.suppress(OSError), _opened(directory) as opened:
+            lock = os.open(_LOCK, os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW, dir_fd=opened)
             try:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                _remove_directory(directory)
+                _remove_directory(directory, opened)
             finally:
                 os.close(lock)
 
 
-def _remove_directory(directory: Path) -> None:
-    with contextlib.suppress(OSError):
-        for file in directory.iterdir():
-            file.unlink(missing_ok=True)
-    with contextlib.suppress(OSError):
-        directory.rmdir()
+def _remove_directory(directory: Path, opened: int) -> None:
+    for name in (_SOCKET, _LOCK):
+        with contextlib.suppress(FileNotFoundError):
+            os.unlink(name, dir_fd=opened)
+    directory.rmdir()
 
 
 def parse_endpoint(text: str) -> Endpoint:
