@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
+import os
 import socket
+import threading
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -12,7 +15,9 @@ from tests.ports import free_port
 
 from holdfast.errors import TransportError
 from holdfast.service.listening import SharedEndpoints
+from holdfast.transport import listener
 from holdfast.transport.endpoints import Endpoint, parse_endpoint
+from holdfast.transport.listener import listen
 
 PATIENCE_S = 30.0
 
@@ -115,6 +120,68 @@ def test_a_local_socket_is_shared_and_removed(tmp_path: Path) -> None:
         with pytest.raises(TransportError, match="another process listens there"):
             SharedEndpoints(sockets.endpoints)
     assert not path.exists()
+
+
+def test_a_local_socket_of_another_service_is_kept(tmp_path: Path) -> None:
+    path = tmp_path / "socket"
+    with contextlib.ExitStack() as stack:
+        with shared(f"unix/{path}") as sockets:
+            path.unlink()
+            (endpoint,) = sockets.endpoints
+            other = stack.enter_context(listen(endpoint))
+        sockets.close()  # may be repeated
+        client = stack.enter_context(socket.socket(socket.AF_UNIX))
+        client.connect(str(path))
+        assert accepted([other]) == 1
+
+
+def test_of_two_that_start_at_once_on_what_is_left_one_listens(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "socket"
+    with socket.socket(socket.AF_UNIX) as killed:
+        killed.bind(str(path))
+    endpoint = parse_endpoint(f"unix/{path}")
+    listening: list[socket.socket] = []
+    refused: list[str] = []
+
+    def start() -> None:
+        try:
+            listening.append(listen(endpoint))
+        except TransportError as error:
+            refused.append(str(error))
+
+    second = threading.Thread(target=start)
+
+    class Slow(socket.socket):
+        def listen(self, *backlog: int) -> None:
+            if threading.current_thread() is not second:
+                second.start()
+                second.join(0.5)  # time to do what it must not
+            super().listen(*backlog)
+
+    monkeypatch.setattr(socket, "socket", Slow)
+    start()
+    second.join(PATIENCE_S)
+    for each in listening:
+        each.close()
+    assert len(listening) == 1
+    assert refused == [f"cannot listen on {endpoint}: another process listens there"]
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_directory_that_stays_locked_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(listener, "_LOCK_TIMEOUT_S", 0.0)
+    directory = os.open(tmp_path, os.O_RDONLY)
+    try:
+        fcntl.flock(directory, fcntl.LOCK_EX)
+        with pytest.raises(TransportError, match=f"another process has locked {tmp_path}"):
+            listen(parse_endpoint(f"unix/{tmp_path / 'socket'}"))
+    finally:
+        os.close(directory)
+    listen(parse_endpoint(f"unix/{tmp_path / 'socket'}")).close()
 
 
 def test_what_was_bound_is_closed_if_another_endpoint_cannot_be() -> None:

@@ -7,14 +7,14 @@ keeps the port while no process has one. A local socket is one file, so all proc
 
 from __future__ import annotations
 
-import contextlib
+import os
 import socket
 from collections.abc import Sequence
 from pathlib import Path
 
 from holdfast.errors import TransportError
 from holdfast.transport.endpoints import Endpoint
-from holdfast.transport.listener import BACKLOG, listen
+from holdfast.transport.listener import BACKLOG, listen, remove_socket_file
 
 __all__ = ["SharedEndpoints"]
 
@@ -39,6 +39,7 @@ class SharedEndpoints:
 
     def __init__(self, endpoints: Sequence[Endpoint]) -> None:
         self._bound: list[socket.socket] = []
+        self._files: list[tuple[Endpoint, os.stat_result]] = []
         self._listening: dict[int, list[socket.socket]] = {}
         bound = []
         for endpoint in endpoints:
@@ -75,15 +76,15 @@ class SharedEndpoints:
         """Give up all sockets and addresses; may be repeated."""
         for index in list(self._listening):
             self.give_up(index)
+        while self._files:
+            remove_socket_file(*self._files.pop())
         for bound in self._bound:
-            if bound.family == socket.AF_UNIX and bound.fileno() >= 0:
-                with contextlib.suppress(OSError):
-                    Path(bound.getsockname()).unlink()
             bound.close()
 
     def _bind(self, endpoint: Endpoint) -> Endpoint:
         if endpoint.is_local_socket:
             self._bound.append(listen(endpoint))
+            self._files.append((endpoint, Path(endpoint.host).stat()))
             return endpoint
         family, *_, where = socket.getaddrinfo(
             endpoint.host, endpoint.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE

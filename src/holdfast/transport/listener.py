@@ -10,11 +10,13 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import errno
+import fcntl
 import os
 import socket
 import stat
+import time
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
@@ -22,7 +24,7 @@ from holdfast.errors import TransportError
 from holdfast.transport.endpoints import Endpoint
 from holdfast.transport.links import OPENING_TIMEOUT_S
 
-__all__ = ["BACKLOG", "MAX_SILENT", "Listener", "listen", "one_too_many"]
+__all__ = ["BACKLOG", "MAX_SILENT", "Listener", "listen", "one_too_many", "remove_socket_file"]
 
 BACKLOG: Final = 1024
 """Connections that wait to be accepted."""
@@ -32,6 +34,10 @@ _ACCEPTED_AT_ONCE: Final = 32
 
 _PAUSE_S: Final = 0.1
 """After the system has refused to accept: no descriptor is free."""
+
+_LOCK_TIMEOUT_S: Final = 10.0
+_LOCK_PAUSE_S: Final = 0.01
+"""For the lock of a local socket's directory; whoever begins to listen holds it for a moment."""
 
 MAX_SILENT: Final = 256
 """Connections of which no byte has come."""
@@ -105,11 +111,7 @@ class Listener:
             self._pause.cancel()
         self._loop.remove_reader(self._socket)
         if self._socket_file is not None:
-            path = Path(self.endpoint.host)
-            # Not if another one listens there meanwhile.
-            with contextlib.suppress(OSError):
-                if os.path.samestat(path.stat(), self._socket_file):
-                    path.unlink()
+            remove_socket_file(self.endpoint, self._socket_file)
         self._socket.close()
         for connection in list(self._silent):
             self._forget(connection)
@@ -195,19 +197,37 @@ def listen(endpoint: Endpoint) -> socket.socket:
         If it cannot.
     """
     if endpoint.is_local_socket:
-        _remove_stale_socket(endpoint)
-        family, address = socket.AF_UNIX, endpoint.host
-        made = socket.socket(family, socket.SOCK_STREAM)
-    else:
-        # As bytes, for the codec of other letters takes long to load.
-        host = endpoint.host.encode() if endpoint.host.isascii() else endpoint.host
-        found = socket.getaddrinfo(
-            host, endpoint.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
-        )
-        family, _, _, _, address = found[0]  # type: ignore[assignment]
-        made = socket.socket(family, socket.SOCK_STREAM)
-        # A service that is started again may have the port of the one that died.
-        made.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        # Who has bound and does not listen yet looks as if it had been killed.
+        with _locked(Path(endpoint.host).parent, endpoint):
+            _remove_stale_socket(endpoint)
+            return _listening(socket.socket(socket.AF_UNIX), endpoint.host)
+    # As bytes, for the codec of other letters takes long to load.
+    host = endpoint.host.encode() if endpoint.host.isascii() else endpoint.host
+    family, *_, address = socket.getaddrinfo(
+        host, endpoint.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+    )[0]
+    made = socket.socket(family)
+    # A service that is started again may have the port of the one that died.
+    made.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    return _listening(made, address)
+
+
+def remove_socket_file(endpoint: Endpoint, made: os.stat_result) -> None:
+    """Remove a local socket's file, unless somebody else listens there meanwhile.
+
+    Parameters
+    ----------
+    endpoint : Endpoint
+    made : os.stat_result
+        Of the file as it was made. Its socket is still open, so no other file is taken for it.
+    """
+    path = Path(endpoint.host)
+    with contextlib.suppress(OSError):
+        if os.path.samestat(path.stat(), made):
+            path.unlink()
+
+
+def _listening(made: socket.socket, address: Any) -> socket.socket:
     try:
         made.bind(address)
         made.listen(BACKLOG)
@@ -215,6 +235,28 @@ def listen(endpoint: Endpoint) -> socket.socket:
         made.close()
         raise
     return made
+
+
+@contextlib.contextmanager
+def _locked(directory: Path, endpoint: Endpoint) -> Iterator[None]:
+    """Let nobody else begin to listen in a directory meanwhile; the lock leaves no file behind."""
+    opened = os.open(directory, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        until = time.monotonic() + _LOCK_TIMEOUT_S
+        while True:
+            try:
+                fcntl.flock(opened, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            except BlockingIOError:
+                if time.monotonic() >= until:
+                    raise TransportError(
+                        f"cannot listen on {endpoint}: another process has locked {directory} "
+                        f"for {_LOCK_TIMEOUT_S:g} s"
+                    ) from None
+                time.sleep(_LOCK_PAUSE_S)
+        yield
+    finally:
+        os.close(opened)
 
 
 def _remove_stale_socket(endpoint: Endpoint) -> None:
