@@ -933,6 +933,12 @@ class TestStreams:
         with pytest.raises(TransportError, match=f"cannot listen on {endpoint}: Address already"):
             robot.start(Inbox())
 
+    async def test_an_address_of_another_machine_is_an_error_that_says_so(self) -> None:
+        service = StreamServiceTransport("cloud", boot="b1", listen=["tcp/192.0.2.1:7447"])
+        reason = r"tcp/192\.0\.2\.1:7447: .*: this machine has no such address \(0\.0\.0\.0"
+        with pytest.raises(TransportError, match=reason):
+            await service.start(echo)
+
     async def test_one_bad_endpoint_of_two_is_an_error(self, tcp: StreamWire) -> None:
         taken, free = tcp.endpoint("taken"), tcp.endpoint("free")
         await tcp.service("taken", "b1").start(echo)
@@ -1527,9 +1533,9 @@ class TestUnreachable:
             assert wire.refusals[1] == ("cloud", reason)
 
     async def test_a_name_that_nobody_has(self, tcp: StreamWire) -> None:
-        # A label this long exists nowhere, and no server need be asked to know it.
-        host = "a" * 70 + ".invalid"
-        tcp._endpoints["cloud"] = f"tcp/{host}:7447"
+        # No server need be asked to know that there is no such network interface.
+        host = "fe80::1%absent"
+        tcp._endpoints["cloud"] = f"tcp/[{host}]:7447"
         assert await self.told(tcp) == f"host name not found: {host}"
 
     async def test_of_a_host_one_of_whose_addresses_answers_nothing_is_told(

@@ -34,6 +34,27 @@ from holdfast.transport.key_ring import make_credentials
         (["--processes", "2", "--connect", "tcp/127.0.0.1:1"], ["--connect"]),
         (["--processes", "2", "--until-stdin-closes"], ["--until-stdin-closes"]),
         (["--processes", "2", "--health", "here"], ["here"]),
+        *(
+            (
+                ["--listen", f"tcp/{host}:7447", "--insecure", option, f"{other}:7447"],
+                [f"{option} {other}:7447", f"--listen tcp/{host}:7447", "same port"],
+            )
+            for host, other, option in (
+                ("127.0.0.1", "127.0.0.1", "--health"),
+                ("0.0.0.0", "127.0.0.1", "--metrics"),
+                ("[::1]", "[::]", "--health"),
+            )
+        ),
+        (["--health", "7447", "--processes", "2"], ["--health 127.0.0.1:7447", "same port"]),
+        *(
+            ([*options, f"{'b' * 70}.example:7447"], ["b" * 70, "at most 63"])
+            for options in (["--health"], ["--processes", "2", "--metrics"])
+        ),
+        *(
+            (["--insecure", *options, "--listen", f"tcp/{host}:7447"], [host, "at most"])
+            for options in ([], ["--processes", "2"])
+            for host in (f"{'b' * 70}.example", f"[fe80::1%{'a' * 70}\u00e9]")
+        ),
     ],
 )
 def test_it_says_why(

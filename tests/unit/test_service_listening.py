@@ -184,6 +184,12 @@ def test_a_directory_that_stays_locked_is_named(
     listen(parse_endpoint(f"unix/{tmp_path / 'socket'}")).close()
 
 
+def test_an_address_of_another_machine() -> None:
+    endpoint = parse_endpoint(f"tcp/192.0.2.1:{free_port()}")
+    with pytest.raises(TransportError, match=f"{endpoint}: .*: this machine has no such address"):
+        SharedEndpoints([endpoint])
+
+
 def test_what_was_bound_is_closed_if_another_endpoint_cannot_be() -> None:
     with socket.socket() as other:
         other.bind(("127.0.0.1", free_port()))
@@ -194,3 +200,10 @@ def test_what_was_bound_is_closed_if_another_endpoint_cannot_be() -> None:
             SharedEndpoints([free, taken])
     with shared(str(free)) as sockets:
         assert sockets.endpoints == (free,)
+
+
+def test_no_local_socket_is_left_if_another_endpoint_cannot_be(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(TransportError, match="there is a file of that name"):
+        SharedEndpoints([parse_endpoint(f"unix/{tmp_path / name}") for name in ("free", "file")])
+    assert not (tmp_path / "free").exists()

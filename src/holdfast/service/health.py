@@ -11,13 +11,13 @@ from __future__ import annotations
 
 import asyncio
 import errno
-import os
 import re
 import socket
 from collections.abc import Awaitable, Callable, Mapping
 from typing import NamedTuple, TypeAlias
 
-from holdfast.errors import HoldfastError
+from holdfast.errors import HoldfastError, TransportError
+from holdfast.transport.endpoints import parse_host, why_not_bound
 
 __all__ = [
     "HealthError",
@@ -101,15 +101,13 @@ def parse_http_address(text: str) -> HttpAddress:
         If it is neither.
     """
     host, colon, port = text.rpartition(":")
-    if colon and host.startswith("[") and host.endswith("]"):
-        host = host[1:-1]
-    elif ":" in host or (colon and not host):
-        raise HealthError(
-            f"{text!r} is no HOST:PORT, as in 127.0.0.1:9090, 0.0.0.0:9090 or [::1]:9090"
-        )
+    try:
+        host = parse_host(host) if colon else _LOOPBACK
+    except TransportError as error:
+        raise HealthError(f"{text!r} is no HOST:PORT: {error}") from None
     if not re.fullmatch("[0-9]{1,5}", port) or int(port) > 65535:
         raise HealthError(f"{text!r}: port {port!r} is not a whole number from 0 to 65535")
-    return HttpAddress(host or _LOOPBACK, int(port))
+    return HttpAddress(host, int(port))
 
 
 class HttpServer:
@@ -149,10 +147,8 @@ class HttpServer:
         except OSError as error:
             if error.errno == errno.EADDRINUSE:
                 reason = "another program listens there"
-            elif error.errno is not None and error.errno > 0:
-                reason = os.strerror(error.errno)  # asyncio's own text names the address again
             else:
-                reason = error.strerror or str(error)
+                reason = why_not_bound(error)
             raise HealthError(f"health or metrics at {self._address}: {reason}") from error
         return self._address._replace(port=self._server.sockets[0].getsockname()[1])
 

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from holdfast.errors import TransportError
-from holdfast.transport.endpoints import Endpoint
+from holdfast.transport.endpoints import Endpoint, why_not_bound
 from holdfast.transport.listener import BACKLOG, listen, remove_socket_file
 
 __all__ = ["SharedEndpoints"]
@@ -45,9 +45,14 @@ class SharedEndpoints:
         for endpoint in endpoints:
             try:
                 bound.append(self._bind(endpoint))
+            except TransportError:
+                self.close()
+                raise
             except OSError as error:
                 self.close()
-                raise TransportError(f"cannot listen on {endpoint}: {error.strerror}") from error
+                raise TransportError(
+                    f"cannot listen on {endpoint}: {why_not_bound(error)}"
+                ) from error
         self.endpoints = tuple(bound)
 
     def of(self, index: int) -> Sequence[socket.socket]:

@@ -100,6 +100,8 @@ def checked_endpoints(options: Options) -> list[Endpoint]:
     TransportError
         If an endpoint is malformed or cannot be used so, or is one that other machines can reach
         although they do not have to prove who they are; the message names the option.
+    InvalidValueError
+        If health or metrics are to be offered at the same port.
     """
     from holdfast.transport.endpoints import check_direction, check_endpoint
 
@@ -122,7 +124,21 @@ def checked_endpoints(options: Options) -> list[Endpoint]:
                 )
             if listens:
                 listen.append(endpoint)
+    for option, address in (("--health", options.health), ("--metrics", options.metrics)):
+        for endpoint in listen:
+            if address is not None and _is_same_port(endpoint, address):
+                raise InvalidValueError(
+                    f"{option} {address} and --listen {endpoint} name the same port; robots need "
+                    f"one of their own"
+                )
     return listen
+
+
+def _is_same_port(endpoint: Endpoint, address: HttpAddress) -> bool:
+    hosts = {endpoint.host, address.host}
+    return endpoint.port == address.port != 0 and (
+        len(hosts) == 1 or not hosts.isdisjoint(("0.0.0.0", "::"))  # all that this machine has
+    )
 
 
 class _Parser(argparse.ArgumentParser):

@@ -89,7 +89,7 @@ class Dialer:
         self._addresses: list[tuple[socket.AddressFamily, _Address]] = []
         if endpoint.is_local_socket:
             self._addresses = [(socket.AF_UNIX, endpoint.host)]
-        else:
+        elif "%" not in endpoint.host:  # the interface that it names may come later
             with contextlib.suppress(ValueError):
                 version = ipaddress.ip_address(endpoint.host).version
                 family = socket.AF_INET if version == 4 else socket.AF_INET6

@@ -39,6 +39,8 @@ __all__ = [
     "check_endpoint",
     "check_name",
     "parse_endpoint",
+    "parse_host",
+    "why_not_bound",
 ]
 
 PROTOCOLS = ("tcp", "tls", "udp", "unix")
@@ -68,6 +70,8 @@ _HOST_NAME = re.compile(
     r"(?=.{1,253}\Z)[A-Za-z0-9_]([A-Za-z0-9_-]*[A-Za-z0-9_])?(\.[A-Za-z0-9_-]+)*"
 )
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
+_MAX_LABEL = 63
+_INTERFACE = re.compile(r"[!-~]{1,15}")
 _NUMBERS = re.compile(r"[0-9.]+")
 
 
@@ -320,7 +324,60 @@ def parse_endpoint(text: str) -> Endpoint:
             f"endpoint {text!r}: port {port_text!r} is not a number from 0 to 65535, "
             f"as in {protocol}/127.0.0.1:7447"
         )
-    return Endpoint(protocol, _host(text, protocol, host), int(port_text))
+    try:
+        return Endpoint(protocol, parse_host(host, f"{protocol}/"), int(port_text))
+    except TransportError as error:
+        raise TransportError(f"endpoint {text!r}: {error}") from None
+
+
+def parse_host(host: str, before: str = "") -> str:
+    """Read a host: a name or an address, one of IPv6 in brackets; return it without them.
+
+    Parameters
+    ----------
+    host : str
+    before : str
+        What precedes the host in the examples of messages.
+
+    Raises
+    ------
+    TransportError
+        If it is none. The message does not name what the host is a part of.
+    """
+    if host.startswith("[") and host.endswith("]"):
+        inner = host[1:-1]
+        if not isinstance(_address_of(inner), ipaddress.IPv6Address):
+            raise TransportError(f"{inner!r} is no IPv6 address, as in {before}[::1]:7447")
+        _, percent, interface = inner.partition("%")
+        if percent and not _INTERFACE.fullmatch(interface):
+            raise TransportError(
+                f"{interface!r} is no name of a network interface, which has at most 15 "
+                f"characters of ASCII, as in {before}[fe80::1%eth0]:7447"
+            )
+        return inner
+    if ":" in host:
+        raise TransportError(
+            f"{host!r}: an IPv6 address stands in brackets, as in {before}[::1]:7447"
+        )
+    long = max(host.split("."), key=len)
+    if len(long) > _MAX_LABEL:
+        raise TransportError(
+            f"{long!r}: a host name has at most {_MAX_LABEL} characters between its dots"
+        )
+    numeric = _NUMBERS.fullmatch(host) is not None
+    if (numeric and _address_of(host) is None) or not _HOST_NAME.fullmatch(host):
+        raise TransportError(f"{host!r} is no host name or address, as in {before}127.0.0.1:7447")
+    return host
+
+
+def why_not_bound(error: OSError) -> str:
+    """Write why the system does not let a socket be bound to an address, and what can be done."""
+    number = error.errno or 0  # of a name that is not found it is below 0
+    # asyncio's own text names the address again.
+    reason = os.strerror(number) if number > 0 else error.strerror or str(error)
+    if number == errno.EADDRNOTAVAIL:
+        reason += ": this machine has no such address (0.0.0.0 is all that it has)"
+    return reason
 
 
 def check_endpoint(text: str, *, listens: bool) -> Endpoint:
@@ -414,27 +471,6 @@ def _local_socket(text: str, path: str) -> Endpoint:
             f"{MAX_SOCKET_PATH_BYTES}"
         )
     return Endpoint(_UNIX, path, 0)
-
-
-def _host(text: str, protocol: str, host: str) -> str:
-    if host.startswith("[") and host.endswith("]"):
-        inner = host[1:-1]
-        if isinstance(_address_of(inner), ipaddress.IPv6Address):
-            return inner
-        raise TransportError(
-            f"endpoint {text!r}: {inner!r} is no IPv6 address, as in {protocol}/[::1]:7447"
-        )
-    if ":" in host:
-        raise TransportError(
-            f"endpoint {text!r}: an IPv6 address stands in brackets, as in {protocol}/[::1]:7447"
-        )
-    numeric = _NUMBERS.fullmatch(host) is not None
-    if (numeric and _address_of(host) is None) or not _HOST_NAME.fullmatch(host):
-        raise TransportError(
-            f"endpoint {text!r}: {host!r} is no host name or address, "
-            f"as in {protocol}/127.0.0.1:7447"
-        )
-    return host
 
 
 def _address_of(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:

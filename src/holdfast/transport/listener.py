@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any, Final, TypeVar
 
 from holdfast.errors import TransportError
-from holdfast.transport.endpoints import Endpoint
+from holdfast.transport.endpoints import Endpoint, why_not_bound
 from holdfast.transport.links import OPENING_TIMEOUT_S
 
 __all__ = ["BACKLOG", "MAX_SILENT", "Listener", "listen", "one_too_many", "remove_socket_file"]
@@ -88,8 +88,7 @@ class Listener:
             self._socket = listen(endpoint) if listening is None else listening
             self._socket.setblocking(False)
         except OSError as error:
-            reason = error.strerror or str(error)
-            raise TransportError(f"cannot listen on {endpoint}: {reason}") from error
+            raise TransportError(f"cannot listen on {endpoint}: {why_not_bound(error)}") from error
         self._socket_file: os.stat_result | None = None
         if endpoint.is_local_socket and listening is not None:
             self.endpoint = endpoint
@@ -202,9 +201,8 @@ def listen(endpoint: Endpoint) -> socket.socket:
             _remove_stale_socket(endpoint)
             return _listening(socket.socket(socket.AF_UNIX), endpoint.host)
     # As bytes, for the codec of other letters takes long to load.
-    host = endpoint.host.encode() if endpoint.host.isascii() else endpoint.host
     family, *_, address = socket.getaddrinfo(
-        host, endpoint.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+        endpoint.host.encode(), endpoint.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
     )[0]
     made = socket.socket(family)
     # A service that is started again may have the port of the one that died.
