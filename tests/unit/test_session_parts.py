@@ -47,6 +47,15 @@ class TestLateReplies:
         assert [services.local.note_first_reply(0.0, 9.0) for _ in range(9)] == [None] * 9
 
 
+def test_a_busy_service_is_asked_again_soon_whatever_it_says() -> None:
+    service = KnownService("cloud", 0.25)
+    assert service.note_busy(2.0, 10.0) == 2.0
+    assert service.note_busy(4_294_967.295, 10.0) == 5.0
+    assert not service.usable(14.9)
+    service.detector.appeared(15.0)
+    assert service.usable(15.0)
+
+
 class TestLaunches:
     def test_a_process_that_answers_is_not_replaced(self) -> None:
         launches = Launches(RecoverySettings(relaunch_delay_ms=100.0))

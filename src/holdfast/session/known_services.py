@@ -23,6 +23,9 @@ _LATE_IN_A_ROW = 3
 
 _FIRST_RETRY_S = 0.02
 _LAST_RETRY_S = 1.0
+_MAX_BUSY_S = 5.0
+"""A busy service is asked again after this time, whatever it says: it may be wrong, or lie."""
+
 _MAX_REFUSALS = 3
 
 _OUT_OF_MEMORY = "out_of_memory"
@@ -224,7 +227,7 @@ class KnownService:
     def note_busy(self, retry_after_s: float, now: float) -> float:
         """Take note that it asks for patience; return for how long it is left alone."""
         # Its own estimate, but never as often as it can answer.
-        after_s = max(retry_after_s, self.backoff_s)
+        after_s = max(min(retry_after_s, _MAX_BUSY_S), self.backoff_s)
         self.delay(now)
         self.retry_at = now + after_s
         self.num_busy += 1
