@@ -882,6 +882,24 @@ class TestStreams:
         assert await inbox.of_call(2) == [Replied(2, b"old"), Ended(2)]
         await wire.close_on_loop()
 
+    async def test_a_robot_remembers_the_last_few_reasons(self, socket_directory: Path) -> None:
+        """A peer may say another one in each goodbye, for as long as it likes."""
+        wire = StreamWire("unix", socket_directory, robot_listens=True)
+        robot = wire.robot("cloud")
+        robot.start(Inbox())
+        endpoint = wire.endpoint("cloud")
+        texts = ["is 0", "is 0", *(f"is {number}" for number in range(1, 20)), "is 0", "is 0"]
+        told = [text for at, text in enumerate(texts) if at not in (1, len(texts) - 1)]
+        for text in texts:
+            with await Visitor(endpoint).connect() as visitor:
+                await visitor.say(frames.MAGIC + frames.encode_goodbye(text))
+                await visitor.hear()
+        await until(lambda: len(wire.refusals) >= len(told), lambda: wire.refusals)
+        assert [reason for _, reason in wire.refusals] == [
+            f"refuses this end, which {text}" for text in told
+        ]
+        await wire.close_on_loop()
+
     async def test_the_service_refuses_what_is_too_large_for_it(self, tcp: StreamWire) -> None:
         received: list[IncomingCall] = []
         await tcp.service("cloud", "b1").start(received.append)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import asyncio
 import socket
+from collections import deque
 from collections.abc import Callable, Mapping
 from itertools import count
 
@@ -59,6 +60,10 @@ _MAX_UNGREETED = 64
 """Connections to a robot that listens, of which nobody knows who they are."""
 
 
+_MAX_TOLD_REASONS = 8
+"""So many are not told again; a service may send a new one in each goodbye."""
+
+
 class StreamRobotTransport:
     """The robot's end: see :class:`~holdfast.transport.contract.RobotTransport`.
 
@@ -79,8 +84,8 @@ class StreamRobotTransport:
         The robot's credentials, for ``tls``.
     on_unreachable : callable or None
         Is told the service and the reason, as the rest of a sentence about it, when it cannot be
-        connected to, refuses this robot or is not what the robot looks for; each reason once until
-        the service is there again.
+        connected to, refuses this robot or is not what the robot looks for. The last few reasons
+        are not told again until the service is there again.
     on_closed_to_datagrams : callable or None
         Is told, once, of a service at ``udp`` to which no datagram gets through, so that the
         stream carries all.
@@ -240,7 +245,7 @@ class _Service:
         self._boot = ""
         self._handshake_is_enough = False
         self._early = count(1)
-        self._told_reasons: set[str] = set()
+        self._told_reasons: deque[str] = deque(maxlen=_MAX_TOLD_REASONS)
         self._told_closed = False
         self._stopped = False
         self.endpoint = endpoint
@@ -433,5 +438,5 @@ class _Service:
     def _tell_unreachable(self, reason: str) -> None:
         on_unreachable = self._robot.on_unreachable
         if on_unreachable is not None and reason not in self._told_reasons:
-            self._told_reasons.add(reason)
+            self._told_reasons.append(reason)
             on_unreachable(self._name, reason)
