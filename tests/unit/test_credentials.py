@@ -21,7 +21,8 @@ from pathlib import Path
 
 import pytest
 from cryptography import x509
-from cryptography.hazmat.primitives import serialization
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from holdfast.files import NewFile, OutputError, create_directory_atomically
@@ -340,6 +341,32 @@ class TestAuthority:
         assert "authority.key: others can read this key (mode 640)" in said[0]
 
 
+def sign_with_names(home: Path, like: str, name: str, names: list[str]) -> None:
+    """Make credentials like others of the same authority, whose certificate has these names."""
+    shutil.copytree(home / like, home / name)
+    model = certificate_of(home / like)
+    authority = certificate_of(home / "authority", "authority.pem")
+    signing_key = serialization.load_pem_private_key(
+        (home / "authority" / "authority.key").read_bytes(), None
+    )
+    assert isinstance(signing_key, ec.EllipticCurvePrivateKey)
+    builder = (
+        x509.CertificateBuilder()
+        .subject_name(x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, each) for each in names]))
+        .issuer_name(authority.subject)
+        .public_key(model.public_key())
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(model.not_valid_before_utc)
+        .not_valid_after(model.not_valid_after_utc)
+    )
+    for extension in model.extensions:
+        builder = builder.add_extension(extension.value, extension.critical)
+    certificate = builder.sign(signing_key, hashes.SHA256())
+    (home / name / "certificate.pem").write_bytes(
+        certificate.public_bytes(serialization.Encoding.PEM)
+    )
+
+
 @pytest.fixture(scope="module")
 def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Good keys (``home``), and all sorts of bad ones."""
@@ -357,6 +384,9 @@ def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
         home, robots=["future_robot"], services=["future_service"], now=NOW + 100 * DAY
     )
     make_credentials(home, robots=["robot"], services=["service"])
+    for role in ("robot", "service"):
+        sign_with_names(home, role, f"nameless_{role}", [])
+        sign_with_names(home, role, f"two_names_{role}", ["one", "two"])
     make_credentials(top / "other")
     # Theirs trust our authority, but are not of it.
     for name in ("robot", "service"):
@@ -384,6 +414,8 @@ class TestLoading:
             ("future_service", "service", "is not valid yet"),
             ("foreign_robot", "robot", r"was not signed by the authority in authority\.pem"),
             ("foreign_service", "service", r"was not signed by the authority in authority\.pem"),
+            ("nameless_robot", "robot", r"certificate\.pem: has 0 common names, and must have one"),
+            ("two_names_service", "service", "has 2 common names, and must have one"),
             ("absent", "robot", r"absent/authority\.pem: cannot be read: .*holdfast keys"),
             (".", "robot", r"did you mean .*robot\?"),
         ],
@@ -548,6 +580,8 @@ class TestOnRealLinks:
             ("expired_robot", "certificate expired"),
             ("future_robot", "bad certificate"),
             ("service", "unsupported certificate"),
+            ("nameless_robot", "which has a certificate that has 0 common names, and must have"),
+            ("two_names_robot", "which has a certificate that has 2 common names, and must have"),
         ],
     )
     async def test_a_service_lets_nobody_in_who_is_no_robot_of_its_authority(
@@ -566,6 +600,8 @@ class TestOnRealLinks:
             ("foreign_service", "was not signed by the authority in authority.pem"),
             ("expired_service", "has expired"),
             ("future_service", "is not valid yet; is a clock wrong?"),
+            ("nameless_service", "has 0 common names, and must have one"),
+            ("two_names_service", "has 2 common names, and must have one"),
         ],
     )
     async def test_a_robot_believes_nobody_who_is_no_service_of_its_authority(

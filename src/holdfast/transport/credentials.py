@@ -72,7 +72,7 @@ def load_credentials(
     CredentialsError
         If the other end would not accept them: a file is missing, unreadable or malformed, the key
         belongs to another certificate, the certificate is not valid now, was signed by another
-        authority, or is for the other role.
+        authority, is for the other role, or has not exactly one common name.
     """
     warn = warn or give_to_warnings
     directory = Path(directory)
@@ -118,7 +118,7 @@ def _rehearse(files: TlsFiles, role: Role) -> float:
     """Let both ends of a link shake hands in memory; return when the certificate expires."""
     import ssl
 
-    from holdfast.transport.tls import fault_of_certificate
+    from holdfast.transport.tls import common_name, fault_of_certificate
 
     authority, certificate, key = files.authority, files.certificate, files.key
     serving = role == "service"
@@ -155,7 +155,7 @@ def _rehearse(files: TlsFiles, role: Role) -> float:
                     end.do_handshake()
                 except ssl.SSLWantReadError:
                     continue
-        shown = far.getpeercert()
+        shown = far.getpeercert() or {}
     except ssl.SSLCertVerificationError as error:
         if error.verify_code in _LIST_IS_WRONG:
             reason = _LIST_IS_WRONG[error.verify_code]
@@ -166,7 +166,11 @@ def _rehearse(files: TlsFiles, role: Role) -> float:
         ) from error
     except (ssl.SSLError, ValueError) as error:
         raise CredentialsError(f"{certificate}: does not work for TLS: {error}") from error
-    return float(ssl.cert_time_to_seconds(str(shown["notAfter"]))) if shown else 0.0
+    try:
+        common_name(shown)
+    except ValueError as error:
+        raise CredentialsError(f"{certificate}: {error}") from error
+    return float(ssl.cert_time_to_seconds(str(shown["notAfter"])))
 
 
 def _unusable_pair(certificate: Path, key: Path, error: ssl.SSLError) -> str:

@@ -515,7 +515,11 @@ class Link(asyncio.BufferedProtocol):
         assert self._transport is not None
         self._transport.write(tls.take())
         if tls.established:
-            self.peer = tls.peer()
+            try:
+                self.peer = tls.peer()
+            except FrameError as error:
+                self.end(str(error), goodbye=str(error), refused=True)
+                return b""
             if self._speaks_first:
                 self._say_hello()
             self._owner.established(self)

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import contextlib
 import ssl
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from holdfast.errors import TransportError
@@ -29,6 +30,7 @@ __all__ = [
     "PeerCertificate",
     "TlsStream",
     "client_context",
+    "common_name",
     "fault_of_certificate",
     "server_context",
 ]
@@ -253,13 +255,21 @@ class TlsStream:
                 return  # it is not waited for that the other end says so, too
 
     def peer(self) -> PeerCertificate:
-        """Return the other end's certificate, once established."""
+        """Return the other end's certificate, once established.
+
+        Raises
+        ------
+        FrameError
+            If it does not say who that is.
+        """
         shown = self._tls.getpeercert() or {}
         der = self._tls.getpeercert(binary_form=True) or b""
-        subject: Any = shown.get("subject", ())
-        names = [str(value) for part in subject for key, value in part if key == "commonName"]
+        try:
+            name = common_name(shown)
+        except ValueError as error:
+            raise FrameError(f"has a certificate that {error}") from error
         return PeerCertificate(
-            names[-1] if names else "",
+            name,
             int(str(shown.get("serialNumber", "0")), 16),
             float(ssl.cert_time_to_seconds(str(shown["notAfter"]))) if shown else 0.0,
             der,
@@ -295,6 +305,26 @@ class TlsStream:
         except ssl.SSLWantReadError:
             return
         self.established = True
+
+
+def common_name(shown: Mapping[str, Any]) -> str:
+    """Return the name in a certificate: it is by this that robots are told apart.
+
+    Parameters
+    ----------
+    shown : mapping
+        As ``getpeercert`` returns it.
+
+    Raises
+    ------
+    ValueError
+        If it has none or several: the rest of a sentence about it.
+    """
+    subject = shown.get("subject", ())
+    names = [str(value) for part in subject for key, value in part if key == "commonName"]
+    if len(names) != 1:
+        raise ValueError(f"has {len(names)} common names, and must have one")
+    return names[0]
 
 
 def fault_of_certificate(error: ssl.SSLCertVerificationError, role: str) -> str:
