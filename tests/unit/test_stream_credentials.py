@@ -17,7 +17,14 @@ from holdfast.session.events import Appeared, Ended, Replied, TransportEvent, Va
 from holdfast.transport.contract import IncomingCall
 from holdfast.transport.credentials import load_credentials
 from holdfast.transport.endpoints import ServiceAddress, TlsFiles
-from holdfast.transport.frames import GOODBYE, FrameDecoder, encode_hello, read_goodbye
+from holdfast.transport.frames import (
+    CALL,
+    GOODBYE,
+    FrameDecoder,
+    encode_frame,
+    encode_hello,
+    read_goodbye,
+)
 from holdfast.transport.key_ring import make_credentials, revoke_credentials
 from holdfast.transport.robot_end import StreamRobotTransport
 from holdfast.transport.service_end import StreamServiceTransport
@@ -75,14 +82,14 @@ class Robot:
 class Cloud:
     """A service's end that answers with the name of who asks."""
 
-    def __init__(self, directory: Path) -> None:
+    def __init__(self, directory: Path, protocol: str = "tls") -> None:
         self.told: list[tuple[str, dict[str, object]]] = []
         self.held: list[IncomingCall] = []
         self.holds = False
         self.transport = StreamServiceTransport(
             "cloud",
             boot="b1",
-            listen=["tls/127.0.0.1:0"],
+            listen=[f"{protocol}/127.0.0.1:0"],
             lease_ms=LEASE_MS,
             tls=TlsFiles.of(directory),
             on_event=lambda name, **fields: self.told.append((name, fields)),
@@ -123,12 +130,11 @@ def test_a_revoked_robots_link_ends_and_no_other(tmp_path: Path) -> None:
         await until(lambda: bool(anna.vanished), anna.events)
         assert 2 in anna.ended
         await until(lambda: f"refuses this end, which {REVOKED}" in anna.refusals, anna.refusals)
-        # It is not let in again, and is told why.
-        await until(
-            lambda: "refuses this end's certificate (certificate revoked)" in anna.refusals,
-            anna.refusals,
-        )
-        assert anna.boots == ["b1"]
+        # It is not let in again, and the log says who that was.
+        await until(lambda: cloud.told[-1][0] == "link_refused", cloud.told)
+        again = cloud.told[-1][1]
+        assert (again["robot"], again["reason"]) == ("anna", REVOKED)
+        assert len([name for name, _ in cloud.told if name == "robot_connected"]) == 2
         # The other one has its answer over the link over which it asked.
         for call in cloud.held:
             cloud.answer(call)
@@ -142,6 +148,41 @@ def test_a_revoked_robots_link_ends_and_no_other(tmp_path: Path) -> None:
         assert [(each["robot"], each["reason"]) for each in told] == [("anna", REVOKED)]
         for end in (anna.transport, berta.transport, cloud.transport):
             await end.close()
+
+    asyncio.run(run())
+
+
+@pytest.mark.parametrize("protocol", ["tls", "udp"])
+def test_nothing_of_a_revoked_robot_is_handled(tmp_path: Path, protocol: str) -> None:
+    """By a service that had the list when it began: no hello is answered, no keys are sent."""
+    make_credentials(tmp_path, robots=["anna"], services=["cloud"])
+    revoke_credentials(tmp_path, names=["anna"])
+
+    async def run() -> None:
+        cloud = Cloud(tmp_path / "cloud", protocol)
+        cloud.holds = True
+        host, port = (await cloud.start()).partition("/")[2].rsplit(":", 1)
+        loop = asyncio.get_running_loop()
+        (tmp_path / "anna" / "revoked.pem").unlink()
+        with socket.create_connection((host, int(port))) as connection:
+            connection.setblocking(False)
+            tls = TlsStream(client_context(TlsFiles.of(tmp_path / "anna")), host)
+            tls.begin()
+            await loop.sock_sendall(connection, tls.take())
+            while not tls.established:
+                tls.receive(await loop.sock_recv(connection, 65536))
+            tls.send(encode_hello("robot", "anna", "0", LEASE_MS) + encode_frame(CALL, 1, b"?"))
+            await loop.sock_sendall(connection, tls.take())
+            told = b""
+            while data := await loop.sock_recv(connection, 65536):
+                told += tls.receive(data)
+        (only,) = FrameDecoder(1000).feed(told)
+        assert only.kind == GOODBYE
+        assert read_goodbye(only.payload) == REVOKED
+        ((name, fields),) = cloud.told
+        assert (name, fields["robot"], fields["reason"]) == ("link_refused", "anna", REVOKED)
+        assert cloud.held == []
+        await cloud.transport.close()
 
     asyncio.run(run())
 

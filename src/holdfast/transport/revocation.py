@@ -1,9 +1,10 @@
 """The authority's list of certificates that are valid no more, though their time is not up.
 
 It lies beside the credentials as ``revoked.pem`` (an X.509 certificate revocation list), is signed
-by the authority, and need not be there. The ``ssl`` module looks into it in each handshake. For
-links that stand already there is nobody to do that, so the numbers in it can be read here, with
-nothing but the standard library. Who reads them must have let a handshake check the signature.
+by the authority, and need not be there. A robot has the ``ssl`` module look into it in each
+handshake. A service reads the numbers in it, with nothing but the standard library, and looks them
+up as soon as a handshake is complete: so it knows whom it refuses, and ends links that stand. Who
+reads them must have let a handshake check the signature, as ``load_credentials`` does.
 """
 
 from __future__ import annotations

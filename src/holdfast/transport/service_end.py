@@ -200,11 +200,12 @@ class StreamServiceTransport:
         self._boot = boot
         self._max_links = MAX_LINKS if max_links is None else max_links
         self._tls = tls
-        self._context = None if tls is None else self._make_context(tls)
-        # Of the last list, and the authorities that are believed since then (None: those of the
-        # start); a handshake looks into what was there when it began.
+        self._context: ssl.SSLContext | None = None
+        # Who has shaken hands is looked up here; a handshake knows the files of when it began.
         self._revoked: frozenset[int] = frozenset()
-        self._believed: frozenset[bytes] | None = None
+        self._believed: frozenset[bytes] = frozenset()
+        if tls is not None:
+            self._read_credentials(tls)
         self._settings = LinkSettings(
             encode_hello("service", name, boot, lease_ms),
             lease_ms,
@@ -320,10 +321,7 @@ class StreamServiceTransport:
         """
         if self._tls is None:
             return 0
-        context = self._make_context(self._tls)
-        self._revoked = revoked_serials(self._tls.authority.with_name(REVOKED_FILE))
-        self._believed = frozenset(context.get_ca_certs(binary_form=True))
-        self._context = context
+        self._read_credentials(self._tls)
         ended = self.end_links(lambda peer: self._objection(peer) == _REVOKED, _REVOKED)
         return ended + self.end_links(lambda peer: self._objection(peer) == _FOREIGN, _FOREIGN)
 
@@ -331,17 +329,20 @@ class StreamServiceTransport:
         """Return why a certificate is believed no more, as the rest of a sentence about a robot."""
         if peer.serial_number in self._revoked:
             return _REVOKED
-        if self._believed is not None and not peer.authorities <= self._believed:
+        if not peer.authorities <= self._believed:
             return _FOREIGN
         return None
 
     # -- links -----------------------------------------------------------------------------------
 
-    def _make_context(self, tls: TlsFiles) -> ssl.SSLContext:
+    def _read_credentials(self, tls: TlsFiles) -> None:
         # OpenSSL takes long to load, which counts in the time that a service takes to be ready.
         from holdfast.transport.tls import server_context
 
-        return server_context(tls, self._boot)
+        context = server_context(tls, self._boot)
+        self._revoked = revoked_serials(tls.authority.with_name(REVOKED_FILE))
+        self._believed = frozenset(context.get_ca_certs(binary_form=True))
+        self._context = context
 
     def _make_link(self, endpoint: Endpoint, network: bytes = b"", *, dialled: bool) -> Link:
         tls = None
@@ -377,15 +378,16 @@ class StreamServiceTransport:
         link.connecting = asyncio.get_running_loop().create_task(link.connect(connection))
 
     def established(self, link: Link) -> None:
-        """Nothing: a robot says who it is next."""
+        """Refuse who is not believed any more, before anything of it is read."""
+        assert link.peer is not None
+        objection = self._objection(link.peer)
+        if objection is not None:
+            link.end(objection, goodbye=objection, refused=True)
 
     def refusal(self, link: Link, hello: Hello) -> str | None:
-        """Refuse what is no robot or not believed, and who would have more than a share of room."""
+        """Refuse what is no robot, and who would have more than a share of room."""
         if hello.role != "robot":
             return "is a service, and a robot was expected"
-        objection = None if link.peer is None else self._objection(link.peer)
-        if objection is not None:
-            return objection
         if len(self._links) >= self._max_links and not self._make_room(_certified(link)):
             return f"is one too many: {self._max_links} robots are connected"
         return None

@@ -69,18 +69,23 @@ class PeerCertificate(NamedTuple):
 
 
 def client_context(files: TlsFiles) -> ssl.SSLContext:
-    """Return what a robot's links need.
+    """Return what a robot's links need; handshakes refuse who is revoked.
 
     Raises
     ------
     TransportError
         If the credentials cannot be used.
     """
-    return _context(ssl.PROTOCOL_TLS_CLIENT, files)
+    context = _context(ssl.PROTOCOL_TLS_CLIENT, files)
+    refuse_revoked(context, files.authority.parent)
+    return context
 
 
 def server_context(files: TlsFiles, incarnation: str) -> ssl.SSLContext:
     """Return what a service's links need.
+
+    Handshakes do not refuse who is revoked: then nobody would know who that was. The service does,
+    as soon as it knows.
 
     Raises
     ------
@@ -102,7 +107,6 @@ def _context(protocol: int, files: TlsFiles) -> ssl.SSLContext:
         context.load_verify_locations(cafile=files.authority)
         # Without the empty password, an encrypted key would ask for one on the terminal.
         context.load_cert_chain(files.certificate, files.key, password="")
-        refuse_revoked(context, files.authority.parent)
     except (OSError, ssl.SSLError) as error:
         raise TransportError(
             f"credentials {files.certificate.parent} cannot be used: {error}"
