@@ -660,6 +660,8 @@ def _explain(
             return source.error(path, f"is not allowed: {what}")
     choices = _choices(field_type)
     close = _close_match(value, choices) if isinstance(value, str) else ""
+    if isinstance(value, str) and isinstance(field_type, msgspec.inspect.VarTupleType):
+        close = f", as in [{value}]"
     length = f" (a list of {len(value)})" if isinstance(value, list) else ""
     expected = _described(field_type) or what
     return source.error(path, f"is {_shown(value)}{length}; expected {expected}{close}")

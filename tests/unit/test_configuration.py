@@ -644,7 +644,10 @@ class TestOffload:
                 "offload:\n  lease_ms: 10",
                 "line 3: offload.lease_ms is 10; expected a number >= 50 and <= 60000",
             ),
-            ("offload: {services: tcp/a:1}", 'is "tcp/a:1"; expected a list of at most 16'),
+            (
+                "offload: {services: tcp/a:1}",
+                'is "tcp/a:1"; expected a list of at most 16, as in [tcp/a:1]',
+            ),
             ("offload: {services: [3]}", "offload.services[0] is 3; expected text of at least 1"),
             (
                 "offload:\n  services:\n    - tcp/a:1\n    - ''",

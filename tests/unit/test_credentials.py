@@ -408,7 +408,11 @@ class TestLoading:
         [
             ("robot", "service", r"robot/certificate\.pem: is not for a service"),
             ("service", "robot", r"service/certificate\.pem: is not for a robot"),
-            ("expired_robot", "robot", r"certificate\.pem: has expired \(valid from 20"),
+            (
+                "expired_robot",
+                "robot",
+                r"certificate\.pem: has expired \(valid from 20.*--renew --robot NAME",
+            ),
             ("expired_service", "service", r"certificate\.pem: has expired"),
             ("future_robot", "robot", r"is not valid yet; is a clock wrong\? \(valid from 20"),
             ("future_service", "service", "is not valid yet"),
@@ -502,7 +506,7 @@ class TestLoading:
         )
         good, expired, making = done.stdout.splitlines()
         assert good == str(keys / "robot" / "key.pem")
-        assert expired.endswith("certificate.pem: has expired")
+        assert "certificate.pem: has expired; 'holdfast keys DIR --renew" in expired
         assert "pip install cryptography" in making
 
     def test_loading_imports_nothing_heavy(self, keys: Path) -> None:
@@ -616,6 +620,7 @@ class TestOnRealLinks:
         (refusal,) = await ends.ask("robot", endpoint.replace("0.0.0.0", "127.0.0.2"))
         assert isinstance(refusal, str)
         assert "does not name this host" in refusal
+        assert "--renew --service NAME --host HOST" in refusal
         assert "127.0.0.2" in refusal
         right = await ends.ask("robot", endpoint.replace("0.0.0.0", "127.0.0.1"))
         assert right == [Replied(1, b"robot: cba"), Ended(1)]

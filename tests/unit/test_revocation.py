@@ -271,7 +271,8 @@ class TestLoading:
     @pytest.mark.parametrize(("name", "role"), [("anna", "robot"), ("cloud", "service")])
     def test_whose_own_is_revoked_is_told(self, home: Path, name: str, role: Role) -> None:
         revoke_credentials(home, names=[name])
-        with pytest.raises(CredentialsError, match=r"certificate\.pem: has been revoked"):
+        wanted = rf"certificate\.pem: has been revoked; .*--rotate --{role} NAME"
+        with pytest.raises(CredentialsError, match=wanted):
             load_credentials(home / name, role)
 
     def test_others_are_not_disturbed(self, home: Path) -> None:

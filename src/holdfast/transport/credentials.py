@@ -162,7 +162,7 @@ def _rehearse(files: TlsFiles, role: Role) -> float:
             raise CredentialsError(f"{authority.with_name(REVOKED_FILE)}: {reason}") from error
         reason = fault_of_certificate(error, role)
         raise CredentialsError(
-            f"{certificate}: {reason}{_more_of(certificate, error.verify_code)}"
+            f"{certificate}: {reason}{_more_of(certificate, role, error.verify_code)}"
         ) from error
     except (ssl.SSLError, ValueError) as error:
         raise CredentialsError(f"{certificate}: does not work for TLS: {error}") from error
@@ -194,20 +194,23 @@ _LIST_IS_WRONG = {
 """By OpenSSL's numbers: what can be wrong with a revocation list."""
 
 
-def _more_of(certificate: Path, verify_code: int) -> str:
+def _more_of(certificate: Path, role: Role, verify_code: int) -> str:
     """Return when a certificate is valid that is not so now, or how to get another one."""
     if verify_code == 23:
-        return "; 'holdfast keys DIR --rotate' makes new ones"
+        return f"; 'holdfast keys DIR --rotate --{role} NAME' makes new ones"
     if verify_code not in (9, 10):
         return ""
+    renew = (
+        f"; 'holdfast keys DIR --renew --{role} NAME' makes another" if verify_code == 10 else ""
+    )
     try:
         from cryptography import x509
     except ImportError:
-        return ""
+        return renew
     read = x509.load_pem_x509_certificate(certificate.read_bytes())
     return (
         f" (valid from {date_text(read.not_valid_before_utc.timestamp())}"
-        f" to {date_text(read.not_valid_after_utc.timestamp())})"
+        f" to {date_text(read.not_valid_after_utc.timestamp())}){renew}"
     )
 
 

@@ -513,7 +513,9 @@ class ServiceDatagramLink(_DatagramLink):
             elif self._answers.passed_over(frame.call):
                 self._owner.received(self, Frame(CALL, frame.call, b"", frame.passed_over_bytes))
         elif frame.kind == CALL:
-            raise FrameError("is at a tls/... endpoint, which goes with tls/... at both ends")
+            raise FrameError(
+                "is at tls/..., and the other end at udp/...: write the same at both ends"
+            )
         elif frame.kind == KEYS:
             raise FrameError(f"is a robot and sends a frame of kind {frame.kind}")
         else:

@@ -294,6 +294,10 @@ def parse_endpoint(text: str) -> Endpoint:
         If it is none, or its protocol is none of :data:`PROTOCOLS`.
     """
     protocol, slash, place = text.partition("/")
+    if protocol[:-1] in PROTOCOLS and protocol.endswith(":") and place.startswith("/"):
+        raise TransportError(
+            f"endpoint {text!r} is a URL: write {protocol[:-1]}/{place.removeprefix('/')}"
+        )
     if not slash or not re.fullmatch(r"[a-z][a-z0-9_-]*", protocol):
         raise TransportError(
             f"endpoint {text!r} does not begin with a protocol: allowed are {_listed(PROTOCOLS)}, "
@@ -301,6 +305,10 @@ def parse_endpoint(text: str) -> Endpoint:
         )
     if protocol not in PROTOCOLS:
         instead = _RENAMED.get(protocol)
+        import difflib  # for a mistake alone
+
+        for meant in () if instead else difflib.get_close_matches(protocol, PROTOCOLS, 1):
+            instead = f"did you mean {meant}?"
         raise TransportError(
             f"endpoint {text!r}: protocol {protocol} is not allowed"
             + (f" ({instead})" if instead else "")

@@ -292,7 +292,9 @@ class FrameDecoder:
         bound = self._bounds.get(kind)
         if bound is None:
             if kind in (KEYS, MESSAGE):
-                raise FrameError("is at a udp/... endpoint, which goes with udp/... at both ends")
+                raise FrameError(
+                    "is at udp/..., and the other end at tls/...: write the same at both ends"
+                )
             raise FrameError(f"sends a frame of the unknown kind {kind}")
         return bound
 

@@ -353,6 +353,9 @@ def fault_of_certificate(error: ssl.SSLCertVerificationError, role: str) -> str:
         case 7 | 18 | 19 | 20 | 21:
             return f"was not signed by the authority in {AUTHORITY_FILE}"
         case 62 | 64:
-            return f"does not name this host ({message})"
+            return (
+                f"does not name this host ({message}); "
+                "'holdfast keys DIR --renew --service NAME --host HOST' adds it"
+            )
         case _:
             return f"is refused: {message}"
