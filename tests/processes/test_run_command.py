@@ -416,6 +416,17 @@ class TestErrors:
         assert "in trial 0 (seed 3)" in done.stderr
 
 
+def test_a_run_that_goes_on_with_other_services_says_so(workplace: Path) -> None:
+    run = ["run", "peg.yaml", "--trials", "1", "--out", "other"]
+    service = f"--service tcp/127.0.0.1:{free_port()}"
+    assert holdfast(workplace, *run).returncode == 0
+    said = holdfast(workplace, *run, "--resume", *service.split()).stderr
+    assert f"the run had no service before, and goes on with {service}" in said
+    assert "the run had" not in holdfast(workplace, *run, "--resume", *service.split()).stderr
+    said = holdfast(workplace, *run, "--resume").stderr
+    assert f"the run had {service} before, and goes on with no service" in said
+
+
 @pytest.mark.slow
 def test_of_two_runs_at_once_in_one_directory_one_is_done(tmp_path: Path) -> None:
     """And what lies there afterwards is that one's, the configuration too."""

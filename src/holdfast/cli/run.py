@@ -6,7 +6,7 @@ import contextlib
 import shlex
 import signal
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
@@ -331,6 +331,9 @@ def _run(options: _Options) -> None:
     with directory:
         earlier = directory.journal.tally()
         notes = _Notes(options)
+        before, now = directory.services_before, configuration.offload.services
+        if before is not None and before != now:
+            notes.note(f"the run had {_listed(before)} before, and goes on with {_listed(now)}")
         display = run_display(configuration, quiet=quiet or options.log == "json")
         recorder = Recorder(trial=0)
         recorded: RecordedEnvironment | None = None
@@ -442,6 +445,11 @@ def _exit_code(summary: RunSummary | None) -> int:
     if summary is not None and (summary.wrong_answers or summary.not_deterministic):
         return EXIT_WRONG_ANSWER
     return 0
+
+
+def _listed(services: Sequence[str]) -> str:
+    words = " ".join(f"--service {service}" for service in services)
+    return words or "no service"
 
 
 def _idle_services(configuration: Configuration, summary: RunSummary, robot: RobotRun) -> list[str]:

@@ -69,12 +69,21 @@ class RunDirectory:
         What the run is.
     journal : Journal
         Its open journal.
+    services_before : tuple of str or None
+        Those of the part before, if the run goes on.
     """
 
-    def __init__(self, path: Path, configuration: Configuration, journal: Journal) -> None:
+    def __init__(
+        self,
+        path: Path,
+        configuration: Configuration,
+        journal: Journal,
+        services_before: tuple[str, ...] | None = None,
+    ) -> None:
         self.path = path
         self.configuration = configuration
         self.journal = journal
+        self.services_before = services_before
         self.earlier_wall_time_s = float(journal.meta().get("wall_time_s", "0"))
 
     @classmethod
@@ -161,7 +170,8 @@ class RunDirectory:
             if meta.get("configuration") != text:
                 journal.set_meta("configuration", text)
                 write_atomically(path / CONFIGURATION_NAME, text)
-            return cls(path, configuration, journal)
+            before = _services_in(meta.get("configuration", ""))
+            return cls(path, configuration, journal, before)
         except BaseException:
             journal.close()
             raise
@@ -386,6 +396,15 @@ def _compared(configuration: Any) -> Any:
     if isinstance(environment, Mapping) and environment.get("object") is not None:
         kept["environment"] = {"object": environment["object"]}
     return kept
+
+
+def _services_in(text: str) -> tuple[str, ...]:
+    import yaml
+
+    match yaml.safe_load(text):
+        case {"offload": {"services": [*services]}}:
+            return tuple(map(str, services))
+    return ()
 
 
 def _require_enough_trials(path: Path, journal: Journal, num_trials: int) -> None:
