@@ -8,6 +8,7 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
+from cryptography import x509
 from tests.ports import free_port
 from tests.processes.faults import (
     LOCAL_RECOVERY,
@@ -79,6 +80,10 @@ def robot_beside(
     return found[0]
 
 
+def certificate_of(directory: Path) -> x509.Certificate:
+    return x509.load_pem_x509_certificate((directory / "certificate.pem").read_bytes())
+
+
 def test_a_revoked_robot_is_cut_off_and_no_other(
     home: Path, site: Site, elsewhere: Site, references: References
 ) -> None:
@@ -87,7 +92,10 @@ def test_a_revoked_robot_is_cut_off_and_no_other(
     def happens(story: Story) -> None:
         def revoke() -> None:
             revoke_credentials(home, names=["anna"])
-            assert reload(cloud)["links_ended"] == 1
+            told = reload(cloud)
+            assert told["links_ended"] == told["num_revoked"] == 1
+            until = certificate_of(home / "cloud").not_valid_after_utc
+            assert told["valid_until"] == f"{until:%Y-%m-%d %H:%M} UTC"
 
         story.at("perform", 20, revoke, story.status(LOCAL_RECOVERY))
 

@@ -228,13 +228,22 @@ async def _run(
         return report()
 
     def reload() -> None:
+        from holdfast.transport.credentials import date_text, rehearse
+
         try:
-            _credentials(options)  # it knows more of what can be wrong with them
+            files = _credentials(options)  # it knows more of what can be wrong with them
+            assert files is not None
+            valid_until = date_text(rehearse(files, "service"))
             ended = transport.reload_credentials()
         except HoldfastError as error:
             events.event("credentials", reason=f"{error}; those of before stay in use")
         else:
-            events.event("credentials_reloaded", links_ended=ended)
+            events.event(
+                "credentials_reloaded",
+                links_ended=ended,
+                valid_until=valid_until,
+                num_revoked=transport.num_revoked,
+            )
 
     async with _watched(options, lambda: None, why_not_ready, reported) as watched:
         try:

@@ -29,6 +29,7 @@ __all__ = [
     "date_text",
     "give_to_warnings",
     "load_credentials",
+    "rehearse",
     "warn_if_open",
 ]
 
@@ -84,7 +85,7 @@ def load_credentials(
         except OSError as error:
             raise CredentialsError(_unreadable(directory, path, role, error)) from error
     warn_if_open(files.key, warn)
-    expires_s = _rehearse(files, role)
+    expires_s = rehearse(files, role)
     days_left = (expires_s - datetime.now(UTC).timestamp()) / 86_400.0
     if days_left < EXPIRES_SOON_DAYS:
         warn(f"{files.certificate}: expires in {days_left:.1f} days, on {date_text(expires_s)}")
@@ -114,8 +115,19 @@ def warn_if_open(key: Path, warn: Callable[[str], None]) -> None:
         warn(f"{key}: others can read this key (mode {mode & 0o777:03o}); chmod 600 {key}")
 
 
-def _rehearse(files: TlsFiles, role: Role) -> float:
-    """Let both ends of a link shake hands in memory; return when the certificate expires."""
+def rehearse(files: TlsFiles, role: Role) -> float:
+    """Let both ends of a link shake hands in memory.
+
+    Returns
+    -------
+    float
+        When the certificate expires, in seconds since 1970.
+
+    Raises
+    ------
+    CredentialsError
+        If the other end would not accept it.
+    """
     import ssl
 
     from holdfast.transport.tls import common_name, fault_of_certificate

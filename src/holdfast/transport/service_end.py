@@ -303,6 +303,11 @@ class StreamServiceTransport:
             link.end(reason, goodbye=reason, refused=True)
         return len(links)
 
+    @property
+    def num_revoked(self) -> int:
+        """How many certificates are in the list of revoked ones."""
+        return len(self._revoked)
+
     def reload_credentials(self) -> int:
         """Read the credentials anew, and end the links of robots that are not believed any more.
 
