@@ -62,6 +62,16 @@ async def connected(
     return robot, inbox, service
 
 
+def noting(payloads: list[bytes]) -> Callable[[IncomingCall], None]:
+    """Return what answers a call with what it asks, and notes that."""
+
+    def serve(call: IncomingCall) -> None:
+        payloads.append(call.payload)
+        echo(call)
+
+    return serve
+
+
 def link_of(robot: StreamRobotTransport) -> RobotDatagramLink:
     link = robot._services["cloud"].current
     assert isinstance(link, RobotDatagramLink)
@@ -212,12 +222,7 @@ class TestStrangers:
         self, udp: StreamWire
     ) -> None:
         calls: list[bytes] = []
-
-        def serve(call: IncomingCall) -> None:
-            calls.append(call.payload)
-            echo(call)
-
-        robot, inbox, service = await connected(udp, serve)
+        robot, inbox, service = await connected(udp, noting(calls))
         greedy, greedy_inbox = udp.robot("cloud", name="greedy"), Inbox()
         greedy.start(greedy_inbox)
         await until(lambda: greedy.sends_datagrams("cloud"))
@@ -238,15 +243,10 @@ class TestStrangers:
         self, udp: StreamWire
     ) -> None:
         calls: list[bytes] = []
-
-        def serve(call: IncomingCall) -> None:
-            calls.append(call.payload)
-            echo(call)
-
-        robot, inbox, service = await connected(udp, serve)
+        robot, inbox, service = await connected(udp, noting(calls))
         kept, at_service = link_of(robot)._sealing, link_at(service)
         assert kept is not None
-        assert service.end_links(lambda peer: peer.name == "robot", "is revoked") == 1
+        assert service.end_links(lambda peer: "is revoked" if peer.name == "robot" else None) == 1
         with stranger(place_of(udp)) as to_service:
             for k in range(1, 200):
                 question = b"\1\0" + k.to_bytes(4, "big") * 2 + b"\0\0stolen"

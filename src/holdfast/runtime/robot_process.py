@@ -385,7 +385,11 @@ class RobotProcess:
         A link's turn is short, and what the robot does with an answer is no part of it.
         """
         self._happened.append((monotonic(), event))
-        if not self._handling and not self._goes_on_soon:
+        if not self._handling:
+            self._go_on_soon()
+
+    def _go_on_soon(self) -> None:
+        if not self._goes_on_soon:
             self._goes_on_soon = True
             self._on_loop().call_soon(self._go_on)
 
@@ -406,8 +410,7 @@ class RobotProcess:
                 self._carry_out(self._robot.wake(self._now))
             while not self._ended and (self._happened or self._own_planner.compute_brief()):
                 if now - began > self._turn_s:
-                    self._goes_on_soon = True
-                    self._on_loop().call_soon(self._go_on)
+                    self._go_on_soon()
                     break
                 at, event = self._happened.popleft()
                 # When it happened, not when it is heard of: that may be long after.

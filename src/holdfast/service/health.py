@@ -17,7 +17,7 @@ from collections.abc import Awaitable, Callable, Mapping
 from typing import NamedTuple, TypeAlias
 
 from holdfast.errors import HoldfastError, TransportError
-from holdfast.transport.endpoints import parse_host, why_not_bound
+from holdfast.transport.endpoints import host_and_port, parse_host, why_not_bound
 
 __all__ = [
     "HealthError",
@@ -64,7 +64,7 @@ class HttpAddress(NamedTuple):
     port: int
 
     def __str__(self) -> str:
-        return f"[{self.host}]:{self.port}" if ":" in self.host else f"{self.host}:{self.port}"
+        return host_and_port(self.host, self.port)
 
 
 class Page(NamedTuple):

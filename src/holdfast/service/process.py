@@ -8,6 +8,7 @@ this module imports nothing at its top that takes time, and the options are read
 from __future__ import annotations
 
 import contextlib
+import functools
 import gc
 import os
 import signal
@@ -228,12 +229,14 @@ async def _run(
         return report()
 
     def reload() -> None:
-        from holdfast.transport.credentials import date_text, rehearse
+        from holdfast.transport.credentials import date_text, load_until
 
+        assert options.tls is not None
         try:
-            files = _credentials(options)  # it knows more of what can be wrong with them
-            assert files is not None
-            valid_until = date_text(rehearse(files, "service"))
+            # It knows more of what can be wrong with them.
+            _, expires_s = load_until(
+                options.tls, "service", warn=functools.partial(_warn, options)
+            )
             ended = transport.reload_credentials()
         except HoldfastError as error:
             events.event("credentials", reason=f"{error}; those of before stay in use")
@@ -241,7 +244,7 @@ async def _run(
             events.event(
                 "credentials_reloaded",
                 links_ended=ended,
-                valid_until=valid_until,
+                valid_until=date_text(expires_s),
                 num_revoked=transport.num_revoked,
             )
 
@@ -289,7 +292,7 @@ def _credentials(options: Options) -> TlsFiles | None:
         return None
     from holdfast.transport.credentials import load_credentials
 
-    return load_credentials(options.tls, "service", warn=lambda text: _warn(options, text))
+    return load_credentials(options.tls, "service", warn=functools.partial(_warn, options))
 
 
 @contextlib.asynccontextmanager

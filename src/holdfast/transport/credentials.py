@@ -12,6 +12,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
@@ -29,7 +30,7 @@ __all__ = [
     "date_text",
     "give_to_warnings",
     "load_credentials",
-    "rehearse",
+    "load_until",
     "warn_if_open",
 ]
 
@@ -75,7 +76,15 @@ def load_credentials(
         belongs to another certificate, the certificate is not valid now, was signed by another
         authority, is for the other role, or has not exactly one common name.
     """
-    warn = warn or give_to_warnings
+    # A warning is about the place from which this function is called.
+    warn = warn or partial(give_to_warnings, stacklevel=4)
+    return load_until(directory, role, warn=warn)[0]
+
+
+def load_until(
+    directory: Path | str, role: Role, *, warn: Callable[[str], None]
+) -> tuple[TlsFiles, float]:
+    """Do as :func:`load_credentials`; return also when they expire, in seconds since 1970."""
     directory = Path(directory)
     files = TlsFiles.of(directory)
     for path in (files.authority, files.certificate, files.key):
@@ -85,16 +94,16 @@ def load_credentials(
         except OSError as error:
             raise CredentialsError(_unreadable(directory, path, role, error)) from error
     warn_if_open(files.key, warn)
-    expires_s = rehearse(files, role)
+    expires_s = _rehearse(files, role)
     days_left = (expires_s - datetime.now(UTC).timestamp()) / 86_400.0
     if days_left < EXPIRES_SOON_DAYS:
         warn(f"{files.certificate}: expires in {days_left:.1f} days, on {date_text(expires_s)}")
-    return files
+    return files, expires_s
 
 
-def give_to_warnings(text: str) -> None:
+def give_to_warnings(text: str, stacklevel: int = 3) -> None:
     """Warn as Python does."""
-    warnings.warn(text, CredentialsWarning, stacklevel=3)
+    warnings.warn(text, CredentialsWarning, stacklevel=stacklevel)
 
 
 def _unreadable(directory: Path, path: Path, role: Role, error: OSError) -> str:
@@ -115,19 +124,8 @@ def warn_if_open(key: Path, warn: Callable[[str], None]) -> None:
         warn(f"{key}: others can read this key (mode {mode & 0o777:03o}); chmod 600 {key}")
 
 
-def rehearse(files: TlsFiles, role: Role) -> float:
-    """Let both ends of a link shake hands in memory.
-
-    Returns
-    -------
-    float
-        When the certificate expires, in seconds since 1970.
-
-    Raises
-    ------
-    CredentialsError
-        If the other end would not accept it.
-    """
+def _rehearse(files: TlsFiles, role: Role) -> float:
+    """Let both ends of a link shake hands in memory; return when the certificate expires."""
     import ssl
 
     from holdfast.transport.tls import common_name, fault_of_certificate

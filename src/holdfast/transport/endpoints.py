@@ -38,6 +38,7 @@ __all__ = [
     "check_direction",
     "check_endpoint",
     "check_name",
+    "host_and_port",
     "parse_endpoint",
     "parse_host",
     "why_not_bound",
@@ -118,8 +119,7 @@ class Endpoint(NamedTuple):
     def __str__(self) -> str:
         if self.protocol == _UNIX:
             return f"{self.protocol}/{self.host}"
-        host = f"[{self.host}]" if ":" in self.host else self.host
-        return f"{self.protocol}/{host}:{self.port}"
+        return f"{self.protocol}/{host_and_port(self.host, self.port)}"
 
     @property
     def is_encrypted(self) -> bool:
@@ -305,10 +305,11 @@ def parse_endpoint(text: str) -> Endpoint:
         )
     if protocol not in PROTOCOLS:
         instead = _RENAMED.get(protocol)
-        import difflib  # for a mistake alone
+        if instead is None:
+            import difflib  # for a mistake alone
 
-        for meant in () if instead else difflib.get_close_matches(protocol, PROTOCOLS, 1):
-            instead = f"did you mean {meant}?"
+            close = difflib.get_close_matches(protocol, PROTOCOLS, n=1)
+            instead = f"did you mean {close[0]}?" if close else None
         raise TransportError(
             f"endpoint {text!r}: protocol {protocol} is not allowed"
             + (f" ({instead})" if instead else "")
@@ -376,6 +377,11 @@ def parse_host(host: str, before: str = "") -> str:
     if (numeric and _address_of(host) is None) or not _HOST_NAME.fullmatch(host):
         raise TransportError(f"{host!r} is no host name or address, as in {before}127.0.0.1:7447")
     return host
+
+
+def host_and_port(host: str, port: int) -> str:
+    """Write HOST:PORT, an address of IPv6 in brackets: what :func:`parse_host` reads."""
+    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
 
 
 def why_not_bound(error: OSError) -> str:

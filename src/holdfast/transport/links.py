@@ -19,6 +19,7 @@ import time
 from collections import deque
 from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
 
+from holdfast.transport.endpoints import host_and_port
 from holdfast.transport.frames import (
     GOODBYE,
     HELLO,
@@ -615,5 +616,4 @@ def _address(found: object) -> str | None:
     """Write the address of a socket as in an endpoint."""
     if not isinstance(found, tuple):
         return None
-    host, port = str(found[0]), found[1]
-    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+    return host_and_port(str(found[0]), found[1])

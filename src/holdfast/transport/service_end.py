@@ -280,28 +280,26 @@ class StreamServiceTransport:
         if self._sockets is not None:
             self._sockets.close()
 
-    def end_links(self, condition: Callable[[PeerCertificate], bool], reason: str) -> int:
-        """End the links of robots whose certificate meets a condition.
+    def end_links(self, objection: Callable[[PeerCertificate], str | None]) -> int:
+        """End the links of robots whose certificate there is something to be said against.
 
         Parameters
         ----------
-        condition : callable
-        reason : str
-            What such a robot is told: the rest of a sentence about it.
+        objection : callable
+            Returns what such a robot is told, as the rest of a sentence about it; else None.
 
         Returns
         -------
         int
             How many there were.
         """
-        links = [
-            link
-            for link in (*self._links, *self._ungreeted)
-            if link.peer is not None and not link.ended and condition(link.peer)
-        ]
-        for link in links:
-            link.end(reason, goodbye=reason, refused=True)
-        return len(links)
+        ended = 0
+        for link in (*self._links, *self._ungreeted):
+            reason = None if link.peer is None or link.ended else objection(link.peer)
+            if reason is not None:
+                link.end(reason, goodbye=reason, refused=True)
+                ended += 1
+        return ended
 
     @property
     def num_revoked(self) -> int:
@@ -327,8 +325,7 @@ class StreamServiceTransport:
         if self._tls is None:
             return 0
         self._read_credentials(self._tls)
-        ended = self.end_links(lambda peer: self._objection(peer) == _REVOKED, _REVOKED)
-        return ended + self.end_links(lambda peer: self._objection(peer) == _FOREIGN, _FOREIGN)
+        return self.end_links(self._objection)
 
     def _objection(self, peer: PeerCertificate) -> str | None:
         """Return why a certificate is believed no more, as the rest of a sentence about a robot."""
