@@ -17,10 +17,10 @@ PACKAGE_SOURCES := $(shell find cmake src -type f -not -name '*.pyc')
 CPP_FILES := $(shell find cpp -name '*.hpp' -o -name '*.cpp')
 
 .DEFAULT_GOAL := help
-.PHONY: help demo install test test-gate test-real test-defects test-slow test-compiled lint format simulate chaos fuzz soak bench results clean
+.PHONY: help demo install test test-gate test-real test-defects test-slow test-deploy test-deploy-slow test-compiled lint format simulate chaos fuzz soak bench results clean
 
 help: ## what there is to make
-	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-13s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-16s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
 demo: $(INSTALLED_FIGURES) ## a cloud and a robot are killed, and no decision changes; see demo-run
 	rm -rf demo-run
@@ -34,17 +34,23 @@ test-gate: $(INSTALLED_DEV) ## those of them that no clock and no network decide
 	$(BIN)/pytest -q -m "not real and not slow" -n 2 --dist worksteal
 
 test-real: $(INSTALLED_DEV) ## those with real processes and sockets
-	$(BIN)/pytest -q -m "real and not slow" -n 2 --dist worksteal
+	$(BIN)/pytest -q -m "real and not slow and not deploy" -n 2 --dist worksteal
 
 test-defects: $(INSTALLED_DEV) ## the simulator finds every defect that is planted: a minute
 	$(BIN)/pytest -q -m slow -n 2 --dist worksteal tests/simulation/test_defects.py
 
 test-slow: $(INSTALLED_DEV) ## what repeats them with more seeds, problems and moments: half an hour
-	$(BIN)/pytest -q -m slow -n 2 --dist worksteal
+	$(BIN)/pytest -q -m "slow and not deploy" -n 2 --dist worksteal
 
 test-compiled: $(INSTALLED_COMPILED) ## the simulator's tests and 10,000 seeds through compiled machines
 	$(COMPILED)/bin/pytest -q -m "slow or not slow" tests/scenarios tests/simulation/test_world.py \
 	    tests/processes/test_compiled.py
+
+test-deploy: $(INSTALLED_DEV) ## images, tunnels and machines; root, and packages that .ci/run installs
+	$(BIN)/pytest -q -m "deploy and not slow" tests/deploy
+
+test-deploy-slow: $(INSTALLED_DEV) ## those of them that take minutes
+	$(BIN)/pytest -q -m "deploy and slow" tests/deploy
 
 fuzz: $(INSTALLED_DEV) ## 1,000,000 hostile messages to a live service; some 15 minutes
 	$(BIN)/python -m tests.fuzz.live --messages 1000000 --seed 1

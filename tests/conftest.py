@@ -26,7 +26,11 @@ os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 HERE = Path(__file__).parent
 
+DEPLOY = "deploy/"
+"""The folder of what needs an engine of containers, tunnels or a machine of its own."""
+
 REAL = (
+    DEPLOY,
     "processes/",
     "contracts/test_datagram_links.py",
     "contracts/test_transport.py",
@@ -132,6 +136,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         place = f"{item.path.relative_to(HERE).as_posix()}::{item.nodeid.partition('::')[2]}"
         if place.startswith(REAL) and IN_PROCESS not in place:
             item.add_marker(pytest.mark.real)
+        if place.startswith(DEPLOY):
+            item.add_marker(pytest.mark.deploy)
 
 
 @pytest.hookimpl(wrapper=True)
