@@ -59,7 +59,7 @@ def test_sensing_part_that_fails_after_its_task_part_ends_the_run_resumably(
     cloud = site.service("--problem", "room:Room", "--problem-directory", str(site.directory))
     cloud.start()
     robot = site.run(file, services=[cloud])
-    assert robot.wait() == 2, robot.account()
+    assert robot.wait() == 4, robot.account()
     for name in (cloud.endpoint, RECOVERY):
         assert f"{name}: {code}: " in robot.output
         refused = robot.matching("refused", service=name)

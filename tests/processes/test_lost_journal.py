@@ -132,7 +132,7 @@ class TestTakenAwayInMidRun:
         story = Story(site, references, SHORT)
         story.at("perform", 12, lambda: remove_log(story.running.out))
         robot = site.run(story.file)
-        assert robot.wait() == 2, robot.account()
+        assert robot.wait() == 4, robot.account()
         assert f"{journal_of(robot)}-wal: the journal's log is gone" in robot.output
         assert story.world.step == 13
         story.finish(site.run(story.file, resume=True))
@@ -301,7 +301,7 @@ class TestCannotBeWritten:
         out = site.directory / "out"
         out.mkdir()
         robot = site.run(story.file, command=in_namespace(SMALL, out))
-        assert robot.wait() == 2, robot.account()
+        assert robot.wait() == 4, robot.account()
         assert f"{journal_of(robot)}: database or disk is full" in robot.output
         assert "--resume" in robot.output
         assert 0 < story.world.step < LONG_STEPS

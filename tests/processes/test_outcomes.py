@@ -190,7 +190,7 @@ def test_asked_to_end_in_the_step_that_ended_the_trial(tmp_path: Path) -> None:
 
 def test_anything_else_is_an_error_that_names_it(tmp_path: Path) -> None:
     ended = Command(tmp_path, "Wrong").run()
-    assert ended.returncode == 2
+    assert ended.returncode == 4
     assert (
         "lander:Wrong: is_done returned 'crashed'; it must return True, False or \"failed\""
         in " ".join(ended.stderr.split())
@@ -247,7 +247,7 @@ def test_an_answer_that_is_none_after_a_move_is_mended_and_the_move_is_not_made_
 ) -> None:
     command = Command(tmp_path, "Absent")
     done = command.run()
-    assert done.returncode == 2
+    assert done.returncode == 4
     assert "trial 1, step 4, whose task action was performed" in done.stderr
     assert 'is_done returned None; it must return True, False or "failed"' in done.stderr
     assert "--resume" in done.stderr

@@ -7,10 +7,13 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 from pathlib import Path
 
 import pytest
 from tests.command_line import Said, run_here
+
+from holdfast.recording.journal import Journal
 
 PEG = """
 problem: peg_in_hole_2d
@@ -101,6 +104,84 @@ def test_a_run_can_be_extended(workplace: Workplace) -> None:
     assert workplace.decided("out") == workplace.decided("whole")
     out, whole = (workplace.directory / name / "config.yaml" for name in ("out", "whole"))
     assert out.read_text() == whole.read_text()
+
+
+class TestResumeIfBegun:
+    ARGUMENTS = ("run", "peg.yaml", "--jobs", "1", "--out", "out", "--resume-if-begun")
+
+    def test_it_begins_goes_on_and_has_ended(self, workplace: Workplace) -> None:
+        (workplace.directory / "out").mkdir()  # as a volume is that was just mounted
+        workplace.runs(*self.ARGUMENTS, "--trials", "2")
+        said = workplace.runs(*self.ARGUMENTS, "--trials", "5")
+        assert "2 finished before" in said.stderr
+        tables = {path: path.stat().st_mtime_ns for path in workplace.directory.glob("out/*")}
+        said = workplace.runs(*self.ARGUMENTS, "--trials", "5")
+        assert (said.stdout, said.stderr) == ("", "note: out: complete, with 5 trials\n")
+        del tables[workplace.directory / "out" / "journal.sqlite"]
+        assert {path: path.stat().st_mtime_ns for path in tables} == tables
+        workplace.runs("run", "peg.yaml", "--jobs", "1", "--out", "whole", "--trials", "5")
+        assert workplace.decided("out") == workplace.decided("whole")
+
+    def test_tables_that_are_missing_or_old_are_made(self, workplace: Workplace) -> None:
+        workplace.runs(*self.ARGUMENTS, "--trials", "2")
+        old = (workplace.directory / "out" / "summary.json").read_bytes()
+        workplace.runs(*self.ARGUMENTS, "--trials", "3")
+        for content in (old, b"", None):
+            summary = workplace.directory / "out" / "summary.json"
+            summary.unlink()
+            if content is not None:
+                summary.write_bytes(content)
+            workplace.runs(*self.ARGUMENTS, "--trials", "3")
+            assert workplace.summary("out")["finished"] == 3
+
+    def test_another_configuration_is_an_error(self, workplace: Workplace) -> None:
+        workplace.runs(*self.ARGUMENTS, "--trials", "2")
+        for trials in ("2", "3"):
+            said = workplace.fails(*self.ARGUMENTS, "--trials", trials, "--seed", "4")
+            assert "out: that run has another configuration: simulator.seed is 3 there" in said
+
+    def test_what_was_killed_while_it_was_made_counts_as_not_begun(
+        self, workplace: Workplace
+    ) -> None:
+        out = workplace.directory / "out"
+        workplace.runs("run", "peg.yaml", "--trials", "1", "--out", "other")
+        out.mkdir()
+        # Whoever made it had this process's number, as all that a container starts have.
+        for name in (f".journal.sqlite.{os.getpid()}", f".journal.sqlite.{os.getpid()}-journal"):
+            (out / name).write_bytes(b"half of it")
+        workplace.runs(*self.ARGUMENTS, "--trials", "1", "--seed", "7")
+        with Journal.open(out / "journal.sqlite") as journal:
+            # A journal without a trial, of another run, and no configuration beside it.
+            for table in ("trials", "steps"):
+                journal._connection.execute(f"DELETE FROM {table}")
+        for path in out.iterdir():
+            if path.name != "journal.sqlite":
+                path.unlink()
+        workplace.runs(*self.ARGUMENTS, "--trials", "1")
+        assert workplace.decided("out") == workplace.decided("other")
+
+    def test_what_is_no_journal_is_an_error(self, workplace: Workplace) -> None:
+        out = workplace.directory / "out"
+        out.mkdir()
+        (out / "journal.sqlite").write_bytes(b"no journal" * 100)
+        assert "journal.sqlite: " in workplace.fails(*self.ARGUMENTS)
+        (out / "journal.sqlite").unlink()
+        (out / "trials.csv").write_bytes(b"")
+        assert "out: holds trials.csv already" in workplace.fails(*self.ARGUMENTS)
+
+    @pytest.mark.parametrize(
+        ("options", "expected"),
+        [
+            (("--resume-if-begun",), "--resume-if-begun needs --out DIR"),
+            (("--resume-if-begun", "--resume", "--out", "out"), "leave one of them out"),
+        ],
+    )
+    def test_what_does_not_go_together(
+        self, workplace: Workplace, options: tuple[str, ...], expected: str
+    ) -> None:
+        assert expected in workplace.fails("run", "peg.yaml", *options)
+        assert not (workplace.directory / "out").exists()
+        assert not (workplace.directory / "runs").exists()
 
 
 def test_a_robot_without_services_tells_of_none(workplace: Workplace) -> None:

@@ -13,6 +13,7 @@ from holdfast.printable import printable
 from holdfast.runtime.command_line import wants_json
 
 __all__ = [
+    "EXIT_CAN_GO_ON",
     "EXIT_DIFFERENT",
     "EXIT_ERROR",
     "EXIT_SIGNAL",
@@ -33,6 +34,9 @@ EXIT_ERROR = 2
 
 EXIT_WRONG_ANSWER = 3
 """A service answered otherwise than the robot's own planner; events.jsonl says which and when."""
+
+EXIT_CAN_GO_ON = 4
+"""An error has ended a run that can go on as soon as the reason is gone."""
 
 EXIT_SIGNAL = 128
 """Added to the number of the signal that ended a run, as shells do it."""

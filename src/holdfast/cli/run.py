@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 import typer
 
 from holdfast.cli.endings import (
+    EXIT_CAN_GO_ON,
     EXIT_ERROR,
     EXIT_WRONG_ANSWER,
     RunError,
@@ -132,6 +133,16 @@ def run(
             ),
         ),
     ] = False,
+    resume_if_begun: Annotated[
+        bool,
+        typer.Option(
+            "--resume-if-begun",
+            help=(
+                "Go on with the run in DIR if it has begun, else begin it; needs --out. For what "
+                "repeats one command: a unit, a container."
+            ),
+        ),
+    ] = False,
     quiet: Annotated[
         bool,
         typer.Option(
@@ -222,6 +233,7 @@ def run(
         jobs=jobs,
         out=out,
         resume=resume,
+        resume_if_begun=resume_if_begun,
         quiet=quiet,
         services=tuple(service or ()),
         recovery=recovery,
@@ -246,6 +258,7 @@ class _Options:
     jobs: int | None
     out: Path | None
     resume: bool
+    resume_if_begun: bool
     quiet: bool
     services: tuple[str, ...]
     recovery: str | None
@@ -322,7 +335,10 @@ def _run(options: _Options) -> None:
     _require_effect(options, configuration, as_robot=as_robot)
     # Before a directory is claimed, too: what cannot be imported shall leave nothing behind.
     maker = load_environment(configuration) if as_robot else None
-    if options.resume:
+    if options.resume_if_begun:
+        directory_path = _out_of_one_run(options)
+        directory = RunDirectory.resume_if_begun(directory_path, configuration)
+    elif options.resume:
         directory_path = options.out or latest_default_directory(configuration, _RUNS)
         directory = RunDirectory.resume(directory_path, configuration)
     else:
@@ -331,6 +347,9 @@ def _run(options: _Options) -> None:
     with directory:
         earlier = directory.journal.tally()
         notes = _Notes(options)
+        if options.resume_if_begun and (told := directory.told_summary()) is not None:
+            notes.note(f"{directory_path}: complete, with {counted(told.trials, 'trial')}")
+            raise SystemExit(_exit_code(told))
         before, now = directory.services_before, configuration.offload.services
         if before is not None and before != now:
             notes.note(f"the run had {_listed(before)} before, and goes on with {_listed(now)}")
@@ -407,6 +426,7 @@ def _run(options: _Options) -> None:
             raise
         except HoldfastError as error:
             from holdfast.recording.journal import LostJournalError
+            from holdfast.session.replies import StaleEpochError
             from holdfast.session.robot import UnknownPerformanceError
 
             cannot_go_on = (
@@ -414,7 +434,10 @@ def _run(options: _Options) -> None:
                 or directory.journal.unfinished_trial() is None
             )
             resume = None if cannot_go_on else options.resume_command(directory_path)
-            raise RunError(error, resume, _exit_code(summary) or EXIT_ERROR) from error
+            # Of two processes of one run each would end the other, were both started again.
+            again = resume is not None and not isinstance(error, StaleEpochError)
+            exit_code = _exit_code(summary) or (EXIT_CAN_GO_ON if again else EXIT_ERROR)
+            raise RunError(error, resume, exit_code) from error
         if not quiet:
             print_files(directory_path)
         if remark is not None:
@@ -438,6 +461,18 @@ def _run(options: _Options) -> None:
         exit_code = _exit_code(summary) or (remark.exit_code if remark is not None else 0)
         if exit_code:
             raise SystemExit(exit_code)
+
+
+def _out_of_one_run(options: _Options) -> Path:
+    """Return the directory of a run of which the command does not say whether it has begun."""
+    if options.resume:
+        raise InvalidValueError(
+            "--resume and --resume-if-begun: the second one begins a run that is not there, the "
+            "first one does not; leave one of them out"
+        )
+    if options.out is None:
+        raise InvalidValueError("--resume-if-begun needs --out DIR, the directory of this one run")
+    return options.out
 
 
 def _exit_code(summary: RunSummary | None) -> int:

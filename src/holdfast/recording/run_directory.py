@@ -16,6 +16,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+import msgspec
+
 from holdfast import __version__
 from holdfast.configuration import Configuration
 from holdfast.files import OutputError, write_atomically
@@ -59,7 +61,8 @@ _MAX_SUFFIX = 10_000
 class RunDirectory:
     """An open directory of a run.
 
-    Use :meth:`create` or :meth:`resume`, and close it or use it in a ``with`` statement.
+    Use :meth:`create`, :meth:`resume` or :meth:`resume_if_begun`, and close it or use it in a
+    ``with`` statement.
 
     Parameters
     ----------
@@ -175,6 +178,42 @@ class RunDirectory:
         except BaseException:
             journal.close()
             raise
+
+    @classmethod
+    def resume_if_begun(cls, path: Path, configuration: Configuration) -> Self:
+        """Open the directory of a run that has begun, else claim it for a new one.
+
+        A process that was killed while it claimed the directory leaves a journal without a trial or
+        none at all, which counts as not begun; so does whatever else lies there.
+
+        Raises
+        ------
+        OutputError
+            As :meth:`resume` and :meth:`create` do.
+        """
+        is_there = False
+        with contextlib.suppress(OSError):  # what is the matter there, the other one says
+            is_there = (path / JOURNAL_NAME).exists()
+        if is_there:
+            unused = _unused_journal(path, configuration.recovery.journal_survives)
+            if unused is None:
+                return cls.resume(path, configuration)
+            unused.close()
+        return cls.create(path, configuration)
+
+    def told_summary(self) -> RunSummary | None:
+        """Return what ``summary.json`` says if all trials are finished and it tells of all.
+
+        A process that was killed after the last trial has left none, perhaps, or an old one.
+        """
+        trials = self.configuration.simulator.num_trials
+        if self.journal.tally().finished < trials:
+            return None
+        try:
+            summary = msgspec.json.decode((self.path / SUMMARY_NAME).read_bytes(), type=RunSummary)
+        except (OSError, msgspec.DecodeError):
+            return None
+        return summary if summary.finished == summary.trials == trials else None
 
     def add(self, result: TrialResult) -> None:
         """Keep a finished trial."""
