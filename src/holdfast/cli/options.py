@@ -8,10 +8,22 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from holdfast.errors import HoldfastError
 
-__all__ = ["MAX_SEED", "MAX_TRIALS", "OptionError", "location", "number", "whole_number"]
+if TYPE_CHECKING:
+    from holdfast.service.health import HttpAddress
+
+__all__ = [
+    "MAX_SEED",
+    "MAX_TRIALS",
+    "OptionError",
+    "http_address",
+    "location",
+    "number",
+    "whole_number",
+]
 
 MAX_SEED = 2**63 - 1
 """Largest seed, as in the configuration."""
@@ -89,5 +101,25 @@ def location(option: str) -> Callable[[str | Path], Path]:
         if not str(text):
             raise OptionError(f"{option} is ''; expected a path (. is the current directory)")
         return Path(text)
+
+    return read
+
+
+def http_address(option: str) -> Callable[[str | HttpAddress], HttpAddress]:
+    """Return what reads where HTTP is to be answered.
+
+    Parameters
+    ----------
+    option : str
+        For messages.
+    """
+
+    def read(text: str | HttpAddress) -> HttpAddress:
+        from holdfast.service.health import HealthError, parse_http_address
+
+        try:
+            return parse_http_address(str(text))
+        except HealthError as error:
+            raise OptionError(f"{option}: {error}") from error
 
     return read

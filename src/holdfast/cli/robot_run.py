@@ -13,6 +13,8 @@ if TYPE_CHECKING:
     from holdfast.recording.run_directory import RunDirectory
     from holdfast.runtime.environment import EnvironmentMaker
     from holdfast.runtime.logs import EventSink, LogFormat
+    from holdfast.runtime.service_manager import ServiceManager
+    from holdfast.service.health import HttpAddress
     from holdfast.session.effects import Verified
 
 __all__ = ["RobotRun", "is_robot_run", "run_as_robot"]
@@ -81,6 +83,8 @@ def run_as_robot(
     rate_hz: float | None,
     log_format: LogFormat,
     quiet: bool,
+    manager: ServiceManager,
+    health: HttpAddress | None,
 ) -> RobotRun:
     """Run the missing trials one after another.
 
@@ -98,6 +102,10 @@ def run_as_robot(
         Of the events on the standard error.
     quiet : bool
         Whether events go to the file alone.
+    manager : ServiceManager
+        Is told how the robot is doing.
+    health : HttpAddress or None
+        Where whoever asks is told the same.
 
     Raises
     ------
@@ -109,6 +117,7 @@ def run_as_robot(
     from holdfast.runtime.links import make_links
     from holdfast.runtime.logs import BoundedEventLog, EventLog, TeeEventLog
     from holdfast.runtime.robot_process import RobotProcess
+    from holdfast.runtime.robot_watch import RobotWatch
 
     with contextlib.ExitStack() as stack:
         # What is only for people on a terminal is kept in the file all the same.
@@ -148,6 +157,7 @@ def run_as_robot(
             links.offload,
             distrusted,
             make_planner=links.make_planner,
+            watch=RobotWatch(manager, health, events),
         )
         launcher = None if links.launcher is None else links.launcher(robot.deliver)
         robot.run(directory.journal.finished(), launcher)

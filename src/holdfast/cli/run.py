@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Annotated, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
@@ -22,7 +22,14 @@ from holdfast.cli.endings import (
     ended_by_signals,
     signal_of,
 )
-from holdfast.cli.options import MAX_SEED, MAX_TRIALS, location, number, whole_number
+from holdfast.cli.options import (
+    MAX_SEED,
+    MAX_TRIALS,
+    http_address,
+    location,
+    number,
+    whole_number,
+)
 from holdfast.cli.overrides import Override, combined, parse_assignment
 from holdfast.cli.terminal import counted, duration, print_files, print_summary, run_display
 from holdfast.errors import HoldfastError, InvalidValueError, TransportError
@@ -37,6 +44,7 @@ if TYPE_CHECKING:
     from holdfast.recording.repetition import Repetition
     from holdfast.recording.run_directory import RunDirectory
     from holdfast.recording.tables import RunSummary
+    from holdfast.service.health import HttpAddress
 
 __all__ = ["run"]
 
@@ -203,6 +211,19 @@ def run(
             show_default=False,
         ),
     ] = None,
+    health: Annotated[
+        Any,  # typer would look for HttpAddress
+        typer.Option(
+            "--health",
+            metavar="HOST:PORT",
+            parser=http_address("--health"),
+            help=(
+                "Answer http://HOST:PORT/livez, and /readyz while somebody decides for the robot; "
+                "a PORT alone is one of 127.0.0.1."
+            ),
+            show_default=False,
+        ),
+    ] = None,
     log: Annotated[
         str,
         typer.Option("--log", metavar="FORMAT", help="Format of the events shown: text or json."),
@@ -240,6 +261,7 @@ def run(
         tls=tls,
         environment=environment,
         rate=rate,
+        health=health,
         log=log,
     )
     with ended_by_signals():
@@ -265,6 +287,7 @@ class _Options:
     tls: Path | None
     environment: str | None
     rate: float | None
+    health: HttpAddress | None
     log: str
 
     def resume_command(self, directory: Path) -> str:
@@ -281,6 +304,7 @@ class _Options:
             ("--tls", self.tls),
             ("--environment", self.environment),
             ("--rate", self.rate),
+            ("--health", self.health),
         ]
         for option, value in options:
             if value is not None:
@@ -327,8 +351,10 @@ def _run(options: _Options) -> None:
         latest_default_directory,
     )
     from holdfast.runtime.environment import load_environment
+    from holdfast.runtime.service_manager import ServiceManager
     from holdfast.runtime.trials import available_cores, run_trials
 
+    manager = ServiceManager()
     configuration = options.load()
     quiet = options.quiet
     as_robot = is_robot_run(configuration, options.rate)
@@ -348,6 +374,8 @@ def _run(options: _Options) -> None:
         earlier = directory.journal.tally()
         notes = _Notes(options)
         if options.resume_if_begun and (told := directory.told_summary()) is not None:
+            manager.ready()  # else it would take the end for a failed start
+            manager.close()
             notes.note(f"{directory_path}: complete, with {counted(told.trials, 'trial')}")
             raise SystemExit(_exit_code(told))
         before, now = directory.services_before, configuration.offload.services
@@ -382,8 +410,12 @@ def _run(options: _Options) -> None:
                         rate_hz=options.rate,
                         log_format="json" if options.log == "json" else "text",
                         quiet=quiet,
+                        manager=manager,
+                        health=options.health,
                     )
                 else:
+                    manager.ready()
+                    manager.close()
                     run_trials(
                         configuration,
                         options.jobs or available_cores(),
@@ -512,6 +544,11 @@ def _require_effect(options: _Options, configuration: Configuration, *, as_robot
             f"--jobs is {options.jobs}, but a robot runs its trials one after another: leave it "
             "out, or leave out --service, --environment and --rate (and offload.services and "
             "environment.object)"
+        )
+    if options.health is not None and not as_robot:
+        raise InvalidValueError(
+            f"--health {options.health} is for a robot: give --service, --environment or --rate "
+            "(or offload.services or environment.object), without which the trials are a batch"
         )
     if configuration.offload.services:
         _check_services(options, configuration)

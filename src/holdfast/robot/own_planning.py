@@ -21,6 +21,7 @@ class OwnPlanning:
     """A :class:`~holdfast.session.decision_source.DecisionSource` that asks nobody else."""
 
     limits_tell = True
+    is_holding = False
     num_unverified = 0
 
     def __init__(self) -> None:

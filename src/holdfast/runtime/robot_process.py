@@ -37,6 +37,7 @@ from holdfast.runtime.logs import EventSink
 from holdfast.runtime.own_planner import OwnPlanner
 from holdfast.runtime.performer import Performer, make_performer
 from holdfast.runtime.recovery_launcher import RecoveryExited
+from holdfast.runtime.robot_watch import Condition, RobotWatch
 from holdfast.session.decision_source import DecisionSource
 from holdfast.session.dispatcher import Dispatcher
 from holdfast.session.effects import (
@@ -194,6 +195,8 @@ class RobotProcess:
         Services that have answered wrongly in an earlier part of the run.
     make_planner : callable
         Joins the problem and the settings to the functions that lead from state to state.
+    watch : RobotWatch or None
+        Tells others how the robot is doing, while it runs.
     """
 
     def __init__(
@@ -212,7 +215,9 @@ class RobotProcess:
         offload: OffloadSettings | None = None,
         distrusted: Collection[str] = (),
         make_planner: Callable[[Problem, PlanningSettings], Planner] = Planner,
+        watch: RobotWatch | None = None,
     ) -> None:
+        self._watch = watch
         self._configuration = configuration
         self._transport = transport
         self._turn_s = _TURN_WITHOUT_WIRE_S if transport is None else _TURN_S
@@ -285,6 +290,17 @@ class RobotProcess:
         """Ticks of the rate that passed while the robot was not ready."""
         return self._robot.missed_ticks
 
+    def condition(self) -> Condition:
+        """Return how the robot is doing."""
+        robot = self._robot
+        if self._interrupted is not None or self._verifying:
+            return Condition("ending", False, robot.trial)
+        if robot.is_holding:
+            return Condition("holding still", False, robot.trial)
+        if not robot.has_decided:
+            return Condition("starting", False, robot.trial)
+        return Condition(robot.status.value, True, robot.trial)
+
     def deliver(self, event: EnvironmentEvent | Decided | RecoveryExited) -> None:
         """Take an event from any thread; once the run has ended it is dropped."""
         # The loop is closed if it is too late for events.
@@ -316,6 +332,8 @@ class RobotProcess:
         before = sys.getswitchinterval()
         sys.setswitchinterval(_SWITCH_INTERVAL_S)
         try:
+            if self._watch is not None:
+                loop.run_until_complete(self._watch.start(self.condition))
             with self._signals_as_events(loop):
                 loop.call_soon(self._start)
                 loop.run_forever()
@@ -336,6 +354,8 @@ class RobotProcess:
         finally:
             sys.setswitchinterval(before)
             self._ended = self._closing = True
+            if self._watch is not None:
+                loop.run_until_complete(self._watch.close())
             if self._performer is not None:
                 self._performer.close()
             if self._transport is not None:
@@ -482,6 +502,8 @@ class RobotProcess:
         robot = self._robot
         if isinstance(event, _Interrupted):
             self._interrupted = event.number
+            if self._watch is not None:
+                self._watch.ending()
             self._carry_out(robot.pause(now))
         elif isinstance(event, RecoveryExited):
             self._carry_out(robot.recovery_exited(event.launch, event.reason, now))
@@ -493,6 +515,8 @@ class RobotProcess:
             self._carry_out(
                 robot.begin_trial(trial, history, event, now, tail_is_certain=tail_is_certain)
             )
+            if self._watch is not None:
+                self._watch.begun()
         elif not isinstance(event, Begun):
             self._carry_out(robot.handle(event, now))
             if self._verifying and isinstance(event, Decided):

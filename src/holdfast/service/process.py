@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     import asyncio
 
     from holdfast.runtime.logs import EventLog
+    from holdfast.runtime.service_manager import ServiceManager
     from holdfast.service.metrics import DecisionTimes, Report
     from holdfast.service.shell import ServiceShell
     from holdfast.service.supervisor import Supervised
@@ -81,9 +82,11 @@ def _serve_with_several(options: Options, arguments: Sequence[str]) -> int:
     import asyncio
 
     from holdfast.runtime.logs import EventLog
+    from holdfast.runtime.service_manager import ServiceManager
     from holdfast.service.listening import SharedEndpoints
     from holdfast.service.supervisor import Supervisor, supervise
 
+    manager = ServiceManager()
     workers = options.workers or max(1, len(os.sched_getaffinity(0)) // options.processes)
     shared = SharedEndpoints(listen)
     events = EventLog(sys.stderr, format=options.log, component=options.name)
@@ -107,6 +110,7 @@ def _serve_with_several(options: Options, arguments: Sequence[str]) -> int:
                 options.ending_signals,
                 options.drain_s + 2 * _CLOSE_TIMEOUT_S,
                 lambda: _say_ready(options, where),
+                manager,
             )
 
     try:
@@ -168,6 +172,7 @@ def _serve(options: Options, supervised: Supervised | None = None) -> int:
 
     from holdfast.runtime.allocator import limit_arenas
     from holdfast.runtime.logs import EventLog
+    from holdfast.runtime.service_manager import ServiceManager
     from holdfast.service.known_problems import KnownProblems
     from holdfast.service.metrics import DecisionTimes
     from holdfast.service.shell import ServiceShell
@@ -190,9 +195,12 @@ def _serve(options: Options, supervised: Supervised | None = None) -> int:
     events = EventLog(sys.stderr, format=options.log, component=options.name)
     times = DecisionTimes()
     shell = ServiceShell(service, transport, workers, events, times.add)
+    manager = ServiceManager()
     sys.setswitchinterval(_SWITCH_INTERVAL_S)
     try:
-        status = asyncio.run(_run(options, boot, transport, shell, events, times, supervised))
+        status = asyncio.run(
+            _run(options, boot, transport, shell, events, times, supervised, manager)
+        )
     finally:
         events.close()
     if shell.is_computing:
@@ -210,6 +218,7 @@ async def _run(
     events: EventLog,
     times: DecisionTimes,
     supervised: Supervised | None,
+    manager: ServiceManager,
 ) -> int:
     """Serve until there is a reason to stop; return the exit status."""
     import asyncio
@@ -232,6 +241,7 @@ async def _run(
         from holdfast.transport.credentials import date_text, load_until
 
         assert options.tls is not None
+        manager.reloading()
         try:
             # It knows more of what can be wrong with them.
             _, expires_s = load_until(
@@ -247,6 +257,11 @@ async def _run(
                 valid_until=date_text(expires_s),
                 num_revoked=transport.num_revoked,
             )
+        manager.ready()
+
+    def status() -> str:
+        sessions = shell.statistics().sessions
+        return why_not_ready() or f"serving, {sessions} session{'' if sessions == 1 else 's'}"
 
     async with _watched(options, lambda: None, why_not_ready, reported) as watched:
         try:
@@ -268,11 +283,14 @@ async def _run(
                 if options.connect:
                     where["connect"] = options.connect
                 _say_ready(options, where)
+                manager.watch(loop, status)
+                manager.ready()
             else:
                 supervised.start(report, lambda: shell.stop("the supervisor is gone"))
             reason = await shell.wait()
             if supervised is None:
                 events.event("stopping", reason=reason)
+                manager.stopping(options.drain_s + 2 * _CLOSE_TIMEOUT_S)
             else:
                 supervised.not_ready()
             if reason == signal.SIGTERM.name:

@@ -32,6 +32,7 @@ import msgspec
 
 from holdfast.errors import HoldfastError
 from holdfast.runtime.logs import EventSink
+from holdfast.runtime.service_manager import ServiceManager
 from holdfast.service.metrics import Report, added
 
 __all__ = ["ListeningSockets", "ServiceProcessError", "Supervised", "Supervisor", "supervise"]
@@ -308,6 +309,16 @@ class Supervisor:
         now = monotonic()
         return next(filter(None, (child.trouble(now) for child in self._living())), None)
 
+    def status(self) -> str:
+        """Return how it is, in a few words, as far as the processes have told by themselves."""
+        living = self._living()
+        sessions = sum(each.report.statistics.sessions for each in living if each.report)
+        serving = (
+            f"serving, {sessions} session{'' if sessions == 1 else 's'} at "
+            f"{sum(each.ready for each in living)} of {len(self._children)} processes"
+        )
+        return self.why_not_alive() or self.why_not_ready() or serving
+
     async def report(self) -> Report:
         """Return what all processes have counted, those that have ended too."""
         self._asked = asked = self._asked + 1
@@ -435,6 +446,7 @@ async def supervise(
     ending: Iterable[signal.Signals],
     drain_s: float,
     ready: Callable[[], None],
+    manager: ServiceManager,
 ) -> int:
     """Run a service's processes until a signal says that they are to end.
 
@@ -448,6 +460,8 @@ async def supervise(
         How long the processes may take to end in order. A second signal ends them at once.
     ready : callable
         Is called once, when all of them serve.
+    manager : ServiceManager
+        Is told so as well, and that all of them live, as long as they do.
 
     Returns
     -------
@@ -468,7 +482,13 @@ async def supervise(
         else:
             stopping.set_result(number)
 
-    loop.add_signal_handler(signal.SIGHUP, supervisor.reload)
+    def reload() -> None:
+        manager.reloading()
+        supervisor.reload()
+        if starting.done():
+            manager.ready()
+
+    loop.add_signal_handler(signal.SIGHUP, reload)
     for each in ending:
         loop.add_signal_handler(each, stop, each)
     starting = loop.create_task(supervisor.start())
@@ -478,8 +498,11 @@ async def supervise(
         if starting.done():
             starting.result()
             ready()
+            manager.watch(loop, supervisor.status, lambda: supervisor.why_not_alive() is None)
+            manager.ready()
         number = await stopping
         events.event("stopping", reason=signal.Signals(number).name)
+        manager.stopping(drain_s)
         await supervisor.stop(number, drain_s)
         return number
     finally:

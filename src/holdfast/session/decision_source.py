@@ -44,6 +44,11 @@ class DecisionSource(Protocol):
         ...
 
     @property
+    def is_holding(self) -> bool:
+        """Whether the robot holds still because nobody can be asked."""
+        ...
+
+    @property
     def num_unverified(self) -> int:
         """Questions that the robot's own planner still has to answer again."""
         ...

@@ -258,6 +258,11 @@ class Dispatcher:
         return self._verification.limits_tell
 
     @property
+    def is_holding(self) -> bool:
+        """Whether the robot holds still because nobody can be asked."""
+        return self._standstill.is_holding
+
+    @property
     def num_unverified(self) -> int:
         """Questions that the robot's own planner still has to answer."""
         return len(self._verification)

@@ -253,6 +253,8 @@ class Robot:
     ----------
     missed_ticks : int
         Ticks of ``rate_hz`` that passed while the robot was not ready.
+    has_decided : bool
+        Whether an answer has been used yet, in this process.
     """
 
     def __init__(
@@ -283,11 +285,17 @@ class Robot:
         self._told_ticks = 0
         self._tell_ticks_at = 0.0
         self.missed_ticks = 0
+        self.has_decided = False
 
     @property
     def status(self) -> Status:
         """Who decides."""
         return self._dispatcher.status
+
+    @property
+    def is_holding(self) -> bool:
+        """Whether the robot holds still because nobody can be asked."""
+        return self._dispatcher.is_holding
 
     @property
     def num_unverified(self) -> int:
@@ -742,6 +750,7 @@ class Robot:
             self._unwritten.append(RecoveredRecord(times))
 
     def _timed(self, kind: str, question: Question, source: Provenance, now: float) -> None:
+        self.has_decided = True
         waited_s = 0.0 if question.needed_at is None else now - question.needed_at
         step = question.state.step if kind == "task" else question.sensing_step
         self._effects.append(

@@ -34,6 +34,11 @@ class Standstill:
         self._effects = effects
         self._holding_since: float | None = None
 
+    @property
+    def is_holding(self) -> bool:
+        """Whether nobody can be asked for what the robot needs."""
+        return self._holding_since is not None
+
     def waiting_at(self, question: Question) -> float | None:
         """Return when it is to be said that the robot waits; None if it does not, or was told."""
         if question.needed_at is None or question.told_waiting:

@@ -1,0 +1,103 @@
+"""How a robot is doing, for whatever watches it: HTTP, and the service manager.
+
+Both are answered by the event loop that the robot itself runs on. So an answer shows that the loop
+moves, and says what people want to know next: whether anybody decides for the robot.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from typing import TYPE_CHECKING, NamedTuple
+
+from holdfast.runtime.logs import EventSink
+from holdfast.runtime.service_manager import ServiceManager
+
+if TYPE_CHECKING:
+    from holdfast.service.health import HttpAddress, Watched
+
+__all__ = ["Condition", "RobotWatch"]
+
+
+class Condition(NamedTuple):
+    """How a robot is doing.
+
+    Attributes
+    ----------
+    word : str
+        The status while somebody decides (``standard``, ``local_recovery``, ``keep_alive``); else
+        ``starting``, ``holding still`` or ``ending``.
+    is_deciding : bool
+    trial : int or None
+        None between two trials.
+    """
+
+    word: str
+    is_deciding: bool
+    trial: int | None
+
+    def __str__(self) -> str:
+        return self.word if self.trial is None else f"{self.word}, trial {self.trial}"
+
+
+class RobotWatch:
+    """Tells whoever asks, or wants to be told, how a robot is doing.
+
+    Parameters
+    ----------
+    manager : ServiceManager
+    health : HttpAddress or None
+        Where to answer ``/livez`` and ``/readyz``.
+    events : EventSink
+        Is told where that is.
+    """
+
+    def __init__(
+        self, manager: ServiceManager, health: HttpAddress | None, events: EventSink
+    ) -> None:
+        self._manager = manager
+        self._health = health
+        self._events = events
+        self._watched: Watched | None = None
+        self._has_begun = False
+
+    async def start(self, condition: Callable[[], Condition]) -> None:
+        """Answer from now on, in the running loop.
+
+        Raises
+        ------
+        HealthError
+            If it cannot listen there; the message names the address.
+        """
+        if self._health is not None:
+            from holdfast.service.health import Page, Watched
+
+            async def alive() -> Page:
+                return Page.of(None)
+
+            async def ready() -> Page:
+                now = condition()
+                return Page(200 if now.is_deciding else 503, f"{now.word}\n".encode())
+
+            self._watched = Watched()
+            self._watched.add("health", self._health, {"/livez": alive, "/readyz": ready})
+            self._events.event("offers", **await self._watched.start())
+        self._manager.watch(asyncio.get_running_loop(), lambda: str(condition()))
+
+    def begun(self) -> None:
+        """Take note that a trial has begun."""
+        if not self._has_begun:
+            self._has_begun = True
+            self._manager.ready()
+
+    def ending(self) -> None:
+        """Take note that the robot was asked to end."""
+        self._manager.stopping()
+
+    async def close(self) -> None:
+        """Answer no more, and tell that the process is about to end."""
+        self._manager.stopping()
+        self._manager.close()
+        if self._watched is not None:
+            self._watched.close()
+            await asyncio.sleep(0)  # the loop lets go of the connections
