@@ -7,6 +7,7 @@ import json
 import os
 import signal
 import socket
+import time
 import urllib.error
 import urllib.request
 from collections.abc import Callable
@@ -15,6 +16,7 @@ from typing import Any
 
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
+from tests.notify_socket import NotifySocket
 from tests.ports import free_port
 from tests.processes.faults import (
     PATIENT,
@@ -49,14 +51,21 @@ class Mortal(CapsuleRobot):
 """
 
 
-def several(site: Site, *options: str, endpoint: str | None = None) -> Service:
+def several(
+    site: Site,
+    *options: str,
+    endpoint: str | None = None,
+    variables: dict[str, str] | None = None,
+) -> Service:
     """Return a service of two processes that tells how it is."""
     address = f"127.0.0.1:{free_port()}"
-    return site.service(
+    service = site.service(
         *("--processes", "2", "--health", address, "--metrics", address),
         *options,
         endpoint=endpoint,
-    ).start()
+    )
+    service.variables = variables or {}
+    return service.start()
 
 
 def page(service: Service, path: str) -> tuple[int, str]:
@@ -245,15 +254,29 @@ class TestHealth:
 
     @pytest.mark.slow  # when one counts as stuck: unit/test_supervised_process.py
     def test_a_process_that_stands_still(self, site: Site) -> None:
-        cloud = several(site)
+        with NotifySocket() as manager:
+            self.stands_still(site, manager)
+
+    @staticmethod
+    def stands_still(site: Site, manager: NotifySocket) -> None:
+        cloud = several(site, variables={**manager.variables, "WATCHDOG_USEC": "100000"})
         pid = children(cloud)[1]
+        manager.wait_for("WATCHDOG=1")
         os.kill(pid, signal.SIGSTOP)
         wait_until(lambda: page(cloud, "/livez")[0] == 503, "the silence to be seen")
+        manager.wait(
+            lambda lines: any(f"process {pid} has said nothing" in line for line in lines),
+            "the silence to be told",
+        )
+        beats = manager.count("WATCHDOG=1")
+        time.sleep(1.0)
+        assert manager.count("WATCHDOG=1") == beats
         assert f"process {pid} has said nothing" in page(cloud, "/livez")[1]
         assert page(cloud, "/readyz") == (200, "ok\n")
         assert metrics(cloud)["holdfast_process_restarts_total[]"] == 0
         os.kill(pid, signal.SIGCONT)
         wait_until(lambda: page(cloud, "/livez")[0] == 200, "it to be heard again")
+        manager.wait_for("WATCHDOG=1", beats + 1)
 
 
 class TestRefusing:

@@ -6,7 +6,9 @@ The commands are real processes, the service manager is a real socket, and healt
 from __future__ import annotations
 
 import os
+import shutil
 import signal
+import tempfile
 import time
 import urllib.error
 import urllib.request
@@ -14,6 +16,7 @@ from pathlib import Path
 
 import pytest
 from tests.notify_socket import NotifySocket
+from tests.ports import free_port
 from tests.processes.faults import (
     COMMAND,
     KEEP_ALIVE,
@@ -24,6 +27,7 @@ from tests.processes.faults import (
     References,
     Site,
     Story,
+    assert_identical,
     document_of,
     sensing_steps,
     services_in_order,
@@ -335,3 +339,32 @@ class TestServiceManager:
             cloud.process.wait()
             manager.wait_for("STOPPING=1")
             assert manager.count("WATCHDOG=1") == 0
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can hand files to another user")
+def test_credentials_of_which_another_user_is_the_owner(keys: Path, references: References) -> None:
+    """As systemd (LoadCredential=) and a cluster hand them over: root's, and read-only."""
+    nobody = 65534
+    as_nobody = ("setpriv", f"--reuid={nobody}", f"--regid={nobody}", "--clear-groups")
+    # Not below pytest's own directories, which no other user may enter.
+    with tempfile.TemporaryDirectory() as name, Site(Path(name)) as site:
+        os.chown(site.directory, nobody, nobody)
+        for role in ("robot", "service"):
+            theirs = Path(shutil.copytree(keys / "ours" / role, site.directory / role))
+            for path in (*theirs.iterdir(), theirs):
+                os.chown(path, 0, nobody)
+                path.chmod(0o550 if path == theirs else 0o440)
+        cloud = site.service("--tls", "service", endpoint=f"tls/localhost:{free_port()}")
+        cloud.command = (*as_nobody, *cloud.command)
+        cloud.start()
+        cloud.process.signal(signal.SIGHUP)
+        cloud.process.wait_for("credentials_reloaded")
+        document = document_of(PEG, max_steps=20)
+        file = site.configure(document, recovery={"launch": "never"})
+        options = ("--tls", site.directory / "robot", "--rate", "10000")
+        robot = site.run(file, *options, services=[cloud], command=(*as_nobody, *COMMAND))
+        robot.finish()
+        for process in (robot, cloud.process):
+            assert process.matching("credentials") == []
+        assert services_in_order(robot) == [cloud.endpoint]
+        assert_identical(robot.out, references(document))

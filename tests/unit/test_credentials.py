@@ -484,6 +484,25 @@ class TestLoading:
         with pytest.warns(CredentialsWarning, match="expires in"):
             load_credentials(tmp_path / "service", "service")
 
+    def test_a_key_that_a_service_manager_or_a_cluster_hands_over_is_not_open(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """It belongs to root, and this user reads it by its group, or by a right of its own."""
+        make_credentials(tmp_path)
+        key = tmp_path / "robot" / "key.pem"
+        owner = key.stat().st_uid
+        for user, mode, is_open in (
+            (owner + 1, 0o440, False),
+            (owner + 1, 0o444, True),
+            (owner + 1, 0o460, True),
+            (owner, 0o440, True),
+        ):
+            key.chmod(mode)
+            monkeypatch.setattr(os, "geteuid", lambda user=user: user)
+            said: list[str] = []
+            load_credentials(tmp_path / "robot", "robot", warn=said.append)
+            assert bool(said) is is_open, (user, mode)
+
     def test_loading_needs_no_package_and_making_says_which_it_needs(self, keys: Path) -> None:
         program = textwrap.dedent("""
             import importlib, sys

@@ -9,6 +9,7 @@ service starts: what the other end would refuse is named then, with the file and
 
 from __future__ import annotations
 
+import os
 import warnings
 from collections.abc import Callable
 from datetime import UTC, datetime
@@ -40,6 +41,7 @@ EXPIRES_SOON_DAYS = 14
 """A certificate with fewer days left is warned of when it is loaded."""
 
 _OPEN_TO_OTHERS = 0o077
+_GROUP_READS = 0o040
 
 
 class CredentialsError(HoldfastError):
@@ -118,9 +120,15 @@ def _unreadable(directory: Path, path: Path, role: Role, error: OSError) -> str:
 
 
 def warn_if_open(key: Path, warn: Callable[[str], None]) -> None:
-    """Warn of a key that others can read."""
-    mode = key.stat().st_mode
-    if mode & _OPEN_TO_OTHERS:
+    """Warn of a key that others can read.
+
+    If it is not this user's own, its group is how this user may read it: so systemd hands
+    credentials over, and so a cluster does.
+    """
+    status = key.stat()
+    mode = status.st_mode
+    allowed = 0 if os.geteuid() in (0, status.st_uid) else _GROUP_READS
+    if mode & _OPEN_TO_OTHERS & ~allowed:
         warn(f"{key}: others can read this key (mode {mode & 0o777:03o}); chmod 600 {key}")
 
 
