@@ -45,6 +45,43 @@ _READ_BYTES = 16 * 1024
 """The largest record."""
 
 
+_WHAT_TO_DO = {
+    10: "; 'holdfast keys DIR --renew --{role} NAME' makes another",
+    18: "; both ends need files of one 'holdfast keys DIR'",
+    19: "; both ends need files of one 'holdfast keys DIR'",
+    20: "; both ends need files of one 'holdfast keys DIR'",
+    23: "; 'holdfast keys DIR --rotate --{role} NAME' makes a new key",
+}
+"""By OpenSSL's numbers, about a certificate of the other end."""
+
+_ALERTS = {
+    "both": {
+        "CERTIFICATE_EXPIRED": (
+            "it has expired by the clock there; 'holdfast keys DIR --renew --{role} NAME' makes "
+            "another"
+        ),
+        "CERTIFICATE_REVOKED": (
+            "it has been revoked; 'holdfast keys DIR --rotate --{role} NAME' makes a new key"
+        ),
+        "UNKNOWN_CA": (
+            f"it was not signed by the authority in {AUTHORITY_FILE} there; both ends need files "
+            "of one 'holdfast keys DIR'"
+        ),
+        "CERTIFICATE_REQUIRED": "there is none, and one is required",
+        "UNSUPPORTED_CERTIFICATE": "it is not for a {role}",
+        "DECRYPT_ERROR": "this end's key is not the certificate's",
+    },
+    "robot": {"BAD_CERTIFICATE": "it is not valid yet by the clock there, or is malformed"},
+    "service": {
+        "BAD_CERTIFICATE": (
+            "it does not name the host that the robot calls, or is not valid yet by the clock "
+            "there; the robot's log says which"
+        )
+    },
+}
+"""What the other end says of this end's certificate (RFC 8446, section 6.2), by this end's role."""
+
+
 class PeerCertificate(NamedTuple):
     """The certificate with which the other end has proved who it is.
 
@@ -293,11 +330,17 @@ class TlsStream:
         assert isinstance(error, ssl.SSLError)
         if isinstance(error, ssl.SSLCertVerificationError):
             role = "robot" if self._is_server else "service"
-            return f"has a certificate that {fault_of_certificate(error, role)}"
+            fault = fault_of_certificate(error, role)
+            what_to_do = _WHAT_TO_DO.get(error.verify_code, "")
+            return f"has a certificate that {fault}{what_to_do.format(role=role)}"
         reason = error.reason or ""
         alert = reason.partition("_ALERT_")[2]
         if alert:
-            return f"refuses this end's certificate ({alert.lower().replace('_', ' ')})"
+            own = "service" if self._is_server else "robot"
+            meaning = _ALERTS[own].get(alert, _ALERTS["both"].get(alert))
+            if meaning is None:
+                return f"refuses this end's TLS ({alert.lower().replace('_', ' ')})"
+            return f"refuses this end's certificate: {meaning.format(role=own)}"
         if "PEER_DID_NOT_RETURN_A_CERTIFICATE" in reason:
             return "shows no certificate"
         text = reason.lower().replace("_", " ") if reason else str(error.args[-1])
