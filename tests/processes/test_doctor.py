@@ -1,0 +1,419 @@
+"""``holdfast doctor``: each layer that can fail, really failing, and what is said of it."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import shutil
+import signal
+import socket
+import struct
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+from tests.ports import free_port
+from tests.processes import lying_problem, test_other_code
+from tests.processes.faults import HERE, PATIENCE_S, Process, Service, Site, document_of
+from tests.wire import CALL, HELLO, LAST, frame_of, hello_of
+
+from holdfast.chaos.namespace import NetworkNamespace, why_no_namespace
+from holdfast.session.messages import NeedState, decode_request, encode
+from holdfast.transport.key_ring import make_credentials, revoke_credentials
+
+PEG = document_of("peg_in_hole_2d", max_steps=40)
+PLAIN = ["name", "route", "port", "tls", "protocol", "clock", "problem", "round trip"]
+SECURE = [*PLAIN[:4], "certificate", *PLAIN[4:]]
+LAYERS = {
+    "tcp": PLAIN,
+    "tls": SECURE,
+    "udp": [*SECURE[:6], "datagrams", *SECURE[6:]],
+    "unix": [PLAIN[0], *PLAIN[2:]],
+}
+
+
+class Seen(NamedTuple):
+    """What the command has said of one service."""
+
+    code: int
+    findings: list[dict[str, str]]
+
+    def __getitem__(self, layer: str) -> dict[str, str]:
+        (found,) = [each for each in self.findings if each["layer"] == layer]
+        return found
+
+    @property
+    def states(self) -> dict[str, str]:
+        return {each["layer"]: each["state"] for each in self.findings}
+
+
+def look(site: Site, endpoint: str, *options: str | Path, prefix: tuple[str, ...] = ()) -> Seen:
+    command = (*prefix, sys.executable, "-m", "holdfast", "doctor", "--json")
+    process = site.process(*command, "--service", endpoint, *map(str, options))
+    code = process.wait()
+    try:
+        findings = [json.loads(line) for line in process.output.splitlines()]
+    except json.JSONDecodeError:
+        raise AssertionError(process.account()) from None
+    assert {each["service"] for each in findings} == {endpoint}
+    assert code == (1 if "fails" in {each["state"] for each in findings} else 0)
+    return Seen(code, findings)
+
+
+def assert_fails(seen: Seen, layer: str, what: str, to_do: str = "") -> None:
+    """Check that this layer fails, those below work, and those above were not reached."""
+    assert seen.code == 1
+    found = seen[layer]
+    assert found["state"] == "fails", seen.findings
+    assert what in found["seen"], found
+    assert to_do in found["advice"], found
+    names = [each["layer"] for each in seen.findings]
+    below, above = names[: names.index(layer)], names[names.index(layer) + 1 :]
+    assert {seen.states[each] for each in below} <= {"ok", "warns"}, seen.findings
+    assert {seen.states[each] for each in above} <= {"-"}, seen.findings
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return credentials of all sorts; beside them, copies from before a revocation."""
+    home = tmp_path_factory.mktemp("home") / "keys"
+    now = datetime.now(UTC)
+    make_credentials(home, robots=["anna"], services=["cloud"], now=now - timedelta(days=30))
+    for days, name in ((3, "old"), (-3, "early")):
+        moment = now - timedelta(days=days)
+        make_credentials(home, robots=[name], services=[f"{name}-cloud"], days=2, now=moment)
+    make_credentials(home, robots=["soon"], services=["soon-cloud"], days=5)
+    make_credentials(home, robots=["thief"], services=["thief-cloud"])
+    for name in ("thief", "thief-cloud"):
+        shutil.copytree(home / name, home.with_name(name))
+    revoke_credentials(home, names=["thief", "thief-cloud"])
+    crossed = home.with_name("crossed")
+    shutil.copytree(home / "anna", crossed)
+    shutil.copy(home / "soon" / "key.pem", crossed)
+    make_credentials(home.with_name("other"), robots=["anna"], services=["cloud"])
+    return home
+
+
+def service_of(
+    site: Site, protocol: str, credentials: Path | None = None, host: str = "127.0.0.1"
+) -> Service:
+    options = () if credentials is None else ("--tls", str(credentials))
+    return site.service(*options, endpoint=f"{protocol}/{host}:{free_port(host)}").start()
+
+
+@contextlib.contextmanager
+def answering(answer: Callable[[socket.socket], None]) -> Iterator[int]:
+    """Take connections, and do something with each; return the port."""
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+
+        def accept() -> None:
+            with contextlib.suppress(OSError):
+                while True:
+                    taken, _ = listener.accept()
+                    threading.Thread(target=handle, args=(taken,), daemon=True).start()
+
+        def handle(taken: socket.socket) -> None:
+            with taken, contextlib.suppress(OSError):
+                answer(taken)
+
+        threading.Thread(target=accept, daemon=True).start()
+        yield listener.getsockname()[1]
+
+
+class TestAllIsWell:
+    @pytest.mark.parametrize("protocol", ["tcp", "tls", "udp", "unix"])
+    def test_with_a_configuration(self, protocol: str, home: Path, site: Site) -> None:
+        options: tuple[str | Path, ...] = ()
+        if protocol == "unix":
+            cloud = site.service(endpoint=f"unix/{site.directory / 's'}").start()
+        elif protocol == "tcp":
+            cloud = service_of(site, protocol)
+        else:
+            cloud = service_of(site, protocol, home / "cloud")
+            options = ("--tls", home / "anna")
+        seen = look(site, cloud.endpoint, *options, site.configure(PEG))
+        assert [each["layer"] for each in seen.findings] == LAYERS[protocol]
+        assert set(seen.states.values()) == {"ok"}, seen.findings
+        assert "2 decisions are the robot's own, bit for bit" in seen["problem"]["seen"]
+        assert seen["clock"]["seen"].endswith("from the service's")
+        if protocol in ("tls", "udp"):
+            assert seen["certificate"]["seen"].startswith("ours: anna, until ")
+            assert "; theirs: cloud, until " in seen["certificate"]["seen"]
+        assert not cloud.process.matching("link_refused")
+
+    def test_without_one_and_for_people(self, site: Site) -> None:
+        cloud = service_of(site, "tcp")
+        done = site.holdfast("doctor", "--service", cloud.endpoint)
+        assert done.process.returncode == 0
+        lines = done.output.splitlines()
+        assert lines[0] == cloud.endpoint
+        assert "  name         ok     127.0.0.1 is an address" in lines
+        assert "  problem      -      not asked: with CONFIG, decisions are compared" in lines
+        assert len(lines) > len(PLAIN)
+
+    def test_services_and_credentials_of_the_configuration(self, home: Path, site: Site) -> None:
+        cloud = service_of(site, "tls", home / "cloud")
+        nobody = f"tls/127.0.0.1:{free_port()}"
+        offload = {"services": [cloud.endpoint, nobody], "tls": str(home / "anna")}
+        done = site.holdfast("doctor", "--json", site.configure(PEG, offload=offload))
+        assert done.process.returncode == 1
+        found = [json.loads(line) for line in done.output.splitlines()]
+        fails = [each for each in found if each["state"] == "fails"]
+        assert [(each["service"], each["layer"]) for each in fails] == [(nobody, "port")]
+
+    def test_what_ends_soon(self, home: Path, site: Site) -> None:
+        cloud = service_of(site, "tls", home / "soon-cloud")
+        seen = look(site, cloud.endpoint, "--tls", home / "soon")
+        assert seen.code == 0
+        assert seen["certificate"]["state"] == "warns"
+        assert "expires in 5.0 days" in seen["certificate"]["advice"]
+        assert "--renew --service soon-cloud" in seen["certificate"]["advice"]
+
+
+class TestTheWay:
+    def test_a_name_that_is_not_found(self, site: Site) -> None:
+        seen = look(site, "tcp/nobody.invalid:7447")
+        assert_fails(seen, "name", "nobody.invalid is not found", "is it spelled right")
+
+    def test_a_socket_that_is_not_there(self, site: Site) -> None:
+        seen = look(site, f"unix/{site.directory / 's'}")
+        assert_fails(seen, "name", "is not there")
+
+    def test_a_port_at_which_nothing_listens(self, site: Site) -> None:
+        endpoint = f"tcp/127.0.0.1:{free_port()}"
+        seen = look(site, endpoint)
+        assert_fails(seen, "port", "refused", f"holdfast serve --listen {endpoint}")
+
+    def test_a_port_that_does_not_answer(self, site: Site) -> None:
+        with contextlib.ExitStack() as stack:
+            full = stack.enter_context(socket.create_server(("127.0.0.1", 0), backlog=0))
+            for _ in range(4):
+                waiting = stack.enter_context(socket.socket())
+                waiting.setblocking(False)
+                waiting.connect_ex(full.getsockname())
+            seen = look(site, f"tcp/127.0.0.1:{full.getsockname()[1]}")
+        assert_fails(seen, "port", "nothing answers", "firewall")
+
+    def test_a_network_without_a_way(self, site: Site) -> None:
+        with own_network() as network:
+            seen = look(site, "tcp/192.0.2.7:7447", prefix=network.prefix)
+        assert_fails(seen, "route", "network is unreachable", "VPN")
+
+    def test_datagrams_that_do_not_get_through(self, home: Path, site: Site) -> None:
+        with own_network() as network:
+            rules = "add table inet t; add chain inet t c {type filter hook input priority 0;}; "
+            rules += "add rule inet t c meta l4proto udp drop"
+            subprocess.run([*network.prefix, "nft", rules], check=True)
+            cloud = site.service(
+                *("--tls", str(home / "cloud")), endpoint=f"udp/127.0.0.1:{free_port()}"
+            )
+            cloud.command = (*network.prefix, *cloud.command)
+            cloud.start()
+            options = ("--tls", home / "anna", site.configure(PEG))
+            seen = look(site, cloud.endpoint, *options, prefix=network.prefix)
+        assert seen["datagrams"]["state"] == "fails"
+        assert "none gets through" in seen["datagrams"]["seen"]
+        assert cloud.endpoint.rpartition(":")[2] in seen["datagrams"]["advice"]
+        # Over the stream all the rest works.
+        assert {state for layer, state in seen.states.items() if layer != "datagrams"} == {"ok"}
+
+
+@contextlib.contextmanager
+def own_network() -> Iterator[NetworkNamespace]:
+    reason = why_no_namespace()
+    if reason is not None:
+        pytest.skip(reason)
+    with NetworkNamespace() as network:
+        yield network
+
+
+class TestTlsAndProtocol:
+    @pytest.mark.parametrize("protocol", ["tcp", "tls"])
+    def test_another_program(self, protocol: str, home: Path, site: Site) -> None:
+        def answer(taken: socket.socket) -> None:
+            taken.recv(1000)
+            taken.sendall(b"HTTP/1.1 400 Bad Request\r\n\r\n")
+
+        options = ("--tls", home / "anna") if protocol == "tls" else ()
+        with answering(answer) as port:
+            seen = look(site, f"{protocol}/127.0.0.1:{port}", *options)
+        if protocol == "tcp":
+            assert_fails(seen, "protocol", "speaks HTTP", "another program")
+        else:
+            assert_fails(seen, "tls", "does not speak TLS", "another program")
+
+    def test_tls_where_there_is_none(self, home: Path, site: Site) -> None:
+        cloud = service_of(site, "tcp")
+        seen = look(site, cloud.endpoint.replace("tcp", "tls"), "--tls", home / "anna")
+        assert_fails(seen, "tls", "closes connections at the first bytes of TLS", "tcp/...")
+
+    def test_no_tls_where_there_is_some(self, home: Path, site: Site) -> None:
+        cloud = service_of(site, "tls", home / "cloud")
+        seen = look(site, cloud.endpoint.replace("tls", "tcp"))
+        assert_fails(seen, "protocol", "refuses this end, which does not speak TLS; as at that end")
+
+    @pytest.mark.parametrize("protocol", ["tcp", "tls"])
+    def test_a_process_that_stands_still(self, protocol: str, home: Path, site: Site) -> None:
+        cloud = service_of(site, protocol, home / "cloud" if protocol == "tls" else None)
+        options = ("--tls", home / "anna") if protocol == "tls" else ()
+        cloud.stop()
+        seen = look(site, cloud.endpoint, *options)
+        layer = "tls" if protocol == "tls" else "protocol"
+        assert_fails(seen, layer, "takes connections and says nothing", "stopped")
+
+    def test_another_version_of_the_wire(self, site: Site) -> None:
+        hello = hello_of("service", "cloud", version=2, release="9.9.9")
+        with answering(lambda taken: (taken.sendall(hello), taken.recv(1000))[0]) as port:
+            seen = look(site, f"tcp/127.0.0.1:{port}")
+        assert_fails(seen, "protocol", "is holdfast 9.9.9 with version 2 of the wire")
+        assert "install the same release at both ends" in seen["protocol"]["seen"]
+
+    def test_a_clock_that_is_wrong(self, site: Site) -> None:
+        with answering(lambda taken: play_service(taken, time.time() - 3600.0)) as port:
+            seen = look(site, f"tcp/127.0.0.1:{port}")
+        assert seen.code == 0
+        assert seen["clock"]["state"] == "warns"
+        assert seen["clock"]["seen"].startswith("3600 s ahead of the service's")
+        assert seen["round trip"]["seen"].startswith("20 echoes")
+
+    def test_ctrl_c(self, site: Site) -> None:
+        heard = threading.Event()
+
+        def answer(taken: socket.socket) -> None:
+            taken.recv(1000)
+            heard.set()
+            taken.recv(1000)
+
+        with answering(answer) as port:
+            command = (sys.executable, "-m", "holdfast", "doctor", "--service")
+            process: Process = site.process(*command, f"tcp/127.0.0.1:{port}")
+            assert heard.wait(PATIENCE_S)
+            process.signal(signal.SIGINT)
+            assert process.wait() == 130
+        assert "Traceback" not in process.output
+
+
+def play_service(taken: socket.socket, clock_s: float) -> None:
+    """Say that nothing is known of any run, as a service does."""
+    taken.sendall(hello_of("service", "cloud", clock_s=clock_s))
+    data, header = b"", struct.Struct("<IBI")
+    while more := taken.recv(65536):
+        data = (data + more).removeprefix(b"holdfast")
+        while len(data) >= header.size and len(data) >= header.size + header.unpack_from(data)[0]:
+            size, kind, call = header.unpack_from(data)
+            payload, data = data[header.size : header.size + size], data[header.size + size :]
+            assert kind in (HELLO, CALL) or not payload
+            if kind == CALL:
+                reply = encode(NeedState(decode_request(payload).number, False))
+                taken.sendall(frame_of(LAST, call, reply))
+
+
+class TestCertificates:
+    @pytest.mark.parametrize(
+        ("robot", "what", "to_do"),
+        [
+            (None, "ours: none was given", "--tls DIR"),
+            ("keys/old", "certificate.pem: has expired (valid from ", ""),
+            ("keys/early", "certificate.pem: is not valid yet; is a clock wrong?", ""),
+            ("keys/thief", "certificate.pem: has been revoked", ""),
+            ("keys/cloud", "certificate.pem: is not for a robot", ""),
+            ("keys/nobody", "authority.pem: cannot be read: No such file", ""),
+            ("crossed", "key.pem: is not the key of", ""),
+            ("thief", "ours: thief, until", ""),
+            ("other/anna", "theirs: has a certificate that was not signed by", "shown is cloud"),
+        ],
+    )
+    def test_a_robot_that_is_not_let_in(
+        self, robot: str | None, what: str, to_do: str, home: Path, site: Site
+    ) -> None:
+        cloud = service_of(site, "tls", home / "cloud")
+        options = () if robot is None else ("--tls", home.parent / robot)
+        seen = look(site, cloud.endpoint, *options)
+        assert_fails(seen, "certificate", what, to_do)
+        if robot == "thief":
+            assert "refuses this end, which has a certificate that has been" in str(seen.findings)
+
+    @pytest.mark.parametrize(
+        ("service", "host", "what"),
+        [
+            ("keys/cloud", "127.0.0.2", "does not name this host"),
+            ("other/cloud", "127.0.0.1", "was not signed by the authority in authority.pem"),
+            ("thief-cloud", "127.0.0.1", "has been revoked"),
+        ],
+    )
+    def test_a_service_that_is_not_believed(
+        self, service: str, host: str, what: str, home: Path, site: Site
+    ) -> None:
+        cloud = service_of(site, "udp", home.parent / service, host)
+        # It has the list of those that are revoked.
+        seen = look(site, cloud.endpoint, "--tls", home / "anna")
+        assert_fails(seen, "certificate", f"theirs: has a certificate that {what}", "shown is ")
+
+    def test_another_robot_s_name(self, home: Path, site: Site) -> None:
+        cloud = service_of(site, "tls", home / "cloud")
+        file = site.configure(PEG, offload={"name": "berta"})
+        seen = look(site, cloud.endpoint, "--tls", home / "anna", file)
+        what = "says that it is berta, and shows the certificate of anna"
+        assert_fails(seen, "certificate", what)
+
+    def test_a_key_that_others_can_read(self, home: Path, site: Site) -> None:
+        shutil.copytree(home / "anna", site.directory / "open")
+        (site.directory / "open" / "key.pem").chmod(0o644)
+        cloud = service_of(site, "tls", home / "cloud")
+        seen = look(site, cloud.endpoint, "--tls", site.directory / "open")
+        assert seen["certificate"]["state"] == "warns"
+        assert "others can read this key (mode 644); chmod 600" in seen["certificate"]["advice"]
+
+
+class TestProblem:
+    def test_other_code(self, site: Site) -> None:
+        shutil.copy(test_other_code.EXAMPLE, site.directory)
+        cloud = test_other_code.older_copy(site).start()
+        seen = look(site, cloud.endpoint, site.configure(test_other_code.DOCUMENT))
+        found = seen["problem"]
+        assert found["state"] == "fails"
+        here, there = test_other_code.digests_in(found["seen"].removeprefix("other_code: "))
+        assert here != there
+        assert seen["round trip"]["state"] == "ok"
+
+    def test_a_problem_that_the_service_does_not_know(self, site: Site) -> None:
+        shutil.copy(test_other_code.EXAMPLE, site.directory)
+        cloud = service_of(site, "tcp")
+        seen = look(site, cloud.endpoint, site.configure(test_other_code.DOCUMENT))
+        assert "is not known to this service" in seen["problem"]["seen"]
+        assert "(--problem)" in seen["problem"]["seen"]
+
+    @pytest.mark.parametrize("what", ["half", "sensing"])
+    def test_a_service_that_decides_otherwise(self, what: str, site: Site) -> None:
+        name = "lying_problem:LyingPeg"
+        cloud = site.service("--problem", name, "--problem-directory", str(HERE))
+        cloud.variables[lying_problem.VARIABLE] = what
+        cloud.start()
+        document: dict[str, Any] = {**PEG, "problem": name, "problem_directory": str(HERE)}
+        seen = look(site, cloud.endpoint, site.configure(document))
+        assert seen["problem"]["state"] == "fails"
+        assert "answers otherwise than this robot's own planner" in seen["problem"]["seen"]
+        assert "trust.md" in seen["problem"]["advice"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((), "Usage"),
+        (("--json",), "no service is named: give --service ENDPOINT"),
+        (("--service", "quic/a:1"), "protocol quic is not allowed"),
+        (("--service", "tcp/a:1", "--tls", "keys"), "tcp does not use the credentials"),
+        (("--service", "tcp/a:1", "missing.yaml"), "missing.yaml: there is no such file"),
+    ],
+)
+def test_options_that_cannot_be_used(arguments: tuple[str, ...], message: str, site: Site) -> None:
+    done = site.holdfast("doctor", *arguments)
+    assert done.process.returncode == 2
+    assert message in done.output
+    assert "Traceback" not in done.output
