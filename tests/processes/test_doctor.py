@@ -7,15 +7,17 @@ import json
 import shutil
 import signal
 import socket
+import ssl
 import struct
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import pytest
 from tests.ports import free_port
@@ -38,7 +40,8 @@ LAYERS = {
 }
 
 
-class Seen(NamedTuple):
+@dataclass
+class Seen:
     """What the command has said of one service."""
 
     code: int
@@ -269,7 +272,12 @@ class TestTlsAndProtocol:
 
     def test_another_version_of_the_wire(self, site: Site) -> None:
         hello = hello_of("service", "cloud", version=2, release="9.9.9")
-        with answering(lambda taken: (taken.sendall(hello), taken.recv(1000))[0]) as port:
+
+        def answer(taken: socket.socket) -> None:
+            taken.sendall(hello)
+            taken.recv(1000)
+
+        with answering(answer) as port:
             seen = look(site, f"tcp/127.0.0.1:{port}")
         assert_fails(seen, "protocol", "is holdfast 9.9.9 with version 2 of the wire")
         assert "install the same release at both ends" in seen["protocol"]["seen"]
@@ -338,6 +346,27 @@ class TestCertificates:
         assert_fails(seen, "certificate", what, to_do)
         if robot == "thief":
             assert "refuses this end, which has a certificate that has been" in str(seen.findings)
+
+    @pytest.mark.parametrize(
+        ("service", "what"),
+        [
+            ("old-cloud", "has expired; 'holdfast keys DIR --renew --service NAME' makes another"),
+            ("early-cloud", "is not valid yet; is a clock wrong?"),
+        ],
+    )
+    def test_a_service_whose_time_is_not_now(
+        self, service: str, what: str, home: Path, site: Site
+    ) -> None:
+        context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+        context.load_cert_chain(home / service / "certificate.pem", home / service / "key.pem")
+
+        def answer(taken: socket.socket) -> None:
+            context.wrap_socket(taken, server_side=True).recv(1000)
+
+        with answering(answer) as port:
+            seen = look(site, f"tls/127.0.0.1:{port}", "--tls", home / "anna")
+        assert_fails(seen, "certificate", what, f"shown is {service} for ")
+        assert "; it is 20" in seen["clock"]["seen"]
 
     @pytest.mark.parametrize(
         ("service", "host", "what"),

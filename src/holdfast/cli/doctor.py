@@ -28,7 +28,7 @@ def doctor(
     configuration_path: Annotated[
         Path | None,
         typer.Argument(
-            metavar="[CONFIG]",
+            metavar="CONFIG",
             parser=location("CONFIG"),
             show_default=False,
             help="Configuration of a run: its decisions are compared with the service's.",

@@ -65,7 +65,10 @@ class WatchedTls(TlsStream):
     def hosts(self) -> str:
         """Return the hosts that the other end's certificate names."""
         named: Any = (self._tls.getpeercert() or {}).get("subjectAltName", ())
-        return ", ".join(str(host) for _, host in named)
+        return ", ".join(
+            str(ipaddress.ip_address(host)) if kind == "IP Address" else str(host)
+            for kind, host in named
+        )
 
     def shown(self) -> bytes:
         """Return the other end's certificate."""

@@ -16,6 +16,7 @@ speaks (ALPN), and a service takes its own.
 from __future__ import annotations
 
 import contextlib
+import re
 import ssl
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -343,7 +344,9 @@ class TlsStream:
             return f"refuses this end's certificate: {meaning.format(role=own)}"
         if "PEER_DID_NOT_RETURN_A_CERTIFICATE" in reason:
             return "shows no certificate"
-        text = reason.lower().replace("_", " ") if reason else str(error.args[-1])
+        # Of what this Python has no word for, OpenSSL's own, without the places in the sources.
+        text = re.sub(r"^\[.*?\] | \(_ssl.*\)$", "", str(error.args[-1]))
+        text = reason.lower().replace("_", " ") if reason else text
         return f"does not speak TLS 1.3 as expected: {text}"
 
     def _shake_hands(self) -> None:
