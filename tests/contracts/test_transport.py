@@ -1699,6 +1699,21 @@ class TestCertificates:
         await self.assert_refused(tls, "refuses this end's certificate")
         assert tls.reasons()[0] == "has a certificate that is not for a robot"
 
+    async def test_a_robot_has_the_name_of_its_certificate_or_tells_none(
+        self, tls: StreamWire
+    ) -> None:
+        await tls.service("cloud", "b1").start(echo)
+        for name in ("robot", ""):
+            robot, inbox = tls.robot("cloud", name=name), Inbox()
+            robot.start(inbox)
+            await inbox.appeared()
+        robot, inbox = tls.robot("cloud", name="another"), Inbox()
+        robot.start(inbox)
+        await until(lambda: bool(tls.refusals) and bool(tls.reasons()))
+        reason = "says that it is another, and shows the certificate of robot"
+        assert tls.refusals[0] == ("cloud", f"refuses this end, which {reason}")
+        assert tls.reasons()[0] == reason
+
     async def test_a_certificate_must_name_the_host(
         self, tls: StreamWire, authority: Authority
     ) -> None:

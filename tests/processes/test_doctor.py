@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import json
 import shutil
 import signal
 import socket
 import ssl
-import struct
 import subprocess
 import sys
 import threading
@@ -23,10 +23,13 @@ import pytest
 from tests.ports import free_port
 from tests.processes import lying_problem, test_other_code
 from tests.processes.faults import HERE, PATIENCE_S, Process, Service, Site, document_of
-from tests.wire import CALL, HELLO, LAST, frame_of, hello_of
+from tests.wire import CALL, LAST, frame_of, hello_of
 
 from holdfast.chaos.namespace import NetworkNamespace, why_no_namespace
-from holdfast.session.messages import NeedState, decode_request, encode
+from holdfast.runtime.doctor import Finding, RobotSetup, check, examine
+from holdfast.session.messages import NeedState, Refused, Reply, decode_request, encode
+from holdfast.settings import OffloadSettings
+from holdfast.transport.frames import FrameDecoder
 from holdfast.transport.key_ring import make_credentials, revoke_credentials
 
 PEG = document_of("peg_in_hole_2d", max_steps=40)
@@ -219,12 +222,18 @@ class TestTheWay:
             cloud.command = (*network.prefix, *cloud.command)
             cloud.start()
             options = ("--tls", home / "anna", site.configure(PEG))
+            lo = ["ip", "link", "set", "lo", "mtu", "1240"]
+            subprocess.run([*network.prefix, *lo], check=True)
             seen = look(site, cloud.endpoint, *options, prefix=network.prefix)
+        assert seen["route"]["state"] == "warns"
+        assert "(lo, MTU 1240)" in seen["route"]["seen"]
+        assert "up to 1248 bytes" in seen["route"]["advice"]
         assert seen["datagrams"]["state"] == "fails"
         assert "none gets through" in seen["datagrams"]["seen"]
         assert cloud.endpoint.rpartition(":")[2] in seen["datagrams"]["advice"]
         # Over the stream all the rest works.
-        assert {state for layer, state in seen.states.items() if layer != "datagrams"} == {"ok"}
+        rest = {k: state for k, state in seen.states.items() if k not in ("route", "datagrams")}
+        assert set(rest.values()) == {"ok"}
 
 
 @contextlib.contextmanager
@@ -234,6 +243,24 @@ def own_network() -> Iterator[NetworkNamespace]:
         pytest.skip(reason)
     with NetworkNamespace() as network:
         yield network
+
+
+def test_a_host_with_two_addresses(home: Path, site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One of them is a way to the service, and that is enough."""
+    cloud = service_of(site, "tls", home / "cloud")
+    port = int(cloud.endpoint.rpartition(":")[2])
+    tcp = (socket.AF_INET, socket.SOCK_STREAM, 6, "")
+    found = [(*tcp, (address, port)) for address in ("127.0.0.2", "127.0.0.1")]
+    monkeypatch.setattr(socket, "getaddrinfo", lambda *_, **__: found)
+    robot = RobotSetup("", home / "anna", OffloadSettings(), None)
+    seen: list[Finding] = []
+    asyncio.run(examine(check(f"tls/localhost:{port}", robot.tls), robot, seen.append))
+    states = {(each.layer, each.address): each.state for each in seen}
+    assert seen[0].seen == "localhost is 127.0.0.2, 127.0.0.1"
+    assert states["port", "127.0.0.1"] == "ok"
+    assert states["port", "127.0.0.2"] == "fails"
+    assert [layer for layer, address in states if address == "127.0.0.2"] == ["route", "port"]
+    assert states["round trip", "127.0.0.1"] == "ok"
 
 
 class TestTlsAndProtocol:
@@ -283,12 +310,36 @@ class TestTlsAndProtocol:
         assert "install the same release at both ends" in seen["protocol"]["seen"]
 
     def test_a_clock_that_is_wrong(self, site: Site) -> None:
-        with answering(lambda taken: play_service(taken, time.time() - 3600.0)) as port:
+        def answer(taken: socket.socket) -> None:
+            play_service(taken, clock_s=time.time() - 3600.0)
+
+        with answering(answer) as port:
             seen = look(site, f"tcp/127.0.0.1:{port}")
         assert seen.code == 0
         assert seen["clock"]["state"] == "warns"
         assert seen["clock"]["seen"].startswith("3600 s ahead of the service's")
         assert seen["round trip"]["seen"].startswith("20 echoes")
+
+    def test_another_version_of_the_messages(self, site: Site) -> None:
+        def answer(taken: socket.socket) -> None:
+            play_service(taken, reply=lambda number: Refused(number, "version", "speaks version 9"))
+
+        with answering(answer) as port:
+            seen = look(site, f"tcp/127.0.0.1:{port}")
+        assert_fails(seen, "protocol", "version: speaks version 9", "same release at both ends")
+
+    def test_limits_that_are_short_for_the_way(self, site: Site) -> None:
+        def answer(taken: socket.socket) -> None:
+            play_service(taken, delay_s=0.03)
+
+        file = site.configure(PEG, offload={"detection_timeout_ms": 40.0})
+        with answering(answer) as port:
+            seen = look(site, f"tcp/127.0.0.1:{port}", file)
+        assert seen["round trip"]["state"] == "warns"
+        advice = seen["round trip"]["advice"]
+        assert "offload.detection_timeout_ms, 40, is short for this way: take " in advice
+        # Nor does it come to the state of a run that it has been told of.
+        assert "comes to another state" in seen["problem"]["seen"]
 
     def test_ctrl_c(self, site: Site) -> None:
         heard = threading.Event()
@@ -307,19 +358,22 @@ class TestTlsAndProtocol:
         assert "Traceback" not in process.output
 
 
-def play_service(taken: socket.socket, clock_s: float) -> None:
-    """Say that nothing is known of any run, as a service does."""
+def play_service(
+    taken: socket.socket,
+    *,
+    clock_s: float = 0.0,
+    delay_s: float = 0.0,
+    reply: Callable[[int], Reply] = lambda number: NeedState(number, False),
+) -> None:
+    """Say that nothing is known of any run, as a service does, or something else."""
     taken.sendall(hello_of("service", "cloud", clock_s=clock_s))
-    data, header = b"", struct.Struct("<IBI")
-    while more := taken.recv(65536):
-        data = (data + more).removeprefix(b"holdfast")
-        while len(data) >= header.size and len(data) >= header.size + header.unpack_from(data)[0]:
-            size, kind, call = header.unpack_from(data)
-            payload, data = data[header.size : header.size + size], data[header.size + size :]
-            assert kind in (HELLO, CALL) or not payload
-            if kind == CALL:
-                reply = encode(NeedState(decode_request(payload).number, False))
-                taken.sendall(frame_of(LAST, call, reply))
+    decoder = FrameDecoder(1 << 20)
+    while data := taken.recv(65536):
+        for frame in decoder.feed(data):
+            if frame.kind == CALL:
+                time.sleep(delay_s)  # the way is long
+                number = decode_request(frame.payload).number
+                taken.sendall(frame_of(LAST, frame.call, encode(reply(number))))
 
 
 class TestCertificates:
@@ -334,7 +388,7 @@ class TestCertificates:
             ("keys/nobody", "authority.pem: cannot be read: No such file", ""),
             ("crossed", "key.pem: is not the key of", ""),
             ("thief", "ours: thief, until", ""),
-            ("other/anna", "theirs: has a certificate that was not signed by", "shown is cloud"),
+            ("other/anna", "theirs: was not signed by", "shown is cloud"),
         ],
     )
     def test_a_robot_that_is_not_let_in(
@@ -382,7 +436,7 @@ class TestCertificates:
         cloud = service_of(site, "udp", home.parent / service, host)
         # It has the list of those that are revoked.
         seen = look(site, cloud.endpoint, "--tls", home / "anna")
-        assert_fails(seen, "certificate", f"theirs: has a certificate that {what}", "shown is ")
+        assert_fails(seen, "certificate", f"theirs: {what}", "shown is ")
 
     def test_another_robot_s_name(self, home: Path, site: Site) -> None:
         cloud = service_of(site, "tls", home / "cloud")

@@ -71,7 +71,7 @@ def doctor(
     import msgspec
 
     from holdfast.configuration import load
-    from holdfast.runtime.doctor import OwnDecisions, Patient, check, examine
+    from holdfast.runtime.doctor import OwnDecisions, RobotSetup, check, examine
     from holdfast.runtime.probe import in_thread
     from holdfast.settings import OffloadSettings
 
@@ -85,7 +85,7 @@ def doctor(
     decisions = None
     if configuration is not None:
         decisions = in_thread(functools.partial(OwnDecisions.of, configuration))
-    patient = Patient(offload.name or "", tls, offload, decisions)
+    robot = RobotSetup(offload.name or ("" if tls else "doctor"), tls, offload, decisions)
     fails = False
     for endpoint in endpoints:
 
@@ -101,7 +101,7 @@ def doctor(
 
         if not json:
             typer.echo(str(endpoint))
-        asyncio.run(examine(endpoint, patient, tell))
+        asyncio.run(examine(endpoint, robot, tell))
     if fails:
         raise typer.Exit(EXIT_DIFFERENT)
 

@@ -80,7 +80,7 @@ __all__ = [
     "WARNS",
     "Finding",
     "OwnDecisions",
-    "Patient",
+    "RobotSetup",
     "check",
     "examine",
 ]
@@ -196,13 +196,13 @@ def _turn(planner: Planner, state: PlanningState, observations: tuple[Observed, 
     return _Turn(state, observations, decision, time.perf_counter() - began)
 
 
-class Patient(NamedTuple):
-    """Whose way to a service is looked at.
+class RobotSetup(NamedTuple):
+    """The robot whose way to a service is looked at.
 
     Attributes
     ----------
     name : str
-        The robot's; empty to tell none.
+        Empty to tell none.
     tls : Path or None
         Directory of its credentials.
     offload : OffloadSettings
@@ -233,17 +233,17 @@ def check(service: str, tls: Path | None) -> Endpoint:
     return endpoint
 
 
-async def examine(endpoint: Endpoint, patient: Patient, tell: Callable[[Finding], None]) -> None:
+async def examine(endpoint: Endpoint, robot: RobotSetup, tell: Callable[[Finding], None]) -> None:
     """Look at all layers between this robot and a service.
 
     Parameters
     ----------
     endpoint : Endpoint
-    patient : Patient
+    robot : RobotSetup
     tell : callable
         Takes each finding as soon as there is one.
     """
-    await _Examination(endpoint, patient, tell).run()
+    await _Examination(endpoint, robot, tell).run()
 
 
 class _Found(Exception):  # noqa: N818 - it ends the look at a layer, and need be no error
@@ -271,10 +271,10 @@ _Look: TypeAlias = Callable[[AddressPath], Awaitable[tuple[str, str] | None]]
 
 class _Examination:
     def __init__(
-        self, endpoint: Endpoint, patient: Patient, tell: Callable[[Finding], None]
+        self, endpoint: Endpoint, robot: RobotSetup, tell: Callable[[Finding], None]
     ) -> None:
         self._endpoint = endpoint
-        self._patient = patient
+        self._robot = robot
         self._report = tell
         self._layer = "name"
         self._paths: list[AddressPath] = []
@@ -283,7 +283,7 @@ class _Examination:
         self._ours = self._ours_advice = ""
         self._decision_s: tuple[float, float] | None = None
         self._settings = LinkSettings(
-            partial(encode_hello, "robot", patient.name, os.urandom(8).hex(), _LEASE_MS),
+            partial(encode_hello, "robot", robot.name, os.urandom(8).hex(), _LEASE_MS),
             _LEASE_MS,
             DEFAULT_MAX_MESSAGE_BYTES,
             HalfReceived(2 * DEFAULT_MAX_MESSAGE_BYTES),
@@ -382,8 +382,8 @@ class _Examination:
             mtu = probe.getsockopt(*_IP_MTU[path.family])
         least = MAX_DATAGRAM_BYTES + _DATAGRAM_HEADERS_BYTES
         short = self._endpoint.protocol == "udp" and mtu < least
-        advice = f"datagrams need an MTU of {least}: use tls/..." if short else ""
-        return f"from {local} ({interface_of(local)}MTU {mtu})", advice
+        cut = f"datagrams of up to {least} bytes are cut to pieces: raise the MTU, or use tls/..."
+        return f"from {local} ({interface_of(local)}MTU {mtu})", cut if short else ""
 
     async def _port(self, path: AddressPath) -> tuple[str, str]:
         endpoint = self._endpoint
@@ -406,14 +406,14 @@ class _Examination:
         return f"{what} is open", ""
 
     def _read_own(self) -> None:
-        patient = self._patient
-        if patient.tls is None:
+        robot = self._robot
+        if robot.tls is None:
             self._ours = "none was given"
             self._ours_advice = "'holdfast keys DIR' makes them; give this robot's with --tls DIR"
             return
         warnings: list[str] = []
         try:
-            own = read_credentials(patient.tls, "robot", warn=warnings.append)
+            own = read_credentials(robot.tls, "robot", warn=warnings.append)
             self._context = client_context(own.files)
         except HoldfastError as error:
             self._ours = str(error)
@@ -449,7 +449,8 @@ class _Examination:
             raise _Found(ours, self._ours_advice)
         if not tls.established:
             shown, _ = await certificate_at(path)
-            raise _Found(f"theirs: {path.why_not}", account_of(shown))
+            fault = path.why_not.removeprefix("has a certificate that ")
+            raise _Found(f"theirs: {fault}", account_of(shown))
         if link.hello is None and "certificate" in path.why_not:
             raise _Found(f"{ours}: {path.why_not}")
         if link.peer is None:
@@ -504,13 +505,13 @@ class _Examination:
         return f"{size} {'ahead of' if ahead_s > 0 else 'behind'} the service's; {now}", advice
 
     async def _problem(self, path: AddressPath) -> tuple[str, str] | None:
-        if path is not next(each for each in self._paths if each.is_greeted):
+        if path is not next((each for each in self._paths if each.is_greeted), path):
             return None
-        if self._patient.decisions is None:
+        if self._robot.decisions is None:
             seen = "not asked: with CONFIG, decisions are compared"
             raise _Found(seen, state=NOT_REACHED)
         try:
-            own = await waited_for(self._patient.decisions, _DECISION_S)
+            own = await waited_for(self._robot.decisions, _DECISION_S)
         except TimeoutError:
             seen = f"not asked: two decisions take longer than {_DECISION_S:g} s here"
             raise _Found(seen, state=NOT_REACHED) from None
@@ -574,7 +575,7 @@ class _Examination:
         if self._decision_s is not None:
             there_s, here_s = self._decision_s
             seen += f"; a decision {1e3 * there_s:.1f} ms, here {1e3 * here_s:.1f} ms"
-        offload = self._patient.offload
+        offload = self._robot.offload
         limits_ms = {
             "--lease-ms of the service": path.link.hello.lease_ms,
             "offload.lease_ms": offload.lease_ms,
