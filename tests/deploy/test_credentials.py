@@ -190,6 +190,12 @@ def test_what_the_log_of_a_robot_says_of_a_refusal(protocol: str, home: Path, si
         standing.wait_for(documented(reason))
     cloud.process.wait_for("link_refused", robot="berta")
     assert not cloud.process.matching("robot_connected")
+    # Files that do not belong together are no reason to give up what was there.
+    standing.show("crossed")
+    told = standing.robot.wait_for("credentials")["reason"]
+    assert told.endswith(
+        "cannot be used: key.pem is not the key of certificate.pem; those of before stay in use"
+    )
     cloud.kill()
 
     has = "has a certificate that "

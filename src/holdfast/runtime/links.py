@@ -102,12 +102,14 @@ def _streams(configuration: Configuration, log_path: Path | None, events: EventS
     offload = configuration.offload
     if offload.name is not None:
         check_name("offload.name", offload.name)
+
+    def tell_credentials(reason: str) -> None:
+        events.event("credentials", reason=reason)
+
     tls = None
     name = offload.name or _machine_name()
     if offload.tls is not None:
-        own = read_credentials(
-            Path(offload.tls), "robot", warn=lambda text: events.event("credentials", reason=text)
-        )
+        own = read_credentials(Path(offload.tls), "robot", warn=tell_credentials)
         tls = own.files
         name = offload.name or ""
         with contextlib.suppress(TransportError):  # what another program made may have any name
@@ -167,6 +169,7 @@ def _streams(configuration: Configuration, log_path: Path | None, events: EventS
                 service=service,
                 reason="none gets through, so everything goes on the TLS stream; is UDP filtered?",
             ),
+            on_unusable=tell_credentials,
         )
     except BaseException:
         close()

@@ -92,6 +92,9 @@ class StreamRobotTransport:
     on_closed_to_datagrams : callable or None
         Is told, once, of a service at ``udp`` to which no datagram gets through, so that the
         stream carries all.
+    on_unusable : callable or None
+        Is told why credentials that somebody has replaced cannot be used, so that those of before
+        stay in use.
 
     Raises
     ------
@@ -110,6 +113,7 @@ class StreamRobotTransport:
         tls: TlsFiles | None = None,
         on_unreachable: Callable[[str, str], None] | None = None,
         on_closed_to_datagrams: Callable[[str], None] | None = None,
+        on_unusable: Callable[[str], None] | None = None,
     ) -> None:
         if name:
             check_name("name of a robot", name)
@@ -135,7 +139,7 @@ class StreamRobotTransport:
             if address.name is not None:
                 check_name("name of a service", address.name)
             if credentials is None and tls is not None and endpoint.is_encrypted:
-                credentials = ClientCredentials(tls)
+                credentials = ClientCredentials(tls, on_unusable)
             if endpoint.protocol == "udp":
                 from holdfast.transport.sealing import require_cryptography
 

@@ -15,10 +15,9 @@ speaks (ALPN), and a service takes its own.
 
 from __future__ import annotations
 
-import contextlib
 import re
 import ssl
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 from holdfast.errors import TransportError
@@ -146,8 +145,11 @@ def _context(protocol: int, files: TlsFiles) -> ssl.SSLContext:
         # Without the empty password, an encrypted key would ask for one on the terminal.
         context.load_cert_chain(files.certificate, files.key, password="")
     except (OSError, ssl.SSLError) as error:
+        reason = str(error)
+        if getattr(error, "reason", None) == "KEY_VALUES_MISMATCH":
+            reason = f"{files.key.name} is not the key of {files.certificate.name}"
         raise TransportError(
-            f"credentials {files.certificate.parent} cannot be used: {error}"
+            f"credentials {files.certificate.parent} cannot be used: {reason}"
         ) from error
     return context
 
@@ -160,15 +162,18 @@ class ClientCredentials:
     Parameters
     ----------
     files : TlsFiles
+    on_unusable : callable or None
+        Is told why what is there now cannot be used.
 
     Raises
     ------
     TransportError
-        If they cannot be used.
+        If they cannot be used at the beginning.
     """
 
-    def __init__(self, files: TlsFiles) -> None:
+    def __init__(self, files: TlsFiles, on_unusable: Callable[[str], None] | None = None) -> None:
         self._files = files
+        self._on_unusable = on_unusable
         self._seen = self._look()
         self._context = client_context(files)
 
@@ -177,8 +182,11 @@ class ClientCredentials:
         seen = self._look()
         if seen != self._seen:
             self._seen = seen
-            with contextlib.suppress(TransportError):
+            try:
                 self._context = client_context(self._files)
+            except TransportError as error:
+                if self._on_unusable is not None:
+                    self._on_unusable(f"{error}; those of before stay in use")
         return self._context
 
     def _look(self) -> list[tuple[int, int, int] | None]:
