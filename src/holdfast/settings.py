@@ -187,8 +187,9 @@ class OffloadSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
         Directory with this robot's credentials, as ``holdfast keys`` makes it. In a file it may be
         relative to that file.
     name : str or None
-        The robot's name in the logs of services, as long as it shows no certificate, whose name
-        counts then: at most 100 letters, digits, ``_``, ``-`` and ``.``. None takes this machine's.
+        The robot's name in the logs of services: at most 100 letters, digits, ``_``, ``-`` and
+        ``.``; with a certificate it must be the one in it. None takes the certificate's or, without
+        one, this machine's.
     """
 
     services: Annotated[tuple[Text, ...], msgspec.Meta(max_length=MAX_SERVICES)] = ()

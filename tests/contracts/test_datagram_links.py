@@ -223,7 +223,7 @@ class TestStrangers:
     ) -> None:
         calls: list[bytes] = []
         robot, inbox, service = await connected(udp, noting(calls))
-        greedy, greedy_inbox = udp.robot("cloud", name="greedy"), Inbox()
+        greedy, greedy_inbox = udp.robot("cloud"), Inbox()
         greedy.start(greedy_inbox)
         await until(lambda: greedy.sends_datagrams("cloud"))
         ours, at_service = link_of(greedy), link_at(service, 1)

@@ -1247,11 +1247,10 @@ class TestPeers:
     ) -> None:
         await tcp.service("cloud", "b1").start(echo)
         robot, inbox = tcp.robot("cloud"), Inbox()
-        hello = robot.settings.hello
-        robot.settings = robot.settings._replace(
-            hello=hello.replace(b"\xa7version\x01", b"\xa7version\x02")
-        )
-        assert robot.settings.hello != hello
+        hello = robot.settings.hello()
+        other = hello.replace(b"\xa7version\x01", b"\xa7version\x02")
+        robot.settings = robot.settings._replace(hello=lambda: other)
+        assert other != hello
         robot.start(inbox)
         await until(lambda: bool(tcp.refusals) and bool(tcp.reasons()))
         text = (
@@ -1602,15 +1601,25 @@ class TestUnreachable:
         async with self.listening(tls, answer):
             assert (await self.told(tls)).startswith("does not speak TLS 1.3 as expected")
 
-    @pytest.mark.parametrize(("at", "asked"), [("tls", "tcp"), ("tcp", "tls")])
+    @pytest.mark.parametrize(
+        ("at", "asked", "expected"),
+        [
+            ("tls", "tcp", "refuses this end, which does not speak TLS; as at that end, write tls"),
+            (
+                "tcp",
+                "tls",
+                "closes connections at the first bytes of TLS: it is at tcp/... instead",
+            ),
+        ],
+    )
     async def test_a_service_at_another_kind_of_endpoint(
-        self, tcp: StreamWire, tls: StreamWire, at: str, asked: str
+        self, tcp: StreamWire, tls: StreamWire, at: str, asked: str, expected: str
     ) -> None:
         wires = {"tcp": tcp, "tls": tls}
         await wires[at].service("cloud", "b1").start(echo)
         place = wires[at].endpoint("cloud").partition("/")[2]
         wires[asked]._endpoints["cloud"] = f"{asked}/{place}"
-        assert "one of the ends speaks TLS" in await self.told(wires[asked])
+        assert (await self.told(wires[asked])).startswith(expected)
 
 
 def assert_matches(text: str, pattern: str) -> None:
@@ -1689,6 +1698,21 @@ class TestCertificates:
         tls.robot_tls = service_tls
         await self.assert_refused(tls, "refuses this end's certificate")
         assert tls.reasons()[0] == "has a certificate that is not for a robot"
+
+    async def test_a_robot_has_the_name_of_its_certificate_or_tells_none(
+        self, tls: StreamWire
+    ) -> None:
+        await tls.service("cloud", "b1").start(echo)
+        for name in ("robot", ""):
+            robot, inbox = tls.robot("cloud", name=name), Inbox()
+            robot.start(inbox)
+            await inbox.appeared()
+        robot, inbox = tls.robot("cloud", name="another"), Inbox()
+        robot.start(inbox)
+        await until(lambda: bool(tls.refusals) and bool(tls.reasons()))
+        reason = "says that it is another, and shows the certificate of robot"
+        assert tls.refusals[0] == ("cloud", f"refuses this end, which {reason}")
+        assert tls.reasons()[0] == reason
 
     async def test_a_certificate_must_name_the_host(
         self, tls: StreamWire, authority: Authority

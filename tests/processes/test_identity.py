@@ -204,6 +204,14 @@ def test_a_robot_without_a_certificate_has_the_name_that_it_says(
     assert cloud.process.matching("robot_connected", robot="anna")
 
 
+def test_a_robot_with_the_certificate_of_another_is_refused(home: Path, site: Site) -> None:
+    file = site.configure(document_of(PEG), offload={"name": "berta"})
+    robot = site.run(file, "--tls", home / "anna", services=["tls/127.0.0.1:1"])
+    assert robot.wait() == 2
+    assert "offload.name 'berta': the certificate in" in robot.output
+    assert "is anna's; copy that robot's own credentials here" in robot.output
+
+
 def test_a_name_that_is_none_is_refused(site: Site) -> None:
     file = site.configure(document_of(PEG), offload={"name": "no name!"})
     robot = site.run(file, services=["tcp/127.0.0.1:1"])

@@ -118,6 +118,7 @@ def test_frames_before_an_error_are_frames() -> None:
         (GREETING + encode_frame(GOODBYE, 0, bytes(2000)), "of kind 7 with 2000 bytes"),
         (b"HTTP/1.1 400 Bad Request", "speaks HTTP"),
         (b"PRI * HTTP/2.0", "speaks HTTP"),
+        (b"\x15\x03\x03\x00\x02\x02\x46", "speaks TLS, and this endpoint does not"),
         (b"\x16\x03\x01\x02\x00\x01", "speaks TLS, and this endpoint does not"),
     ],
 )
@@ -133,6 +134,13 @@ def test_a_hello_is_read_as_it_was_written() -> None:
     hello = decode_hello(frame.payload)
     assert (hello.role, hello.name, hello.incarnation) == ("service", "cloud", "b1")
     assert (hello.version, hello.lease_ms) == (WIRE_VERSION, 250.0)
+
+
+def test_a_service_tells_its_clock_and_need_not() -> None:
+    (frame,) = FrameDecoder(MAX_BYTES).feed(encode_hello("service", "cloud", "b1", 250.0, 1.8e9))
+    assert decode_hello(frame.payload).clock_s == 1.8e9
+    assert decode_hello(changed()).clock_s == 0.0
+    assert b"clock_s" not in GREETING
 
 
 def changed(**values: object) -> bytes:

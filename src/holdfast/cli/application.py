@@ -14,6 +14,7 @@ import typer
 from holdfast.cli.chaos import chaos
 from holdfast.cli.compare import compare
 from holdfast.cli.demo import demo
+from holdfast.cli.doctor import doctor
 from holdfast.cli.endings import EXIT_ERROR
 from holdfast.cli.experiment import experiment
 from holdfast.cli.keys import keys
@@ -48,6 +49,7 @@ app.command(
         "help_option_names": [],
     },
 )(serve)
+app.command(no_args_is_help=True, short_help="Say what works on the way to a service.")(doctor)
 app.command(short_help="See a cloud and a robot killed, and no decision change.")(demo)
 app.command(short_help="Strike real runs with real faults, and compare them.")(chaos)
 app.command(no_args_is_help=True, short_help="Regenerate the tables and figures.")(experiment)

@@ -6,6 +6,7 @@ launched, finds the robot. With none named the planner is in the robot's own pro
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import os
 import re
@@ -15,6 +16,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from holdfast.configuration import Configuration
+from holdfast.errors import TransportError
 from holdfast.planning import Planner
 from holdfast.problems.problem import Problem
 from holdfast.robot.memory import RememberingPlanner, StateMemory
@@ -87,7 +89,7 @@ def make_links(configuration: Configuration, log_path: Path | None, events: Even
 
 def _streams(configuration: Configuration, log_path: Path | None, events: EventSink) -> Links:
     # Only a robot that has services needs these.
-    from holdfast.transport.credentials import load_credentials
+    from holdfast.transport.credentials import read_credentials
     from holdfast.transport.endpoints import (
         PrivateSocket,
         ServiceAddress,
@@ -98,13 +100,27 @@ def _streams(configuration: Configuration, log_path: Path | None, events: EventS
     from holdfast.transport.robot_end import StreamRobotTransport
 
     offload = configuration.offload
-    tls = None
-    if offload.tls is not None:
-        tls = load_credentials(
-            Path(offload.tls), "robot", warn=lambda text: events.event("credentials", reason=text)
-        )
     if offload.name is not None:
         check_name("offload.name", offload.name)
+
+    def tell_credentials(reason: str) -> None:
+        events.event("credentials", reason=reason)
+
+    tls = None
+    name = offload.name or _machine_name()
+    if offload.tls is not None:
+        own = read_credentials(Path(offload.tls), "robot", warn=tell_credentials)
+        tls = own.files
+        name = offload.name or ""
+        with contextlib.suppress(TransportError):  # what another program made may have any name
+            check_name("", own.name)
+            name = name or own.name
+        if name not in ("", own.name):
+            raise TransportError(
+                f"offload.name {name!r}: the certificate in {offload.tls} is {own.name}'s; copy "
+                f"that robot's own credentials here ('holdfast keys DIR --robot {name}' makes "
+                "them), or leave the key out"
+            )
     for service in offload.services:
         endpoint = parse_endpoint(service)
         check_credentials(endpoint, tls)
@@ -141,7 +157,7 @@ def _streams(configuration: Configuration, log_path: Path | None, events: EventS
     try:
         transport = StreamRobotTransport(
             addresses,
-            name=offload.name or _machine_name(),
+            name=name,
             incarnation=os.urandom(8).hex(),
             lease_ms=offload.lease_ms,
             tls=tls,
@@ -153,6 +169,7 @@ def _streams(configuration: Configuration, log_path: Path | None, events: EventS
                 service=service,
                 reason="none gets through, so everything goes on the TLS stream; is UDP filtered?",
             ),
+            on_unusable=tell_credentials,
         )
     except BaseException:
         close()

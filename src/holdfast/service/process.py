@@ -238,15 +238,13 @@ async def _run(
         return report()
 
     def reload() -> None:
-        from holdfast.transport.credentials import date_text, load_until
+        from holdfast.transport.credentials import date_text, read_credentials
 
         assert options.tls is not None
         manager.reloading()
         try:
             # It knows more of what can be wrong with them.
-            _, expires_s = load_until(
-                options.tls, "service", warn=functools.partial(_warn, options)
-            )
+            read = read_credentials(options.tls, "service", warn=functools.partial(_warn, options))
             ended = transport.reload_credentials()
         except HoldfastError as error:
             events.event("credentials", reason=f"{error}; those of before stay in use")
@@ -254,7 +252,7 @@ async def _run(
             events.event(
                 "credentials_reloaded",
                 links_ended=ended,
-                valid_until=date_text(expires_s),
+                valid_until=date_text(read.expires_s),
                 num_revoked=transport.num_revoked,
             )
         manager.ready()

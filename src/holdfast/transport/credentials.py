@@ -15,7 +15,7 @@ from collections.abc import Callable
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, TypeAlias
+from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias
 
 from holdfast.errors import HoldfastError, TransportError
 from holdfast.transport.endpoints import AUTHORITY_FILE, TlsFiles
@@ -25,13 +25,15 @@ if TYPE_CHECKING:
     import ssl
 
 __all__ = [
+    "EXPIRES_SOON_DAYS",
     "CredentialsError",
     "CredentialsWarning",
+    "OwnCredentials",
     "Role",
     "date_text",
     "give_to_warnings",
     "load_credentials",
-    "load_until",
+    "read_credentials",
     "warn_if_open",
 ]
 
@@ -50,6 +52,23 @@ class CredentialsError(HoldfastError):
 
 class CredentialsWarning(UserWarning):
     """Credentials work, but somebody should look at them."""
+
+
+class OwnCredentials(NamedTuple):
+    """Credentials that will work.
+
+    Attributes
+    ----------
+    files : TlsFiles
+    name : str
+        In the certificate.
+    expires_s : float
+        When, in seconds since 1970.
+    """
+
+    files: TlsFiles
+    name: str
+    expires_s: float
 
 
 def load_credentials(
@@ -80,13 +99,13 @@ def load_credentials(
     """
     # A warning is about the place from which this function is called.
     warn = warn or partial(give_to_warnings, stacklevel=4)
-    return load_until(directory, role, warn=warn)[0]
+    return read_credentials(directory, role, warn=warn).files
 
 
-def load_until(
+def read_credentials(
     directory: Path | str, role: Role, *, warn: Callable[[str], None]
-) -> tuple[TlsFiles, float]:
-    """Do as :func:`load_credentials`; return also when they expire, in seconds since 1970."""
+) -> OwnCredentials:
+    """Do as :func:`load_credentials`; return also what the certificate says."""
     directory = Path(directory)
     files = TlsFiles.of(directory)
     for path in (files.authority, files.certificate, files.key):
@@ -96,11 +115,11 @@ def load_until(
         except OSError as error:
             raise CredentialsError(_unreadable(directory, path, role, error)) from error
     warn_if_open(files.key, warn)
-    expires_s = _rehearse(files, role)
+    name, expires_s = _rehearse(files, role)
     days_left = (expires_s - datetime.now(UTC).timestamp()) / 86_400.0
     if days_left < EXPIRES_SOON_DAYS:
         warn(f"{files.certificate}: expires in {days_left:.1f} days, on {date_text(expires_s)}")
-    return files, expires_s
+    return OwnCredentials(files, name, expires_s)
 
 
 def give_to_warnings(text: str, stacklevel: int = 3) -> None:
@@ -132,8 +151,8 @@ def warn_if_open(key: Path, warn: Callable[[str], None]) -> None:
         warn(f"{key}: others can read this key (mode {mode & 0o777:03o}); chmod 600 {key}")
 
 
-def _rehearse(files: TlsFiles, role: Role) -> float:
-    """Let both ends of a link shake hands in memory; return when the certificate expires."""
+def _rehearse(files: TlsFiles, role: Role) -> tuple[str, float]:
+    """Let both ends of a link shake hands in memory; return the certificate's name and end."""
     import ssl
 
     from holdfast.transport.tls import common_name, fault_of_certificate
@@ -185,10 +204,10 @@ def _rehearse(files: TlsFiles, role: Role) -> float:
     except (ssl.SSLError, ValueError) as error:
         raise CredentialsError(f"{certificate}: does not work for TLS: {error}") from error
     try:
-        common_name(shown)
+        name = common_name(shown)
     except ValueError as error:
         raise CredentialsError(f"{certificate}: {error}") from error
-    return float(ssl.cert_time_to_seconds(str(shown["notAfter"])))
+    return name, float(ssl.cert_time_to_seconds(str(shown["notAfter"])))
 
 
 def _unusable_pair(certificate: Path, key: Path, error: ssl.SSLError) -> str:

@@ -98,7 +98,7 @@ class Frame(NamedTuple):
     passed_over_bytes: int = 0
 
 
-class Hello(msgspec.Struct, frozen=True):
+class Hello(msgspec.Struct, frozen=True, omit_defaults=True):
     """Who is at an end of a link.
 
     Attributes
@@ -114,6 +114,8 @@ class Hello(msgspec.Struct, frozen=True):
         Of this process; another one is another process, with another memory.
     lease_ms : float
         When nothing comes from it for this long, the link may be given up.
+    clock_s : float
+        Of a service: what its machine takes for the time, in seconds since 1970; 0 is not told.
     """
 
     version: int
@@ -122,6 +124,7 @@ class Hello(msgspec.Struct, frozen=True):
     name: str
     incarnation: str
     lease_ms: float
+    clock_s: float = 0.0
 
 
 class _Version(msgspec.Struct):
@@ -136,9 +139,11 @@ def encode_frame(kind: int, call: int = 0, payload: bytes = b"") -> bytes:
     return _HEADER.pack(len(payload), kind, call) + payload
 
 
-def encode_hello(role: Role, name: str, incarnation: str, lease_ms: float) -> bytes:
+def encode_hello(
+    role: Role, name: str, incarnation: str, lease_ms: float, clock_s: float = 0.0
+) -> bytes:
     """Return the first bytes of this end: the magic word and its hello."""
-    hello = Hello(WIRE_VERSION, __version__, role, name, incarnation, lease_ms)
+    hello = Hello(WIRE_VERSION, __version__, role, name, incarnation, lease_ms, clock_s)
     return MAGIC + encode_frame(HELLO, 0, msgspec.msgpack.encode(hello))
 
 
@@ -301,7 +306,7 @@ class FrameDecoder:
 
 def _what_speaks(first: bytes) -> str:
     """Say what it may be that does not begin with the magic word."""
-    if first[:2] == b"\x16\x03":
+    if first[:2] in (b"\x16\x03", b"\x15\x03"):
         return "speaks TLS, and this endpoint does not (tls/... goes with tls/...)"
     if re.match(rb"(GET|HEAD|POST|PUT|OPTIONS|CONNECT|PRI|HTTP)\b", first):
         return "speaks HTTP"

@@ -17,6 +17,7 @@ import math
 import socket
 import time
 from collections import deque
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
 
 from holdfast.transport.endpoints import host_and_port
@@ -62,6 +63,7 @@ _PINGS_IN_LEASE: Final = 3
 _CLOSE_TIMEOUT_S: Final = 1.0
 _PING: Final = encode_frame(PING)
 
+_NO_TLS: Final = "does not speak TLS; as at that end, write tls/... or udp/... with --tls DIR"
 _EXPIRED: Final = "has a certificate that has expired"
 
 
@@ -114,8 +116,8 @@ class LinkSettings(NamedTuple):
 
     Attributes
     ----------
-    hello : bytes
-        This end's first bytes.
+    hello : callable
+        Returns this end's first bytes.
     lease_ms : float
         This end lets itself be heard several times in this time.
     max_message_bytes : int
@@ -127,7 +129,7 @@ class LinkSettings(NamedTuple):
         Whether nothing more is heard of an end that does not read what it is sent.
     """
 
-    hello: bytes
+    hello: Callable[[], bytes]
     lease_ms: float
     max_message_bytes: int
     half_received: HalfReceived
@@ -511,6 +513,11 @@ class Link(asyncio.BufferedProtocol):
             self._transport.write(tls.take())  # it is told, in an alert
             self.end(tls.what_is_wrong(error), refused=True)
             return b""
+        except FrameError:
+            if data.startswith(MAGIC) and self._transport is not None:
+                # One of our own kind is told, in clear as it has asked.
+                self._transport.write(MAGIC + encode_goodbye(_NO_TLS))
+            raise
         if was_established:
             return data
         assert self._transport is not None
@@ -556,7 +563,7 @@ class Link(asyncio.BufferedProtocol):
 
     def _say_hello(self) -> None:
         self._said_hello = True
-        self.send(self._settings.hello)
+        self.send(self._settings.hello())
 
     def _tell(self) -> None:
         if not self._told:

@@ -12,6 +12,7 @@ import asyncio
 import socket
 from collections import deque
 from collections.abc import Callable, Mapping
+from functools import partial
 from itertools import count
 
 from holdfast.errors import InvalidValueError, TransportError
@@ -51,9 +52,11 @@ _CALL_NUMBERS = 1 << 32
 _PAUSE_S = 0.004
 """Between turns of services that send more than anybody has asked for: a robot decides, too."""
 
-_SAYS_NO_HELLO = (
-    "closes connections without a hello: it is no holdfast service, is just ending, or one of the "
-    "ends speaks TLS (tls/..., udp/...) and the other does not (tcp/...)"
+_SAYS_NO_HELLO = "closes connections without a hello: it is no holdfast service, or is just ending"
+
+_TAKES_NO_TLS = (
+    "closes connections at the first bytes of TLS: it is at tcp/... instead of tls/..., is no "
+    "holdfast service, or is just ending"
 )
 
 _MAX_UNGREETED = 64
@@ -89,6 +92,9 @@ class StreamRobotTransport:
     on_closed_to_datagrams : callable or None
         Is told, once, of a service at ``udp`` to which no datagram gets through, so that the
         stream carries all.
+    on_unusable : callable or None
+        Is told why credentials that somebody has replaced cannot be used, so that those of before
+        stay in use.
 
     Raises
     ------
@@ -107,12 +113,13 @@ class StreamRobotTransport:
         tls: TlsFiles | None = None,
         on_unreachable: Callable[[str, str], None] | None = None,
         on_closed_to_datagrams: Callable[[str], None] | None = None,
+        on_unusable: Callable[[str], None] | None = None,
     ) -> None:
         if name:
             check_name("name of a robot", name)
         check_name("incarnation of a robot", incarnation)
         self.settings = LinkSettings(
-            encode_hello("robot", name, incarnation, lease_ms),
+            partial(encode_hello, "robot", name, incarnation, lease_ms),
             lease_ms,
             max_message_bytes,
             HalfReceived(2 * (max_message_bytes + HEADER_BYTES)),
@@ -132,7 +139,7 @@ class StreamRobotTransport:
             if address.name is not None:
                 check_name("name of a service", address.name)
             if credentials is None and tls is not None and endpoint.is_encrypted:
-                credentials = ClientCredentials(tls)
+                credentials = ClientCredentials(tls, on_unusable)
             if endpoint.protocol == "udp":
                 from holdfast.transport.sealing import require_cryptography
 
@@ -423,7 +430,8 @@ class _Service:
         if link.refused:
             self._tell_unreachable(link.reason)
         elif link.hello is None and dialer is not None and not self._links:
-            self._tell_unreachable(link.reason or _SAYS_NO_HELLO)
+            takes_tls = link.tls is None or link.tls.established
+            self._tell_unreachable(link.reason or (_SAYS_NO_HELLO if takes_tls else _TAKES_NO_TLS))
         if boot is not None and boot in self._links.values():
             self._robot.calls.lost(link)  # it goes on over another link
         elif boot is not None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import socket
+import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -207,7 +208,7 @@ class StreamServiceTransport:
         if tls is not None:
             self._read_credentials(tls)
         self._settings = LinkSettings(
-            encode_hello("service", name, boot, lease_ms),
+            lambda: encode_hello("service", name, boot, lease_ms, time.time()),
             lease_ms,
             max_message_bytes,
             HalfReceived(2 * (max_message_bytes + HEADER_BYTES)),
@@ -390,6 +391,8 @@ class StreamServiceTransport:
         """Refuse what is no robot, and who would have more than a share of room."""
         if hello.role != "robot":
             return "is a service, and a robot was expected"
+        if link.peer is not None and hello.name not in ("", link.peer.name):
+            return f"says that it is {hello.name}, and shows the certificate of {link.peer.name}"
         if len(self._links) >= self._max_links and not self._make_room(_certified(link)):
             return f"is one too many: {self._max_links} robots are connected"
         return None

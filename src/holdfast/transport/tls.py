@@ -15,9 +15,9 @@ speaks (ALPN), and a service takes its own.
 
 from __future__ import annotations
 
-import contextlib
+import re
 import ssl
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 from holdfast.errors import TransportError
@@ -44,6 +44,43 @@ Debian 12's, cannot choose X25519."""
 
 _READ_BYTES = 16 * 1024
 """The largest record."""
+
+
+_WHAT_TO_DO = {
+    10: "; 'holdfast keys DIR --renew --{role} NAME' makes another",
+    18: "; both ends need files of one 'holdfast keys DIR'",
+    19: "; both ends need files of one 'holdfast keys DIR'",
+    20: "; both ends need files of one 'holdfast keys DIR'",
+    23: "; 'holdfast keys DIR --rotate --{role} NAME' makes a new key",
+}
+"""By OpenSSL's numbers, about a certificate of the other end."""
+
+_ALERTS = {
+    "both": {
+        "CERTIFICATE_EXPIRED": (
+            "it has expired by the clock there; 'holdfast keys DIR --renew --{role} NAME' makes "
+            "another"
+        ),
+        "CERTIFICATE_REVOKED": (
+            "it has been revoked; 'holdfast keys DIR --rotate --{role} NAME' makes a new key"
+        ),
+        "UNKNOWN_CA": (
+            f"it was not signed by the authority in {AUTHORITY_FILE} there; both ends need files "
+            "of one 'holdfast keys DIR'"
+        ),
+        "CERTIFICATE_REQUIRED": "there is none, and one is required",
+        "UNSUPPORTED_CERTIFICATE": "it is not for a {role}",
+        "DECRYPT_ERROR": "this end's key is not the certificate's",
+    },
+    "robot": {"BAD_CERTIFICATE": "it is not valid yet by the clock there, or is malformed"},
+    "service": {
+        "BAD_CERTIFICATE": (
+            "it does not name the host that the robot calls, or is not valid yet by the clock "
+            "there; the robot's log says which"
+        )
+    },
+}
+"""What the other end says of this end's certificate (RFC 8446, section 6.2), by this end's role."""
 
 
 class PeerCertificate(NamedTuple):
@@ -109,8 +146,11 @@ def _context(protocol: int, files: TlsFiles) -> ssl.SSLContext:
         # Without the empty password, an encrypted key would ask for one on the terminal.
         context.load_cert_chain(files.certificate, files.key, password="")
     except (OSError, ssl.SSLError) as error:
+        reason = str(error)
+        if getattr(error, "reason", None) == "KEY_VALUES_MISMATCH":
+            reason = f"{files.key.name} is not the key of {files.certificate.name}"
         raise TransportError(
-            f"credentials {files.certificate.parent} cannot be used: {error}"
+            f"credentials {files.certificate.parent} cannot be used: {reason}"
         ) from error
     return context
 
@@ -123,15 +163,18 @@ class ClientCredentials:
     Parameters
     ----------
     files : TlsFiles
+    on_unusable : callable or None
+        Is told why what is there now cannot be used.
 
     Raises
     ------
     TransportError
-        If they cannot be used.
+        If they cannot be used at the beginning.
     """
 
-    def __init__(self, files: TlsFiles) -> None:
+    def __init__(self, files: TlsFiles, on_unusable: Callable[[str], None] | None = None) -> None:
         self._files = files
+        self._on_unusable = on_unusable
         self._seen = self._look()
         self._context = client_context(files)
 
@@ -140,8 +183,11 @@ class ClientCredentials:
         seen = self._look()
         if seen != self._seen:
             self._seen = seen
-            with contextlib.suppress(TransportError):
+            try:
                 self._context = client_context(self._files)
+            except TransportError as error:
+                if self._on_unusable is not None:
+                    self._on_unusable(f"{error}; those of before stay in use")
         return self._context
 
     def _look(self) -> list[tuple[int, int, int] | None]:
@@ -294,14 +340,22 @@ class TlsStream:
         assert isinstance(error, ssl.SSLError)
         if isinstance(error, ssl.SSLCertVerificationError):
             role = "robot" if self._is_server else "service"
-            return f"has a certificate that {fault_of_certificate(error, role)}"
+            fault = fault_of_certificate(error, role)
+            what_to_do = _WHAT_TO_DO.get(error.verify_code, "")
+            return f"has a certificate that {fault}{what_to_do.format(role=role)}"
         reason = error.reason or ""
         alert = reason.partition("_ALERT_")[2]
         if alert:
-            return f"refuses this end's certificate ({alert.lower().replace('_', ' ')})"
+            own = "service" if self._is_server else "robot"
+            meaning = _ALERTS[own].get(alert, _ALERTS["both"].get(alert))
+            if meaning is None:
+                return f"refuses this end's TLS ({alert.lower().replace('_', ' ')})"
+            return f"refuses this end's certificate: {meaning.format(role=own)}"
         if "PEER_DID_NOT_RETURN_A_CERTIFICATE" in reason:
             return "shows no certificate"
-        text = reason.lower().replace("_", " ") if reason else str(error.args[-1])
+        # Of what this Python has no word for, OpenSSL's own, without the places in the sources.
+        text = re.sub(r"^\[.*?\] | \(_ssl.*\)$", "", str(error.args[-1]))
+        text = reason.lower().replace("_", " ") if reason else text
         return f"does not speak TLS 1.3 as expected: {text}"
 
     def _shake_hands(self) -> None:
