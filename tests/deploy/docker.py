@@ -1,8 +1,8 @@
-"""A Docker Engine for tests, the base image that no registry hands out here, and the images built of the tree.
+"""A Docker Engine for tests, the base that no registry hands out here, and the images of the tree.
 
-An engine that runs already is used and left as it is found, but for what it has built. Where none runs, root
-starts one with a directory of its own, and ends it. The images' tags are digests of what they are made of, so a
-tree that has not changed is not built again.
+An engine that runs already is used and left as it is found, but for what it has built. Where none
+runs, root starts one with a directory of its own, and ends it. The images' tags are digests of what
+they are made of, so a tree that has not changed is not built again.
 """
 
 from __future__ import annotations
@@ -43,11 +43,8 @@ _BUILD_S = 1200.0
 _DEBIAN = "http://deb.debian.org/debian"
 _AUTHORITIES = Path("/etc/ssl/certs/ca-certificates.crt")
 _NOT_IN_SLIM = (
-    "usr/share/doc",
-    "usr/share/man",
-    "usr/share/locale",
-    "var/cache/apt",
-    "var/lib/apt/lists",
+    *("usr/share/doc", "usr/share/man", "usr/share/locale"),
+    *("var/cache/apt", "var/lib/apt/lists"),
 )
 
 
@@ -88,8 +85,7 @@ class Engine:
             [str(word) for word in words],
             env={**self.variables, **(variables or {})},
             text=True,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
+            capture_output=True,
             check=False,
             timeout=options.pop("timeout", PATIENCE_S),
             **options,
@@ -222,9 +218,9 @@ def _make_base(engine: Engine) -> None:
             (root / path).mkdir()
         if _AUTHORITIES.exists():
             shutil.copy(_AUTHORITIES, root / _AUTHORITIES.relative_to("/"))
-        for path in Path("/etc/apt/apt.conf.d").iterdir():
-            if "Acquire::" in path.read_text():
-                shutil.copy(path, root / "etc/apt/apt.conf.d")
+        for file in Path("/etc/apt/apt.conf.d").iterdir():
+            if "Acquire::" in file.read_text():
+                shutil.copy(file, root / "etc/apt/apt.conf.d")
         archive = Path(name) / "base.tar"
         engine.checked("tar", "-C", root, "-cf", archive, ".", timeout=_BUILD_S)
         engine.docker("import", archive, BASE, timeout=_BUILD_S)
