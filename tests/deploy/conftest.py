@@ -1,0 +1,21 @@
+"""What the tests of deployment begin with."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+from tests.deploy.docker import Engine, Images, build, running_engine
+
+
+@pytest.fixture(scope="session")
+def engine() -> Iterator[Engine]:
+    """Return a Docker Engine."""
+    with running_engine() as engine:
+        yield engine
+
+
+@pytest.fixture(scope="session")
+def images(engine: Engine) -> Images:
+    """Return the images of this tree."""
+    return build(engine)
