@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import contextlib
 import json
+import shutil
 import subprocess
 import uuid
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from tests.deploy.docker import BASE, Engine, wait_until
+from tests.deploy.docker import BASE, Engine, missing, wait_until
 
 __all__ = ["USER", "Machine", "booted"]
 
@@ -94,6 +95,8 @@ class Machine(NamedTuple):
 @contextlib.contextmanager
 def booted(engine: Engine, user_data: Path, directory: Path) -> Iterator[Machine]:
     """Switch a machine on that takes this user-data, and in the end throw it away."""
+    if shutil.which("ssh-keygen") is None:
+        missing("there is no command ssh-keygen (Debian: openssh-client)")
     engine.docker("build", "-q", "-t", "holdfast-test-machine", "-", input=_IMAGE, timeout=_BUILD_S)
     key = directory / "ssh_key"
     subprocess.run(["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", key], check=True)
