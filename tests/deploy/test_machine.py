@@ -35,7 +35,7 @@ SLOWLY = "--rate 10"
 """With it the run takes eight minutes, which no fault outlasts; without it, seconds."""
 
 SOON = "[Service]\nWatchdogSec=2\nTimeoutAbortSec=1\n"
-"""So that nobody waits for ten seconds and five."""
+"""So that nobody waits for twenty seconds and five."""
 
 
 class Lab(NamedTuple):
