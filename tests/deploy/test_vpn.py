@@ -23,6 +23,7 @@ from datetime import datetime
 from pathlib import Path
 
 import pytest
+from tests.deploy.docker import missing
 from tests.processes.faults import (
     KEEP_ALIVE,
     LOCAL_RECOVERY,
@@ -288,14 +289,14 @@ def called(*words: str | Path, **variables: str) -> subprocess.CompletedProcess[
 
 @pytest.fixture(scope="module", autouse=True)
 def _tools() -> None:
-    missing = sorted({package for tool, package in TOOLS.items() if shutil.which(tool) is None})
-    reason = f"not installed (Debian's packages): {', '.join(missing)}" if missing else ""
+    packages = sorted({package for tool, package in TOOLS.items() if shutil.which(tool) is None})
+    reason = f"not installed (Debian's packages): {', '.join(packages)}" if packages else ""
     if os.geteuid() != 0:
         reason = "devices in networks of their own need root"
     elif not Path("/dev/net/tun").exists():
         reason = "this machine has no /dev/net/tun"
     if reason:
-        (pytest.fail if os.environ.get("CI") else pytest.skip)(reason)
+        missing(reason)
 
 
 @pytest.fixture(scope="module")
