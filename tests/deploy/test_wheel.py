@@ -113,6 +113,7 @@ def test_the_sources_are_whole(dist: Path) -> None:
     assert not [name for name in names if name.endswith((".so", ".pyc"))]
 
 
+@pytest.mark.usefixtures("images")  # which stand on the bare machine's own
 def test_it_runs_on_a_bare_machine(wheel: Path, engine: Engine) -> None:
     if sys.version_info[:2] != (3, 11):
         missing(f"{wheel.name} is not for the Python 3.11 of {BASE}")
