@@ -12,12 +12,16 @@ INSTALLED_FIGURES := $(VENV)/.installed-figures
 INSTALLED_DEV := $(VENV)/.installed-dev
 INSTALLED_COMPILED := $(COMPILED)/.installed
 
+DIST ?= dist
+# Seconds since 1970 that archives bear, so that they come out the same whenever they are made.
+RELEASED = $(shell git log -1 --format=%ct 2>/dev/null || date +%s)
+
 NATIVE_SOURCES := $(wildcard CMakeLists.txt) $(shell find cpp -type f)
 PACKAGE_SOURCES := $(shell find cmake src -type f -not -name '*.pyc')
 CPP_FILES := $(shell find cpp -name '*.hpp' -o -name '*.cpp')
 
 .DEFAULT_GOAL := help
-.PHONY: help demo install test test-gate test-real test-defects test-slow test-deploy test-deploy-slow test-compiled lint format simulate chaos fuzz soak bench results clean
+.PHONY: help demo install test test-gate test-real test-defects test-slow test-deploy test-deploy-slow test-compiled lint format simulate chaos fuzz soak bench results wheel sbom clean
 
 help: ## what there is to make
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-16s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -86,6 +90,17 @@ results: $(INSTALLED_DEV) ## the experiments behind docs/results.md: hours, the 
 	    name=$$(basename $$(dirname $$study)); mkdir -p docs/results/$$name; \
 	    find runs/experiments/$$name -maxdepth 1 -type f -not -name '*_trials.csv' -exec cp {} docs/results/$$name/ \; ; \
 	done
+
+wheel: $(INSTALLED_DEV) ## dist/: the sources, and a wheel for machines of this kind, the same bytes each time
+	rm -rf $(DIST)
+	SOURCE_DATE_EPOCH=$(RELEASED) $(BIN)/python -m build --outdir $(DIST)/unrepaired
+	mv $(DIST)/unrepaired/*.tar.gz $(DIST)
+	PATH="$(CURDIR)/$(BIN):$$PATH" SOURCE_DATE_EPOCH=$(RELEASED) \
+	    $(BIN)/auditwheel repair -w $(DIST) $(DIST)/unrepaired/*.whl
+	rm -rf $(DIST)/unrepaired
+
+sbom: $(INSTALLED_DEV) ## dist/holdfast-VERSION.cdx.json: what the images' environment is made of, with licences
+	$(BIN)/python deploy/sbom.py $(DIST)
 
 clean: ## remove what was built or run here, but keep .venv
 	rm -rf build dist demo-run chaos-run .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis

@@ -7,12 +7,15 @@ a reason, which stands in CHANGELOG.md. ::
 
     python -m tests.golden.table
 
-writes the table anew and says which rows changed.
+writes the table anew and says which rows changed. With ``--check`` it compares instead, and needs
+nothing but holdfast: so a wheel is tried on the machine and with the compiler that it is for.
 """
 
 from __future__ import annotations
 
 import csv
+import platform
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple, get_args, get_type_hints
@@ -138,12 +141,27 @@ def rewrite() -> None:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(COLUMNS)
         writer.writerows((name, *row) for name, row in now.items())
-    for name in sorted(before.keys() | now.keys()):
-        if before.get(name) != now.get(name):
-            was, is_now = (rows.get(name, ("", "no row"))[1] for rows in (before, now))
-            print(f"{name}: {was} -> {is_now}")
+    _print_differences(before, now)
     print(f"{TABLE}: {len(now)} rows; a changed digest needs its reason in CHANGELOG.md")
 
 
+def check() -> bool:
+    """Run everything, and tell whether all of it comes out as the table says."""
+    now = {run.name: (run.command(), run.digest()) for run in runs()}
+    different = _print_differences(pinned(), now)
+    print(f"{len(now)} runs on {platform.machine()}, {different} of them differ from {TABLE.name}")
+    return different == 0
+
+
+def _print_differences(before: dict[str, tuple[str, str]], now: dict[str, tuple[str, str]]) -> int:
+    names = [name for name in sorted(before | now) if before.get(name) != now.get(name)]
+    for name in names:
+        was, is_now = (rows.get(name, ("", "no row"))[1] for rows in (before, now))
+        print(f"{name}: {was} -> {is_now}")
+    return len(names)
+
+
 if __name__ == "__main__":
+    if sys.argv[1:] == ["--check"]:
+        sys.exit(not check())
     rewrite()
