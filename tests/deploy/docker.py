@@ -13,6 +13,7 @@ import json
 import os
 import shutil
 import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -24,9 +25,12 @@ import pytest
 __all__ = [
     "PATIENCE_S",
     "ROOT",
+    "USER",
     "Engine",
     "Images",
     "build",
+    "give_to",
+    "holdfast",
     "missing",
     "running_engine",
     "wait_until",
@@ -35,6 +39,9 @@ __all__ = [
 ROOT = Path(__file__).parents[2]
 BASE = "debian:bookworm-slim"
 TARGETS = ("cloud", "robot")
+
+USER = 10001
+"""Of what runs in the images."""
 
 PATIENCE_S = 120.0
 """For whatever must happen; only a hang takes so long."""
@@ -53,6 +60,28 @@ def missing(reason: str) -> NoReturn:
     if os.environ.get("CI"):
         pytest.fail(reason, pytrace=False)
     pytest.skip(reason)
+
+
+def holdfast(*words: object, cwd: Path) -> None:
+    """Run the command on this machine, which must succeed."""
+    done = subprocess.run(
+        [sys.executable, "-m", "holdfast", *map(str, words)],
+        cwd=cwd,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=PATIENCE_S,
+    )
+    assert done.returncode == 0, f"{words}: {done.returncode}\n{done.stdout}\n{done.stderr}"
+
+
+def give_to(user: int, *paths: Path) -> None:
+    """Let a user have files and directories."""
+    if os.geteuid() != 0:
+        missing("files have to be given to the user of the images, which root alone can")
+    for path in paths:
+        for each in (path, *path.rglob("*")):
+            os.chown(each, user, user)
 
 
 def wait_until(condition: Callable[[], bool], what: str) -> None:

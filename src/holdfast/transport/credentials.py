@@ -129,6 +129,9 @@ def give_to_warnings(text: str, stacklevel: int = 3) -> None:
 
 def _unreadable(directory: Path, path: Path, role: Role, error: OSError) -> str:
     text = f"{path}: cannot be read: {error.strerror}"
+    if isinstance(error, PermissionError):
+        # Of this directory nothing else can be found out, either.
+        return f"{text}; this process is user {os.geteuid()}"
     if TlsFiles.of(directory / role).certificate.exists():
         return f"{text}; did you mean {directory / role}?"
     if directory.with_name(f".{directory.name}.old").exists():
