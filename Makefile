@@ -21,7 +21,7 @@ PACKAGE_SOURCES := $(shell find cmake src -type f -not -name '*.pyc')
 CPP_FILES := $(shell find cpp -name '*.hpp' -o -name '*.cpp')
 
 .DEFAULT_GOAL := help
-.PHONY: help demo install test test-gate test-real test-defects test-slow test-deploy test-deploy-slow test-compiled lint format simulate chaos fuzz soak bench results wheel sbom clean
+.PHONY: help demo install test test-gate test-real test-defects test-slow test-deploy test-deploy-slow test-compiled lint format simulate chaos fuzz soak bench results wheel sbom requirements clean
 
 help: ## what there is to make
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-16s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -101,6 +101,13 @@ wheel: $(INSTALLED_DEV) ## dist/: the sources, and a wheel for machines of this 
 
 sbom: $(INSTALLED_DEV) ## dist/holdfast-VERSION.cdx.json: what the images' environment is made of, with licences
 	$(BIN)/python deploy/sbom.py $(DIST)
+
+requirements: $(INSTALLED_DEV) ## deploy/*requirements.txt anew: the versions and digests that images are made of
+	$(BIN)/uv pip compile -q --upgrade --python-version 3.11 --generate-hashes --no-annotate --extra service --extra udp \
+	    --custom-compile-command "make requirements" pyproject.toml -o deploy/requirements.txt
+	printf 'scikit-build-core>=0.11\nnanobind>=2.4\ncmake\nninja\n' | \
+	    $(BIN)/uv pip compile -q --upgrade --python-version 3.11 --generate-hashes --no-annotate \
+	    --custom-compile-command "make requirements" - -o deploy/build-requirements.txt
 
 clean: ## remove what was built or run here, but keep .venv
 	rm -rf build dist demo-run chaos-run .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis

@@ -70,7 +70,8 @@ def test_nothing_in_an_image_helps_an_intruder(engine: Engine, images: Images, r
         find /opt -name '*.pem' -o -name '*.key' -o -name tests -o -name pip
         command -v gcc c++ cc pip pip3 git curl make || true
         touch /opt/holdfast/written 2>/dev/null && echo /opt/holdfast/written
-        find /opt/holdfast/lib -name '*.py' -path '*/site-packages/holdfast/*' | while read -r source; do
+        find /opt/holdfast/lib/python3*/site-packages/holdfast -name '*.py' |
+        while read -r source; do
             compiled="${source%/*}/__pycache__/$(basename "$source" .py).cpython-*.pyc"
             ls $compiled >/dev/null 2>&1 || echo "$source is not compiled"
         done
