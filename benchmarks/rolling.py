@@ -134,13 +134,22 @@ class Replicas:
 
 
 def start_robots(
-    directory: Path, replicas: Replicas, way: Way, count: int, rate: float, trials: int
+    directory: Path,
+    replicas: Replicas,
+    way: Way,
+    count: int,
+    *,
+    rate: float,
+    trials: int,
+    num_seeds: int,
 ) -> dict[Path, subprocess.Popen[bytes]]:
     """Start robots; return each one's directory and process."""
     robots = {}
     for number in range(count):
         configuration = directory / f"robot-{number}.yaml"
-        configuration.write_text(_CONFIGURATION.format(seed=number, trials=trials, hedge=HEDGE_MS))
+        configuration.write_text(
+            _CONFIGURATION.format(seed=number % num_seeds, trials=trials, hedge=HEDGE_MS)
+        )
         out = directory / f"out-{number}"
         services = [word for each in replicas.services(way) for word in ("--service", each)]
         command = [*_HOLDFAST, "run", str(configuration), *services]
@@ -181,7 +190,9 @@ def _measure(way: Way, count: int, rate: float, trials: int, *, restart: bool) -
         try:
             for address in replicas.addresses:
                 replicas.start(address)
-            robots = start_robots(directory, replicas, way, count, rate, trials)
+            robots = start_robots(
+                directory, replicas, way, count, rate=rate, trials=trials, num_seeds=count
+            )
             wait_until(lambda: all(len(decisions_of(out)) > 4 for out in robots), "decisions")
             # Twenty interpreters that start at once make everybody late, restart or not.
             warm = {out: len(decisions_of(out)) for out in robots}
