@@ -628,14 +628,24 @@ class TestEveryWire:
         assert Vanished("west", "b1") not in inbox
         assert Ended(2) not in inbox
 
-    async def test_a_service_that_stops_listening_serves_those_that_are_there(
+    async def test_a_service_that_is_about_to_end_answers_those_that_are_there(
         self, wire: Wire
     ) -> None:
-        robot, inbox, service = await connected(wire)
-        service.stop_listening()
-        service.stop_listening()
-        robot.call("cloud", 1, b"question")
-        assert await inbox.of_call(1) == [Replied(1, b"question"), Ended(1)]
+        calls = Received()
+        robot, inbox, service = await connected(wire, calls)
+        robot.call("cloud", 1, b"before")
+        before = await calls.next()
+        gone = service.dismiss()
+        robot.call("cloud", 2, b"after")
+        echo(await calls.next())
+        assert await inbox.of_call(2) == [Replied(2, b"after"), Ended(2)]
+        assert Vanished("cloud", "b1") not in inbox
+        echo(before)
+        assert await inbox.of_call(1) == [Replied(1, b"before"), Ended(1)]
+        if isinstance(wire, StreamWire):  # else nobody is told
+            await inbox.wait_for(Vanished("cloud", "b1"))
+        async with asyncio.timeout(PATIENCE_S):
+            await gone
 
     async def test_a_request_that_is_too_large_is_refused(self, wire: Wire) -> None:
         robot, inbox, _ = await connected(wire)
@@ -832,8 +842,7 @@ class TestStreams:
         (dialer,) = service._dialers.values()
         robot.call("cloud", 1, b"")
         await inbox.of_call(1)
-        service.stop_listening()
-        await robot.close()
+        service.dismiss()
         await until(lambda: len(wire.told) == 2)
         assert dialer._next is None
         await wire.close_on_loop()
@@ -1565,6 +1574,7 @@ class TestUnreachable:
         ]
         await tcp.service("cloud", "b1").start(echo)
         monkeypatch.setattr(socket, "getaddrinfo", lambda *_, **__: found)
+        monkeypatch.setattr(Dialer, "_place_of", lambda *_: b"")  # in this order
         tcp._endpoints["cloud"] = f"tcp/robot.example:{port}"
         robot, inbox = tcp.robot("cloud"), Inbox()
         robot.start(inbox)
@@ -1620,6 +1630,209 @@ class TestUnreachable:
         place = wires[at].endpoint("cloud").partition("/")[2]
         wires[asked]._endpoints["cloud"] = f"{asked}/{place}"
         assert (await self.told(wires[asked])).startswith(expected)
+
+
+class Replicas:
+    """Several services at one name, each at an address of its own."""
+
+    def __init__(self, wire: StreamWire, count: int, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.wire = wire
+        self.port = int(wire.endpoint("cloud").rpartition(":")[2])
+        self.hosts = [f"127.0.0.{number}" for number in range(1, count + 1)]
+        self.running: dict[str, StreamServiceTransport] = {}
+        self._look_up_really = socket.getaddrinfo
+        monkeypatch.setattr(socket, "getaddrinfo", self._look_up)
+        # The name in the certificates of these tests.
+        wire._endpoints["cloud"] = f"{wire.protocol}/localhost:{self.port}"
+
+    def _look_up(self, host: str, *arguments: Any, **others: Any) -> list[tuple[Any, ...]]:
+        if host != "localhost":
+            return self._look_up_really(host, *arguments, **others)
+        return [(socket.AF_INET, socket.SOCK_STREAM, 6, "", (h, self.port)) for h in self.hosts]
+
+    async def start(self, host: str, serve: Serve = echo) -> StreamServiceTransport:
+        service = StreamServiceTransport(
+            "cloud",
+            boot=f"at-{host}",
+            listen=[f"{self.wire.protocol}/{host}:{self.port}"],
+            tls=self.wire.service_tls,
+            on_event=lambda event, **fields: self.wire.told.append((event, fields)),
+        )
+        await service.start(serve)
+        self.wire.ends.append(service)
+        self.running[f"at-{host}"] = service
+        return service
+
+
+class TestReplicas:
+    @pytest.fixture(params=["tcp", "tls", "udp"])
+    def wire(
+        self,
+        request: pytest.FixtureRequest,
+        socket_directory: Path,
+        robot_tls: TlsFiles,
+        service_tls: TlsFiles,
+    ) -> StreamWire:
+        keys = (None, None) if request.param == "tcp" else (robot_tls, service_tls)
+        return StreamWire(request.param, socket_directory, robot_tls=keys[0], service_tls=keys[1])
+
+    @pytest.fixture
+    def replicas(self, wire: StreamWire, monkeypatch: pytest.MonkeyPatch) -> Replicas:
+        return Replicas(wire, 3, monkeypatch)
+
+    async def test_one_that_is_about_to_end_is_left_before_it_is_missed(
+        self, wire: StreamWire, replicas: Replicas
+    ) -> None:
+        calls = Received()
+        for host in replicas.hosts:
+            await replicas.start(host, calls)
+        robot, inbox = wire.robot("cloud"), Inbox()
+        robot.start(inbox)
+        first = await inbox.appeared()
+        robot.call("cloud", 1, b"owed")
+        owed = await calls.next()
+        gone = replicas.running[first].dismiss()
+        connected = [f for e, f in wire.told if e == "robot_connected"]
+        await until(
+            lambda: len([1 for e, _ in wire.told if e == "robot_connected"]) > len(connected)
+        )
+        echo(owed)
+        assert await inbox.of_call(1) == [Replied(1, b"owed"), Ended(1)]
+        second = await inbox.appeared(times=2)
+        async with asyncio.timeout(PATIENCE_S):
+            await gone
+        assert second != first
+        robot.call("cloud", 2, b"next")
+        echo(await calls.next())
+        assert await inbox.of_call(2) == [Replied(2, b"next"), Ended(2)]
+        # The robot is told of the next process before it hears that the one before is gone.
+        kinds = [type(e) for e in inbox.events if isinstance(e, Appeared | Vanished)]
+        assert kinds[:2] == [Appeared, Appeared]
+        ends = [reason for event, _, reason in wire.heard() if event == "robot_disconnected"]
+        assert ends == ["said goodbye"]
+        assert not wire.refusals
+
+    async def test_a_question_asked_while_another_is_owed_goes_to_the_next(
+        self, wire: StreamWire, replicas: Replicas
+    ) -> None:
+        calls = Received()
+        for host in replicas.hosts[:2]:
+            await replicas.start(host, calls)
+        robot, inbox = wire.robot("cloud"), Inbox()
+        robot.start(inbox)
+        first = await inbox.appeared()
+        robot.call("cloud", 1, b"given up")
+        await calls.next()
+        replicas.running[first].dismiss()
+        service = robot._services["cloud"]
+        await until(lambda: service._successor is not None)
+        robot.call("cloud", 2, b"new")
+        echo(await calls.next())
+        assert await inbox.of_call(2) == [Replied(2, b"new"), Ended(2)]
+        assert await inbox.appeared(times=2) != first
+
+    async def test_it_goes_on_being_asked_while_nobody_else_answers(
+        self, wire: StreamWire, replicas: Replicas
+    ) -> None:
+        """At the other addresses somebody takes connections and says nothing."""
+        await replicas.start(replicas.hosts[0])
+        robot, inbox = wire.robot("cloud"), Inbox()
+        robot.start(inbox)
+        first = await inbox.appeared()
+        with contextlib.ExitStack() as stack:
+            for host in replicas.hosts[1:]:
+                stack.enter_context(socket.create_server((host, replicas.port)))
+            gone = replicas.running[first].dismiss()
+            dialer = robot._services["cloud"]._dialer
+            assert dialer is not None
+            await until(lambda: bool(dialer._links))
+            for number in range(3):
+                robot.call("cloud", number, b"echo")
+                assert await inbox.of_call(number) == [Replied(number, b"echo"), Ended(number)]
+            assert not gone.done()
+            assert Vanished("cloud", first) not in inbox
+            await robot.close()
+        await wire.close_on_loop()
+
+    async def test_the_next_one_is_lost_too(self, wire: StreamWire, replicas: Replicas) -> None:
+        calls = Received()
+        for host in replicas.hosts:
+            await replicas.start(host, calls)
+        robot, inbox = wire.robot("cloud"), Inbox()
+        robot.start(inbox)
+        first = await inbox.appeared()
+        robot.call("cloud", 1, b"owed")
+        owed = await calls.next()
+        replicas.running[first].dismiss()
+        service = robot._services["cloud"]
+        await until(lambda: service._successor is not None)
+        assert service._successor is not None
+        link, second = service._successor
+        await replicas.running[second].close()
+        await until(lambda: service._successor is not None and service._successor[0] is not link)
+        echo(owed)
+        assert await inbox.of_call(1) == [Replied(1, b"owed"), Ended(1)]
+        assert await inbox.appeared(times=2) not in (first, second)
+        assert service._links
+
+    async def test_one_that_dies_is_replaced_by_another(
+        self, wire: StreamWire, replicas: Replicas
+    ) -> None:
+        for host in replicas.hosts:
+            await replicas.start(host)
+        robot, inbox = wire.robot("cloud"), Inbox()
+        robot.start(inbox)
+        first = await inbox.appeared()
+        await replicas.running[first].close(0.0)
+        assert await inbox.appeared(times=2) != first
+
+
+async def test_robots_spread_over_the_addresses_of_a_name(
+    tcp: StreamWire, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    replicas = Replicas(tcp, 3, monkeypatch)
+    for host in replicas.hosts:
+        await replicas.start(host)
+    chosen: list[str] = []
+    for number in range(30):
+        for _ in range(2):  # one that comes again goes where it was
+            robot, inbox = tcp.robot("cloud", name=f"robot-{number}"), Inbox()
+            robot.start(inbox)
+            chosen.append(await inbox.appeared())
+            await robot.close()
+    assert chosen[::2] == chosen[1::2]
+    counts = [chosen.count(boot) // 2 for boot in replicas.running]
+    assert min(counts) >= 5, counts
+    # So do those that have lost theirs.
+    await replicas.running.popitem()[1].close()
+    replicas.hosts.pop()
+    moved = []
+    for number, before in enumerate(chosen[::2]):
+        robot, inbox = tcp.robot("cloud", name=f"robot-{number}"), Inbox()
+        robot.start(inbox)
+        after = await inbox.appeared()
+        await robot.close()
+        if before in replicas.running:
+            assert after == before
+        else:
+            moved.append(after)
+    assert set(moved) == set(replicas.running)
+
+
+async def test_a_name_is_looked_up_again_once_nobody_is_left(
+    tcp: StreamWire, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(dialer_module, "_RESOLVE_AGAIN_S", 0.01)
+    replicas = Replicas(tcp, 2, monkeypatch)
+    replicas.hosts = ["127.0.0.1"]
+    service = await replicas.start("127.0.0.1")
+    robot, inbox = tcp.robot("cloud"), Inbox()
+    robot.start(inbox)
+    await inbox.appeared()
+    replicas.hosts = ["127.0.0.2"]
+    await replicas.start("127.0.0.2")
+    service.dismiss()
+    assert await inbox.appeared(times=2) == "at-127.0.0.2"
 
 
 def assert_matches(text: str, pattern: str) -> None:

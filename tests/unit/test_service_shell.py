@@ -408,18 +408,12 @@ async def test_close_does_not_wait_for_a_computation() -> None:
 
 
 @on_a_loop
-async def test_a_service_that_drains_answers_what_it_owes_and_takes_nothing_new() -> None:
+async def test_a_service_that_drains_answers_whoever_is_still_there() -> None:
     async with joined(workers=1) as both:
         patient, call, _ = await both.robot_in_work(1)
         drained = asyncio.create_task(both.shell.drain(PATIENCE_S))
         await asyncio.sleep(0)
         assert both.shell.is_draining
-        # Over a link that stands: no answer comes, so the robot asks elsewhere.
-        trace: list[str] = []
-        both.shell.deliver(Call(trace))
-        assert trace == ["end"]
-        # Over a new one: nobody is there.
-        assert await Patient(both.network).ask(encode(Robot(key=3).request())) == []
         assert not drained.done()
         both.held.let_go.set()
         await drained

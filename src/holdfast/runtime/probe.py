@@ -174,6 +174,9 @@ class AddressPath:
             if frame.kind in (END, LAST):
                 queue.put_nowait(None)
 
+    def leaving(self, link: Link) -> None:
+        """Go on: it still answers."""
+
     def went_adrift(self, link: Link) -> None:
         """Nothing: no other link is made."""
 

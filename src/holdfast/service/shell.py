@@ -81,7 +81,7 @@ class ServiceShell:
     Attributes
     ----------
     is_draining : bool
-        Whether new calls are turned away, because the service is about to end.
+        Whether no new robots are taken, because the service is about to end.
     """
 
     def __init__(
@@ -144,15 +144,16 @@ class ServiceShell:
             self._stopped.set_result(reason)
 
     async def drain(self, timeout_s: float) -> None:
-        """Take no more links and calls, and wait until the calls so far are answered.
+        """Take no more links, and wait until all robots have their answers and have left.
 
-        A call that comes meanwhile is ended at once, so that the robot asks elsewhere.
+        Until it has found another service a robot goes on asking this one, and is answered.
         """
         self.is_draining = True
-        self._transport.stop_listening()
+        awaited = {self._transport.dismiss()}
         if self._calls or self._undecoded:
             self._idle = self._loop.create_future()
-            await asyncio.wait((self._idle,), timeout=timeout_s)
+            awaited.add(self._idle)
+        await asyncio.wait(awaited, timeout=timeout_s)
 
     async def close(self, timeout_s: float = 1.0) -> None:
         """End all calls and links, within this time; a job that runs is not waited for."""
@@ -191,7 +192,7 @@ class ServiceShell:
 
     def deliver(self, call: IncomingCall) -> None:
         """Take a call from the transport."""
-        if self._closed or self.is_draining:
+        if self._closed:
             call.end()
         else:
             self._guarded(self._received, call)

@@ -10,6 +10,7 @@ Every implementation passes ``tests/contracts/test_transport``.
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Callable
 from typing import Protocol
 
@@ -111,8 +112,12 @@ class ServiceTransport(Protocol):
         """
         ...
 
-    def stop_listening(self) -> None:
-        """Take no new links; those that stand go on. May be repeated."""
+    def dismiss(self) -> asyncio.Future[None]:
+        """Take no new links, and ask the robots to go elsewhere.
+
+        Until they do, calls are delivered and answered as before. What is returned is done when all
+        robots that can be told have gone.
+        """
         ...
 
     async def close(self, timeout_s: float = 1.0) -> None:

@@ -10,6 +10,10 @@ doubles with each such link, up to a fifth of a second. (It may be a proxy that 
 service is being started.) A link that has brought an answer, or has lasted, makes it short again:
 so a service that dies and is started again is found as fast as ever.
 
+A name may stand for several addresses, at each of which there is another process. Each robot tries
+them in an order of its own, so that robots spread over the processes, and one that loses a link
+comes back to the process that knows it. An address that refuses leads to the next one at once.
+
 Why attempts fail is told, for whoever has to mend it.
 """
 
@@ -47,7 +51,8 @@ _NEXT_LINK_S: Final = 0.25
 _REFUSED_PAUSE_S: Final = 1.0
 """After one of the ends did not want the other."""
 
-_RESOLVE_AGAIN_S: Final = 5.0
+_RESOLVE_AGAIN_S: Final = 1.0
+"""After the last answer: while nobody is reached, a name may come to stand for somebody else."""
 
 _Address: TypeAlias = str | tuple[Any, ...]
 
@@ -63,6 +68,8 @@ class Dialer:
     on_failed : callable
         Is told why no connection comes about, each time that an attempt has failed and all of the
         endpoint's addresses have.
+    identity : str
+        Of this end: by it the addresses of a name are put into an order.
     """
 
     def __init__(
@@ -70,8 +77,10 @@ class Dialer:
         endpoint: Endpoint,
         make_link: Callable[[], Link],
         on_failed: Callable[[str], None] = lambda _: None,
+        identity: str = "",
     ) -> None:
         self._endpoint = endpoint
+        self._identity = identity
         self._make_link = make_link
         self._on_failed = on_failed
         # Since somebody was there, why the last attempt at each address came to nothing.
@@ -85,7 +94,7 @@ class Dialer:
         self._absent_since: float | None = None
         self._attempted_at = self._connected_at = float("-inf")
         self._turn = 0
-        self._resolved_at = float("-inf")
+        self._resolve_at = float("-inf")
         self._addresses: list[tuple[socket.AddressFamily, _Address]] = []
         if endpoint.is_local_socket:
             self._addresses = [(socket.AF_UNIX, endpoint.host)]
@@ -160,8 +169,8 @@ class Dialer:
         absent_s = 0.0 if self._absent_since is None else now - self._absent_since
         pause_s = min(max(self._least_pause_s, _SHARE_OF_OUTAGE * absent_s), _LAST_PAUSE_S)
         self._next = self._loop.call_later(pause_s, self._attempt)
-        if self._is_name and now >= self._resolved_at + _RESOLVE_AGAIN_S:
-            self._resolved_at = now
+        if self._is_name and now >= self._resolve_at:
+            self._resolve_at = float("inf")
             # The search for an address can take many seconds and cannot be broken off.
             threading.Thread(target=self._resolve, name="holdfast-resolve", daemon=True).start()
         if not self._addresses or now < self._connected_at + _NEXT_LINK_S:
@@ -228,6 +237,14 @@ class Dialer:
         self._failures = {each: failures[each] for _, each in self._addresses if each in failures}
         if None not in reasons:
             self._on_failed("; ".join(dict.fromkeys(filter(None, reasons))))
+        elif self._next is not None and not self._links:
+            self._next.cancel()
+            self._next = self._loop.call_later(0.0, self._attempt)
+
+    def _place_of(self, address: _Address) -> bytes:
+        import hashlib  # most endpoints are no names
+
+        return hashlib.blake2b(f"{self._identity} {address}".encode(), digest_size=8).digest()
 
     def _resolve(self) -> None:
         """Look up the host's addresses; on a thread of its own."""
@@ -239,8 +256,12 @@ class Dialer:
         addresses: list[tuple[socket.AddressFamily, _Address]] = [
             (entry[0], entry[4]) for entry in found
         ]
+        # Of two kinds the system knows which is likelier to work.
+        kinds = [family for family, _ in addresses]
+        addresses.sort(key=lambda each: (kinds.index(each[0]), self._place_of(each[1])))
 
         def take() -> None:
+            self._resolve_at = self._loop.time() + _RESOLVE_AGAIN_S
             # Without new ones, those of before may still be right.
             self._addresses = addresses or self._addresses
             if not self._addresses:

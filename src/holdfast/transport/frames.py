@@ -61,7 +61,7 @@ REPLY: Final = 3  # one of the replies to a call
 END: Final = 4  # no more replies to a call
 LAST: Final = 5  # a reply and the end
 PING: Final = 6  # this end lives
-GOODBYE: Final = 7  # why this end closes the link, in words
+GOODBYE: Final = 7  # why this end closes the link, in words; without any, soon
 KEYS: Final = 8  # with which datagrams are sealed
 MESSAGE: Final = 9  # of an exchange that is too large for a datagram
 

@@ -189,9 +189,12 @@ class InProcessServiceTransport:
         for robot in self._network._robots:
             robot.appeared(self)
 
-    def stop_listening(self) -> None:
-        """Be seen by no more robots than those that see it."""
+    def dismiss(self) -> asyncio.Future[None]:
+        """Be seen by no more robots than those that see it; these are not told."""
         self.listens = False
+        gone: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        gone.set_result(None)
+        return gone
 
     async def close(self, timeout_s: float = 1.0) -> None:
         """Be seen no more, and end all calls. May be repeated."""

@@ -157,6 +157,13 @@ class LinkOwner(Protocol):
         """Take a frame of a call."""
         ...
 
+    def leaving(self, link: Link) -> None:
+        """Hear that the other end is about to end the link, and has nothing against this one.
+
+        It still answers what it is asked, for a while; who needs it no more ends the link.
+        """
+        ...
+
     def went_adrift(self, link: Link) -> None:
         """Hear that a link goes on without its stream, so that another one has to take its place.
 
@@ -205,7 +212,8 @@ class Link(asyncio.BufferedProtocol):
         Why the link has ended, as the rest of a sentence about the other end; empty if that has
         simply closed.
     said_goodbye : bool
-        Whether the other end has said that it ends the link; one that is killed does not.
+        Whether the other end has said that it ends the link, now or soon; one that is killed does
+        not.
     refused : bool
         Whether it has ended because one of the ends does not want the other, so that to try again
         at once is of no use.
@@ -308,6 +316,10 @@ class Link(asyncio.BufferedProtocol):
     def send_message(self, kind: int, call: int, payload: bytes = b"") -> None:
         """Send a frame of a call; never waits."""
         self.send(encode_frame(kind, call, payload))
+
+    def say_goodbye(self) -> None:
+        """Ask the other end to end the link as soon as it can do without."""
+        self.send(encode_goodbye(""))
 
     def forget(self, call: int) -> None:
         """Take note that nobody wants to hear more of a call."""
@@ -557,7 +569,10 @@ class Link(asyncio.BufferedProtocol):
         elif kind == GOODBYE:
             reason = read_goodbye(frame.payload)
             self.said_goodbye = True
-            self.end(f"refuses this end, which {reason}" if reason else "", refused=reason != "")
+            if reason:
+                self.end(f"refuses this end, which {reason}", refused=True)
+            else:
+                self._owner.leaving(self)
         else:
             self._owner.received(self, frame)
 

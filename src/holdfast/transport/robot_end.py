@@ -118,6 +118,7 @@ class StreamRobotTransport:
         if name:
             check_name("name of a robot", name)
         check_name("incarnation of a robot", incarnation)
+        self.identity = f"{name}/{incarnation}"
         self.settings = LinkSettings(
             partial(encode_hello, "robot", name, incarnation, lease_ms),
             lease_ms,
@@ -176,7 +177,7 @@ class StreamRobotTransport:
     def call(self, service: str, call: int, payload: bytes) -> None:
         """Send a request; never waits."""
         to = self._service(service)
-        link = to.current
+        link = to.link_for_call()
         pending = self.calls.begin(call, link)
         if pending is None:
             return
@@ -242,6 +243,8 @@ class _Service:
         # Those over which it is seen, with the boot that was told, the newest last. There are
         # several only where the robot listens.
         self._links: dict[Link, str] = {}
+        # One with its boot that waits until what the process before it owes has come.
+        self._successor: tuple[Link, str] | None = None
         # In the order of their beginning, with the network from which each came.
         self._made: dict[Link, bytes] = {}
         self._calls: dict[Link, dict[int, PendingCall]] = {}
@@ -269,7 +272,9 @@ class _Service:
                 self.endpoint, self._accepted, speaks_first=self._credentials is not None
             )
         else:
-            self._dialer = Dialer(self.endpoint, self._make_link, self._tell_unreachable)
+            self._dialer = Dialer(
+                self.endpoint, self._make_link, self._found_nobody, self._robot.identity
+            )
             self._dialer.start()
 
     def stop(self) -> list[asyncio.Future[None]]:
@@ -282,6 +287,18 @@ class _Service:
         for link in links:
             link.end("", goodbye="")
         return [link.closed for link in links]
+
+    def link_for_call(self) -> Link | None:
+        """Return the link for a new call.
+
+        Who asks anew has what it asked for before, or does not want it any more.
+        """
+        if self._successor is None:
+            return self.current
+        # In a later turn, for nothing is delivered from here. Then the call is asked again, with
+        # what the other process does not know.
+        asyncio.get_running_loop().call_soon(self._move_on)
+        return self._successor[0]
 
     def send(self, link: Link, pending: PendingCall, payload: bytes) -> None:
         number = next(self._numbers) % _CALL_NUMBERS
@@ -296,6 +313,8 @@ class _Service:
                 if call is pending:
                     del self._calls[link][number]
                     link.forget(number)
+            if link.said_goodbye and self._successor is not None:
+                asyncio.get_running_loop().call_soon(self._move_on_if_free)
 
     # -- links -----------------------------------------------------------------------------------
 
@@ -360,27 +379,69 @@ class _Service:
         self._told_reasons.clear()
         if self._dialer is not None:
             self._dialer.succeeded()
+        before = self.current
+        if link not in self._links and before is not None and before.said_goodbye:
+            self._calls[link] = {}
+            self._successor = link, boot
+            if self._dialer is not None:
+                self._dialer.won(link)
+            self._move_on_if_free()
+            return
         if link not in self._links:
             self._appeared(link, boot)
-        self._replace_adrift(link, boot)
+        self._replace_others(link, boot)
 
     def _appeared(self, link: Link, boot: str) -> None:
         is_news = boot not in self._links.values()
         self._links[link] = boot
-        self._calls[link] = {}
+        self._calls.setdefault(link, {})
         if self._dialer is not None:
             self._dialer.won(link)
         if is_news:
             self._robot.calls.appeared(self._name, boot)
 
-    def _replace_adrift(self, by: Link, boot: str) -> None:
-        """End the links that go on without a stream, now that there is a whole one.
+    def _replace_others(self, by: Link, boot: str) -> None:
+        """End the links that go on without a stream or are about to end: there is a better one.
 
         Those to the same process first hear the answers that are on their way.
         """
         for link, its_boot in list(self._links.items()):
-            if link is not by and link.adrift and (its_boot != boot or not self._calls[link]):
-                link.end("")
+            ending = link is not by and (link.adrift or link.said_goodbye)
+            if ending and (its_boot != boot or not self._calls[link]):
+                link.end("", goodbye="")
+
+    # -- a process that is about to end ----------------------------------------------------------
+
+    def leaving(self, link: Link) -> None:
+        """Look for another process, while this one still answers."""
+        if self._dialer is not None and link is self.current and not self._stopped:
+            self._dialer.start()
+        else:
+            self._leave(link)
+
+    def _leave(self, link: Link) -> None:
+        if not self._calls.get(link):
+            link.end("", goodbye="")
+
+    def _found_nobody(self, reason: str) -> None:
+        """Take note that nobody is at any of the service's addresses."""
+        current = self.current
+        if current is not None and current.said_goodbye:
+            self._leave(current)  # whoever else there is can be asked at once
+        else:
+            self._tell_unreachable(reason)
+
+    def _move_on_if_free(self) -> None:
+        """Go over to the next process if the one before owes nothing."""
+        current = self.current
+        if current is None or not self._calls.get(current):
+            self._move_on()
+
+    def _move_on(self) -> None:
+        successor, self._successor = self._successor, None
+        if successor is not None and not self._stopped:
+            self._appeared(*successor)
+            self._replace_others(*successor)
 
     def received(self, link: Link, frame: Frame) -> None:
         """Take a reply, or the end of a call."""
@@ -398,8 +459,14 @@ class _Service:
         if frame.kind != REPLY:
             calls.pop(frame.call, None)
             self._robot.calls.ended(call)
-            if link.adrift and not calls and link is not self.current:
-                link.end("")
+            if calls:
+                return
+            if link.said_goodbye and self._successor is not None:
+                self._move_on_if_free()
+            elif (link.adrift and link is not self.current) or (
+                link.said_goodbye and self._dialer is None
+            ):
+                link.end("", goodbye="")
 
     def went_adrift(self, link: Link) -> None:
         """Make another link, while this one goes on."""
@@ -418,6 +485,14 @@ class _Service:
         """Take note that a link has ended."""
         self._made.pop(link, None)
         self._calls.pop(link, None)
+        if self._successor is not None:
+            if link is self._successor[0]:
+                self._successor = None
+                if self._dialer is not None and not self._stopped:
+                    self._dialer.ended(link)
+                    self._dialer.start(refused=link.refused)
+                return
+            self._move_on_if_free()
         was_current = next(reversed(self._links), None) is link
         boot = self._links.pop(link, None)
         if link.refused or (link.hello is None and boot is not None):

@@ -226,6 +226,7 @@ class StreamServiceTransport:
         self._ungreeted: dict[Link, bytes] = {}
         self._links: dict[Link, set[_StreamCall]] = {}
         self._closing: set[asyncio.Future[None]] = set()
+        self._gone: asyncio.Future[None] | None = None
 
     @property
     def endpoints(self) -> tuple[str, ...]:
@@ -249,7 +250,7 @@ class StreamServiceTransport:
                 accepted = partial(self._accepted, endpoint)
                 self._listeners.append(Listener(endpoint, accepted, listening=listening))
         except TransportError:
-            self.stop_listening()
+            self._stop_listening()
             raise
         self._listen = [listener.endpoint for listener in self._listeners]
         for endpoint in self._connect:
@@ -257,8 +258,31 @@ class StreamServiceTransport:
             self._dialers[endpoint] = dialer
             dialer.start()
 
-    def stop_listening(self) -> None:
-        """Take no new links; those that stand go on. May be repeated."""
+    def dismiss(self) -> asyncio.Future[None]:
+        """Take no new links, and ask the robots to go elsewhere.
+
+        A robot leaves once it is owed nothing and has found another process, or nobody at all.
+        Until then it is answered: so it loses no time by the search.
+
+        Returns
+        -------
+        Future
+            Done when all have gone.
+        """
+        self._stop_listening()
+        self._gone = asyncio.get_running_loop().create_future()
+        for link in list(self._ungreeted):
+            link.end("")
+        for link in list(self._links):
+            link.say_goodbye()
+        self._note_gone()
+        return self._gone
+
+    def _note_gone(self) -> None:
+        if self._gone is not None and not self._links and not self._gone.done():
+            self._gone.set_result(None)
+
+    def _stop_listening(self) -> None:
         for listener in self._listeners:
             listener.close()
         for dialer in self._dialers.values():
@@ -269,7 +293,7 @@ class StreamServiceTransport:
         """End all calls, send what was to be sent, and close all links, within this time."""
         self._deliver = None
         self._started = True
-        self.stop_listening()
+        self._stop_listening()
         for link, calls in list(self._links.items()):
             for call in list(calls):
                 call.end()
@@ -446,6 +470,10 @@ class StreamServiceTransport:
         call.is_being_delivered = False
         call.flush()
 
+    def leaving(self, link: Link) -> None:
+        """End the link: a robot that goes is owed nothing."""
+        link.end("")
+
     def went_adrift(self, link: Link) -> None:
         """Nothing: it is the robot that makes another link."""
 
@@ -463,6 +491,7 @@ class StreamServiceTransport:
         elif link.reason:
             fields = {"robot": link.peer.name} if link.peer is not None else {}
             self._tell("link_refused", reason=link.reason, address=link.address, **fields)
+        self._note_gone()
         dialer = self._dialled.pop(link, None)
         if dialer is not None:
             dialer.ended(link)
