@@ -213,8 +213,11 @@ async def certificate_at(path: AddressPath) -> tuple[bytes, str]:
             async with asyncio.timeout(GREETING_S):
                 await loop.sock_connect(stream, path.address)
                 tls.begin()
-                await loop.sock_sendall(stream, tls.take())
-                while not tls.established and (data := await loop.sock_recv(stream, 65536)):
+                while not tls.established:
+                    # It may ask for a key of another kind before it shows anything.
+                    await loop.sock_sendall(stream, tls.take())
+                    if not (data := await loop.sock_recv(stream, 65536)):
+                        break
                     tls.receive(data)
         except TimeoutError:
             reason = _SAYS_NOTHING
