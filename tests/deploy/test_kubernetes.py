@@ -169,6 +169,9 @@ def check_certificate(manifests: list[Manifest]) -> None:
         *("secretName", "issuerRef", "commonName", "dnsNames", "usages", "isCA"),
         *("duration", "renewBefore", "privateKey"),
     }
+    assert 0 < len(spec["commonName"]) <= 64
+    # Whoever steals it must not be able to ask as well.
+    assert spec["usages"] == ["digital signature", "server auth"]
     services = [each["metadata"]["name"] for each in manifests if each["kind"] == "Service"]
     assert {f"{name}.holdfast.svc" for name in services} <= set(spec["dnsNames"])
     (secret,) = (each["secret"] for each in keys_volume(manifests)["sources"] if "secret" in each)

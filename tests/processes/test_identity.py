@@ -261,7 +261,7 @@ def test_what_is_renewed_where_it_is_mounted_is_read_without_a_signal(
     make_credentials(home, services=["cloud"], rotate=True, days=30)
     new = home / "cloud"
 
-    # The certificate has come and its key has not: each process says so once, however often it looks.
+    # The certificate has come and its key has not: each process says so once.
     mounted.put(old, certificate=new / "certificate.pem")
     cloud.process.wait_for("credentials", processes)
     mounted.put(new)

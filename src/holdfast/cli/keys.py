@@ -90,8 +90,8 @@ def keys(
     is replaced, and its key stays or is replaced, too.
 
     --revoke writes revoked.pem into each directory. Copied to a service it takes effect within
-    seconds (with the signal SIGHUP at once), copied to a robot with its next connection. Together with --rotate, what is revoked are
-    the certificates of before.
+    seconds (with the signal SIGHUP at once), copied to a robot with its next connection. Together
+    with --rotate, what is revoked are the certificates of before.
     """
     from holdfast.transport.key_ring import (
         alone_in,
@@ -148,8 +148,8 @@ def _account_of_revocation(directory: Path, done: Revocation) -> str:
         "",
         f"Copy {directory / 'NAME' / 'revoked.pem'} to each service and robot, beside its "
         "certificate.pem.",
-        "Each 'holdfast serve' notices within seconds, and at once with the signal SIGHUP: links of "
-        "what is revoked end, others go on.",
+        "Each 'holdfast serve' notices within seconds, and at once with the signal SIGHUP: links "
+        "of what is revoked end, others go on.",
     ]
     return "\n".join(lines) + "\n"
 
