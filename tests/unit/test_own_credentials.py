@@ -6,6 +6,7 @@ import asyncio
 import os
 import shutil
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -31,12 +32,14 @@ class Events:
 
 
 class Looks(asyncio.SelectorEventLoop):
-    """A loop in which time passes when it is told to."""
+    """A loop in which the next look comes when it is told to."""
 
-    def call_later(
-        self, delay: float, callback: Callable[..., object], *args: Any, **_: Any
+    next_look: Callable[[], object]
+
+    def call_later(  # type: ignore[override]
+        self, delay: float, callback: Any, *args: Any, context: Any = None
     ) -> Any:
-        self.next_look = lambda: callback(*args)
+        self.next_look = partial(callback, *args)
 
     def look(self, times: int = 1) -> None:
         for _ in range(times):
