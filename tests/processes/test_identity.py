@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import signal
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime, timedelta
@@ -217,3 +218,66 @@ def test_a_name_that_is_none_is_refused(site: Site) -> None:
     robot = site.run(file, services=["tcp/127.0.0.1:1"])
     assert robot.wait() == 2
     assert "offload.name 'no name!': allowed are 1 to 100 letters" in robot.output
+
+
+class Mounted:
+    """Credentials as a cluster mounts them: a link to what is current, which is put in its place.
+
+    Parameters
+    ----------
+    directory : Path
+    first : Path
+        The credentials to begin with.
+    """
+
+    def __init__(self, directory: Path, first: Path) -> None:
+        self.directory = directory
+        self._versions = 0
+        directory.mkdir()
+        self.put(first)
+        for file in first.iterdir():
+            (directory / file.name).symlink_to(Path("..data") / file.name)
+
+    def put(self, source: Path, **changed: Path) -> None:
+        """Put other files in place of those there, all at once."""
+        self._versions += 1
+        new = Path(shutil.copytree(source, self.directory / f"..{self._versions}"))
+        for name, file in changed.items():
+            shutil.copy(file, new / f"{name}.pem")
+        (self.directory / "..new").symlink_to(new.name)
+        (self.directory / "..new").rename(self.directory / "..data")
+
+
+@pytest.mark.parametrize("processes", [1, 2])
+def test_what_is_renewed_where_it_is_mounted_is_read_without_a_signal(
+    processes: int, home: Path, site: Site, references: References, tmp_path: Path
+) -> None:
+    old = Path(shutil.copytree(home / "cloud", tmp_path / "old"))
+    mounted = Mounted(tmp_path / "mounted", old)
+    endpoint = f"tls/127.0.0.1:{free_port()}"
+    cloud = site.service(
+        *("--tls", str(mounted.directory), "--processes", str(processes)), endpoint=endpoint
+    ).start()
+    make_credentials(home, services=["cloud"], rotate=True, days=30)
+    new = home / "cloud"
+
+    # The certificate has come and its key has not: each process says so once.
+    mounted.put(old, certificate=new / "certificate.pem")
+    cloud.process.wait_for("credentials", processes)
+    mounted.put(new)
+    until = f"{certificate_of(new).not_valid_after_utc:%Y-%m-%d %H:%M} UTC"
+    told = cloud.process.wait_for("credentials_reloaded", processes, valid_until=until)
+    assert told["links_ended"] == 0
+    for failure in cloud.process.matching("credentials"):
+        assert "key.pem: is not the key of" in failure["reason"]
+        assert "those of before stay in use" in failure["reason"]
+    assert len(cloud.process.matching("credentials")) == processes
+
+    revoke_credentials(home, names=["berta"])
+    story = Story(site, references, document_of(PEG))
+    story.at("perform", 20, lambda: mounted.put(new, revoked=home / "cloud" / "revoked.pem"))
+    (mounted.directory / "revoked.pem").symlink_to(Path("..data") / "revoked.pem")
+    robot = story.run(cloud, options=("--tls", str(home / "anna")))
+    assert robot.statuses() == []
+    cloud.process.wait_for("credentials_reloaded", processes, num_revoked=1)
+    assert len(cloud.process.matching("credentials_reloaded")) == 2 * processes

@@ -89,9 +89,9 @@ def keys(
     What is there already stays as it is, unless --renew or --rotate is said; then its certificate
     is replaced, and its key stays or is replaced, too.
 
-    --revoke writes revoked.pem into each directory. Copied to a service it takes effect with the
-    signal SIGHUP, copied to a robot with its next run. Together with --rotate, what is revoked are
-    the certificates of before.
+    --revoke writes revoked.pem into each directory. Copied to a service it takes effect within
+    seconds (with the signal SIGHUP at once), copied to a robot with its next connection. Together
+    with --rotate, what is revoked are the certificates of before.
     """
     from holdfast.transport.key_ring import (
         alone_in,
@@ -148,8 +148,8 @@ def _account_of_revocation(directory: Path, done: Revocation) -> str:
         "",
         f"Copy {directory / 'NAME' / 'revoked.pem'} to each service and robot, beside its "
         "certificate.pem.",
-        "Then send each 'holdfast serve' the signal SIGHUP: links of what is revoked end at once, "
-        "others go on.",
+        "Each 'holdfast serve' notices within seconds, and at once with the signal SIGHUP: links "
+        "of what is revoked end, others go on.",
     ]
     return "\n".join(lines) + "\n"
 
@@ -177,8 +177,8 @@ def _account(ring: KeyRing) -> str:
     if any(made.renewed for made in ring.made):
         lines += [
             "",
-            "Copy each certificate.pem over the old one. Services read it when they start, and "
-            "with the signal SIGHUP.",
+            "Copy each certificate.pem over the old one. Services read it within "
+            "seconds, and at once with the signal SIGHUP.",
         ]
     commands = [
         f"  holdfast serve --listen tls/0.0.0.0:7447 --tls {made.directory}"

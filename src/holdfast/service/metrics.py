@@ -120,11 +120,14 @@ class Report(msgspec.Struct):
     times : DecisionTimes
     restarts : int
         Processes that were started again.
+    certificate_expires_s : float or None
+        When the certificate in use does, of several the first, in seconds since 1970; None without.
     """
 
     statistics: ServiceStatistics = msgspec.field(default_factory=ServiceStatistics)
     times: DecisionTimes = msgspec.field(default_factory=DecisionTimes)
     restarts: int = 0
+    certificate_expires_s: float | None = None
 
     def without_gauges(self) -> Report:
         """Return what is left of a process that has ended: it holds nothing any more."""
@@ -137,6 +140,8 @@ def added(reports: Iterable[Report]) -> Report:
     total = Report()
     for report in reports:
         total.restarts += report.restarts
+        ends = (total.certificate_expires_s, report.certificate_expires_s)
+        total.certificate_expires_s = min((end for end in ends if end is not None), default=None)
         mine, theirs = total.statistics, report.statistics
         for field in theirs.__struct_fields__:
             value = getattr(theirs, field)
@@ -183,16 +188,16 @@ class Exposition:
         self._name = name
         self._processes = processes
 
-    def text(self, report: Report) -> bytes:
+    def text(self, report: Report, *, is_ready: bool = True) -> bytes:
         """Return the metrics."""
         from prometheus_client import CollectorRegistry, generate_latest
 
-        families = [*self._families(report), *self._process_families()]
+        families = [*self._families(report, is_ready), *self._process_families()]
         registry = CollectorRegistry(auto_describe=False)
         registry.register(_Collected(families))
         return generate_latest(registry)
 
-    def _families(self, report: Report) -> Iterator[Metric]:
+    def _families(self, report: Report, is_ready: bool) -> Iterator[Metric]:
         from prometheus_client.core import (
             CounterMetricFamily,
             GaugeMetricFamily,
@@ -207,6 +212,13 @@ class Exposition:
         )
         build.add_metric([__version__, str(PROTOCOL_VERSION), self._name], 1)
         yield build
+        yield GaugeMetricFamily("holdfast_ready", "Whether robots are welcome.", int(is_ready))
+        if report.certificate_expires_s is not None:
+            yield GaugeMetricFamily(
+                "holdfast_certificate_expiry_timestamp_seconds",
+                "When the certificate in use expires, in seconds since 1970.",
+                report.certificate_expires_s,
+            )
         decisions = CounterMetricFamily(
             "holdfast_decisions", "Parts of answers computed.", labels=["kind"]
         )

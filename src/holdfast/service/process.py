@@ -28,9 +28,9 @@ if TYPE_CHECKING:
     from holdfast.runtime.logs import EventLog
     from holdfast.runtime.service_manager import ServiceManager
     from holdfast.service.metrics import DecisionTimes, Report
+    from holdfast.service.own_credentials import ServiceCredentials
     from holdfast.service.shell import ServiceShell
     from holdfast.service.supervisor import Supervised
-    from holdfast.transport.endpoints import TlsFiles
     from holdfast.transport.service_end import StreamServiceTransport
 
 __all__ = ["main"]
@@ -55,7 +55,7 @@ def main(arguments: Sequence[str]) -> int:
     -------
     int
         0 after SIGTERM or the end of standard input, 130 after SIGINT, 129 after SIGHUP. With
-        credentials it is SIGHUP that has them read again.
+        credentials it is SIGHUP that has them read again, which their change does as well.
 
     Raises
     ------
@@ -141,10 +141,10 @@ def _serve(options: Options, supervised: Supervised | None = None) -> int:
     if options.until_stdin_closes and sys.stdin is None:
         raise InvalidValueError("--until-stdin-closes: this process has no standard input")
     # In the order in which they are needed, so that a mistake in the options is told at once.
-    tls = _credentials(options)
+    credentials = _credentials(options)
     checked_endpoints(options)
 
-    if tls is None:
+    if credentials is None:
         _import_without_openssl()
 
     from holdfast.runtime.descriptors import NEEDED, allow_descriptors
@@ -162,7 +162,7 @@ def _serve(options: Options, supervised: Supervised | None = None) -> int:
         lease_ms=options.lease_ms,
         # Else those who have the most links would leave no descriptor for anybody new.
         max_links=min(MAX_LINKS, max(allowed // 4, allowed - beside)),
-        tls=tls,
+        tls=None if credentials is None else credentials.files,
         on_event=lambda event, **fields: shell.note(event, **fields),
     )
 
@@ -199,7 +199,7 @@ def _serve(options: Options, supervised: Supervised | None = None) -> int:
     sys.setswitchinterval(_SWITCH_INTERVAL_S)
     try:
         status = asyncio.run(
-            _run(options, boot, transport, shell, events, times, supervised, manager)
+            _run(options, boot, transport, credentials, shell, events, times, supervised, manager)
         )
     finally:
         events.close()
@@ -214,6 +214,7 @@ async def _run(
     options: Options,
     boot: str,
     transport: StreamServiceTransport,
+    credentials: ServiceCredentials | None,
     shell: ServiceShell,
     events: EventLog,
     times: DecisionTimes,
@@ -232,29 +233,16 @@ async def _run(
         return "draining" if shell.is_draining else None if is_serving else "starting"
 
     def report() -> Report:
-        return Report(shell.statistics(), times)
+        expires_s = None if credentials is None else credentials.expires_s
+        return Report(shell.statistics(), times, certificate_expires_s=expires_s)
 
     async def reported() -> Report:
         return report()
 
     def reload() -> None:
-        from holdfast.transport.credentials import date_text, read_credentials
-
-        assert options.tls is not None
+        assert credentials is not None
         manager.reloading()
-        try:
-            # It knows more of what can be wrong with them.
-            read = read_credentials(options.tls, "service", warn=functools.partial(_warn, options))
-            ended = transport.reload_credentials()
-        except HoldfastError as error:
-            events.event("credentials", reason=f"{error}; those of before stay in use")
-        else:
-            events.event(
-                "credentials_reloaded",
-                links_ended=ended,
-                valid_until=date_text(read.expires_s),
-                num_revoked=transport.num_revoked,
-            )
+        credentials.reload(transport, events)
         manager.ready()
 
     def status() -> str:
@@ -265,9 +253,11 @@ async def _run(
         try:
             for number in options.ending_signals:
                 loop.add_signal_handler(number, shell.stop, number.name)
-            if options.tls is not None:
+            if credentials is not None:
                 loop.add_signal_handler(signal.SIGHUP, reload)
             await shell.start()
+            if credentials is not None:
+                credentials.watch(loop, transport, events)
             if options.until_stdin_closes:
                 _watch_stdin(loop, shell)
             # What was loaded stays; the collector need never look at it again.
@@ -303,12 +293,12 @@ async def _run(
     return _exit_status(reason)
 
 
-def _credentials(options: Options) -> TlsFiles | None:
+def _credentials(options: Options) -> ServiceCredentials | None:
     if options.tls is None:
         return None
-    from holdfast.transport.credentials import load_credentials
+    from holdfast.service.own_credentials import ServiceCredentials
 
-    return load_credentials(options.tls, "service", warn=functools.partial(_warn, options))
+    return ServiceCredentials(options.tls, functools.partial(_warn, options))
 
 
 @contextlib.asynccontextmanager
@@ -340,7 +330,9 @@ async def _watched(
         exposition = Exposition(options.name, processes)
 
         async def metrics() -> Page:
-            return Page(200, exposition.text(await report()), CONTENT_TYPE)
+            return Page(
+                200, exposition.text(await report(), is_ready=why_not_ready() is None), CONTENT_TYPE
+            )
 
         watched.add("metrics", options.metrics, {"/metrics": metrics})
     try:

@@ -31,6 +31,7 @@ __all__ = [
     "OwnCredentials",
     "Role",
     "date_text",
+    "file_versions",
     "give_to_warnings",
     "load_credentials",
     "read_credentials",
@@ -120,6 +121,24 @@ def read_credentials(
     if days_left < EXPIRES_SOON_DAYS:
         warn(f"{files.certificate}: expires in {days_left:.1f} days, on {date_text(expires_s)}")
     return OwnCredentials(files, name, expires_s)
+
+
+def file_versions(files: TlsFiles) -> list[tuple[int, int, int] | None]:
+    """Return what is different as soon as one of the files, or the list beside them, is.
+
+    The time is that of the last change of any kind, rights included: what is copied may bring
+    along the time at which it was written.
+    """
+    found: list[tuple[int, int, int] | None] = []
+    revoked = files.authority.with_name(REVOKED_FILE)
+    for path in (files.authority, files.certificate, files.key, revoked):
+        try:
+            status = path.stat()
+        except OSError:
+            found.append(None)
+        else:
+            found.append((status.st_ino, status.st_ctime_ns, status.st_size))
+    return found
 
 
 def give_to_warnings(text: str, stacklevel: int = 3) -> None:

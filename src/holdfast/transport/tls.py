@@ -21,9 +21,10 @@ from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 from holdfast.errors import TransportError
+from holdfast.transport.credentials import file_versions
 from holdfast.transport.endpoints import AUTHORITY_FILE, TlsFiles
 from holdfast.transport.frames import FrameError
-from holdfast.transport.revocation import REVOKED_FILE, refuse_revoked
+from holdfast.transport.revocation import refuse_revoked
 
 __all__ = [
     "ClientCredentials",
@@ -175,12 +176,12 @@ class ClientCredentials:
     def __init__(self, files: TlsFiles, on_unusable: Callable[[str], None] | None = None) -> None:
         self._files = files
         self._on_unusable = on_unusable
-        self._seen = self._look()
+        self._seen = file_versions(files)
         self._context = client_context(files)
 
     def context(self) -> ssl.SSLContext:
         """Return what a new link needs; that of before, if what is there now cannot be used."""
-        seen = self._look()
+        seen = file_versions(self._files)
         if seen != self._seen:
             self._seen = seen
             try:
@@ -189,19 +190,6 @@ class ClientCredentials:
                 if self._on_unusable is not None:
                     self._on_unusable(f"{error}; those of before stay in use")
         return self._context
-
-    def _look(self) -> list[tuple[int, int, int] | None]:
-        files = self._files
-        found: list[tuple[int, int, int] | None] = []
-        revoked = files.authority.with_name(REVOKED_FILE)
-        for path in (files.authority, files.certificate, files.key, revoked):
-            try:
-                status = path.stat()
-            except OSError:
-                found.append(None)
-            else:
-                found.append((status.st_ino, status.st_mtime_ns, status.st_size))
-        return found
 
 
 def _of(incarnation: str) -> str:
