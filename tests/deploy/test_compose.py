@@ -62,7 +62,8 @@ class Site:
         self.override("robot", [*run, "--health", "0.0.0.0:8080", *options])
 
     def compose(self, role: str, *words: str) -> str:
-        ports = {name: str(free_port()) for name in ("HOLDFAST_PORT", "HOLDFAST_HEALTH_PORT")}
+        own = f"HOLDFAST_{role.upper()}"
+        ports = {name: str(free_port()) for name in ("HOLDFAST_PORT", f"{own}_HEALTH_PORT")}
         keys = "service" if role == "cloud" else "robot"
         files = ("-f", COMPOSE / f"{role}.yaml", "-f", self.directory / f"{role}.yaml")
         return self.engine.compose(
@@ -71,7 +72,7 @@ class Site:
             variables={
                 **self.variables,
                 **ports,
-                "HOLDFAST_KEYS": str(self.directory / "keys" / keys),
+                f"{own}_KEYS": str(self.directory / "keys" / keys),
             },
         )
 
