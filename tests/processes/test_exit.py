@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -45,3 +48,26 @@ def test_daemon_threads_in_the_kernel_do_not_abort_the_process(count: int, threa
 
 def test_a_problem_that_is_alive_at_the_end_is_no_leak() -> None:
     ends_quietly(ALIVE_AT_THE_END)
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="a namespace of processes takes root")
+def test_the_first_process_of_a_container_ends_while_it_starts() -> None:
+    """The system gives it no signal that it has no handler for."""
+    # It hangs where a start takes long: at the imports.
+    program = (
+        "import builtins, os, sys, time\n"
+        "import holdfast.cli\n"
+        "def slow(name, *rest):\n"
+        "    builtins.__import__ = really\n"
+        "    print(os.getpid(), flush=True)\n"
+        "    time.sleep(60)\n"
+        "really, builtins.__import__ = builtins.__import__, slow\n"
+        "holdfast.cli.main()\n"
+    )
+    command = ("unshare", "--pid", "--fork", sys.executable, "-c", program)
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as unshare:
+        assert unshare.stdout is not None
+        assert unshare.stdout.readline() == "1\n"
+        (child,) = Path(f"/proc/{unshare.pid}/task/{unshare.pid}/children").read_text().split()
+        os.kill(int(child), signal.SIGTERM)
+        assert unshare.wait(timeout=30) == 128 + signal.SIGTERM

@@ -14,6 +14,8 @@ line that is made for people.
 
 from __future__ import annotations
 
+import os
+import signal
 import sys
 from types import TracebackType
 
@@ -22,6 +24,9 @@ __all__ = ["main"]
 
 def main() -> None:
     """Run the command line and exit."""
+    if os.getpid() == 1:
+        # The first process of a container does not get what it has no handler for.
+        signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
     from holdfast.cli.streams import (
         end_with_the_reader,
         forgive_unwritable_errors,

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import socket
 import time
 from collections.abc import Callable
@@ -22,6 +23,8 @@ __all__ = ["ServiceManager"]
 
 _LOOK_EVERY_S = 1.0
 """At least so often it is looked whether the status has changed."""
+
+_LEAST_PAUSE_S = 0.01
 
 
 class ServiceManager:
@@ -39,6 +42,7 @@ class ServiceManager:
         self._beats = False
         self._every_s = _LOOK_EVERY_S
         self._told: str | None = None
+        self._owes_ready = False
         self._timer: asyncio.TimerHandle | None = None
         if not address.startswith(("/", "@")):
             return
@@ -46,9 +50,9 @@ class ServiceManager:
         self._address = f"\0{address[1:]}" if address.startswith("@") else address
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
-        if its_process == str(os.getpid()) and watchdog_us.isdecimal() and int(watchdog_us):
+        if its_process == str(os.getpid()) and re.fullmatch("0*[1-9][0-9]{0,17}", watchdog_us):
             self._beats = True
-            self._every_s = min(_LOOK_EVERY_S, 0.5e-6 * int(watchdog_us))
+            self._every_s = min(_LOOK_EVERY_S, max(_LEAST_PAUSE_S, 0.5e-6 * int(watchdog_us)))
 
     def watch(
         self,
@@ -70,6 +74,8 @@ class ServiceManager:
             return
 
         def look() -> None:
+            if self._owes_ready:
+                self.ready()
             lines = []
             text = status()
             if text != self._told:
@@ -84,7 +90,7 @@ class ServiceManager:
 
     def ready(self) -> None:
         """Tell that what was started is up."""
-        self._tell("READY=1")
+        self._owes_ready = not self._tell("READY=1")
 
     def reloading(self) -> None:
         """Tell that files are read again; when they are, tell that it is :meth:`ready`."""
@@ -106,9 +112,12 @@ class ServiceManager:
             self._socket.close()
             self._socket = None
 
-    def _tell(self, *lines: str) -> None:
+    def _tell(self, *lines: str) -> bool:
+        """Return whether it could be told."""
         if self._socket is None or not lines:
-            return
+            return False
         # Whoever does not read, or is gone, is no reason to stop.
         with contextlib.suppress(OSError):
             self._socket.sendto("\n".join(lines).encode(), self._address)
+            return True
+        return False
