@@ -43,6 +43,8 @@ def test_what_is_computed_when_the_signal_comes_is_delivered(
         first.start()
         second.start()
         story = Story(site, references, GATED, recovery={"launch": "on_failure"})
+        # However fast it is, it does not come to its end before it has heard the goodbye.
+        story.at("perform", 30, lambda: story.running.wait_for("service_vanished"))
         robot = site.run(story.file, services=[first, second])
         gate.wait()
         answered = len(decisions_of(robot.out))

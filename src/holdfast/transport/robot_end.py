@@ -245,6 +245,8 @@ class _Service:
         self._links: dict[Link, str] = {}
         # One with its boot that waits until what the process before it owes has come.
         self._successor: tuple[Link, str] | None = None
+        # Whether, since the one that is called has said goodbye, nobody else was found.
+        self._found_no_other = False
         # In the order of their beginning, with the network from which each came.
         self._made: dict[Link, bytes] = {}
         self._calls: dict[Link, dict[int, PendingCall]] = {}
@@ -395,6 +397,7 @@ class _Service:
         is_news = boot not in self._links.values()
         self._links[link] = boot
         self._calls.setdefault(link, {})
+        self._found_no_other = False
         if self._dialer is not None:
             self._dialer.won(link)
         if is_news:
@@ -427,7 +430,9 @@ class _Service:
         """Take note that nobody is at any of the service's addresses."""
         current = self.current
         if current is not None and current.said_goodbye:
-            self._leave(current)  # whoever else there is can be asked at once
+            # Other services can be asked, as soon as this one owes nothing.
+            self._found_no_other = True
+            self._leave(current)
         else:
             self._tell_unreachable(reason)
 
@@ -464,7 +469,7 @@ class _Service:
             if link.said_goodbye and self._successor is not None:
                 self._move_on_if_free()
             elif (link.adrift and link is not self.current) or (
-                link.said_goodbye and self._dialer is None
+                link.said_goodbye and (self._dialer is None or self._found_no_other)
             ):
                 link.end("", goodbye="")
 
