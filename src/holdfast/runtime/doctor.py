@@ -37,7 +37,6 @@ from holdfast.runtime.probe import (
     account_of,
     certificate_at,
     in_thread,
-    in_words,
     interface_of,
     waited_for,
 )
@@ -64,7 +63,13 @@ from holdfast.transport.credentials import (
     date_text,
     read_credentials,
 )
-from holdfast.transport.endpoints import Endpoint, TlsFiles, check_credentials, check_endpoint
+from holdfast.transport.endpoints import (
+    Endpoint,
+    TlsFiles,
+    check_credentials,
+    check_endpoint,
+    system_words,
+)
 from holdfast.transport.exchanges import MAX_DATAGRAM_BYTES
 from holdfast.transport.frames import encode_hello
 from holdfast.transport.links import HalfReceived, LinkSettings, receive_buffer
@@ -375,7 +380,7 @@ class _Examination:
                 probe.connect(path.address)
             except OSError as error:
                 raise _Found(
-                    f"no way there: {in_words(error.errno)}",
+                    f"no way there: {system_words(error.errno)}",
                     "is the network up, and the VPN? 'ip route' lists what there is",
                 ) from None
             local = str(probe.getsockname()[0])
@@ -402,7 +407,7 @@ class _Examination:
             advice = f"start the service there: holdfast serve --listen {at}"
             raise _Found(f"{what}: refused, nothing listens there", advice) from None
         except OSError as error:
-            raise _Found(f"{what}: {in_words(error.errno)}", _OPEN_IT) from None
+            raise _Found(f"{what}: {system_words(error.errno)}", _OPEN_IT) from None
         return f"{what} is open", ""
 
     def _read_own(self) -> None:

@@ -9,7 +9,6 @@ import asyncio
 import contextlib
 import fcntl
 import ipaddress
-import os
 import socket
 import ssl
 import struct
@@ -24,7 +23,7 @@ from holdfast.errors import TransportError
 from holdfast.session.messages import Progress, Reply, Request, decode_reply, encode
 from holdfast.transport.credentials import date_text
 from holdfast.transport.datagrams import RobotDatagramLink
-from holdfast.transport.endpoints import Endpoint
+from holdfast.transport.endpoints import Endpoint, system_words
 from holdfast.transport.frames import CALL, END, LAST, REPLY, Frame, Hello
 from holdfast.transport.links import Link, LinkSettings
 from holdfast.transport.tls import TlsStream
@@ -36,7 +35,6 @@ __all__ = [
     "account_of",
     "certificate_at",
     "in_thread",
-    "in_words",
     "interface_of",
     "waited_for",
 ]
@@ -224,7 +222,7 @@ async def certificate_at(path: AddressPath) -> tuple[bytes, str]:
         except ssl.SSLError as error:
             reason = tls.what_is_wrong(error)
         except OSError as error:
-            reason = in_words(error.errno)
+            reason = system_words(error.errno)
     return (tls.shown(), "") if tls.established else (b"", reason)
 
 
@@ -295,9 +293,3 @@ async def waited_for(done: Future[_T], limit_s: float) -> _T:
     """
     async with asyncio.timeout(limit_s):
         return await asyncio.wrap_future(done)
-
-
-def in_words(number: int | None) -> str:
-    """Write the system's own words as the rest of a sentence."""
-    text = os.strerror(number or 0)
-    return text[:1].lower() + text[1:]

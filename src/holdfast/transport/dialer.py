@@ -23,13 +23,12 @@ import asyncio
 import contextlib
 import errno
 import ipaddress
-import os
 import socket
 import threading
 from collections.abc import Callable
 from typing import Any, Final, TypeAlias
 
-from holdfast.transport.endpoints import Endpoint
+from holdfast.transport.endpoints import Endpoint, system_words
 from holdfast.transport.links import Link
 
 __all__ = ["Dialer"]
@@ -278,5 +277,4 @@ def _reason(number: int | None) -> str:
     """Write the system's own words as the rest of a sentence."""
     if number == errno.ETIMEDOUT:
         return "nothing answers"
-    text = os.strerror(number or 0)
-    return text[:1].lower() + text[1:]
+    return system_words(number)

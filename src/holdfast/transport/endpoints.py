@@ -41,6 +41,7 @@ __all__ = [
     "host_and_port",
     "parse_endpoint",
     "parse_host",
+    "system_words",
     "why_not_bound",
 ]
 
@@ -382,6 +383,12 @@ def parse_host(host: str, before: str = "") -> str:
 def host_and_port(host: str, port: int) -> str:
     """Write HOST:PORT, an address of IPv6 in brackets: what :func:`parse_host` reads."""
     return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+
+
+def system_words(number: int | None) -> str:
+    """Write the system's own words for an error's number as the rest of a sentence."""
+    text = os.strerror(number or 0)
+    return text[:1].lower() + text[1:]
 
 
 def why_not_bound(error: OSError) -> str:
