@@ -12,6 +12,9 @@ INSTALLED_FIGURES := $(VENV)/.installed-figures
 INSTALLED_DEV := $(VENV)/.installed-dev
 INSTALLED_COMPILED := $(COMPILED)/.installed
 
+# The wheels of a real ROS 2, for tests alone.
+ROS2 ?= $(CURDIR)/.ros2
+
 DIST ?= dist
 # Seconds since 1970 that archives bear, so that they come out the same whenever they are made.
 RELEASED = $(shell git log -1 --format=%ct 2>/dev/null || date +%s)
@@ -21,7 +24,7 @@ PACKAGE_SOURCES := $(shell find cmake src -type f -not -name '*.pyc')
 CPP_FILES := $(shell find cpp -name '*.hpp' -o -name '*.cpp')
 
 .DEFAULT_GOAL := help
-.PHONY: help demo install test test-gate test-real test-defects test-slow test-deploy test-deploy-slow test-compiled lint format simulate chaos fuzz soak bench results wheel sbom requirements clean
+.PHONY: help demo install test test-gate test-real test-defects test-slow test-deploy test-deploy-slow test-ros test-compiled lint format simulate chaos fuzz soak bench results wheel sbom requirements clean
 
 help: ## what there is to make
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-16s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -38,13 +41,13 @@ test-gate: $(INSTALLED_DEV) ## those of them that no clock and no network decide
 	$(BIN)/pytest -q -m "not real and not slow" -n 2 --dist worksteal
 
 test-real: $(INSTALLED_DEV) ## those with real processes and sockets
-	$(BIN)/pytest -q -m "real and not slow and not deploy" -n 2 --dist worksteal
+	$(BIN)/pytest -q -m "real and not slow and not deploy and not ros" -n 2 --dist worksteal
 
 test-defects: $(INSTALLED_DEV) ## the simulator finds every defect that is planted: a minute
 	$(BIN)/pytest -q -m slow -n 2 --dist worksteal tests/simulation/test_defects.py
 
 test-slow: $(INSTALLED_DEV) ## what repeats them with more seeds, problems and moments: half an hour
-	$(BIN)/pytest -q -m "slow and not deploy" -n 2 --dist worksteal
+	$(BIN)/pytest -q -m "slow and not deploy and not ros" -n 2 --dist worksteal
 
 test-compiled: $(INSTALLED_COMPILED) ## the simulator's tests and 10,000 seeds through compiled machines
 	$(COMPILED)/bin/pytest -q -m "slow or not slow" tests/scenarios tests/simulation/test_world.py \
@@ -55,6 +58,10 @@ test-deploy: $(INSTALLED_DEV) ## images, tunnels and machines; root, and package
 
 test-deploy-slow: $(INSTALLED_DEV) ## those of them that take minutes
 	$(BIN)/pytest -q -m "deploy and slow" tests/deploy
+
+test-ros: $(INSTALLED_DEV) ## a real ROS 1 and ROS 2, which tests/ros/set_up_ros2 installs the first time
+	tests/ros/set_up_ros2 $(ROS2) $(PYTHON)
+	ROS2=$(ROS2) $(BIN)/pytest -q -m "ros and not slow" -n 2 --dist loadfile tests/ros
 
 fuzz: $(INSTALLED_DEV) ## 1,000,000 hostile messages to a live service; some 15 minutes
 	$(BIN)/python -m tests.fuzz.live --messages 1000000 --seed 1

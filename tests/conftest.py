@@ -29,8 +29,12 @@ HERE = Path(__file__).parent
 DEPLOY = "deploy/"
 """The folder of what needs an engine of containers, tunnels or a machine of its own."""
 
+ROS = "ros/"
+"""The folder of what needs a real ROS."""
+
 REAL = (
     DEPLOY,
+    ROS,
     "processes/",
     "contracts/test_datagram_links.py",
     "contracts/test_transport.py",
@@ -138,6 +142,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.real)
         if place.startswith(DEPLOY):
             item.add_marker(pytest.mark.deploy)
+        if place.startswith(ROS):
+            item.add_marker(pytest.mark.ros)
 
 
 @pytest.hookimpl(wrapper=True)

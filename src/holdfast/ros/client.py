@@ -1,0 +1,258 @@
+"""The robot's side of the typed service: the thesis's algorithm, without its losses.
+
+The cloud decides. If it does not answer in time, the recovery service on the robot does (*local
+recovery*), and the cloud is asked the same in the background at every turn; its first answer makes
+it the one that decides again, while the recovery service stays ready (*keep alive*). If neither
+answers, the robot holds still and both are asked again and again. The state goes with every
+request, so nothing is lost on the way from one to the other.
+
+Each service has a thread of its own that asks it, one request at a time. Whoever waits for a
+decision waits for these threads and never for a socket, so no call holds a robot for longer than
+its deadline.
+"""
+
+from __future__ import annotations
+
+import queue
+import threading
+from collections.abc import Callable
+from time import monotonic
+from typing import NamedTuple, Protocol, Self
+
+from holdfast.errors import HoldfastError, InvalidValueError, TransportError
+from holdfast.ros.active_sensing import Answer, ErrorCode, Request
+from holdfast.session.status import Cause, Status, next_status
+
+__all__ = ["ActiveSensingClient", "Service"]
+
+_AGAIN_S = 0.05
+"""A service that failed at once is not asked again before this time has passed."""
+
+_ELSEWHERE = (ErrorCode.OTHER_CONFIGURATION, ErrorCode.BUSY)
+"""What another service may answer; all other errors are the request's or the problem's own."""
+
+
+class Service(Protocol):
+    """A way to one service."""
+
+    @property
+    def name(self) -> str:
+        """Its name, for people."""
+        ...
+
+    def ask(self, request: Request, deadline_s: float) -> Answer:
+        """Ask, and wait for the answer for so long at most.
+
+        Raises
+        ------
+        TransportError
+            If there is no answer; the message says why.
+        """
+        ...
+
+    def close(self) -> None:
+        """End what is being asked; may be called from another thread, and repeated."""
+        ...
+
+
+class _Outcome(NamedTuple):
+    asker: _Asker
+    number: int
+    answer: Answer | None
+    reason: str
+
+
+class _Asker:
+    """Asks one service, on a thread of its own, one request at a time."""
+
+    def __init__(
+        self, service: Service, deadline_s: float, outcomes: queue.SimpleQueue[_Outcome]
+    ) -> None:
+        self.service = service
+        self._deadline_s = deadline_s
+        self._outcomes = outcomes
+        self._requests: queue.SimpleQueue[tuple[int, Request] | None] = queue.SimpleQueue()
+        self.asked = 0
+        self.busy = False
+        self.reason = ""
+        self.not_before = 0.0
+        self._thread = threading.Thread(target=self._work, name=service.name, daemon=True)
+        self._thread.start()
+
+    def ask(self, number: int, request: Request) -> None:
+        """Ask, unless an earlier request is still out or the last one has just failed."""
+        if not self.busy and monotonic() >= self.not_before:
+            self.busy = True
+            self.asked = number
+            self._requests.put((number, request))
+
+    def take(self, outcome: _Outcome) -> bool:
+        """Note an outcome of this service and tell whether it was an answer."""
+        self.busy = False
+        self.reason = outcome.reason
+        self.not_before = 0.0 if outcome.answer is not None else monotonic() + _AGAIN_S
+        return outcome.answer is not None
+
+    def close(self) -> None:
+        """End the thread."""
+        self._requests.put(None)
+        self.service.close()
+        self._thread.join(self._deadline_s)
+
+    def _work(self) -> None:
+        while (asked := self._requests.get()) is not None:
+            number, request = asked
+            answer: Answer | None = None
+            reason = ""
+            try:
+                answer = self.service.ask(request, self._deadline_s)
+            except HoldfastError as error:
+                reason = str(error)
+            except Exception as error:  # noqa: BLE001 - a thread that ends would never answer
+                reason = f"{type(error).__name__}: {error}"
+            if answer is not None and answer.error in _ELSEWHERE:
+                reason = f"{answer.error.name}: {answer.message}"
+                answer = None
+            self._outcomes.put(_Outcome(self, number, answer, reason))
+
+
+class ActiveSensingClient:
+    """Asks the cloud, and the recovery service when the cloud does not answer.
+
+    Parameters
+    ----------
+    cloud, recovery : Service
+        They are closed with the client.
+    deadline_s : float
+        A service that has not answered by then is given up for this decision.
+    on_event : callable or None
+        Is told of each change as ``on_event(name, **fields)``: ``status`` (``status``, ``reason``)
+        and ``holding`` (``reason``) when nobody answers.
+
+    Attributes
+    ----------
+    status : Status
+    decided_by : str
+        Name of the service whose answer was returned last.
+
+    Raises
+    ------
+    InvalidValueError
+        If ``deadline_s`` is not positive.
+    """
+
+    def __init__(
+        self,
+        cloud: Service,
+        recovery: Service,
+        deadline_s: float = 0.5,
+        on_event: Callable[..., None] | None = None,
+    ) -> None:
+        if not deadline_s > 0:
+            raise InvalidValueError(f"deadline_s {deadline_s}: it must be above 0 s")
+        self.status = Status.STANDARD
+        self.decided_by = ""
+        self._deadline_s = deadline_s
+        self._on_event = on_event or _ignore
+        self._number = 0
+        self._outcomes: queue.SimpleQueue[_Outcome] = queue.SimpleQueue()
+        self._cloud = _Asker(cloud, deadline_s, self._outcomes)
+        self._recovery = _Asker(recovery, deadline_s, self._outcomes)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Ask nobody any more."""
+        self._cloud.close()
+        self._recovery.close()
+
+    def decide(self, request: Request, give_up_s: float | None = None) -> Answer:
+        """Return what a service answers; while none does, wait.
+
+        Parameters
+        ----------
+        request : Request
+        give_up_s : float or None
+            Stop waiting after this time; None waits until somebody answers.
+
+        Raises
+        ------
+        InvalidValueError
+            If the services say that nobody can answer this, and why.
+        TransportError
+            If nobody has answered in time.
+        """
+        self._number += 1
+        began = monotonic()
+        until = began + self._deadline_s
+        held = False
+        self._hear(0.0)
+        while True:
+            if self._cloud_decides and monotonic() >= until:
+                self._cloud_is_lost(f"no answer in {self._deadline_s:g} s")
+            self._cloud.ask(self._number, request)
+            if not self._cloud_decides:
+                self._recovery.ask(self._number, request)
+            answer = self._hear(0.01 if held else self._wait_s(until))
+            if answer is not None:
+                return answer
+            waited = monotonic() - began
+            if give_up_s is not None and waited >= give_up_s:
+                raise TransportError(f"nobody has answered in {give_up_s:g} s: {self._reasons()}")
+            if waited >= 2 * self._deadline_s and not held:
+                held = True
+                self._on_event("holding", reason=self._reasons())
+
+    @property
+    def _cloud_decides(self) -> bool:
+        return self.status is not Status.LOCAL_RECOVERY
+
+    def _wait_s(self, until: float) -> float:
+        """Return how long nothing but an outcome can change anything."""
+        left = until - monotonic()
+        return min(_AGAIN_S, left) if left > 0 else _AGAIN_S
+
+    def _hear(self, timeout_s: float) -> Answer | None:
+        """Take all outcomes that are there, after waiting for one, up to the one asked for."""
+        block = timeout_s > 0
+        while True:
+            try:
+                outcome = self._outcomes.get(block, max(timeout_s, 0.0) if block else None)
+            except queue.Empty:
+                return None
+            block = False
+            answered = outcome.asker.take(outcome)
+            if outcome.asker is self._cloud:
+                if answered and not self._cloud_decides:
+                    self._change(Cause.CLOUD_ANSWERED, "")
+                elif not answered and self._cloud_decides:
+                    self._cloud_is_lost(outcome.reason)
+            if outcome.answer is not None and outcome.number == self._number:
+                self.decided_by = outcome.asker.service.name
+                if outcome.answer.error is not ErrorCode.OK:
+                    raise InvalidValueError(
+                        f"{self.decided_by}: {outcome.answer.error.name}: {outcome.answer.message}"
+                    )
+                return outcome.answer
+
+    def _cloud_is_lost(self, reason: str) -> None:
+        self._cloud.reason = reason
+        self._change(Cause.CLOUD_LOST, reason)
+
+    def _change(self, cause: Cause, reason: str) -> None:
+        self.status = next_status(self.status, cause)
+        self._on_event("status", status=self.status.value, reason=reason)
+
+    def _reasons(self) -> str:
+        return "; ".join(
+            f"{asker.service.name}: {asker.reason or 'no answer yet'}"
+            for asker in (self._cloud, self._recovery)
+        )
+
+
+def _ignore(_name: str, **_fields: object) -> None:
+    """Do nothing."""
