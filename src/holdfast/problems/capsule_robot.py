@@ -174,6 +174,7 @@ class CapsuleRobot(RigidBodyProblem):
     state_size = 2
     action_size = 2
     state_labels: Sequence[str] = ("x (m)", "y (m)")
+    pose: Sequence[str | None] = ("x", "y")
 
     def __init__(
         self,

@@ -104,6 +104,8 @@ class PegInHole2D(PegProblem):
     action_size = 3
     sensing_actions: Sequence[str] = ("x", "y", "θ")
     state_labels: Sequence[str] = ("x (m)", "y (m)", "θ (rad)")
+    pose: Sequence[str | None] = ("x", "y", "yaw")
+    up = "y"
 
     def __init__(
         self,

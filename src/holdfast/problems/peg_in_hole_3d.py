@@ -126,6 +126,7 @@ class PegInHole3D(PegProblem):
         "pitch (rad)",
         "roll (rad)",
     )
+    pose: Sequence[str | None] = ("x", "y", "z", "yaw", "pitch", "roll")
 
     def __init__(
         self,
