@@ -1,0 +1,333 @@
+"""The typed service as ROS messages: in CDR for ROS 2, and in ROS 1's own serialisation.
+
+ROS knows a type by a digest of its definition, and two ends with different digests do not talk to
+each other. So the definitions stand in one place, ``interfaces``, where colcon and catkin read them
+as well, and everything here is made of them: the serialisation and both kinds of digest, RIHS01
+of ROS 2 (REP 2016) and the MD5 sum of ROS 1.
+
+rosbags does all of this for messages. A service is, to RIHS01, one more message with three fields:
+its request, its response, and an event that has both.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+from importlib.resources import files
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from holdfast.errors import HoldfastError, InvalidValueError
+from holdfast.ros.active_sensing import Answer, ErrorCode, Request, checked_state, no_state
+
+if TYPE_CHECKING:
+    from rosbags.interfaces.typing import Typesdict
+    from rosbags.typesys.store import Typestore
+
+    from holdfast.planning import PlanningState
+
+__all__ = [
+    "MAX_BYTES",
+    "SERVICE",
+    "Serialization",
+    "decode_answer",
+    "decode_request",
+    "encode_answer",
+    "encode_request",
+    "md5_sum",
+    "service_types",
+    "type_hash",
+    "typestore",
+]
+
+SERVICE = "holdfast_interfaces/srv/ActiveSensing"
+"""The service's type."""
+
+MAX_BYTES = 16_000_000
+"""Of a message; a state of 100,000 particles in nine coordinates has half of it."""
+
+Serialization: TypeAlias = Literal["cdr", "ros1"]
+
+_PACKAGE = "holdfast_interfaces"
+_MESSAGES = ("Belief", "PlanningState")
+
+# What a service's event has, as ROS 2 defines it (REP 2012); REP 2016 makes it part of the hash.
+_TIME = "int32 sec\nuint32 nanosec\n"
+_EVENT_INFO = (
+    "uint8 REQUEST_SENT=0\nuint8 REQUEST_RECEIVED=1\nuint8 RESPONSE_SENT=2\n"
+    "uint8 RESPONSE_RECEIVED=3\nuint8 event_type\nbuiltin_interfaces/Time stamp\n"
+    "uint8[16] client_gid\nint64 sequence_number\n"
+)
+
+
+@functools.cache
+def typestore() -> Typestore:
+    """Return rosbags' store of the types that the service is made of.
+
+    Raises
+    ------
+    InvalidValueError
+        If rosbags is not installed; the message says what mends it.
+    """
+    try:
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+    except ImportError as error:
+        raise InvalidValueError(
+            f"ROS messages need rosbags: pip install 'holdfast[ros]' ({error})"
+        ) from error
+    folder = files("holdfast.ros") / "interfaces"
+    store = get_typestore(Stores.EMPTY)
+    types = get_types_from_msg(_TIME, "builtin_interfaces/msg/Time")
+    types |= get_types_from_msg(_EVENT_INFO, "service_msgs/msg/ServiceEventInfo")
+    for name in _MESSAGES:
+        text = (folder / "msg" / f"{name}.msg").read_text(encoding="utf-8")
+        types |= get_types_from_msg(text, f"{_PACKAGE}/msg/{name}")
+    name = SERVICE.rpartition("/")[2]
+    text = (folder / "srv" / f"{name}.srv").read_text(encoding="utf-8")
+    store.register(types | service_types(SERVICE, text))
+    return store
+
+
+def service_types(service: str, definition: str) -> Typesdict:
+    """Return the types that a service consists of, for a store.
+
+    Parameters
+    ----------
+    service : str
+        Its type, as in ``std_srvs/srv/Trigger``.
+    definition : str
+        The text of its ``.srv`` file.
+    """
+    from rosbags.interfaces import Nodetype
+    from rosbags.typesys import get_types_from_msg
+
+    package, _, name = service.split("/")
+    types: Typesdict = {}
+    request, _, response = f"\n{definition}\n".partition("\n---\n")
+    for part, text in (("Request", request), ("Response", response)):
+        # As a message, so that a name without a package means one of the service's own.
+        parsed = get_types_from_msg(f"{text}\n", f"{package}/msg/{name}_{part}")
+        types[f"{service}_{part}"] = parsed[f"{package}/msg/{name}_{part}"]
+
+    def one_at_most(part: str) -> Any:
+        return (Nodetype.SEQUENCE, ((Nodetype.NAME, f"{service}_{part}"), 1))
+
+    types[f"{service}_Event"] = (
+        [],
+        [
+            ("info", (Nodetype.NAME, "service_msgs/msg/ServiceEventInfo")),
+            ("request", one_at_most("Request")),
+            ("response", one_at_most("Response")),
+        ],
+    )
+    types[service] = (
+        [],
+        [
+            (f"{part.lower()}_message", (Nodetype.NAME, f"{service}_{part}"))
+            for part in ("Request", "Response", "Event")
+        ],
+    )
+    return types
+
+
+def type_hash(name: str = SERVICE, store: Typestore | None = None) -> str:
+    """Return the RIHS01 hash by which ROS 2 knows a type of the store, services among them."""
+    return (store or typestore()).hash_rihs01(name)
+
+
+def md5_sum(name: str = SERVICE, store: Typestore | None = None) -> str:
+    """Return the MD5 sum by which ROS 1 knows a type of the store, services among them."""
+    store = store or typestore()
+    if "/srv/" not in name:
+        return store.gendefhash(name, {})[1]
+    texts = (_hashed_text(store, f"{name}_{part}") for part in ("Request", "Response"))
+    return hashlib.md5("".join(texts).encode(), usedforsecurity=False).hexdigest()
+
+
+def _hashed_text(store: Typestore, name: str) -> str:
+    """Return what the MD5 sum is made of: the definition, with sums in place of messages' names."""
+    parts: dict[str, tuple[str, str]] = {}
+    text, _ = store.gendefhash(name, parts)
+    sums = {part.replace("/msg/", "/"): md5 for part, (_, md5) in parts.items()}
+    lines = []
+    for line in text.splitlines():
+        kind, _, field = line.partition(" ")
+        nested = sums.get(kind.partition("[")[0])
+        lines.append(line if nested is None else f"{nested} {field}")
+    return "\n".join(lines)
+
+
+def encode_request(request: Request, serialization: Serialization = "cdr") -> bytes:
+    """Return a request as a message.
+
+    Raises
+    ------
+    InvalidValueError
+        If a number does not fit into its field, or the text is none.
+    """
+    types = typestore().types
+    message = types[f"{SERVICE}_Request"](
+        kind=_whole("kind", request.kind, 0, 8),
+        configuration=request.configuration,
+        seed=_whole("seed", request.seed, 63, 63),
+        trial=_whole("trial", request.trial, 0, 32),
+        state=_state_message(request.state),
+        sensing_action=_whole("sensing_action", request.sensing_action, 0, 32),
+        observation=_flat(request.observation),
+    )
+    return _encode(message, "Request", serialization)
+
+
+def decode_request(data: bytes | memoryview, serialization: Serialization = "cdr") -> Request:
+    """Return the request that a message has.
+
+    Raises
+    ------
+    InvalidValueError
+        If it is no message of this type.
+    CheckpointError
+        If its state is none.
+    """
+    message = _decode(data, "Request", serialization)
+    return Request(
+        kind=message.kind,
+        configuration=message.configuration,
+        seed=message.seed,
+        trial=message.trial,
+        state=_state(message.state),
+        sensing_action=message.sensing_action,
+        observation=_array(message.observation),
+    )
+
+
+def encode_answer(answer: Answer, serialization: Serialization = "cdr") -> bytes:
+    """Return an answer as a message.
+
+    Raises
+    ------
+    InvalidValueError
+        If a number does not fit into its field, or a text is none.
+    """
+    types = typestore().types
+    actions = answer.task_actions
+    message = types[f"{SERVICE}_Response"](
+        error=_whole("error", answer.error, 0, 8),
+        message=answer.message,
+        configuration=answer.configuration,
+        state=_state_message(answer.state),
+        sensing_action=_whole("sensing_action", answer.sensing_action, 0, 32),
+        entropies=_flat(answer.entropies),
+        action_size=actions.shape[1] if len(actions) else 0,
+        task_actions=_flat(actions),
+    )
+    return _encode(message, "Response", serialization)
+
+
+def decode_answer(data: bytes | memoryview, serialization: Serialization = "cdr") -> Answer:
+    """Return the answer that a message has.
+
+    Raises
+    ------
+    InvalidValueError
+        If it is no message of this type, or its fields contradict each other.
+    CheckpointError
+        If its state is none.
+    """
+    message = _decode(data, "Response", serialization)
+    try:
+        error = ErrorCode(message.error)
+    except ValueError:
+        known = ", ".join(f"{code.value} {code.name}" for code in ErrorCode)
+        raise InvalidValueError(f"error {message.error}: there are {known}") from None
+    actions = _array(message.task_actions)
+    size = message.action_size
+    if actions.size and (not size or actions.size % size):
+        raise InvalidValueError(
+            f"task_actions has {actions.size} numbers: they must be actions of action_size {size}"
+        )
+    return Answer(
+        error=error,
+        message=message.message,
+        configuration=message.configuration,
+        state=_state(message.state),
+        sensing_action=message.sensing_action,
+        entropies=_array(message.entropies),
+        task_actions=actions.reshape(-1, size) if actions.size else np.empty((0, size)),
+    )
+
+
+def _state_message(state: PlanningState | None) -> Any:
+    types = typestore().types
+    seed, trial, step, stage, sensed, (states, weights) = no_state() if state is None else state
+    return types[f"{_PACKAGE}/msg/PlanningState"](
+        seed=_whole("state.seed", seed, 63, 63),
+        trial=_whole("state.trial", trial, 0, 32),
+        step=_whole("state.step", step, 0, 32),
+        stage=_whole("state.stage", stage, 0, 32),
+        sensed=bool(sensed),
+        belief=types[f"{_PACKAGE}/msg/Belief"](
+            state_size=states.shape[1], states=_flat(states), weights=_flat(weights)
+        ),
+    )
+
+
+def _state(message: Any) -> PlanningState | None:
+    belief = message.belief
+    return checked_state(
+        message.seed,
+        message.trial,
+        message.step,
+        message.stage,
+        bool(message.sensed),
+        belief.state_size,
+        _array(belief.states),
+        _array(belief.weights),
+    )
+
+
+def _encode(message: Any, part: str, serialization: Serialization) -> bytes:
+    store = typestore()
+    serialize = store.serialize_cdr if serialization == "cdr" else store.serialize_ros1
+    try:
+        data = bytes(serialize(message, f"{SERVICE}_{part}"))
+    except UnicodeEncodeError as error:
+        raise InvalidValueError(f"{part}: a text in it is none: {error}") from error
+    if len(data) > MAX_BYTES:
+        raise InvalidValueError(f"{part} of {len(data)} bytes: at most {MAX_BYTES} are allowed")
+    return data
+
+
+def _decode(data: bytes | memoryview, part: str, serialization: Serialization) -> Any:
+    if len(data) > MAX_BYTES:
+        raise InvalidValueError(f"{part} of {len(data)} bytes: at most {MAX_BYTES} are allowed")
+    store = typestore()
+    deserialize = store.deserialize_cdr if serialization == "cdr" else store.deserialize_ros1
+    try:
+        return deserialize(data, f"{SERVICE}_{part}")
+    except HoldfastError:
+        raise
+    except Exception as error:
+        # What was generated for the type checks nothing; on other bytes it fails in many ways.
+        raise InvalidValueError(
+            f"{len(data)} bytes are no {SERVICE}_{part} in {serialization}: "
+            f"{type(error).__name__} {error}".rstrip()
+        ) from error
+
+
+def _whole(name: str, value: int, negative_bits: int, bits: int) -> int:
+    """Return a whole number that fits into a field of so many bits below and above zero."""
+    least, most = -(2**negative_bits) if negative_bits else 0, 2**bits - 1
+    if not least <= value <= most:
+        raise InvalidValueError(f"{name} {value}: it must be from {least} to {most}")
+    return int(value)
+
+
+def _flat(array: npt.ArrayLike) -> npt.NDArray[np.float64]:
+    return np.ascontiguousarray(array, dtype=np.float64).ravel()
+
+
+def _array(array: npt.ArrayLike) -> npt.NDArray[np.float64]:
+    """Return an array of one's own; a message's lies in its bytes, as they were sent."""
+    return np.array(array, dtype=np.float64)
