@@ -14,7 +14,7 @@ import re
 import select
 import stat
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -25,9 +25,12 @@ __all__ = [
     "OutputError",
     "claim_directory",
     "create_directory_atomically",
+    "directory_beside",
+    "move_into_place",
     "read_bounded",
     "remove_unfinished",
     "replace_directory",
+    "require_free",
     "restore_directory",
     "write_atomically",
 ]
@@ -297,6 +300,81 @@ def claim_directory(out: Path | None, parent: Path, name: str) -> Path:
     except OSError as error:
         raise OutputError(f"{out or parent}: cannot be made: {error.strerror}") from error
     raise OutputError(f"{parent}: more than {_MAX_DEFAULT_DIRECTORIES} of {name}; give --out")
+
+
+def require_free(path: Path, option: str, *, directory: bool) -> None:
+    """Make sure that something can be made at a place: nothing is there, but what it lies in is.
+
+    Parameters
+    ----------
+    path : Path
+    option : str
+        By which a person has named it, for messages.
+    directory : bool
+        Whether it will be a directory: then an empty one may be there.
+
+    Raises
+    ------
+    OutputError
+        If not.
+    """
+    try:
+        if directory and path.is_dir():
+            if any(path.iterdir()):
+                raise OutputError(
+                    f"{path}: holds files already; remove it, or choose another directory "
+                    f"({option})"
+                )
+        elif path.is_symlink() or path.exists():
+            raise OutputError(f"{path}: is there already; remove it, or choose another ({option})")
+        elif not path.parent.is_dir():
+            raise OutputError(f"{path}: cannot be made: there is no directory {path.parent}")
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be made: {error.strerror}") from error
+
+
+@contextlib.contextmanager
+def directory_beside(path: Path) -> Iterator[Path]:
+    """Make a directory in which something can grow, and remove it in the end, whatever happens.
+
+    Parameters
+    ----------
+    path : Path
+        Where it shall be when it is whole (:func:`move_into_place`): in the same file system.
+
+    Raises
+    ------
+    OutputError
+        If it cannot be made, or what is inside raises OSError: the disk is full, say.
+    """
+    temporary = _unfinished(path)
+    try:
+        temporary.mkdir()
+        yield temporary
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written: {error.strerror or error}") from error
+    finally:
+        _remove_tree(temporary)
+
+
+def move_into_place(made: Path, path: Path) -> None:
+    """Give a file, or a directory of files, its name, once all of it is on the disk.
+
+    Raises
+    ------
+    OutputError
+        If that fails.
+    """
+    try:
+        for file in sorted(made.iterdir()) if made.is_dir() else [made]:
+            descriptor = os.open(file, os.O_RDONLY | os.O_CLOEXEC)
+            try:
+                os.fsync(descriptor)
+            finally:
+                os.close(descriptor)
+        made.rename(path)
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written: {error.strerror}") from error
 
 
 def _remove_tree(directory: Path) -> None:

@@ -17,6 +17,7 @@ from holdfast.cli.demo import demo
 from holdfast.cli.doctor import doctor
 from holdfast.cli.endings import EXIT_ERROR
 from holdfast.cli.experiment import experiment
+from holdfast.cli.export import export
 from holdfast.cli.keys import keys
 from holdfast.cli.run import run
 from holdfast.cli.serve import serve
@@ -54,6 +55,9 @@ app.command(short_help="See a cloud and a robot killed, and no decision change."
 app.command(short_help="Strike real runs with real faults, and compare them.")(chaos)
 app.command(no_args_is_help=True, short_help="Regenerate the tables and figures.")(experiment)
 app.command(no_args_is_help=True, short_help="Tell whether two runs decided the same.")(compare)
+app.command(no_args_is_help=True, short_help="Write a run for RViz, Foxglove, or as tables.")(
+    export
+)
 app.command(short_help="Search for faults that change a decision.")(simulate)
 app.command(no_args_is_help=True, short_help="Make keys for robots and services.")(keys)
 

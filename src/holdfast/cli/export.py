@@ -1,0 +1,252 @@
+"""``holdfast export``: a recorded run as an MCAP file of ROS 2 messages, or as tables."""
+
+from __future__ import annotations
+
+import contextlib
+import re
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from holdfast.cli.endings import ended_by_signals
+from holdfast.cli.options import MAX_TRIALS, OptionError, location, number
+from holdfast.cli.terminal import counted, progress_line
+from holdfast.errors import HoldfastError
+from holdfast.files import OutputError, directory_beside, move_into_place, require_free
+from holdfast.printable import printable
+from holdfast.user_code import account_of_user_error
+
+if TYPE_CHECKING:
+    from holdfast.recording.export import FactSink, RecordedRun
+
+__all__ = ["export"]
+
+_MIN_RATE_HZ, _MAX_RATE_HZ = 0.001, 10_000.0
+_RANGE = re.compile(r"(\d{1,9}):(\d{1,9})")
+
+
+def export(
+    run: Annotated[
+        Path,
+        typer.Argument(
+            metavar="RUN",
+            parser=location("RUN"),
+            show_default=False,
+            help="Directory of a run, or its journal.",
+        ),
+    ],
+    mcap: Annotated[
+        Path | None,
+        typer.Option(
+            "--mcap",
+            metavar="FILE",
+            parser=location("--mcap"),
+            help="Write FILE: standard ROS 2 messages, for RViz, Foxglove, PlotJuggler and "
+            "ros2 bag (extra ros).",
+        ),
+    ] = None,
+    tables: Annotated[
+        Path | None,
+        typer.Option(
+            "--csv",
+            metavar="DIR",
+            parser=location("--csv"),
+            help="Write DIR: trials.csv, steps.csv, beliefs.csv and events.csv.",
+        ),
+    ] = None,
+    trials: Annotated[
+        str | None,
+        typer.Option(
+            "--trials",
+            metavar="A:B",
+            help="Only the trials from A up to, but without, B (default: all).",
+        ),
+    ] = None,
+    rate: Annotated[
+        float,
+        typer.Option(
+            "--rate",
+            metavar="HZ",
+            parser=number("--rate", _MIN_RATE_HZ, _MAX_RATE_HZ, "Hz"),
+            help="Steps a second, for a run that was recorded without times.",
+        ),
+    ] = 10.0,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Show no progress.")] = False,
+) -> None:
+    """Write a recorded run as other programs read it; the run is not changed.
+
+    Beliefs are not recorded, but computed again from the recorded seed and observations; every
+    decision on the way must be the recorded one, bit for bit, else nothing is written. Of finished
+    trials in an environment of your own only decisions and times are known.
+
+    Times are the robot's own where the run has them (timings.csv), else steps of 1/HZ.
+    """
+    if mcap is None and tables is None:
+        raise HoldfastError("nothing to write: give --mcap FILE or --csv DIR, or both")
+    wanted = None if trials is None else _range_of(trials)
+    with ended_by_signals():
+        _export(run, mcap, tables, wanted, rate, quiet=quiet)
+
+
+def _range_of(text: str) -> range:
+    match = _RANGE.fullmatch(text)
+    if match is None or int(match[2]) > MAX_TRIALS:
+        raise OptionError(
+            f"--trials is {text!r:.80}; allowed are two whole numbers A:B from 0 to {MAX_TRIALS}, "
+            "such as 0:5"
+        )
+    begin, end = map(int, match.groups())
+    if begin >= end:
+        raise OptionError(
+            f"--trials is {text!r:.80}; the second number must be above the first: 0:5 are the "
+            "first five trials"
+        )
+    return range(begin, end)
+
+
+def _export(
+    path: Path,
+    mcap: Path | None,
+    tables: Path | None,
+    wanted: range | None,
+    rate_hz: float,
+    *,
+    quiet: bool,
+) -> None:
+    if mcap is not None:
+        from holdfast.ros.mcap_export import require_rosbags
+
+        require_rosbags()
+        require_free(mcap, "--mcap", directory=False)
+    if tables is not None:
+        require_free(tables, "--csv", directory=True)
+        if mcap is not None and mcap.absolute() == tables.absolute():
+            raise OptionError(f"--mcap and --csv are both {mcap}; give two places")
+    from holdfast.recording.export import RecordedRun
+
+    with RecordedRun(path) as recorded:
+        trials = [trial for trial in recorded.trials if wanted is None or trial in wanted]
+        if not trials:
+            raise OutputError(f"{path}: {_nothing_there(recorded, wanted)}")
+        notes = _write(recorded, trials, mcap, tables, rate_hz, quiet=quiet)
+    for note in () if quiet else notes:
+        sys.stderr.write(f"note: {printable(note)}\n")
+    for place in (mcap, tables):
+        if place is not None:
+            sys.stdout.write(printable(f"{place}  {_size_of(place)}\n"))
+    sys.stdout.flush()
+
+
+def _nothing_there(recorded: RecordedRun, wanted: range | None) -> str:
+    if not recorded.trials:
+        return "no trial of that run is finished or begun, so there is nothing to export"
+    assert wanted is not None
+    first, last = recorded.trials[0], recorded.trials[-1]
+    return (
+        f"has no trial from {wanted.start} to {wanted.stop - 1} (--trials); it has "
+        f"{counted(len(recorded.trials), 'trial')} from {first} to {last}"
+    )
+
+
+def _write(
+    recorded: RecordedRun,
+    trials: Sequence[int],
+    mcap: Path | None,
+    tables: Path | None,
+    rate_hz: float,
+    *,
+    quiet: bool,
+) -> list[str]:
+    """Write all of it beside its places, and move it there when all is whole; return notes."""
+    from holdfast.recording.csv_export import CsvSink
+    from holdfast.recording.export import Facts
+
+    notes = _notes(recorded, trials, rate_hz)
+    line = progress_line(len(trials), quiet=quiet)
+    with contextlib.ExitStack() as stack:
+        made: list[tuple[Path, Path]] = []
+        sinks: list[FactSink] = []
+        # What closes the files stands on a stack of its own: it comes before they are moved.
+        with contextlib.ExitStack() as files:
+            if mcap is not None:
+                from holdfast.ros.mcap_export import McapSink
+
+                bag = stack.enter_context(directory_beside(mcap)) / mcap.stem
+                about = _about(recorded, rate_hz)
+                sink = files.enter_context(McapSink(bag, recorded.configuration, about))
+                if not sink.has_poses:
+                    notes.append(
+                        f"{recorded.configuration.problem_name} does not say which coordinates of "
+                        'its state are a pose (pose = ("x", "y", "yaw")), so there are no poses; '
+                        "/holdfast/belief has the states"
+                    )
+                sinks.append(sink)
+                made.append((sink.file, mcap))
+            if tables is not None:
+                directory = stack.enter_context(directory_beside(tables)) / "tables"
+                directory.mkdir()
+                sinks.append(
+                    files.enter_context(CsvSink(directory, recorded.configuration.problem))
+                )
+                made.append((directory, tables))
+            line.start(f"{counted(len(trials), 'trial')} of {recorded.path}", 0, "")
+            try:
+                told = recorded.tell(trials, Facts(sinks), rate_hz)
+                for finished, _ in enumerate(told, start=1):
+                    line.show(finished, "")
+            except (HoldfastError, OSError, KeyboardInterrupt):
+                raise
+            except BaseException as error:
+                account = account_of_user_error(error, recorded.configuration.problem_name)
+                if account is None:
+                    raise
+                raise HoldfastError(account) from error
+            finally:
+                with contextlib.suppress(OSError):
+                    line.stop()
+            recorded.require_unchanged()
+        for here, there in made:
+            move_into_place(here, there)
+    return notes
+
+
+def _notes(recorded: RecordedRun, trials: Sequence[int], rate_hz: float) -> list[str]:
+    """Return what a person should know of what is exported."""
+    notes = []
+    if not recorded.has_times:
+        notes.append(
+            f"the run was recorded without times, so every step takes {1.0 / rate_hz:g} s (--rate)"
+        )
+    blind = [trial for trial in trials if not recorded.beliefs_known(trial)]
+    if blind:
+        notes.append(
+            f"no beliefs and observations of {counted(len(blind), 'trial')}: what an environment "
+            "of your own has shown is kept only until the trial ends"
+        )
+    asked_for = recorded.configuration.simulator.num_trials
+    finished = len(recorded.trials) - (recorded.unfinished is not None)
+    if finished < asked_for:
+        notes.append(f"the run is not finished: {finished:,} of {asked_for:,} trials are")
+    return notes
+
+
+def _about(recorded: RecordedRun, rate_hz: float) -> dict[str, str]:
+    """Return what the metadata of a file says of its run."""
+    from holdfast.source_digest import core_version
+
+    configuration = recorded.configuration
+    return {
+        "holdfast_problem": configuration.problem_name,
+        "holdfast_seed": str(configuration.simulator.seed),
+        "holdfast_version": core_version(),
+        "holdfast_times": "recorded" if recorded.has_times else f"{rate_hz:g} steps a second",
+    }
+
+
+def _size_of(place: Path) -> str:
+    files = sorted(place.iterdir()) if place.is_dir() else [place]
+    size = sum(file.stat().st_size for file in files)
+    return f"{size / 2**20:.1f} MiB" if size >= 2**20 else f"{size / 2**10:.1f} KiB"

@@ -1,0 +1,218 @@
+"""A recorded run as plain tables: ``trials.csv``, ``steps.csv``, ``beliefs.csv``, ``events.csv``.
+
+Numbers are written so that reading them gives the same bits. An empty cell means that there is
+none, or that it is not known. Times are seconds on the clock of the export, with nanoseconds.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Iterable, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self, TextIO
+
+from holdfast.belief import Belief
+from holdfast.problems.problem import FloatArray, Problem
+from holdfast.recording.export import (
+    Decider,
+    EventFact,
+    SensingFact,
+    TaskFact,
+    TrialBeginFact,
+    TrialEndFact,
+)
+
+__all__ = ["TABLES", "CsvSink"]
+
+TABLES = ("trials.csv", "steps.csv", "beliefs.csv", "events.csv")
+"""One row a trial; a step; a particle of a belief; an event of the services."""
+
+_DECIDER = ("service", "status", "waited_ms", "round_trip_ms", "computed_ms")
+
+
+class CsvSink:
+    """Writes the facts of a run as tables; to be used in a ``with`` statement.
+
+    Parameters
+    ----------
+    directory : Path
+        Where the tables are made; it is there, and empty.
+    problem : Problem
+        Of the run: the state's labels are the names of columns.
+    """
+
+    def __init__(self, directory: Path, problem: Problem) -> None:
+        self._actions = [str(label) for label in problem.sensing_actions]
+        self._state_size = problem.state_size
+        self._action_size = problem.action_size
+        self._began_ns = 0
+        self._sensing: SensingFact | None = None
+        labels = state_labels(problem)
+        with ExitStack() as stack:
+            self._files = [
+                stack.enter_context((directory / name).open("w", encoding="utf-8", newline=""))
+                for name in TABLES
+            ]
+            self._trials, self._steps, self._beliefs, self._events = map(_writer, self._files)
+            self._close = stack.pop_all()
+        self._trials.writerow(
+            ["trial", "began", "ended", "seed", "outcome", "success", "steps", "reward", "digest"]
+        )
+        self._steps.writerow(
+            [
+                "trial",
+                "step",
+                "stage",
+                "sensing_action",
+                "sensing_action_label",
+                "observation",
+                *(f"entropy_{index}" for index in range(len(self._actions))),
+                "explained",
+                "mahalanobis_distance",
+                "effective_sample_size",
+                "resampled",
+                "state_digest",
+                *(f"estimate {label}" for label in labels),
+                *(f"true {label}" for label in labels),
+                *(f"action_{index}" for index in range(self._action_size)),
+                "reward",
+                "sensing_time",
+                "observation_time",
+                "action_time",
+                *(f"sensing_{name}" for name in _DECIDER),
+                *(f"action_{name}" for name in _DECIDER),
+            ]
+        )
+        self._beliefs.writerow(["trial", "step", "when", "particle", *labels, "weight"])
+        self._events.writerow(["time", "event", "trial", "fields"])
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._close.close()
+
+    @property
+    def files(self) -> Sequence[TextIO]:
+        """The open files."""
+        return self._files
+
+    def trial_begins(self, fact: TrialBeginFact) -> None:
+        """Note when the trial began."""
+        self._began_ns = fact.time_ns
+        self._sensing = None
+
+    def sensed(self, fact: SensingFact) -> None:
+        """Write the belief before; the rest of the row comes with the task action."""
+        self._sensing = fact
+        self._write_belief(fact.trial, fact.step, "sensing", fact.before)
+
+    def acted(self, fact: TaskFact) -> None:
+        """Write the row of the step, and the belief."""
+        self._write_step(fact.trial, fact.step, fact)
+        self._write_belief(fact.trial, fact.step, "acting", fact.belief)
+
+    def trial_ends(self, fact: TrialEndFact) -> None:
+        """Write the row of the trial and the last belief, and a row if it ends in mid-step."""
+        if self._sensing is not None:
+            self._write_step(fact.trial, fact.steps, None)
+        self._write_belief(fact.trial, fact.steps, "end", fact.belief)
+        result = fact.result
+        self._trials.writerow(
+            [
+                fact.trial,
+                _seconds(self._began_ns),
+                _seconds(fact.time_ns),
+                *(
+                    (None, "unfinished", None, fact.steps, None, None)
+                    if result is None
+                    else (
+                        result.seed,
+                        result.outcome,
+                        int(result.success),
+                        result.steps,
+                        result.reward,
+                        result.digest,
+                    )
+                ),
+            ]
+        )
+
+    def happened(self, fact: EventFact) -> None:
+        """Write an event."""
+        fields = json.dumps(fact.fields, ensure_ascii=False)
+        self._events.writerow([_seconds(fact.time_ns), fact.name, fact.fields.get("trial"), fields])
+
+    def _write_step(self, trial: int, step: int, fact: TaskFact | None) -> None:
+        sensing, self._sensing = self._sensing, None
+        row: list[Any] = [trial, step]
+        row.append(fact.stage if fact is not None else None if sensing is None else sensing.stage)
+        if sensing is None:
+            row += [None] * (8 + len(self._actions))
+        else:
+            observation = sensing.observation
+            row += [
+                sensing.sensing_action,
+                self._actions[sensing.sensing_action],
+                None if observation is None else " ".join(map(repr, observation.tolist())),
+                *_cells(sensing.entropies, len(self._actions)),
+                None if sensing.explained is None else int(sensing.explained),
+                sensing.mahalanobis_distance,
+                sensing.effective_sample_size,
+                None if sensing.resampled is None else int(sensing.resampled),
+                sensing.state_digest.hex(),
+            ]
+        row += _cells(None if fact is None else fact.estimate, self._state_size)
+        row += _cells(None if fact is None else fact.true_state, self._state_size)
+        row += _cells(None if fact is None else fact.action, self._action_size)
+        row.append(None if fact is None else fact.reward)
+        row += [
+            None if sensing is None else _seconds(sensing.decided_ns),
+            None if sensing is None else _seconds(sensing.observed_ns),
+            None if fact is None else _seconds(fact.time_ns),
+        ]
+        row += _decider_cells(None if sensing is None else sensing.decider)
+        row += _decider_cells(None if fact is None else fact.decider)
+        self._steps.writerow(row)
+
+    def _write_belief(self, trial: int, step: int, when: str, belief: Belief | None) -> None:
+        if belief is None:
+            return
+        pairs = zip(belief.states.tolist(), belief.weights.tolist(), strict=True)
+        self._beliefs.writerows(
+            (trial, step, when, particle, *state, weight)
+            for particle, (state, weight) in enumerate(pairs)
+        )
+
+
+def state_labels(problem: Problem) -> list[str]:
+    """Return a name for each coordinate of a state, with its unit where the problem says it."""
+    labels = list(map(str, problem.state_labels))
+    if len(labels) == problem.state_size:
+        return labels
+    return [f"state_{index}" for index in range(problem.state_size)]
+
+
+def _writer(file: io.TextIOBase) -> Any:
+    return csv.writer(file, lineterminator="\n")
+
+
+def _cells(values: FloatArray | None, count: int) -> Iterable[float | None]:
+    return [None] * count if values is None else values.tolist()
+
+
+def _decider_cells(decider: Decider | None) -> Sequence[Any]:
+    return [None] * len(_DECIDER) if decider is None else list(decider)
+
+
+def _seconds(time_ns: int) -> str:
+    return f"{time_ns // 1_000_000_000}.{time_ns % 1_000_000_000:09d}"

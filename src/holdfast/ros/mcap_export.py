@@ -1,0 +1,536 @@
+"""A recorded run as one MCAP file of standard ROS 2 messages, without ROS.
+
+MCAP is what rosbag2 writes by default, so ``ros2 bag``, RViz, Foxglove and PlotJuggler open the
+file as one of their own. All messages are of packages that every ROS 2 has; their definitions are
+in the file. rosbags (extra ``ros``) knows these, encodes the messages and writes the file.
+
+Poses are in the frame ``task``, which stands in ``map`` so that what the problem calls up points
+up. Everything is offered as reliable, for then a subscriber of either kind gets it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+
+from holdfast.belief import Belief
+from holdfast.configuration import Configuration
+from holdfast.errors import HoldfastError
+from holdfast.problems.problem import FloatArray
+from holdfast.recording.csv_export import state_labels
+from holdfast.recording.export import (
+    Decider,
+    EventFact,
+    SensingFact,
+    TaskFact,
+    TrialBeginFact,
+    TrialEndFact,
+)
+from holdfast.ros.markers import Marker, scene_markers, sensing_markers
+from holdfast.ros.poses import pose_layout
+
+if TYPE_CHECKING:
+    from rosbags.interfaces import Connection
+
+__all__ = ["MAP_FRAME", "TASK_FRAME", "McapSink", "MissingRosbagsError", "require_rosbags"]
+
+MAP_FRAME = "map"
+TASK_FRAME = "task"
+ESTIMATE_FRAME = "estimate"
+TRUTH_FRAME = "truth"
+
+_NS_PER_S = 1_000_000_000
+_BAG_VERSION = 8
+"""Of rosbag2's metadata: the last one whose qualities of service Humble's rosbag2 reads as well."""
+
+_PATH_GROWTH = 10
+"""A path is written anew when it is longer by this part of itself: all of them together take ten
+times its length, not the square of it."""
+
+_LEVELS = {"DEBUG": 10, "INFO": 20, "WARN": 30, "ERROR": 40}
+_WARNINGS = frozenset(
+    [
+        "launch_failed",
+        "recovery_exited",
+        "service_vanished",
+        "service_suspected",
+        "unreachable",
+        "holding",
+        "unexplained",
+        "filter_diverged",
+        "malformed_reply",
+        "disagreement",
+        "refused",
+        "verification_failed",
+        "distrusted",
+        "missed_ticks",
+        "performed_unseen",
+        "insecure",
+    ]
+)
+_ERRORS = frozenset(("wrong_answer", "not_deterministic", "state_diverged", "stopped", "error"))
+
+
+class MissingRosbagsError(HoldfastError):
+    """The library rosbags is not installed."""
+
+
+def require_rosbags() -> None:
+    """Make sure that rosbags is there.
+
+    Raises
+    ------
+    MissingRosbagsError
+        If it is not.
+    """
+    try:
+        import rosbags.rosbag2  # noqa: F401
+    except ImportError as error:
+        raise MissingRosbagsError(
+            "MCAP files need the library rosbags: pip install 'holdfast[ros]'"
+        ) from error
+
+
+class McapSink:
+    """Writes the facts of a run as ROS 2 messages; to be used in a ``with`` statement.
+
+    Parameters
+    ----------
+    directory : Path
+        Where the file is made, with the ``metadata.yaml`` of a rosbag2; it must not be there yet.
+    configuration : Configuration
+        Of the run.
+    notes : mapping of str to str
+        What the file's metadata is to say of the run.
+
+    Attributes
+    ----------
+    has_poses : bool
+        Whether the problem says which coordinates are a pose.
+
+    Raises
+    ------
+    MissingRosbagsError
+        If rosbags is not installed.
+    ProblemError
+        If what the problem says of its pose cannot be.
+    """
+
+    def __init__(
+        self, directory: Path, configuration: Configuration, notes: Mapping[str, str]
+    ) -> None:
+        require_rosbags()
+        from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+        from rosbags.typesys import Stores, get_typestore
+
+        problem = configuration.problem
+        self._problem = problem
+        self._layout = pose_layout(problem)
+        self.has_poses = self._layout is not None
+        self._labels = state_labels(problem)
+        self._actions = [str(label) for label in problem.sensing_actions]
+        self._store = get_typestore(Stores.ROS2_HUMBLE)
+        self._types: dict[str, Any] = dict(self._store.types)
+        self._connections: dict[str, Connection] = {}
+        self._directory = directory
+        self._writer = Writer(directory, version=_BAG_VERSION, storage_plugin=StoragePlugin.MCAP)
+        self._writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+        for key, value in notes.items():
+            self._writer.set_custom_data(key, value)
+        self._stage: int | None = None
+        self._paths: dict[str, _GrowingPath] = {}
+        self._has_frame = False
+
+    def __enter__(self) -> Self:
+        self._writer.open()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if kind is None:
+            self._writer.close()
+        else:
+            self._writer.abort()
+
+    @property
+    def file(self) -> Path:
+        """The file that is written."""
+        return self._directory / f"{self._directory.name}.mcap"
+
+    # -- facts -------------------------------------------------------------------------------------
+
+    def trial_begins(self, fact: TrialBeginFact) -> None:
+        """Write the frames, once, and the scene, and say that the trial begins."""
+        now = fact.time_ns
+        self._stage = None
+        self._paths = {}
+        if self._layout is not None:
+            if not self._has_frame:
+                self._has_frame = True
+                turned = np.array([0.0, 0.0, 0.0, *self._layout.upright])
+                self._transform(now, "/tf_static", MAP_FRAME, {TASK_FRAME: turned})
+            markers = scene_markers(
+                self._problem,
+                self._layout,
+                TASK_FRAME,
+                ESTIMATE_FRAME if fact.beliefs_known else None,
+                TRUTH_FRAME,
+            )
+            self._markers(now, "/holdfast/scene", markers, anew=True)
+            self._markers(now, "/holdfast/sensing", [], anew=True)
+        self._log(now, "INFO", f"trial {fact.trial} begins")
+
+    def sensed(self, fact: SensingFact) -> None:
+        """Write the belief and the choice, then the observation and the belief that it led to."""
+        now = fact.decided_ns
+        self._place(now, fact.trial, fact.step, fact.stage)
+        self._belief(now, fact.before)
+        label = self._actions[fact.sensing_action]
+        self._number(now, "/holdfast/sensing_action", "Int32", fact.sensing_action)
+        self._write(now, "/holdfast/sensing_action_label", "std_msgs/msg/String", data=label)
+        if fact.entropies is not None:
+            self._array(now, "/holdfast/entropies", fact.entropies, ", ".join(self._actions))
+        if self._layout is not None and fact.before is not None:
+            markers = sensing_markers(
+                self._problem, self._layout, TASK_FRAME, fact.before, fact.sensing_action
+            )
+            self._markers(now, "/holdfast/sensing", markers)
+        later = fact.observed_ns
+        if fact.observation is not None:
+            self._array(later, "/holdfast/observation", fact.observation, label)
+        self._belief(later, fact.after)
+        values: dict[str, Any] = {"sensing_action": label}
+        values |= {
+            name: getattr(fact, name)
+            for name in ("effective_sample_size", "mahalanobis_distance", "explained", "resampled")
+        }
+        self._diagnose(
+            later, fact.trial, fact.step, "sensing", fact.decider, values, fact.explained
+        )
+        if fact.explained is False:
+            self._log(later, "WARN", f"trial {fact.trial}, step {fact.step}: no particle explains "
+                      f"the observation of {label}")  # fmt: skip
+
+    def acted(self, fact: TaskFact) -> None:
+        """Write the belief, its estimate, the true state if it is known, and the action."""
+        now = fact.time_ns
+        self._place(now, fact.trial, fact.step, fact.stage)
+        self._state(now, fact.belief, fact.estimate, fact.true_state)
+        labels = self._labels if len(fact.action) == len(self._labels) else None
+        self._array(now, "/holdfast/task_action", fact.action,
+                    "action" if labels is None else ", ".join(labels))  # fmt: skip
+        if fact.reward is not None:
+            self._number(now, "/holdfast/reward", "Float64", fact.reward)
+        values = {} if fact.reward is None else {"reward": fact.reward}
+        self._diagnose(now, fact.trial, fact.step, "task", fact.decider, values, None)
+
+    def trial_ends(self, fact: TrialEndFact) -> None:
+        """Write the last belief, and what the trial came to."""
+        now = fact.time_ns
+        self._number(now, "/holdfast/step", "Int32", fact.steps)
+        self._state(now, fact.belief, fact.estimate, fact.true_state, last=True)
+        result = fact.result
+        if result is None:
+            self._log(now, "INFO", f"trial {fact.trial}: {fact.steps} steps so far; not finished")
+            return
+        text = f"trial {fact.trial} {result.outcome} after {result.steps} steps"
+        if result.reward is not None:
+            text += f", reward {result.reward:.6g}"
+        level = "INFO" if result.outcome == "succeeded" else "WARN"
+        self._log(now, level, f"{text}; decisions {result.digest[:16]}")
+
+    def happened(self, fact: EventFact) -> None:
+        """Write an event of the services."""
+        name, fields = fact.name, dict(fact.fields)
+        if name == "trial":
+            return  # its beginning and its end are there
+        worse = name == "status" and fields.get("to") == "local_recovery"
+        level = "ERROR" if name in _ERRORS else "WARN" if worse or name in _WARNINGS else "INFO"
+        component = str(fields.pop("component", "robot"))
+        text = ", ".join(f"{key} {value}" for key, value in fields.items())
+        self._log(fact.time_ns, level, f"{name}: {text}" if text else name, component)
+
+    # -- messages ----------------------------------------------------------------------------------
+
+    def _place(self, now: int, trial: int, step: int, stage: int | None) -> None:
+        self._number(now, "/holdfast/trial", "Int32", trial)
+        self._number(now, "/holdfast/step", "Int32", step)
+        if stage is not None:
+            self._number(now, "/holdfast/stage", "Int32", stage)
+
+    def _state(
+        self,
+        now: int,
+        belief: Belief | None,
+        estimate: FloatArray | None,
+        true_state: FloatArray | None,
+        *,
+        last: bool = False,
+    ) -> None:
+        self._belief(now, belief)
+        frames: dict[str, FloatArray] = {}
+        if belief is not None and estimate is not None:
+            self._array(now, "/holdfast/state_estimate", estimate, ", ".join(self._labels))
+            if self._layout is not None:
+                pose = frames[ESTIMATE_FRAME] = self._layout.poses(estimate)
+                covariance = self._layout.covariance(belief).reshape(-1)
+                self._write(
+                    now,
+                    "/holdfast/estimate",
+                    "geometry_msgs/msg/PoseWithCovarianceStamped",
+                    header=self._header(now),
+                    pose=self._make("geometry_msgs/msg/PoseWithCovariance")(
+                        pose=self._pose(pose), covariance=covariance
+                    ),
+                )
+        if true_state is not None:
+            self._array(now, "/holdfast/true_state", true_state, ", ".join(self._labels))
+            if self._layout is not None:
+                pose = frames[TRUTH_FRAME] = self._layout.poses(true_state)
+                self._write(
+                    now,
+                    "/holdfast/truth",
+                    "geometry_msgs/msg/PoseStamped",
+                    header=self._header(now),
+                    pose=self._pose(pose),
+                )
+        if frames:
+            self._transform(now, "/tf", TASK_FRAME, frames)
+        for topic, frame in (("path", ESTIMATE_FRAME), ("true_path", TRUTH_FRAME)):
+            if frame in frames:
+                self._extend_path(now, f"/holdfast/{topic}", frames[frame], last=last)
+
+    def _belief(self, now: int, belief: Belief | None) -> None:
+        if belief is None:
+            return
+        table = np.column_stack([belief.states, belief.weights])
+        self._array(now, "/holdfast/belief", table, ", ".join([*self._labels, "weight"]))
+        if self._layout is not None:
+            self._write(
+                now,
+                "/holdfast/particle_cloud",
+                "geometry_msgs/msg/PoseArray",
+                header=self._header(now),
+                poses=self._poses(self._layout.poses(belief.states)),
+            )
+
+    def _extend_path(self, now: int, topic: str, pose: FloatArray, *, last: bool) -> None:
+        path = self._paths.setdefault(topic, _GrowingPath())
+        stamped = self._make("geometry_msgs/msg/PoseStamped")
+        path.poses.append(stamped(header=self._header(now), pose=self._pose(pose)))
+        if last or len(path.poses) >= path.next_length:
+            path.next_length = len(path.poses) + 1 + len(path.poses) // _PATH_GROWTH
+            self._write(now, topic, "nav_msgs/msg/Path", header=self._header(now), poses=path.poses)
+
+    def _transform(
+        self, now: int, topic: str, parent: str, children: Mapping[str, FloatArray]
+    ) -> None:
+        vector, turn = self._make("geometry_msgs/msg/Vector3"), self._quaternion
+        transforms = [
+            self._make("geometry_msgs/msg/TransformStamped")(
+                header=self._header(now, parent),
+                child_frame_id=child,
+                transform=self._make("geometry_msgs/msg/Transform")(
+                    translation=vector(*map(float, pose[:3])), rotation=turn(pose[3:])
+                ),
+            )
+            for child, pose in children.items()
+        ]
+        self._write(now, topic, "tf2_msgs/msg/TFMessage", transforms=transforms)
+
+    def _markers(
+        self, now: int, topic: str, markers: Sequence[Marker], *, anew: bool = False
+    ) -> None:
+        kind = self._make("visualization_msgs/msg/Marker")
+        gone = Marker(kind="DELETEALL", frame=TASK_FRAME, namespace="")
+        numbers: dict[str, int] = {}
+        made = []
+        for marker in [gone, *markers] if anew else markers:
+            number = numbers[marker.namespace] = numbers.get(marker.namespace, -1) + 1
+            made.append(self._marker(now, kind, marker, number))
+        self._write(now, topic, "visualization_msgs/msg/MarkerArray", markers=made)
+
+    def _marker(self, now: int, kind: Any, marker: Marker, number: int) -> Any:
+        point, vector = (
+            self._make("geometry_msgs/msg/Point"),
+            self._make("geometry_msgs/msg/Vector3"),
+        )
+        color = self._make("std_msgs/msg/ColorRGBA")
+        time, duration = (
+            self._make(f"builtin_interfaces/msg/{name}") for name in ("Time", "Duration")
+        )
+        fields: dict[str, Any] = {
+            "header": self._header(now, marker.frame),
+            "ns": marker.namespace,
+            "id": number,
+            "type": 0 if marker.kind == "DELETEALL" else getattr(kind, marker.kind),
+            "action": kind.DELETEALL if marker.kind == "DELETEALL" else kind.ADD,
+            "pose": self._pose(np.asarray(marker.pose)),
+            "scale": vector(*map(float, marker.scale)),
+            "color": color(*map(float, marker.color)),
+            "lifetime": duration(sec=0, nanosec=0),
+            "frame_locked": marker.moves_with_frame,
+            "points": [point(*map(float, each)) for each in marker.points],
+            "colors": [],
+            "text": marker.text,
+            "mesh_resource": "",
+            "mesh_use_embedded_materials": False,
+        }
+        if marker.moves_with_frame:
+            # Time 0: wherever the frame is now.
+            header = self._make("std_msgs/msg/Header")
+            fields["header"] = header(stamp=time(sec=0, nanosec=0), frame_id=marker.frame)
+        # There is no texture and no mesh file, but the message has fields for them.
+        compressed = self._make("sensor_msgs/msg/CompressedImage")
+        fields |= {
+            "texture_resource": "",
+            "texture": compressed(
+                header=self._header(0, ""), format="", data=np.zeros(0, dtype=np.uint8)
+            ),
+            "uv_coordinates": [],
+            "mesh_file": self._make("visualization_msgs/msg/MeshFile")(
+                filename="", data=np.zeros(0, dtype=np.uint8)
+            ),
+        }
+        return kind(**fields)
+
+    def _diagnose(
+        self,
+        now: int,
+        trial: int,
+        step: int,
+        kind: str,
+        decider: Decider | None,
+        values: Mapping[str, Any],
+        explained: bool | None,
+    ) -> None:
+        status = "decided" if decider is None else decider.status
+        entries: dict[str, Any] = {"trial": trial, "step": step, **values}
+        if decider is not None:
+            entries |= decider._asdict()
+        level, message = 0, status
+        if decider is not None and decider.status == "local_recovery":
+            level = 1
+        if explained is False:
+            level, message = 1, f"{status}; no particle explains the observation"
+        value = self._make("diagnostic_msgs/msg/KeyValue")
+        self._write(
+            now,
+            "/diagnostics",
+            "diagnostic_msgs/msg/DiagnosticArray",
+            header=self._header(now, ""),
+            status=[
+                self._make("diagnostic_msgs/msg/DiagnosticStatus")(
+                    level=level,
+                    name=f"holdfast: {kind} decision",
+                    message=message,
+                    hardware_id="" if decider is None else decider.service,
+                    values=[
+                        value(key=key, value=str(entry))
+                        for key, entry in entries.items()
+                        if entry is not None
+                    ],
+                )
+            ],
+        )
+
+    def _log(self, now: int, level: str, text: str, name: str = "robot") -> None:
+        self._write(
+            now,
+            "/rosout",
+            "rcl_interfaces/msg/Log",
+            stamp=self._time(now),
+            level=_LEVELS[level],
+            name=f"holdfast.{name}",
+            msg=text,
+            file="",
+            function="",
+            line=0,
+        )
+
+    def _number(self, now: int, topic: str, kind: str, value: float) -> None:
+        self._write(now, topic, f"std_msgs/msg/{kind}", data=value)
+
+    def _array(self, now: int, topic: str, values: FloatArray, columns: str) -> None:
+        """Write numbers; of a table the rows are particles."""
+        dimension = self._make("std_msgs/msg/MultiArrayDimension")
+        width = values.shape[-1]
+        dims = [dimension(label=columns, size=width, stride=width)]
+        if values.ndim == 2:
+            dims.insert(0, dimension(label="particle", size=len(values), stride=values.size))
+        layout = self._make("std_msgs/msg/MultiArrayLayout")(dim=dims, data_offset=0)
+        data = np.ascontiguousarray(values, dtype=np.float64).reshape(-1)
+        self._write(now, topic, "std_msgs/msg/Float64MultiArray", layout=layout, data=data)
+
+    def _poses(self, poses: FloatArray) -> list[Any]:
+        pose = self._make("geometry_msgs/msg/Pose")
+        point = self._make("geometry_msgs/msg/Point")
+        quaternion = self._make("geometry_msgs/msg/Quaternion")
+        return [pose(point(x, y, z), quaternion(*turn)) for x, y, z, *turn in poses.tolist()]
+
+    def _pose(self, pose: FloatArray) -> Any:
+        return self._poses(pose.reshape(1, 7))[0]
+
+    def _quaternion(self, turn: FloatArray) -> Any:
+        return self._make("geometry_msgs/msg/Quaternion")(*map(float, turn))
+
+    def _header(self, now: int, frame: str = TASK_FRAME) -> Any:
+        return self._make("std_msgs/msg/Header")(stamp=self._time(now), frame_id=frame)
+
+    def _time(self, now: int) -> Any:
+        seconds, nanoseconds = divmod(now, _NS_PER_S)
+        return self._make("builtin_interfaces/msg/Time")(sec=seconds, nanosec=nanoseconds)
+
+    def _make(self, kind: str) -> Any:
+        return self._types[kind]
+
+    def _write(self, now: int, topic: str, kind: str, **fields: Any) -> None:
+        connection = self._connections.get(topic)
+        if connection is None:
+            latched = topic in ("/tf_static", "/holdfast/scene")
+            connection = self._writer.add_connection(
+                topic, kind, typestore=self._store, offered_qos_profiles=[_qos(latched=latched)]
+            )
+            self._connections[topic] = connection
+        message = self._types[kind](**fields)
+        self._writer.write(connection, now, self._store.serialize_cdr(message, kind))
+
+
+class _GrowingPath:
+    """The poses of a path so far, and how long it is when it is written next."""
+
+    def __init__(self) -> None:
+        self.poses: list[Any] = []
+        self.next_length = 1
+
+
+def _qos(*, latched: bool) -> Any:
+    from rosbags.interfaces import (
+        Qos,
+        QosDurability,
+        QosHistory,
+        QosLiveliness,
+        QosReliability,
+        QosTime,
+    )
+
+    for_ever = QosTime(9223372036, 854775807)
+    return Qos(
+        history=QosHistory.KEEP_LAST,
+        depth=1 if latched else 10,
+        reliability=QosReliability.RELIABLE,
+        durability=QosDurability.TRANSIENT_LOCAL if latched else QosDurability.VOLATILE,
+        deadline=for_ever,
+        lifespan=for_ever,
+        liveliness=QosLiveliness.AUTOMATIC,
+        liveliness_lease_duration=for_ever,
+        avoid_ros_namespace_conventions=False,
+    )
