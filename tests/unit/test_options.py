@@ -31,6 +31,8 @@ NUMBERS = [
     ["simulate", "--jobs"],
     ["simulate", "--seeds"],
     ["keys", "mine", "--days"],
+    ["export", "run", "--trials"],
+    ["export", "run", "--rate"],
     ["serve", "--workers"],
     ["serve", "--lease-ms"],
     ["serve", "--max-sessions"],
@@ -49,6 +51,9 @@ PATHS = [
     ["doctor", "--tls"],
     ["compare"],
     ["compare", "one"],
+    ["export"],
+    ["export", "run", "--mcap"],
+    ["export", "run", "--csv"],
     ["keys"],
     ["serve", "--tls"],
     ["serve", "--problem-directory"],
@@ -148,7 +153,7 @@ def test_other_misuse(
     assert reason in last_words(arguments, capsys, monkeypatch)
 
 
-@pytest.mark.parametrize("arguments", [[], ["run"], ["compare"], ["keys"], ["experiment"]])
+@pytest.mark.parametrize("arguments", [[], ["run"], ["compare"], ["export"], ["keys"], ["experiment"]])
 def test_without_arguments_there_is_help(
     arguments: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

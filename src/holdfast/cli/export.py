@@ -197,7 +197,7 @@ def _write(
                 told = recorded.tell(trials, Facts(sinks), rate_hz)
                 for finished, _ in enumerate(told, start=1):
                     line.show(finished, "")
-            except (HoldfastError, OSError, KeyboardInterrupt):
+            except (HoldfastError, KeyboardInterrupt):
                 raise
             except BaseException as error:
                 account = account_of_user_error(error, recorded.configuration.problem_name)

@@ -141,8 +141,8 @@ class McapSink:
         self._writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
         for key, value in notes.items():
             self._writer.set_custom_data(key, value)
-        self._stage: int | None = None
         self._paths: dict[str, _GrowingPath] = {}
+        self._belief_written: Belief | None = None
         self._has_frame = False
 
     def __enter__(self) -> Self:
@@ -155,10 +155,7 @@ class McapSink:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        if kind is None:
-            self._writer.close()
-        else:
-            self._writer.abort()
+        self._writer.__exit__(kind, error, trace)
 
     @property
     def file(self) -> Path:
@@ -170,7 +167,6 @@ class McapSink:
     def trial_begins(self, fact: TrialBeginFact) -> None:
         """Write the frames, once, and the scene, and say that the trial begins."""
         now = fact.time_ns
-        self._stage = None
         self._paths = {}
         if self._layout is not None:
             if not self._has_frame:
@@ -309,8 +305,9 @@ class McapSink:
                 self._extend_path(now, f"/holdfast/{topic}", frames[frame], last=last)
 
     def _belief(self, now: int, belief: Belief | None) -> None:
-        if belief is None:
+        if belief is None or belief is self._belief_written:
             return
+        self._belief_written = belief
         table = np.column_stack([belief.states, belief.weights])
         self._array(now, "/holdfast/belief", table, ", ".join([*self._labels, "weight"]))
         if self._layout is not None:
