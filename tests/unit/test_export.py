@@ -341,7 +341,7 @@ class TestReadBack:
             for observer in seen
             for trial, step, when, belief in observer.beliefs
         }
-        found = defaultdict(list)
+        found: dict[tuple[int, int, str], list[list[float]]] = defaultdict(list)
         for row in rows_of(directory / "tables" / "beliefs.csv"):
             key = (int(row["trial"]), int(row["step"]), row["when"])
             assert int(row["particle"]) == len(found[key])

@@ -84,9 +84,9 @@ def export(
 
     Times are the robot's own where the run has them (timings.csv), else steps of 1/HZ.
     """
+    wanted = None if trials is None else _range_of(trials)
     if mcap is None and tables is None:
         raise HoldfastError("nothing to write: give --mcap FILE or --csv DIR, or both")
-    wanted = None if trials is None else _range_of(trials)
     with ended_by_signals():
         _export(run, mcap, tables, wanted, rate, quiet=quiet)
 

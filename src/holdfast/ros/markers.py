@@ -177,7 +177,7 @@ def sensing_markers(
 
 def _up(layout: PoseLayout) -> FloatArray:
     """Return the unit vector that points up on a screen: y in a plane, z in space."""
-    return np.eye(3)[1 if layout.indices[2] is None else 2]
+    return np.asarray(np.eye(3)[1 if layout.indices[2] is None else 2])
 
 
 def _sensed_coordinate(problem: Problem, layout: PoseLayout, label: str) -> str | None:

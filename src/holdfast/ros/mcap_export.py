@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Final, Self
 
 import numpy as np
 
@@ -44,7 +44,7 @@ ESTIMATE_FRAME = "estimate"
 TRUTH_FRAME = "truth"
 
 _NS_PER_S = 1_000_000_000
-_BAG_VERSION = 8
+_BAG_VERSION: Final = 8
 """Of rosbag2's metadata: the last one whose qualities of service Humble's rosbag2 reads as well."""
 
 _PATH_GROWTH = 10
