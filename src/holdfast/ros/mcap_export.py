@@ -211,7 +211,8 @@ class McapSink:
         self._diagnose(
             later, fact.trial, fact.step, "sensing", fact.decider, values, fact.explained
         )
-        if fact.explained is False:
+        if fact.explained is False and fact.decider is None:
+            # With services there is an event of it.
             self._log(later, "WARN", f"trial {fact.trial}, step {fact.step}: no particle explains "
                       f"the observation of {label}")  # fmt: skip
 
