@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import itertools
 import json
 import resource
 import signal
+import sqlite3
 from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
@@ -595,24 +597,31 @@ class TestOwnCode:
         assert "pose[1] of cart is 'angle': allowed are x, y, z, roll" in said.stderr
         assert not (tmp_path / "run.mcap").exists()
 
+    @pytest.mark.parametrize("kept", [True, False], ids=["kept", "an_older_run"])
     def test_in_a_world_of_ones_own(
-        self, capsys: pytest.CaptureFixture[str], tmp_path: Path
+        self, kept: bool, capsys: pytest.CaptureFixture[str], tmp_path: Path
     ) -> None:
-        """Of the finished trial there are decisions and times; of the other one also beliefs."""
+        """What the world has shown is in the journal, of the trial that is not finished as well."""
         (tmp_path / "world.py").write_text(OWN_WORLD)
-        make_run(capsys, tmp_path, PEG, "--environment", "world:World", "--rate", "5000", code=2)
+        options = ("--environment", "world:World", "--rate", "5000")
+        run = make_run(capsys, tmp_path, PEG, *options, code=2)
+        if not kept:
+            with contextlib.closing(sqlite3.connect(run / "journal.sqlite")) as connection:
+                connection.execute("DROP TABLE kept_steps")
         said = export(capsys, tmp_path, "--mcap", "run.mcap", "--csv", "tables")
-        assert "no beliefs and observations of 1 trial: what an environment" in said.stderr
+        assert ("no beliefs and observations of 1 trial" in said.stderr) != kept
         assert "the run is not finished: 1 of 2 trials are" in said.stderr
         steps = rows_of(tmp_path / "tables" / "steps.csv")
-        assert [(row["trial"], row["step"]) for row in steps] == [
-            ("0", str(step)) for step in range(7)
-        ] + [("1", str(step)) for step in range(5)]
-        assert steps[0]["observation"] == ""
-        assert steps[0]["sensing_action"] != ""
-        assert steps[7]["observation"] != ""
+        places = [(int(row["trial"]), int(row["step"])) for row in steps]
+        assert places == [(0, step) for step in range(7)] + [(1, step) for step in range(5)]
+        sensed = [row for row in steps if row["sensing_action"]]
+        assert [row["step"] for row in sensed] == ["0", "4", "0", "4"]
+        for row in sensed:
+            value = 1.0 + 0.1 * int(row["sensing_action"]) + 0.01 * int(row["step"])
+            known = kept or row["trial"] == "1"
+            assert row["observation"] == (repr(value) if known else "")
         beliefs = rows_of(tmp_path / "tables" / "beliefs.csv")
-        assert {row["trial"] for row in beliefs} == {"1"}
+        assert {row["trial"] for row in beliefs} == ({"0", "1"} if kept else {"1"})
         assert [row["outcome"] for row in rows_of(tmp_path / "tables" / "trials.csv")] == [
             "succeeded",
             "unfinished",
@@ -620,7 +629,7 @@ class TestOwnCode:
         messages = by_rosbags(tmp_path / "run.mcap")
         assert not of_topic(messages, "/holdfast/truth")
         assert len(of_topic(messages, "/holdfast/task_action")) == 12
-        assert len(of_topic(messages, "/holdfast/estimate")) == 5
+        assert len(of_topic(messages, "/holdfast/estimate")) == (13 if kept else 5)
 
     def test_code_that_fails_now(self, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
         (tmp_path / "cart.py").write_text(OWN_PROBLEM.replace("POSE", ""))
@@ -639,7 +648,7 @@ class TestDecisionsAreCompared:
     ) -> None:
         (tmp_path / "cart.py").write_text(OWN_PROBLEM.replace("POSE", ""))
         make_run(capsys, tmp_path, PEG.replace("peg_in_hole_2d", "cart:Cart"))
-        (tmp_path / "cart.py").write_text(OWN_PROBLEM.replace("POSE", "").replace("0.3", "0.4"))
+        (tmp_path / "cart.py").write_text(OWN_PROBLEM.replace("POSE", "").replace("0.3", "0.45"))
         said = export(capsys, tmp_path, "--csv", "tables", "--mcap", "run.mcap", code=2)
         assert "trial 0 is decided otherwise at step 0 when it is computed again" in said.stderr
         assert "the problem's source has changed since (module cart)" in said.stderr

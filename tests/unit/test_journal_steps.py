@@ -633,3 +633,43 @@ class TestDamage:
         for read in (False, True):
             assert self.check(path, read=read, where="") is None
         assert content(tmp_path) == before
+
+
+class TestKeptSteps:
+    """Steps that stay when their trial is finished, because nobody could make them again."""
+
+    def journal(self, path: Path, *, keep_steps: bool) -> list[Record]:
+        with Journal.create(path, {"configuration": ""}) as journal:
+            for step in range(4):
+                journal.append(TRIAL, records_of(step))
+            journal.add(result_of(TRIAL), keep_steps=keep_steps)
+        return all_records(4)
+
+    def test_they_stay_if_that_is_asked_for(self, path: Path) -> None:
+        records = self.journal(path, keep_steps=True)
+        with Journal.read(path) as journal:
+            assert journal.unfinished() is None
+            assert journal.kept_steps(TRIAL) == records
+            assert journal.kept_steps(TRIAL + 1) is None
+            assert journal.finished() == {TRIAL}
+
+    def test_else_they_go(self, path: Path) -> None:
+        self.journal(path, keep_steps=False)
+        with Journal.open(path) as journal:
+            assert journal.kept_steps(TRIAL) is None
+            # Of a trial without steps there are none to keep.
+            journal.add(result_of(5), keep_steps=True)
+            assert journal.kept_steps(5) is None
+
+    @pytest.mark.parametrize("changes", ["records = x'90'", "trial = 4", "records = 7"])
+    def test_damage_is_noticed(self, changes: str, path: Path) -> None:
+        self.journal(path, keep_steps=True)
+        with contextlib.closing(sqlite3.connect(path)) as connection:
+            connection.execute(f"UPDATE kept_steps SET {changes}")
+            connection.commit()
+        trial = 4 if changes == "trial = 4" else TRIAL
+        with (
+            Journal.read(path) as journal,
+            pytest.raises(OutputError, match=f"the steps of trial {trial} have a wrong checksum"),
+        ):
+            journal.kept_steps(trial)

@@ -153,7 +153,9 @@ def test_other_misuse(
     assert reason in last_words(arguments, capsys, monkeypatch)
 
 
-@pytest.mark.parametrize("arguments", [[], ["run"], ["compare"], ["export"], ["keys"], ["experiment"]])
+@pytest.mark.parametrize(
+    "arguments", [[], ["run"], ["compare"], ["export"], ["keys"], ["experiment"]]
+)
 def test_without_arguments_there_is_help(
     arguments: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -8,6 +8,8 @@ from __future__ import annotations
 import csv
 import json
 import os
+import sqlite3
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -224,12 +226,19 @@ def test_a_world_of_ones_own_has_a_figure_of_the_belief(workplace: Workplace) ->
         assert [row["reward"] for row in csv.DictReader(table)] == [""]
     figure = workplace.directory / "out" / "trial.png"
     assert figure.read_bytes().startswith(b"\x89PNG\r\n")
-    # Of an earlier part of the run there are no observations: the figure stays as it is.
+    # It is there already: the figure stays as it is.
     before = figure.stat().st_mtime_ns
     said = workplace.runs(*arguments, "--trials", "2", "--resume", figures=True)
     assert "figure" not in said.stderr
     assert figure.stat().st_mtime_ns == before
     figure.unlink()
+    said = workplace.runs(*arguments, "--trials", "2", "--resume", figures=True)
+    assert "figure" not in said.stderr
+    assert figure.read_bytes().startswith(b"\x89PNG\r\n")
+    # Runs of earlier versions have kept no observations.
+    figure.unlink()
+    with closing(sqlite3.connect(workplace.directory / "out" / "journal.sqlite")) as connection:
+        connection.execute("DROP TABLE kept_steps")
     said = workplace.runs(*arguments, "--trials", "2", "--resume", figures=True)
     assert "note: no figure, because trial 0 ended in an earlier part of the run" in said.stderr
 

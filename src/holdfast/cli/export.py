@@ -79,8 +79,7 @@ def export(
     """Write a recorded run as other programs read it; the run is not changed.
 
     Beliefs are not recorded, but computed again from the recorded seed and observations; every
-    decision on the way must be the recorded one, bit for bit, else nothing is written. Of finished
-    trials in an environment of your own only decisions and times are known.
+    decision on the way must be the recorded one, bit for bit, else nothing is written.
 
     Times are the robot's own where the run has them (timings.csv), else steps of 1/HZ.
     """
@@ -223,8 +222,8 @@ def _notes(recorded: RecordedRun, trials: Sequence[int], rate_hz: float) -> list
     blind = [trial for trial in trials if not recorded.beliefs_known(trial)]
     if blind:
         notes.append(
-            f"no beliefs and observations of {counted(len(blind), 'trial')}: what an environment "
-            "of your own has shown is kept only until the trial ends"
+            f"no beliefs and observations of {counted(len(blind), 'trial')}: this run is older "
+            "than the keeping of what an environment of your own has shown"
         )
     asked_for = recorded.configuration.simulator.num_trials
     finished = len(recorded.trials) - (recorded.unfinished is not None)

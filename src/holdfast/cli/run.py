@@ -666,10 +666,12 @@ def _draw_figure(
     if configuration.environment.object is not None and recorded is None:
         if (directory.path / FIGURE_NAME).exists():
             return None
-        return _Remark(
-            f"no figure, because trial {recorder.trial} ended in an earlier part of the run: its "
-            "observations are kept only until the trial ends"
-        )
+        recorded = _world_of(directory, recorder.trial)
+        if recorded is None:
+            return _Remark(
+                f"no figure, because trial {recorder.trial} ended in an earlier part of the run, "
+                "which did not keep its observations"
+            )
     if recorder.record.result is None:
         again_s = _time_of_sensing(directory, recorder.trial)
         if again_s > _LONGEST_REPETITION_S:
@@ -695,6 +697,16 @@ def _draw_figure(
         if account is None:
             raise
         raise HoldfastError(f"the figure of trial {recorder.trial}: {account}") from error
+
+
+def _world_of(directory: RunDirectory, trial: int) -> RecordedEnvironment | None:
+    from holdfast.recording.recorder import RecordedEnvironment
+
+    records = directory.journal.kept_steps(trial)
+    if records is None:
+        return None
+    result = next(each for each in directory.journal.results() if each.trial == trial)
+    return RecordedEnvironment(records, result)
 
 
 def _time_of_sensing(directory: RunDirectory, trial: int) -> float:

@@ -6,8 +6,8 @@ process, and every decision, bit for bit, is compared with the recorded one befo
 What comes out are *facts*, in order, for whoever writes them down (:class:`FactSink`).
 
 A simulated world is a function of the seed as well, so its true states are facts, too. What a
-robot's own world has shown is in the journal only until the trial ends: of its finished trials
-there are the decisions and the times, and no beliefs.
+robot's own world has shown is in the journal. Of journals that were written before observations
+were kept there are the decisions and the times, and no beliefs.
 
 All facts have times on one clock: that of the robot, where the run was recorded with times
 (``timings.csv``; steps between two rows are spread evenly), else a clock on which every step takes
@@ -38,7 +38,7 @@ from holdfast.planning import PlanningState, digest
 from holdfast.problems.problem import FloatArray
 from holdfast.recording.fingerprint import difference, fingerprint
 from holdfast.recording.journal import Journal, UnfinishedTrial
-from holdfast.recording.recorder import DecidedOtherwiseError
+from holdfast.recording.recorder import DecidedOtherwiseError, RecordedEnvironment
 from holdfast.recording.run_directory import EVENTS_NAME, JOURNAL_NAME, TIMINGS_NAME
 from holdfast.recording.timings import TIMING_COLUMNS
 from holdfast.runtime.environment import Environment, SimulatedEnvironment
@@ -352,7 +352,9 @@ class RecordedRun:
 
     def beliefs_known(self, trial: int) -> bool:
         """Tell whether a trial can be run again: its observations are known."""
-        return self.world_is_simulated or trial == self.unfinished
+        if self.world_is_simulated or trial == self.unfinished:
+            return True
+        return self._journal.kept_steps(trial) is not None
 
     def tell(self, trials: Sequence[int], sink: FactSink, rate_hz: float) -> Iterator[int]:
         """Tell the facts of some trials, in order, and yield the number of each when it is told.
@@ -391,10 +393,14 @@ class RecordedRun:
         trial, decisions = result.trial, result.decisions
         assert decisions is not None
         moments = self._moments(trial, result.steps, clock)
-        if self.beliefs_known(trial):
+        world: Environment | None = None
+        if self.world_is_simulated:
             world = SimulatedEnvironment(
                 self.configuration.problem, self.configuration.simulator.seed, trial
             )
+        elif (records := self._journal.kept_steps(trial)) is not None:
+            world = RecordedEnvironment(records, result)
+        if world is not None:
             expected = list(decisions)
             teller = _Teller(trial, expected, moments, sink, result, decisions)
             self._run_again(trial, world, teller)

@@ -3,7 +3,9 @@
 It is one SQLite file. A finished trial is one transaction, so after a crash or a power cut it is in
 the journal whole or not at all. The steps of an unfinished trial are appended before the robot acts
 on them, so that a new process can go on where the old one died; they go when their trial is
-finished. Tables and summary are made from the journal and can be made again at any time.
+finished. Where nobody else knows what the robot has observed, because its world is no simulated
+one, they stay, in a table that is made for the first of them: beliefs can be computed again. Tables
+and summary are made from the journal and can be made again at any time.
 
 SQLite writes ahead (WAL): a commit is one append to ``journal.sqlite-wal``, which takes some
 microseconds and outlives the death of the process. To outlive the death of the machine it has to be
@@ -67,6 +69,12 @@ _SCHEMA = (
     "record BLOB NOT NULL, checksum BLOB NOT NULL)",
 )
 
+_KEPT_STEPS = (
+    "CREATE TABLE IF NOT EXISTS kept_steps "
+    "(trial INTEGER PRIMARY KEY, records BLOB NOT NULL, checksum BLOB NOT NULL)"
+)
+"""Not in every journal, so that those without it are still journals of this version."""
+
 _SESSION_SIZE = 16
 _MAX_EPOCH = 2**32 - 1
 _CHECKSUM_SIZE = 8
@@ -88,6 +96,7 @@ _START_ANEW = "start anew in another directory (--out)"
 
 _RESULT_DECODER = msgspec.msgpack.Decoder(TrialResult)
 _DECISIONS_DECODER = msgspec.msgpack.Decoder(Decisions)
+_KEPT_DECODER = msgspec.msgpack.Decoder(list[bytes])
 _NUMBERS = struct.Struct("<qq")
 
 # Copied for each row: to make one takes longer than to sum up a step.
@@ -696,13 +705,15 @@ class Journal:
     # Finished trials
     # -----------------------------------------------------------------------------------------
 
-    def add(self, result: TrialResult) -> None:
+    def add(self, result: TrialResult, *, keep_steps: bool = False) -> None:
         """Keep a finished trial, and drop its steps; when this returns, it is on the disk.
 
         Parameters
         ----------
         result : TrialResult
             The outcome, with its decisions.
+        keep_steps : bool
+            Whether its steps stay, for :meth:`kept_steps`.
 
         Raises
         ------
@@ -722,14 +733,53 @@ class Journal:
             _trial_checksum(trial, 1, decisions),
         )
         self._steps = None
+        kept: bytes | None = None
+        if keep_steps:
+            unfinished = self.unfinished()
+            if unfinished is not None and unfinished.trial == trial:
+                kept = self._encode([encode_record(record) for record in unfinished.records])
         with self._transaction():
             self._connection.execute("INSERT INTO trials VALUES (?, ?, ?, ?, ?)", row)
+            if kept is not None:
+                self._connection.execute(_KEPT_STEPS)
+                self._connection.execute(
+                    "INSERT INTO kept_steps VALUES (?, ?, ?)",
+                    (trial, kept, _trial_checksum(trial, 2, kept)),
+                )
             dropped = self._connection.execute("DELETE FROM steps WHERE trial = ?", (trial,))
         if dropped.rowcount:
             # Now, while the robot has nothing to do, and not in the middle of its next trial. The
             # trial is kept already, so trouble here is told by whatever is written next.
             with contextlib.suppress(OutputError):
                 self._move_log()
+
+    def kept_steps(self, trial: int) -> list[Record] | None:
+        """Return the records of a finished trial whose steps were kept, None if they were not.
+
+        Raises
+        ------
+        OutputError
+            If they are damaged.
+        """
+        with self._errors():
+            there = self._connection.execute(
+                "SELECT 1 FROM sqlite_master WHERE type = 'table' AND name = 'kept_steps'"
+            ).fetchone()
+            row = (
+                there
+                and self._connection.execute(
+                    "SELECT records, checksum FROM kept_steps WHERE trial = ?", (trial,)
+                ).fetchone()
+            )
+            if not row:
+                return None
+            blob, checksum = row
+            if not _is_intact(blob, checksum, _trial_checksum, trial, 2):
+                raise self._damaged(f"the steps of trial {trial} have a wrong checksum")
+            try:
+                return [decode_record(data) for data in _KEPT_DECODER.decode(blob)]
+            except RecordError as error:
+                raise self._damaged(f"the steps of trial {trial}: {error}") from error
 
     def is_empty(self) -> bool:
         """Tell whether nothing has been done yet: no trial is finished, and none is begun."""

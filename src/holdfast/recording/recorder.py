@@ -1,7 +1,7 @@
 """Looks on at one trial and keeps what a figure of it needs.
 
 A robot's own world cannot be run again for a figure. But all that the planner had of it is in the
-journal until the trial ends: the same observations, given to the same planner, lead to the same
+journal: the same observations, given to the same planner, lead to the same
 beliefs. What the world's true state was nobody knows.
 """
 

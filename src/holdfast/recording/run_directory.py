@@ -216,8 +216,8 @@ class RunDirectory:
         return summary if summary.finished == summary.trials == trials else None
 
     def add(self, result: TrialResult) -> None:
-        """Keep a finished trial."""
-        self.journal.add(result)
+        """Keep a finished trial, with its observations unless they can be simulated again."""
+        self.journal.add(result, keep_steps=self.configuration.environment.object is not None)
 
     def write_tables(self, wall_time_s: float) -> RunSummary:
         """Write ``trials.csv`` and ``summary.json`` from the journal.
