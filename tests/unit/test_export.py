@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import csv
+import io
 import itertools
 import json
 import resource
@@ -15,9 +16,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import mcap.reader
+import mcap.records
 import numpy as np
 import pytest
 import yaml
+from mcap.records import Chunk, MessageIndex
+from mcap.stream_reader import StreamReader, breakup_chunk, get_chunk_data_stream
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import QosDurability, QosReliability
@@ -420,6 +424,43 @@ class TestTheFile:
         assert info["message_count"] == len(times)
         assert info["custom_data"]["holdfast_seed"] == "5"
 
+    def test_every_index_points_at_its_messages(self, built_in: Any) -> None:
+        """As ``mcap doctor`` looks: what a chunk holds, and what the records after it say of it."""
+        _, directory, _ = built_in
+        content = (directory / "run.mcap").read_bytes()
+        stream = StreamReader(io.BytesIO(content), emit_chunks=True)
+        records = list(stream.records)
+        summary = mcap.reader.make_reader(io.BytesIO(content)).get_summary()
+        assert summary is not None
+        chunks = [record for record in records if isinstance(record, Chunk)]
+        assert len(chunks) == len(summary.chunk_indexes) > 0
+        for chunk, index in zip(chunks, summary.chunk_indexes, strict=True):
+            inside = [
+                each for each in breakup_chunk(chunk) if isinstance(each, mcap.records.Message)
+            ]
+            times = [message.log_time for message in inside]
+            assert (chunk.message_start_time, chunk.message_end_time) == (min(times), max(times))
+            assert (index.message_start_time, index.message_end_time) == (min(times), max(times))
+            assert content[index.chunk_start_offset] == 0x06
+            following = records[records.index(chunk) + 1 :]
+            by_channel = {}
+            for record in following:
+                if not isinstance(record, MessageIndex):
+                    break
+                by_channel[record.channel_id] = record.records
+            assert by_channel.keys() == index.message_index_offsets.keys()
+            assert all(content[each] == 0x07 for each in index.message_index_offsets.values())
+            expected: dict[int, list[int]] = defaultdict(list)
+            for message in inside:
+                expected[message.channel_id].append(message.log_time)
+            data, size = get_chunk_data_stream(chunk)
+            raw = data.read(size)
+            for channel, entries in by_channel.items():
+                assert [time for time, _ in entries] == expected[channel]
+                for _, offset in entries:
+                    assert raw[offset] == 0x05
+                    assert int.from_bytes(raw[offset + 9 : offset + 11], "little") == channel
+
     def test_qualities_of_service(self, built_in: Any) -> None:
         _, directory, _ = built_in
         with AnyReader([directory / "run.mcap"]) as reader:
@@ -608,12 +649,19 @@ class TestOwnCode:
         if not kept:
             with contextlib.closing(sqlite3.connect(run / "journal.sqlite")) as connection:
                 connection.execute("DROP TABLE kept_steps")
+            # As if the process had died before the first answer was in the table.
+            table = run / "timings.csv"
+            lines = table.read_text().splitlines(keepends=True)
+            table.write_text("".join(line for line in lines if not line.startswith("1,")))
         said = export(capsys, tmp_path, "--mcap", "run.mcap", "--csv", "tables")
         assert ("no beliefs and observations of 1 trial" in said.stderr) != kept
         assert "the run is not finished: 1 of 2 trials are" in said.stderr
         steps = rows_of(tmp_path / "tables" / "steps.csv")
         places = [(int(row["trial"]), int(row["step"])) for row in steps]
         assert places == [(0, step) for step in range(7)] + [(1, step) for step in range(5)]
+        times = [float(row["action_time"]) for row in steps]
+        assert times[0] > 1.7e9
+        assert all(later > earlier for earlier, later in itertools.pairwise(times))
         sensed = [row for row in steps if row["sensing_action"]]
         assert [row["step"] for row in sensed] == ["0", "4", "0", "4"]
         for row in sensed:

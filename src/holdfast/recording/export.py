@@ -24,7 +24,7 @@ from contextlib import ExitStack
 from datetime import datetime
 from pathlib import Path
 from types import TracebackType
-from typing import Any, NamedTuple, Protocol, Self
+from typing import Any, Literal, NamedTuple, Protocol, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -316,6 +316,7 @@ class RecordedRun:
             self._meta = self._journal.meta()
             self.configuration = _configuration(self._meta, path)
             self.world_is_simulated = self.configuration.environment.object is None
+            self._estimate = self.configuration.planning.particle_filter.estimate
             self._begun = self._journal.unfinished()
             self.unfinished = None if self._begun is None else self._begun.trial
             trials = self._journal.finished()
@@ -325,8 +326,11 @@ class RecordedRun:
             self._rows = _timings(directory / TIMINGS_NAME)
             self._events = _events(directory / EVENTS_NAME)
             self._ends = _trial_ends(self._events)
-            # A batch has no rows of its times: then no trial may have any, for one clock.
-            self.has_times = bool(self.trials) and all(t in self._rows for t in self.trials)
+            # A batch has no rows of its times: then those of other trials are of no use, for all
+            # facts have one clock. A trial in which nothing was decided needs none.
+            self.has_times = bool(self._rows) and all(
+                result.trial in self._rows or not result.steps for result in self._journal.results()
+            )
             self._close = stack.pop_all()
 
     def __enter__(self) -> Self:
@@ -402,7 +406,7 @@ class RecordedRun:
             world = RecordedEnvironment(records, result)
         if world is not None:
             expected = list(decisions)
-            teller = _Teller(trial, expected, moments, sink, result, decisions)
+            teller = _Teller(trial, expected, moments, sink, result, decisions, self._estimate)
             self._run_again(trial, world, teller)
         else:
             _tell_decisions(result, decisions, moments, sink)
@@ -423,7 +427,8 @@ class RecordedRun:
                 expected.append(TaskDecision(record.step, tuple(action.tolist())))
         steps = sum(isinstance(decision, TaskDecision) for decision in expected)
         world = _JournalledWorld(begun, simulated)
-        teller = _Teller(trial, expected, self._moments(trial, steps, clock), sink, None, None)
+        moments = self._moments(trial, steps, clock)
+        teller = _Teller(trial, expected, moments, sink, None, None, self._estimate)
         try:
             self._run_again(trial, world, teller)
         except _EndOfRecords:
@@ -492,8 +497,10 @@ class _Teller:
         sink: FactSink,
         result: TrialResult | None,
         decisions: Decisions | None,
+        estimate_kind: Literal["mean", "most_likely"],
     ) -> None:
         self._trial = trial
+        self._estimate = estimate_kind
         self._expected = expected
         self._moments = moments
         self._sink = sink
@@ -574,7 +581,7 @@ class _Teller:
                 steps=self._steps,
                 result=self._result,
                 belief=belief,
-                estimate=None if belief is None else estimate(belief),
+                estimate=None if belief is None else estimate(belief, self._estimate),
                 true_state=self._true_state,
             )
         )
