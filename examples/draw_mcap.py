@@ -12,6 +12,7 @@ are topics over time::
 from __future__ import annotations
 
 import argparse
+import itertools
 from collections import defaultdict
 from pathlib import Path
 from typing import Any
@@ -22,12 +23,13 @@ mpl.use("agg")
 
 import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib.patches import Polygon
+from matplotlib.patches import Rectangle
 from rosbags.highlevel import AnyReader
 
 BLUE, BLACK, GOLD, GREEN, GREY = "#2F6DB3", "#111111", "#C98A00", "#1E8A4C", "#C9CDD2"
 ENTROPIES = ("#1D3C78", "#E8A317", "#B5342B", "#54B5A6", "#7D3C98", "#9AA05A")
 MARKERS = "os^DvP"
+CORNERS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
 STATUSES = {"standard": "#9FC5E8", "local_recovery": "#F6B26B", "keep_alive": "#B6D7A8"}
 
 
@@ -76,12 +78,18 @@ def last(messages: list[tuple[float, Any]], moment: float) -> Any:
 
 
 def draw_scene(panel: Any, topics: dict[str, list[tuple[float, Any]]], moment: float) -> None:
-    """Draw the x-z plane of the frame map, in which a vertical task stands upright."""
+    """Draw the frame map: from the front (x and z), or a task in the ground's plane from above."""
     frames = Frames(topics, moment)
+    cloud = last(topics["/holdfast/particle_cloud"], moment)
+    frame = cloud.header.frame_id
+    tails = np.array([xyz(pose.position) for pose in cloud.poses])
+    middle = frames.to_map(frame, tails)
+    seen = [0, 1] if np.ptp(middle[:, 2]) < 1e-9 else [0, 2]
+    depth = 3 - sum(seen)
 
     def flat(frame: str, points: np.ndarray) -> np.ndarray:
         """Return points of a frame in the picture."""
-        return frames.to_map(frame, np.atleast_2d(points))[:, [0, 2]]
+        return frames.to_map(frame, np.atleast_2d(points))[:, seen]
 
     places = []
 
@@ -89,12 +97,22 @@ def draw_scene(panel: Any, topics: dict[str, list[tuple[float, Any]]], moment: f
         frame, color = marker.header.frame_id, marker.color
         center, scale = xyz(marker.pose.position), marker.scale
         if marker.ns == "obstacle":
-            corners = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * 0.5
-            points = np.column_stack([corners * [scale.x, scale.y], np.zeros(4)])
-            panel.add_patch(Polygon(flat(frame, points + center), facecolor=GREY, zorder=1))
+            corners = frames.to_map(frame, center + 0.5 * CORNERS * xyz(scale))
+            low, high = corners.min(axis=0), corners.max(axis=0)
+            # Of obstacles in space, those that the plane of the belief's middle cuts.
+            if low[depth] <= middle[:, depth].mean() <= high[depth]:
+                panel.add_patch(Rectangle(low[seen], *(high - low)[seen], facecolor=GREY, zorder=1))
+        elif marker.ns == "body":
+            corners = flat(frame, center + 0.5 * CORNERS * xyz(scale))
+            for one, other in itertools.combinations(range(8), 2):
+                if (CORNERS[one] != CORNERS[other]).sum() == 1:
+                    panel.plot(*corners[[one, other]].T, color=(color.r, color.g, color.b),
+                               linewidth=1.2, zorder=5)  # fmt: skip
+            places.append(corners)
         elif marker.ns == "goal":
             panel.plot(*flat(frame, center).T, "*", color=GREEN, markersize=13, label="goal",
                        linestyle="", zorder=6)  # fmt: skip
+            places.append(flat(frame, center) - 1.0)
         elif marker.points:
             points = flat(frame, np.array([xyz(point) for point in marker.points]))
             panel.plot(*points.T, color=(color.r, color.g, color.b), linewidth=1.6, zorder=5)
@@ -110,9 +128,7 @@ def draw_scene(panel: Any, topics: dict[str, list[tuple[float, Any]]], moment: f
         places.append(points)
         panel.plot(*points.T, color=color, linestyle=style,
                    linewidth=1.3, label=label, zorder=3)  # fmt: skip
-    cloud = last(topics["/holdfast/particle_cloud"], moment)
     frame = cloud.header.frame_id
-    tails = np.array([xyz(pose.position) for pose in cloud.poses])
     heads = np.array([rotate(pose.orientation, np.array([[0.3, 0.0, 0.0]]))[0]
                       for pose in cloud.poses])  # fmt: skip
     starts, ends = flat(frame, tails), flat(frame, tails + heads)
@@ -138,10 +154,10 @@ def draw_scene(panel: Any, topics: dict[str, list[tuple[float, Any]]], moment: f
             panel.text(*place, marker.text, color=GOLD, ha="center", weight="bold", zorder=8)
     panel.set_aspect("equal")
     panel.set_xlabel("map x (m)")
-    panel.set_ylabel("map z (m)")
+    panel.set_ylabel(f"map {'xyz'[seen[1]]} (m)")
     shown = np.concatenate(places)
     panel.set_xlim(shown[:, 0].min() - 0.5, shown[:, 0].max() + 0.5)
-    panel.set_ylim(min(shown[:, 1].min() - 0.5, -1.5), shown[:, 1].max() + 0.5)
+    panel.set_ylim(shown[:, 1].min() - 0.5, shown[:, 1].max() + 0.5)
     panel.legend(loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=2, frameon=False)
 
 
@@ -150,14 +166,15 @@ def draw_topics(
 ) -> None:
     """Draw what is sensed, how sure the belief is, and who decides, over time."""
     entropies, deviation, sensed, waits = panels
-    labels = topics["/holdfast/entropies"][0][1].layout.dim[0].label.split(", ")
+    labels = topics["/holdfast/entropies"][0][1].layout.dim[0].label.split("; ")
     times = [time - begin for time, _ in topics["/holdfast/entropies"]]
     values = np.array([message.data for _, message in topics["/holdfast/entropies"]])
     for index, label in enumerate(labels):
         style = {"color": ENTROPIES[index % 6], "marker": MARKERS[index % 6]}
         entropies.plot(times, values[:, index], markersize=3, linewidth=0.7, label=label, **style)
     entropies.set_title("/holdfast/entropies (nats)", loc="left")
-    entropies.legend(loc="lower right", bbox_to_anchor=(1, 0.98), ncols=6, frameon=False)
+    entropies.legend(loc="lower right", bbox_to_anchor=(1, 0.98), ncols=6, frameon=False,
+                     columnspacing=0.8, handletextpad=0.3)  # fmt: skip
 
     estimates = topics["/holdfast/estimate"]
     for row, (label, color) in enumerate((("x", BLUE), ("y", GREEN))):
@@ -189,6 +206,8 @@ def draw_topics(
             waits.axvspan(time, end, color=STATUSES[status], linewidth=0,
                           label=None if status in shown else status)  # fmt: skip
             shown.add(status)
+    if not shown:
+        waits.text(0.5, 0.5, "no service decided", ha="center", transform=waits.transAxes)
     if asked:
         waits.plot(*zip(*asked, strict=True), ".", color=BLACK, markersize=4)
         waits.set_yscale("symlog", linthresh=1.0)

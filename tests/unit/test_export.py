@@ -267,7 +267,7 @@ class TestReadBack:
             assert stamp_ns(cloud.data.header) == cloud.time_ns
             particle, coordinates = table.data.layout.dim
             assert (particle.label, particle.size) == ("particle", 25)
-            assert coordinates.label.endswith(", weight")
+            assert coordinates.label.endswith("; weight")
             rows = np.array(table.data.data).reshape(particle.size, coordinates.size)
             assert np.array_equal(rows, np.column_stack([belief.states, belief.weights]))
 
@@ -617,7 +617,7 @@ class TestOwnCode:
         tables = of_topic(messages, "/holdfast/belief")
         clouds = of_topic(messages, "/holdfast/particle_cloud")
         assert len(tables) > 40
-        assert tables[0].data.layout.dim[1].label == "z (m), charge, weight"
+        assert tables[0].data.layout.dim[1].label == "z (m); charge; weight"
         if positions is None:
             assert "does not say which coordinates of its state are a pose" in said.stderr
             assert not clouds

@@ -47,8 +47,8 @@ _NS_PER_S = 1_000_000_000
 _BAG_VERSION: Final = 8
 """Of rosbag2's metadata: the last one whose qualities of service Humble's rosbag2 reads as well."""
 
-_PATH_GROWTH = 10
-"""A path is written anew when it is longer by this part of itself: all of them together take ten
+_PATH_GROWTH = 20
+"""A path is written anew when it is longer by this part of itself: all of them together take twenty
 times its length, not the square of it."""
 
 _LEVELS = {"DEBUG": 10, "INFO": 20, "WARN": 30, "ERROR": 40}
@@ -193,7 +193,7 @@ class McapSink:
         self._number(now, "/holdfast/sensing_action", "Int32", fact.sensing_action)
         self._write(now, "/holdfast/sensing_action_label", "std_msgs/msg/String", data=label)
         if fact.entropies is not None:
-            self._array(now, "/holdfast/entropies", fact.entropies, ", ".join(self._actions))
+            self._array(now, "/holdfast/entropies", fact.entropies, "; ".join(self._actions))
         if self._layout is not None and fact.before is not None:
             markers = sensing_markers(
                 self._problem, self._layout, TASK_FRAME, fact.before, fact.sensing_action
@@ -223,7 +223,7 @@ class McapSink:
         self._state(now, fact.belief, fact.estimate, fact.true_state)
         labels = self._labels if len(fact.action) == len(self._labels) else None
         self._array(now, "/holdfast/task_action", fact.action,
-                    "action" if labels is None else ", ".join(labels))  # fmt: skip
+                    "action" if labels is None else "; ".join(labels))  # fmt: skip
         if fact.reward is not None:
             self._number(now, "/holdfast/reward", "Float64", fact.reward)
         values = {} if fact.reward is None else {"reward": fact.reward}
@@ -275,7 +275,7 @@ class McapSink:
         self._belief(now, belief)
         frames: dict[str, FloatArray] = {}
         if belief is not None and estimate is not None:
-            self._array(now, "/holdfast/state_estimate", estimate, ", ".join(self._labels))
+            self._array(now, "/holdfast/state_estimate", estimate, "; ".join(self._labels))
             if self._layout is not None:
                 pose = frames[ESTIMATE_FRAME] = self._layout.poses(estimate)
                 covariance = self._layout.covariance(belief).reshape(-1)
@@ -289,7 +289,7 @@ class McapSink:
                     ),
                 )
         if true_state is not None:
-            self._array(now, "/holdfast/true_state", true_state, ", ".join(self._labels))
+            self._array(now, "/holdfast/true_state", true_state, "; ".join(self._labels))
             if self._layout is not None:
                 pose = frames[TRUTH_FRAME] = self._layout.poses(true_state)
                 self._write(
@@ -310,7 +310,7 @@ class McapSink:
             return
         self._belief_written = belief
         table = np.column_stack([belief.states, belief.weights])
-        self._array(now, "/holdfast/belief", table, ", ".join([*self._labels, "weight"]))
+        self._array(now, "/holdfast/belief", table, "; ".join([*self._labels, "weight"]))
         if self._layout is not None:
             self._write(
                 now,
