@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import socket
 import sys
@@ -12,7 +13,13 @@ import pytest
 
 from holdfast import files
 from holdfast.cli import main
-from holdfast.files import read_bounded
+from holdfast.files import (
+    OutputError,
+    directory_beside,
+    move_into_place,
+    read_bounded,
+    require_free,
+)
 
 
 def test_a_file(tmp_path: Path) -> None:
@@ -106,3 +113,58 @@ def test_a_pipe_is_no_journal(
         assert "is a pipe or device, not a journal" in capsys.readouterr().err
     finally:
         os.close(held)
+
+
+class TestMadeBesideItsPlace:
+    def test_it_appears_whole(self, tmp_path: Path) -> None:
+        place = tmp_path / "place"
+        with directory_beside(place) as growing:
+            (growing / "made").mkdir()
+            (growing / "made" / "file").write_text("whole")
+            assert [path.name for path in tmp_path.iterdir()] == [growing.name]
+            move_into_place(growing / "made", place)
+        assert [path.name for path in tmp_path.iterdir()] == ["place"]
+        assert (place / "file").read_text() == "whole"
+
+    @pytest.mark.parametrize("error", [KeyboardInterrupt(), ValueError("mine")])
+    def test_or_not_at_all(self, error: BaseException, tmp_path: Path) -> None:
+        with pytest.raises(type(error)), directory_beside(tmp_path / "place") as growing:
+            (growing / "file").write_text("half")
+            raise error
+        assert list(tmp_path.iterdir()) == []
+
+    def test_what_the_system_refuses(self, tmp_path: Path) -> None:
+        place = tmp_path / "place"
+        with (
+            pytest.raises(OutputError, match="place: cannot be written: No space left on device"),
+            directory_beside(place),
+        ):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        with (
+            pytest.raises(OutputError, match="place: cannot be written: No such file"),
+            directory_beside(tmp_path / "nowhere" / "place"),
+        ):
+            pass
+        (tmp_path / "full").mkdir()
+        (tmp_path / "full" / "file").touch()
+        (tmp_path / "made").mkdir()
+        with pytest.raises(OutputError, match="full: cannot be written: Directory not empty"):
+            move_into_place(tmp_path / "made", tmp_path / "full")
+
+    @pytest.mark.parametrize("directory", [False, True])
+    def test_a_place_must_be_free(self, directory: bool, tmp_path: Path) -> None:
+        require_free(tmp_path / "free", "--out", directory=directory)
+        (tmp_path / "file").touch()
+        (tmp_path / "link").symlink_to("nothing")
+        for name in ("file", "link"):
+            with pytest.raises(OutputError, match=rf"{name}: is there already; .* \(--out\)"):
+                require_free(tmp_path / name, "--out", directory=directory)
+        with pytest.raises(OutputError, match=r"holds files already|is there already"):
+            require_free(tmp_path, "--out", directory=directory)
+        with pytest.raises(OutputError, match="there is no directory"):
+            require_free(tmp_path / "no" / "place", "--out", directory=directory)
+        with pytest.raises(OutputError, match=r"there is no directory|Not a directory"):
+            require_free(tmp_path / "file" / "place", "--out", directory=directory)
+        (tmp_path / "empty").mkdir()
+        if directory:
+            require_free(tmp_path / "empty", "--out", directory=True)

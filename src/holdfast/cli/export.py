@@ -25,6 +25,9 @@ if TYPE_CHECKING:
 __all__ = ["export"]
 
 _MIN_RATE_HZ, _MAX_RATE_HZ = 0.001, 10_000.0
+_NOTE = "decided as recorded"
+"""What is to be said of the trials that are written."""
+
 _RANGE = re.compile(r"(\d{1,9}):(\d{1,9})")
 
 
@@ -191,11 +194,11 @@ def _write(
                     files.enter_context(CsvSink(directory, recorded.configuration.problem))
                 )
                 made.append((directory, tables))
-            line.start(f"{counted(len(trials), 'trial')} of {recorded.path}", 0, "")
+            line.start(f"{counted(len(trials), 'trial')} of {recorded.path}", 0, _NOTE)
             try:
                 told = recorded.tell(trials, Facts(sinks), rate_hz)
                 for finished, _ in enumerate(told, start=1):
-                    line.show(finished, "")
+                    line.show(finished, _NOTE)
             except (HoldfastError, KeyboardInterrupt):
                 raise
             except BaseException as error:
