@@ -8,6 +8,7 @@ import io
 import itertools
 import json
 import resource
+import shutil
 import signal
 import sqlite3
 from collections import defaultdict
@@ -678,6 +679,27 @@ class TestOwnCode:
         assert not of_topic(messages, "/holdfast/truth")
         assert len(of_topic(messages, "/holdfast/task_action")) == 12
         assert len(of_topic(messages, "/holdfast/estimate")) == (13 if kept else 5)
+
+    def test_a_run_that_was_copied_from_the_robot(
+        self, capsys: pytest.CaptureFixture[str], tmp_path: Path
+    ) -> None:
+        """Its world is not here, and the problem lies elsewhere: beside the run, say."""
+        robot, desk = tmp_path / "robot", tmp_path / "desk"
+        robot.mkdir()
+        desk.mkdir()
+        (robot / "world.py").write_text(OWN_WORLD.replace("(1, 5)", "None"))
+        (robot / "cart.py").write_text(OWN_PROBLEM.replace("POSE", 'pose = ("z",)'))
+        text = PEG.replace("peg_in_hole_2d", "cart:Cart")
+        make_run(capsys, robot, text, "--environment", "world:World", "--rate", "5000")
+        (robot / "run").rename(desk / "run")
+        (robot / "cart.py").rename(desk / "cart.py")
+        shutil.rmtree(robot)
+        said = export(capsys, desk, "--csv", "tables", "--mcap", "run.mcap")
+        assert "note" not in said.stderr
+        assert len(rows_of(desk / "tables" / "steps.csv")) == 14
+        (desk / "cart.py").unlink()
+        said = export(capsys, desk, "--csv", "again", code=2)
+        assert "cart" in said.stderr
 
     def test_code_that_fails_now(self, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
         (tmp_path / "cart.py").write_text(OWN_PROBLEM.replace("POSE", ""))

@@ -292,6 +292,7 @@ class RecordedRun:
     ----------
     path : Path
     configuration : Configuration
+        What decides; it names no services and no environment, for nobody is asked again.
     trials : tuple of int
         All trials that have facts, in order: those that are finished, and the one that was begun.
     unfinished : int or None
@@ -314,8 +315,7 @@ class RecordedRun:
         with ExitStack() as stack:
             self._journal = stack.enter_context(Journal.read(path))
             self._meta = self._journal.meta()
-            self.configuration = _configuration(self._meta, path)
-            self.world_is_simulated = self.configuration.environment.object is None
+            self.configuration, self.world_is_simulated = _configuration(self._meta, path)
             self._estimate = self.configuration.planning.particle_filter.estimate
             self._begun = self._journal.unfinished()
             self.unfinished = None if self._begun is None else self._begun.trial
@@ -885,9 +885,20 @@ def _places(run: Path) -> tuple[Path, Path]:
     return run.parent, run
 
 
-def _configuration(meta: Mapping[str, str], path: Path) -> Configuration:
+def _configuration(meta: Mapping[str, str], path: Path) -> tuple[Configuration, bool]:
+    """Return what decided in a run, and whether its world was simulated.
+
+    A run may have been copied from the robot: its world, keys and directories need not be here.
+    """
     from holdfast.yaml_document import read
 
     text = meta.get("configuration", "")
-    plain = read(text.encode(), f"the configuration in {path}").data
-    return Configuration.from_plain({"path": str(path), "configuration": plain})
+    plain = dict(read(text.encode(), f"the configuration in {path}").data)
+    environment = plain.pop("environment", None) or {}
+    plain.pop("offload", None)
+    directory = plain.get("problem_directory")
+    if directory is not None and not Path(directory).is_dir():
+        # Then its module is looked for beside the journal and in the current directory.
+        del plain["problem_directory"]
+    configuration = Configuration.from_plain({"path": str(path), "configuration": plain})
+    return configuration, environment.get("object") is None
