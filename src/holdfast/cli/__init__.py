@@ -17,7 +17,13 @@ from __future__ import annotations
 import os
 import signal
 import sys
+from collections.abc import Sequence
 from types import TracebackType
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from holdfast.service.beside import Beside
+    from holdfast.service.options import Options
 
 __all__ = ["main"]
 
@@ -44,7 +50,7 @@ def main() -> None:
         if arguments[:1] == ["serve"]:
             from holdfast.service.process import main as serve
 
-            sys.exit(serve(arguments[1:]))
+            sys.exit(serve(arguments[1:], _make_beside))
         from holdfast.cli.application import run_application
 
         end_with_the_reader()
@@ -61,6 +67,12 @@ def main() -> None:
         from holdfast.cli.endings import EXIT_SIGNAL, signal_of
 
         sys.exit(EXIT_SIGNAL + signal_of(interruption))
+
+
+def _make_beside(options: Options) -> Sequence[Beside]:
+    from holdfast.cli.ros_services import make_ros_services
+
+    return make_ros_services(options)
 
 
 def _tell_defect(

@@ -46,6 +46,11 @@ class Options(argparse.Namespace):
     max_sessions_per_robot: int | None
     problem: list[str]
     problem_directory: Path | None
+    configuration: Path | None
+    ros2_domain: int | None
+    ros2_name: str
+    ros2_router: str | None
+    ros2_listen: str | None
     until_stdin_closes: bool
     supervised: tuple[int, int] | None
     sockets: list[int]
@@ -59,6 +64,11 @@ class Options(argparse.Namespace):
         ending = [signal.SIGINT, signal.SIGTERM, *([] if self.tls else [signal.SIGHUP])]
         return [number for number in ending if signal.getsignal(number) is not signal.SIG_IGN]
 
+    @property
+    def has_beside(self) -> bool:
+        """Whether something else is to be offered, besides the service."""
+        return self.ros2_domain is not None
+
 
 def parse_options(arguments: Sequence[str]) -> Options:
     """Read what follows ``serve`` on the command line.
@@ -69,18 +79,46 @@ def parse_options(arguments: Sequence[str]) -> Options:
         If an option cannot be used, or two do not go together.
     """
     options = _parser().parse_args(arguments, Options())
+    _check_beside(options)
     if options.processes > 1:
         for option, given in (
             ("--connect", options.connect),
+            ("--ros2-domain", options.ros2_domain is not None),
             ("--until-stdin-closes", options.until_stdin_closes),
         ):
             if given:
                 raise InvalidValueError(
                     f"{option}: goes with one process only, not with --processes"
                 )
-    if not options.listen and not options.connect:
+    if not options.listen and not options.connect and not options.has_beside:
         options.listen = [f"{'tls' if options.tls else 'tcp'}/{_DEFAULT_PLACE}"]
     return options
+
+
+def _check_beside(options: Options) -> None:
+    """Refuse options of what is offered besides the service that are given without it, or lack."""
+    if options.ros2_domain is None:
+        for option, given in (
+            ("--ros2-name", options.ros2_name != DEFAULT_NAME),
+            ("--ros2-router", options.ros2_router),
+            ("--ros2-listen", options.ros2_listen),
+        ):
+            if given:
+                raise InvalidValueError(f"{option}: goes with --ros2-domain only")
+    if options.ros2_router and options.ros2_listen:
+        raise InvalidValueError(
+            "--ros2-router and --ros2-listen do not go together: nodes are reached through a "
+            "router, or they connect to this service"
+        )
+    if options.has_beside and options.configuration is None:
+        raise InvalidValueError(
+            "--ros2-domain: --configuration is missing; it says for which problem and with which "
+            "settings this service decides in ROS"
+        )
+    if options.configuration is not None and not options.has_beside:
+        raise InvalidValueError(
+            "--configuration: goes with --ros2-domain only; other robots bring theirs along"
+        )
 
 
 def options_of_each(arguments: Sequence[str]) -> list[str]:
@@ -124,6 +162,8 @@ def checked_endpoints(options: Options) -> list[Endpoint]:
                 )
             if listens:
                 listen.append(endpoint)
+    _check_ros2_endpoint("--ros2-router", options.ros2_router, options)
+    _check_ros2_endpoint("--ros2-listen", options.ros2_listen, options)
     for option, address in (("--health", options.health), ("--metrics", options.metrics)):
         for endpoint in listen:
             if address is not None and _is_same_port(endpoint, address):
@@ -132,6 +172,28 @@ def checked_endpoints(options: Options) -> list[Endpoint]:
                     f"one of their own"
                 )
     return listen
+
+
+def _check_ros2_endpoint(option: str, text: str | None, options: Options) -> None:
+    from holdfast.transport.endpoints import parse_endpoint
+
+    if text is None:
+        return
+    try:
+        endpoint = parse_endpoint(text)
+    except TransportError as error:
+        raise TransportError(f"{option}: {error}") from None
+    if endpoint.protocol != "tcp" or not endpoint.port:
+        raise TransportError(
+            f"{option}: endpoint {endpoint}: rmw_zenoh is spoken over tcp, at a port that is "
+            f"given, as in tcp/localhost:7447"
+        )
+    if not (endpoint.is_loopback or options.insecure):
+        raise TransportError(
+            f"{option}: endpoint {endpoint}: it is on other machines or they can reach it, and "
+            f"nobody there has to prove who he is; use one of this machine alone, as in "
+            f"tcp/localhost:7447, or say --insecure"
+        )
 
 
 def _is_same_port(endpoint: Endpoint, address: HttpAddress) -> bool:
@@ -275,6 +337,35 @@ def _parser() -> _Parser:
         action="store_true",
         help="stop when standard input ends, as it does when the process that started this one "
         "dies",
+    )
+    add(
+        "--configuration",
+        type=Path,
+        metavar="FILE",
+        help="the configuration by which this service decides in ROS, whose nodes bring none along",
+    )
+    add(
+        "--ros2-domain",
+        type=_whole_number(0, 232),
+        metavar="N",
+        help="offer a service to ROS 2 nodes of this domain that use rmw_zenoh, too; it needs no "
+        "ROS (pip install 'holdfast[ros]'). Then nothing else listens here unless --listen says so",
+    )
+    add(
+        "--ros2-name",
+        default=DEFAULT_NAME,
+        metavar="NAME",
+        help=f"name of that service in ROS 2 (default: {DEFAULT_NAME})",
+    )
+    add(
+        "--ros2-router",
+        metavar="ENDPOINT",
+        help="where rmw_zenohd listens (default: tcp/localhost:7447); it may come later, and go",
+    )
+    add(
+        "--ros2-listen",
+        metavar="ENDPOINT",
+        help="where nodes of ROS 2 can connect, instead of a router",
     )
     # For the processes that a supervisor starts: its number, and the descriptors that they inherit.
     add("--supervised", type=_whole_numbers, help=argparse.SUPPRESS)

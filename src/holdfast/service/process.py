@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
     from holdfast.runtime.logs import EventLog
     from holdfast.runtime.service_manager import ServiceManager
+    from holdfast.service.beside import Beside, MakeBeside
     from holdfast.service.metrics import DecisionTimes, Report
     from holdfast.service.own_credentials import ServiceCredentials
     from holdfast.service.shell import ServiceShell
@@ -40,16 +41,22 @@ _SWITCH_INTERVAL_S = 0.0005
 
 _BETWEEN_COLLECTIONS = 10_000
 _CLOSE_TIMEOUT_S = 0.7
+_LOOK_S = 0.01
 _STDIN = 0
 
+_OFFERED = ("health", "metrics", "ros2")
+"""What the ready line may say that is offered, and where."""
 
-def main(arguments: Sequence[str]) -> int:
+
+def main(arguments: Sequence[str], make_beside: MakeBeside | None = None) -> int:
     """Run ``holdfast serve`` until it is told to stop.
 
     Parameters
     ----------
     arguments : sequence of str
         What follows ``serve`` on the command line.
+    make_beside : callable or None
+        Makes what the options ask for besides the service.
 
     Returns
     -------
@@ -71,7 +78,7 @@ def main(arguments: Sequence[str]) -> int:
         return _serve_with_several(options, arguments)
     if options.supervised is not None:
         return _serve_supervised(options, *options.supervised)
-    return _serve(options)
+    return _serve(options, make_beside=make_beside)
 
 
 def _serve_with_several(options: Options, arguments: Sequence[str]) -> int:
@@ -137,7 +144,11 @@ def _serve_supervised(options: Options, parent: int, descriptor: int) -> int:
         return 2
 
 
-def _serve(options: Options, supervised: Supervised | None = None) -> int:
+def _serve(
+    options: Options,
+    supervised: Supervised | None = None,
+    make_beside: MakeBeside | None = None,
+) -> int:
     if options.until_stdin_closes and sys.stdin is None:
         raise InvalidValueError("--until-stdin-closes: this process has no standard input")
     # In the order in which they are needed, so that a mistake in the options is told at once.
@@ -146,6 +157,7 @@ def _serve(options: Options, supervised: Supervised | None = None) -> int:
 
     if credentials is None:
         _import_without_openssl()
+    others = make_beside(options) if make_beside and options.has_beside else ()
 
     from holdfast.runtime.descriptors import NEEDED, allow_descriptors
     from holdfast.transport.service_end import MAX_LINKS, MAX_UNKNOWN, StreamServiceTransport
@@ -164,6 +176,7 @@ def _serve(options: Options, supervised: Supervised | None = None) -> int:
         max_links=min(MAX_LINKS, max(allowed // 4, allowed - beside)),
         tls=None if credentials is None else credentials.files,
         on_event=lambda event, **fields: shell.note(event, **fields),
+        needs_endpoint=not others,
     )
 
     import asyncio
@@ -199,11 +212,22 @@ def _serve(options: Options, supervised: Supervised | None = None) -> int:
     sys.setswitchinterval(_SWITCH_INTERVAL_S)
     try:
         status = asyncio.run(
-            _run(options, boot, transport, credentials, shell, events, times, supervised, manager)
+            _run(
+                options,
+                boot,
+                transport,
+                credentials,
+                shell,
+                events,
+                times,
+                supervised,
+                manager,
+                others,
+            )
         )
     finally:
         events.close()
-    if shell.is_computing:
+    if shell.is_computing or any(each.is_busy for each in others):
         # A thread that comes back from foreign code while the interpreter goes down would abort
         # the process.
         _end_at_once(status)
@@ -220,6 +244,7 @@ async def _run(
     times: DecisionTimes,
     supervised: Supervised | None,
     manager: ServiceManager,
+    others: Sequence[Beside],
 ) -> int:
     """Serve until there is a reason to stop; return the exit status."""
     import asyncio
@@ -245,6 +270,23 @@ async def _run(
         credentials.reload(transport, events)
         manager.ready()
 
+    def note(event: str, /, **fields: object) -> None:
+        """Log an event, from any thread."""
+        with contextlib.suppress(RuntimeError):  # the loop is closed
+            loop.call_soon_threadsafe(functools.partial(shell.note, event, **fields))
+
+    async def drain_others() -> None:
+        for each in others:
+            each.take_no_more()
+        while any(each.is_busy for each in others):
+            await asyncio.sleep(_LOOK_S)
+
+    async def drain() -> None:
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(
+                asyncio.gather(shell.drain(options.drain_s), drain_others()), options.drain_s
+            )
+
     def status() -> str:
         sessions = shell.statistics().sessions
         return why_not_ready() or f"serving, {sessions} session{'' if sessions == 1 else 's'}"
@@ -258,6 +300,9 @@ async def _run(
             await shell.start()
             if credentials is not None:
                 credentials.watch(loop, transport, events)
+            offered: dict[str, object] = {}
+            for each in others:
+                offered |= each.start(note)
             if options.until_stdin_closes:
                 _watch_stdin(loop, shell)
             # What was loaded stays; the collector need never look at it again.
@@ -266,7 +311,7 @@ async def _run(
             gc.enable()
             is_serving = True
             if supervised is None:
-                where: dict[str, object] = {"boot": boot, **watched}
+                where: dict[str, object] = {"boot": boot, **watched, **offered}
                 where["listen"] = list(transport.endpoints)
                 if options.connect:
                     where["connect"] = options.connect
@@ -282,11 +327,13 @@ async def _run(
             else:
                 supervised.not_ready()
             if reason == signal.SIGTERM.name:
-                draining = loop.create_task(shell.drain(options.drain_s))
+                draining = loop.create_task(drain())
                 for number in options.ending_signals:
                     loop.add_signal_handler(number, draining.cancel)
                 await asyncio.wait((draining,))
         finally:
+            for each in others:
+                each.close(_CLOSE_TIMEOUT_S)
             await shell.close(_CLOSE_TIMEOUT_S)
             if supervised is not None:
                 supervised.close()
@@ -408,7 +455,7 @@ def _say_ready(options: Options, where: Mapping[str, object]) -> None:
     ]
     if "processes" in where:
         parts[-1] += f" with {where['processes']} processes"
-    parts += [f"offers {what} at {where[what]}" for what in ("health", "metrics") if what in where]
+    parts += [f"offers {what} at {where[what]}" for what in _OFFERED if what in where]
     # Nobody may be reading: that is no reason not to serve.
     with contextlib.suppress(OSError, ValueError):
         sys.stdout.write(printable(f"{options.name} {', '.join(parts)}\n"))

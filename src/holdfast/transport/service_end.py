@@ -177,10 +177,11 @@ class StreamServiceTransport:
         max_links: int | None = None,
         tls: TlsFiles | None = None,
         on_event: Callable[..., None] | None = None,
+        needs_endpoint: bool = True,
     ) -> None:
         check_name("name of a service", name)
         check_name("boot of a service", boot)
-        if not listen and not connect:
+        if needs_endpoint and not listen and not connect:
             raise TransportError(
                 f"service {name} has no endpoint: give one, as in tcp/127.0.0.1:7447"
             )

@@ -1,0 +1,87 @@
+"""What ``holdfast serve`` offers to ROS besides its own service; nothing is imported unless asked.
+
+The service's own package knows nothing of ROS, so the command line brings the two together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING
+
+from holdfast.errors import InvalidValueError
+
+if TYPE_CHECKING:
+    from holdfast.ros.active_sensing import ActiveSensing
+    from holdfast.service.beside import Beside
+    from holdfast.service.options import Options
+
+__all__ = ["make_ros_services"]
+
+
+def make_ros_services(options: Options) -> Sequence[Beside]:
+    """Return the services in ROS that the options of ``holdfast serve`` ask for.
+
+    Raises
+    ------
+    HoldfastError
+        If the configuration or an option cannot be used, or a library is missing.
+    """
+    from holdfast.configuration import load
+    from holdfast.ros.active_sensing import ActiveSensing
+
+    assert options.configuration is not None
+    configuration = load(options.configuration)
+    services: list[Beside] = []
+    if options.ros2_domain is not None:
+        services.append(_Ros2(ActiveSensing(configuration), options))
+    return services
+
+
+class _Ros2:
+    """The service in ROS 2, with rmw_zenoh's wire."""
+
+    def __init__(self, service: ActiveSensing, options: Options) -> None:
+        from holdfast.ros.ros2_wire import (
+            DEFAULT_ROUTER,
+            Ros2Server,
+            check_service_name,
+            zenoh_module,
+        )
+
+        assert options.ros2_domain is not None
+        name = check_service_name(options.ros2_name, "--ros2-name")
+        try:
+            zenoh_module()
+        except InvalidValueError as error:
+            raise InvalidValueError(f"--ros2-domain: {error}") from None
+        endpoint = options.ros2_listen or options.ros2_router or DEFAULT_ROUTER
+        via = "listening on" if options.ros2_listen else "router"
+        self._where = f"/{name} in domain {options.ros2_domain} ({via} {endpoint})"
+        self._on_event: Callable[..., None] | None = None
+        self._server = Ros2Server(
+            service,
+            name,
+            options.ros2_domain,
+            endpoint,
+            listens=options.ros2_listen is not None,
+            on_event=self._tell,
+        )
+
+    @property
+    def is_busy(self) -> bool:
+        return self._server.is_busy
+
+    def start(self, on_event: Callable[..., None]) -> Mapping[str, str]:
+        self._on_event = on_event
+        self._server.start()
+        return {"ros2": self._where}
+
+    def take_no_more(self) -> None:
+        self._server.take_no_more()
+
+    def close(self, timeout_s: float) -> None:
+        self._server.close(timeout_s)
+
+    def _tell(self, name: str, **fields: object) -> None:
+        if self._on_event is not None:
+            self._on_event(name, **fields)
