@@ -61,6 +61,7 @@ test-deploy-slow: $(INSTALLED_DEV) ## those of them that take minutes
 
 test-ros: $(INSTALLED_DEV) ## a real ROS 1 and ROS 2, which tests/ros/set_up_ros2 installs the first time
 	tests/ros/set_up_ros2 $(ROS2) $(PYTHON)
+	tests/ros/set_up_peers $(ROS2) $(PYTHON)
 	ROS2=$(ROS2) $(BIN)/pytest -q -m "ros and not slow" -n 2 --dist loadfile tests/ros
 
 fuzz: $(INSTALLED_DEV) ## 1,000,000 hostile messages to a live service; some 15 minutes

@@ -56,7 +56,9 @@ def main(role: str, name: str, domain: int, port: int, definitions: str) -> None
         session.register_message_type(text, f"holdfast_interfaces/msg/{each}")
     # It takes a name without a package for one of the folder srv.
     text = (package / "srv" / "ActiveSensing.srv").read_text()
-    parts = text.replace("\nPlanningState ", "\nholdfast_interfaces/PlanningState ").split("\n---\n")
+    parts = text.replace("\nPlanningState ", "\nholdfast_interfaces/PlanningState ").split(
+        "\n---\n"
+    )
     where = {
         "domain_id": domain,
         "router_ip": "127.0.0.1",
