@@ -6,6 +6,7 @@ client. They know nothing of holdfast: keys, hashes, attachments and serialisati
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import subprocess
@@ -16,13 +17,13 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 import pytest
 from tests.ports import free_port
 from tests.ros.conftest import ROOT, left_out
 from tests.unit.test_active_sensing import EXAMPLE, configuration, decisions, in_process
 
+from holdfast.configuration import Configuration
 from holdfast.ros.active_sensing import (
     ActiveSensing,
     Answer,
@@ -31,7 +32,7 @@ from holdfast.ros.active_sensing import (
     checked_state,
     no_state,
 )
-from holdfast.ros.client import ActiveSensingClient
+from holdfast.ros.client import ActiveSensingClient, Service
 from holdfast.ros.messages import type_hash
 from holdfast.ros.ros2_wire import Ros2Service
 from holdfast.runtime.environment import SimulatedEnvironment
@@ -105,23 +106,27 @@ def router(port: int) -> Iterator[None]:
 
 
 @contextmanager
-def service(*options: str) -> Iterator[subprocess.Popen[str]]:
-    """Run ``holdfast serve`` with 50 particles."""
+def service(way: str, port: int) -> Iterator[None]:
+    """Run ``holdfast serve``, which listens or is there through a router."""
     # fmt: off
     with running(
         sys.executable, "-m", "holdfast", "serve", "--ros2-domain", str(DOMAIN),
-        "--until-stdin-closes", *options,
+        f"--ros2-{way}", f"tcp/127.0.0.1:{port}", "--configuration", EXAMPLE,
+        "--until-stdin-closes",
     ) as process:
         assert "offers ros2" in line_of(process)
-        yield process
+        yield
     # fmt: on
 
 
-@pytest.fixture
-def settings_file(tmp_path: Path) -> Path:
-    path = tmp_path / "settings.yaml"
-    path.write_text(EXAMPLE.read_text())
-    return path
+@contextmanager
+def offered(way: str, port: int) -> Iterator[None]:
+    """Run the service, and a router if it needs one."""
+    with contextlib.ExitStack() as stack:
+        if way == "router":
+            stack.enter_context(router(port))
+        stack.enter_context(service(way, port))
+        yield
 
 
 def array(numbers: list[float]) -> np.ndarray:
@@ -146,7 +151,11 @@ def state_fields(state: Any) -> dict[str, Any]:
 def state_of(fields: dict[str, Any]) -> Any:
     belief = fields["belief"]
     return checked_state(
-        *(fields[key] for key in ("seed", "trial", "step", "stage", "sensed")),
+        fields["seed"],
+        fields["trial"],
+        fields["step"],
+        fields["stage"],
+        fields["sensed"],
         belief["state_size"],
         array(belief["states"]),
         array(belief["weights"]),
@@ -200,27 +209,35 @@ class Nobody:
         pass
 
 
-def trial_of(client_of: Any, settings: Any) -> list[Any]:
+def trial_of(way: Service, settings: Configuration) -> list[Any]:
     simulator = settings.simulator
-    with ActiveSensingClient(client_of, Nobody(), PATIENCE_S) as client:
+    with ActiveSensingClient(way, Nobody(), PATIENCE_S) as client:
         world = SimulatedEnvironment(settings.problem, simulator.seed, TRIAL)
         return decisions(client, world, simulator.seed, TRIAL, simulator.max_steps)
 
 
-@pytest.mark.parametrize("way", ["listens", "router"])
-def test_a_peer_asks_us(peer: str, way: str, peers_python: Path, settings_file: Path) -> None:
+@pytest.mark.parametrize("way", ["listen", "router"])
+def test_a_peer_asks_us(peer: str, way: str, peers_python: Path) -> None:
     port = free_port()
-    where = ["--configuration", str(settings_file)]
-    with (
-        router(port) if way == "router" else running("true"),
-        service(
-            *where, f"--ros2-{'router' if way == 'router' else 'listen'}", f"tcp/127.0.0.1:{port}"
-        ),
-        start_peer(peers_python, peer, "client", port) as process,
-    ):
+    with offered(way, port), start_peer(peers_python, peer, "client", port) as process:
         assert json.loads(line_of(process)) == {"ready": type_hash()}
         settings = configuration(**{"particle_filter.num_particles": 100})
         assert trial_of(ThroughPeer(process), settings) == in_process(settings, TRIAL)
+
+
+@pytest.mark.parametrize("way", ["listen", "router"])
+def test_a_peer_lists_us(way: str, peers_python: Path) -> None:
+    """As ``ros2 service list -t`` would."""
+    port = free_port()
+    with offered(way, port):
+        # fmt: off
+        listed = subprocess.run(
+            [peers_python.with_name("zenoh-ros2"), "--no-daemon", "--domain-id", str(DOMAIN),
+             "--router", f"127.0.0.1:{port}", "--timeout", "5", "service", "list", "-t"],
+            capture_output=True, text=True, timeout=PATIENCE_S, check=True,
+        )
+        # fmt: on
+    assert listed.stdout == f"/{NAME} [holdfast_interfaces/srv/ActiveSensing]\n"
 
 
 def test_a_peer_answers_us(peer: str, peers_python: Path) -> None:
@@ -229,7 +246,6 @@ def test_a_peer_answers_us(peer: str, peers_python: Path) -> None:
     answers = ActiveSensing(settings)
 
     def answer(process: subprocess.Popen[str]) -> None:
-        """Answer what the peer has been asked."""
         assert process.stdin is not None and process.stdout is not None
         for line in process.stdout:
             asked = json.loads(line)
@@ -258,9 +274,9 @@ def test_a_peer_answers_us(peer: str, peers_python: Path) -> None:
         assert json.loads(line_of(process)) == {"ready": type_hash()}
         answering = threading.Thread(target=answer, args=(process,))
         answering.start()
-        service = Ros2Service(NAME, DOMAIN, f"tcp/127.0.0.1:{port}")
+        way = Ros2Service(NAME, DOMAIN, f"tcp/127.0.0.1:{port}")
         try:
-            assert trial_of(service, settings) == in_process(settings, TRIAL)
+            assert trial_of(way, settings) == in_process(settings, TRIAL)
         finally:
             process.kill()
             answering.join()

@@ -407,9 +407,11 @@ class Ros2Server:
         self._takes_requests = False
         if self._worker.ident is not None:
             with contextlib.suppress(queue.Empty):
-                while True:
-                    # Dropped without an answer, which ends it at the other side.
-                    self._requests.get_nowait()
+                while (waiting := self._requests.get_nowait()) is not None:
+                    # Without an answer, which ends it at the other side.
+                    waiting.query.drop()
+                    with self._lock:
+                        self._num_open -= 1
             self._requests.put(None)
             self._worker.join(timeout_s)
         self._session.close()

@@ -10,7 +10,6 @@ import asyncio
 import dataclasses
 import json
 import sys
-import threading
 from dataclasses import dataclass, field
 from typing import Any
 
