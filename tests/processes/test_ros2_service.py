@@ -80,8 +80,8 @@ def router(port: int) -> Any:
 
 
 @contextmanager
-def way_to(port: int, name: str = NAME) -> Iterator[Ros2Service]:
-    way = Ros2Service(name, DOMAIN, f"tcp/127.0.0.1:{port}")
+def way_to(port: int, name: str = NAME, type_hash: str | None = None) -> Iterator[Ros2Service]:
+    way = Ros2Service(name, DOMAIN, f"tcp/127.0.0.1:{port}", type_hash=type_hash)
     try:
         yield way
     finally:
@@ -125,7 +125,7 @@ def test_a_trial_decides_as_in_process_though_the_cloud_is_killed() -> None:
         service("listen", ports[0]) as cloud,
         service("listen", ports[1], "recovery") as _,
         way_to(ports[0]) as way,
-        way_to(ports[1], "recovery") as other_way,
+        way_to(ports[1], "recovery", NO_HASH) as other_way,
     ):
         made = trial(
             way,
@@ -190,6 +190,25 @@ def test_through_a_router_that_comes_later_and_goes_and_comes_again() -> None:
             process.wait()
             with pytest.raises(TransportError, match="has died"):
                 way.ask(BEGIN, 3600.0)
+
+
+def test_robots_of_both_kinds_are_served_by_one_process(tmp_path: Path) -> None:
+    ports = free_port(), free_port()
+    # fmt: off
+    with running(
+        "-m", "holdfast", "serve", "--listen", f"tcp/127.0.0.1:{ports[0]}", "--log", "json",
+        "--ros2-domain", DOMAIN, "--ros2-listen", f"tcp/127.0.0.1:{ports[1]}",
+        "--configuration", EXAMPLE, "--until-stdin-closes",
+        ready=f'"ros2":"/{NAME} in domain {DOMAIN} (listening on tcp/127.0.0.1:{ports[1]})"',
+    ), way_to(ports[1]) as way:
+        done = subprocess.run(
+            [sys.executable, "-m", "holdfast", "run", str(EXAMPLE), "--out", str(tmp_path / "run"),
+             "--service", f"tcp/127.0.0.1:{ports[0]}", "--recovery", "never", "--trials", "1"],
+            capture_output=True, text=True, timeout=PATIENCE_S, check=False,
+        )
+        assert way.ask(BEGIN, PATIENCE_S).error is ErrorCode.OK
+    # fmt: on
+    assert done.returncode == 0, done.stderr
 
 
 def test_it_answers_what_it_owes_and_ends_with_0() -> None:
@@ -291,6 +310,33 @@ def test_what_is_owed_is_answered_and_nothing_new_is_taken() -> None:
         answers.may.set()
         answered = owed.outcome()
         assert isinstance(answered, Answer) and answered.error is ErrorCode.OK
+
+
+def test_a_defect_costs_its_request_alone() -> None:
+    class Defective(ActiveSensing):
+        def answer(self, request: Request) -> Answer:
+            if request.seed == 7:
+                raise KeyError("a defect")
+            return super().answer(request)
+
+    port = free_port()
+    told: list[tuple[str, object]] = []
+    server = Ros2Server(
+        Defective(configuration()),
+        NAME,
+        DOMAIN,
+        f"tcp/127.0.0.1:{port}",
+        listens=True,
+        on_event=lambda name, **fields: told.append((name, fields["reason"])),
+    )
+    server.start()
+    with way_to(port) as way:
+        with pytest.raises(TransportError, match="a defect of the service: KeyError"):
+            way.ask(Request(Kind.INITIALIZE, seed=7), PATIENCE_S)
+        assert way.ask(BEGIN, PATIENCE_S).error is ErrorCode.OK
+    server.close(PATIENCE_S)
+    assert told == [("ros2_failed", "KeyError: 'a defect'")]
+    assert not server.is_busy
 
 
 def test_closing_ends_what_is_asked() -> None:

@@ -24,6 +24,7 @@ import queue
 import re
 import struct
 import threading
+import traceback
 from collections.abc import Callable
 from time import monotonic, time_ns
 from types import ModuleType
@@ -346,7 +347,7 @@ class Ros2Server:
     on_event : callable or None
         Is told what happens, from any thread: ``ros2_waiting`` (``endpoint``, ``reason``) while
         the router is not there, then ``ros2_connected`` (``endpoint``); ``ros2_refused``
-        (``reason``) of a request that is none.
+        (``reason``) of a request that is none; ``ros2_failed`` (``reason``, ``where``) of a defect.
 
     Raises
     ------
@@ -449,6 +450,13 @@ class Ros2Server:
         while (waiting := self._requests.get()) is not None:
             try:
                 self._reply(waiting, self._answer(waiting.query))
+            except Exception as error:  # noqa: BLE001 - else nobody would be answered any more
+                reason = f"{type(error).__name__}: {error}"
+                where = traceback.extract_tb(error.__traceback__)[-1]
+                self._on_event("ros2_failed", reason=reason, where=f"{where.name}:{where.lineno}")
+                with contextlib.suppress(self._zenoh_error):
+                    waiting.query.reply_err(f"a defect of the service: {reason}")
+                    waiting.query.drop()
             finally:
                 with self._lock:
                     self._num_open -= 1

@@ -332,9 +332,11 @@ async def _run(
                     loop.add_signal_handler(number, draining.cancel)
                 await asyncio.wait((draining,))
         finally:
-            for each in others:
-                each.close(_CLOSE_TIMEOUT_S)
-            await shell.close(_CLOSE_TIMEOUT_S)
+            try:
+                await shell.close(_CLOSE_TIMEOUT_S)
+            finally:
+                for each in others:
+                    each.close(_CLOSE_TIMEOUT_S)
             if supervised is not None:
                 supervised.close()
     return _exit_status(reason)
