@@ -592,7 +592,7 @@ class Ros2Service:
         try:
             session.get(
                 self._key,
-                zenoh.handlers.Callback(replies.put, lambda: replies.put(None)),
+                zenoh.handlers.Callback(replies.put, lambda: replies.put(None), indirect=False),
                 target=zenoh.QueryTarget.ALL_COMPLETE,
                 consolidation=zenoh.ConsolidationMode.NONE,
                 # Else a service that reads nothing would hold up whoever asks it.
