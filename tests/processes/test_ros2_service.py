@@ -269,8 +269,12 @@ def gated() -> Iterator[tuple[Gated, Ros2Server, Ros2Service]]:
 class Asked:
     """A request that is asked on a thread of its own."""
 
-    def __init__(self, way: Ros2Service) -> None:
-        self._outcome: queue.SimpleQueue[Answer | TransportError] = queue.SimpleQueue()
+    def __init__(
+        self,
+        way: Ros2Service,
+        outcomes: queue.SimpleQueue[Answer | TransportError] | None = None,
+    ) -> None:
+        self._outcome = outcomes or queue.SimpleQueue()
         self._way = way
         threading.Thread(target=self._ask, daemon=True).start()
 
@@ -285,19 +289,19 @@ class Asked:
 
 
 def test_whoever_comes_when_too_many_wait_is_told_so() -> None:
+    outcomes: queue.SimpleQueue[Answer | TransportError] = queue.SimpleQueue()
     with gated() as (answers, _, way):
-        first = Asked(way)
-        assert answers.begun.acquire(timeout=PATIENCE_S)
-        asked = [Asked(way) for _ in range(20)]
-        refused = way.ask(BEGIN, 3600.0)
-        while refused.error is not ErrorCode.BUSY:
-            refused = way.ask(BEGIN, 3600.0)
-        assert "16 requests are waiting" in refused.message
+        for _ in range(21):
+            Asked(way, outcomes)
+        # One is being answered and 16 wait; the others are told so while nothing moves.
+        for _ in range(4):
+            refused = outcomes.get(timeout=PATIENCE_S)
+            assert isinstance(refused, Answer) and refused.error is ErrorCode.BUSY
+            assert "16 requests are waiting" in refused.message
         answers.may.set()
-        outcomes = [each.outcome() for each in (first, *asked)]
-    errors = [each.error for each in outcomes if isinstance(each, Answer)]
-    assert len(errors) == 21
-    assert errors.count(ErrorCode.OK) >= 16
+        for _ in range(17):
+            answered = outcomes.get(timeout=PATIENCE_S)
+            assert isinstance(answered, Answer) and answered.error is ErrorCode.OK
 
 
 def test_what_is_owed_is_answered_and_nothing_new_is_taken() -> None:

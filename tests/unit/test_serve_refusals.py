@@ -58,13 +58,21 @@ from holdfast.transport.key_ring import make_credentials
         *(
             (["--ros2-domain", "0", "--configuration", "none.yaml", *options], texts)
             for options, texts in (
-                ([], ["none.yaml"]),
+                (["--ros2-listen", "tcp/127.0.0.1:7447"], ["none.yaml"]),
                 (["--processes", "2"], ["--ros2-domain", "--processes"]),
                 (["--ros2-listen", "tcp/0.0.0.0:7447"], ["--ros2-listen", "--insecure"]),
                 (["--ros2-router", "tcp/192.0.2.1:7447"], ["--ros2-router", "--insecure"]),
                 (["--ros2-router", "udp/127.0.0.1:7447"], ["--ros2-router", "udp", "over tcp"]),
                 (["--ros2-listen", "tcp/127.0.0.1:0"], ["--ros2-listen", "port that is given"]),
                 (["--ros2-listen", "here"], ["--ros2-listen", "here"]),
+                (
+                    ["--ros2-router", "tcp/127.0.0.1:7447", "--listen", "tcp/127.0.0.1:7447"],
+                    [
+                        "--listen tcp/127.0.0.1:7447",
+                        "--ros2-router tcp/127.0.0.1:7447",
+                        "same port",
+                    ],
+                ),
                 (
                     ["--ros2-listen", "tcp/127.0.0.1:1", "--ros2-router", "tcp/127.0.0.1:1"],
                     ["--ros2-router", "--ros2-listen", "do not go together"],

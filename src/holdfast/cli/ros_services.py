@@ -41,20 +41,15 @@ class _Ros2:
     """The service in ROS 2, with rmw_zenoh's wire."""
 
     def __init__(self, service: ActiveSensing, options: Options) -> None:
-        from holdfast.ros.ros2_wire import (
-            DEFAULT_ROUTER,
-            Ros2Server,
-            check_service_name,
-            zenoh_module,
-        )
+        from holdfast.ros.ros2_wire import Ros2Server, check_service_name, zenoh_module
 
-        assert options.ros2_domain is not None
+        endpoint = options.ros2_listen or options.ros2_router
+        assert options.ros2_domain is not None and endpoint is not None
         name = check_service_name(options.ros2_name, "--ros2-name")
         try:
             zenoh_module()
         except InvalidValueError as error:
             raise InvalidValueError(f"--ros2-domain: {error}") from None
-        endpoint = options.ros2_listen or options.ros2_router or DEFAULT_ROUTER
         via = "listening on" if options.ros2_listen else "router"
         self._where = f"/{name} in domain {options.ros2_domain} ({via} {endpoint})"
         self._on_event: Callable[..., None] | None = None

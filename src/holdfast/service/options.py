@@ -23,6 +23,9 @@ DEFAULT_NAME = "cloud_active_sensing"
 
 _DEFAULT_PLACE = "127.0.0.1:7447"
 
+_DEFAULT_ROUTER = "tcp/localhost:7447"
+"""Where nodes of ROS 2 with rmw_zenoh look for their router."""
+
 _OF_THE_SUPERVISOR = ("--listen", "--processes", "--health", "--metrics", "--workers")
 """Options that the processes of a service do not get as they were given."""
 
@@ -105,11 +108,13 @@ def _check_beside(options: Options) -> None:
         ):
             if given:
                 raise InvalidValueError(f"{option}: goes with --ros2-domain only")
-    if options.ros2_router and options.ros2_listen:
+    elif options.ros2_router and options.ros2_listen:
         raise InvalidValueError(
             "--ros2-router and --ros2-listen do not go together: nodes are reached through a "
             "router, or they connect to this service"
         )
+    elif not options.ros2_listen:
+        options.ros2_router = options.ros2_router or _DEFAULT_ROUTER
     if options.has_beside and options.configuration is None:
         raise InvalidValueError(
             "--ros2-domain: --configuration is missing; it says for which problem and with which "
@@ -139,7 +144,7 @@ def checked_endpoints(options: Options) -> list[Endpoint]:
         If an endpoint is malformed or cannot be used so, or is one that other machines can reach
         although they do not have to prove who they are; the message names the option.
     InvalidValueError
-        If health or metrics are to be offered at the same port.
+        If health or metrics are to be offered, or a router of ROS 2 is, at the same port.
     """
     from holdfast.transport.endpoints import check_direction, check_endpoint
 
@@ -162,8 +167,14 @@ def checked_endpoints(options: Options) -> list[Endpoint]:
                 )
             if listens:
                 listen.append(endpoint)
-    _check_ros2_endpoint("--ros2-router", options.ros2_router, options)
     _check_ros2_endpoint("--ros2-listen", options.ros2_listen, options)
+    router = _check_ros2_endpoint("--ros2-router", options.ros2_router, options)
+    for endpoint in listen:
+        if router is not None and router.port == endpoint.port and router.is_loopback:
+            raise InvalidValueError(
+                f"--listen {endpoint} and --ros2-router {router} name the same port, which "
+                f"rmw_zenohd needs; robots need one of their own"
+            )
     for option, address in (("--health", options.health), ("--metrics", options.metrics)):
         for endpoint in listen:
             if address is not None and _is_same_port(endpoint, address):
@@ -174,11 +185,11 @@ def checked_endpoints(options: Options) -> list[Endpoint]:
     return listen
 
 
-def _check_ros2_endpoint(option: str, text: str | None, options: Options) -> None:
+def _check_ros2_endpoint(option: str, text: str | None, options: Options) -> Endpoint | None:
     from holdfast.transport.endpoints import parse_endpoint
 
     if text is None:
-        return
+        return None
     try:
         endpoint = parse_endpoint(text)
     except TransportError as error:
@@ -194,6 +205,7 @@ def _check_ros2_endpoint(option: str, text: str | None, options: Options) -> Non
             f"nobody there has to prove who he is; use one of this machine alone, as in "
             f"tcp/localhost:7447, or say --insecure"
         )
+    return endpoint
 
 
 def _is_same_port(endpoint: Endpoint, address: HttpAddress) -> bool:
@@ -360,7 +372,7 @@ def _parser() -> _Parser:
     add(
         "--ros2-router",
         metavar="ENDPOINT",
-        help="where rmw_zenohd listens (default: tcp/localhost:7447); it may come later, and go",
+        help=f"where rmw_zenohd listens (default: {_DEFAULT_ROUTER}); it may come later, and go",
     )
     add(
         "--ros2-listen",
