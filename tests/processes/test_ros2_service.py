@@ -93,7 +93,8 @@ def until_answered(way: Service, attempts: int = 600) -> Answer:
     reason = ""
     for _ in range(attempts):
         try:
-            return way.ask(BEGIN, PATIENCE_S)
+            # What was sent to somebody who does not read may be lost: that costs its deadline.
+            return way.ask(BEGIN, 1.0)
         except TransportError as error:
             reason = str(error)
             threading.Event().wait(0.05)

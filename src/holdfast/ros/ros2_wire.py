@@ -321,7 +321,9 @@ def _configuration(endpoint: str, *, listens: bool) -> zenoh.Config:
         "timestamping/enabled": True,
         "transport/shared_memory/enabled": False,
         "transport/link/rx/max_message_size": messages.MAX_BYTES + 65_536,
-        # Whoever reads nothing may hold up a message for so long, in microseconds.
+        # A megabyte may wait for a slow link; then whoever reads nothing may hold up a message for
+        # so long, in microseconds.
+        "transport/link/tx/queue/size/data": 16,
         "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 50_000,
         "transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments": 200_000,
         "transport/link/tx/queue/congestion_control/block/wait_before_close": 1_000_000,
@@ -541,6 +543,8 @@ class Ros2Service:
 
     def ask(self, request: Request, deadline_s: float) -> Answer:
         """Ask, and wait for the answer for so long at most.
+
+        Only sending may take longer, by 0.2 s: a megabyte to somebody who reads nothing.
 
         Raises
         ------
