@@ -33,6 +33,7 @@ from typing import TYPE_CHECKING, NamedTuple, Self
 from holdfast.errors import HoldfastError, InvalidValueError, TransportError
 from holdfast.ros import messages
 from holdfast.ros.active_sensing import ActiveSensing, Answer, ErrorCode, Request
+from holdfast.transport.endpoints import why_not_bound
 
 if TYPE_CHECKING:
     import zenoh
@@ -267,7 +268,7 @@ class _Session:
             except TransportError as error:
                 with self._changed:
                     if not self._reason:
-                        self._on_event("ros2_waiting", endpoint=self._endpoint, reason=str(error))
+                        self._on_event("ros2_waiting", reason=str(error))
                     self._reason = str(error)
                     self._changed.notify_all()
                     if self._closed or self._changed.wait_for(lambda: self._closed, pause_s):
@@ -281,10 +282,12 @@ class _Session:
         try:
             session = zenoh.open(_configuration(self._endpoint, listens=self._listens))
         except zenoh.ZError as error:
-            verb = "listen on" if self._listens else "connect to"
-            # Zenoh adds the place in its sources.
-            why = str(error).partition(" at /")[0].partition(". ")[0].rstrip("!. ")
-            raise TransportError(f"cannot {verb} {self._endpoint}: {why}") from None
+            if not self._listens:
+                why = "no router of Zenoh answers there"
+                raise TransportError(f"cannot connect to {self._endpoint}: {why}") from error
+            raise TransportError(
+                f"cannot listen on {self._endpoint}: {_why_not_bound(error)}"
+            ) from error
         try:
             self._on_open(session)
         except BaseException:
@@ -296,6 +299,15 @@ class _Session:
                 self._on_event("ros2_connected", endpoint=self._endpoint)
             self._reason = ""
             self._changed.notify_all()
+
+
+def _why_not_bound(error: zenoh.ZError) -> str:
+    """Return what the system has said; Zenoh says it in the midst of much else."""
+    found = re.search(r"\(os error (\d+)\)", str(error))
+    if found is None:
+        return str(error)
+    number = int(found[1])
+    return why_not_bound(OSError(number, os.strerror(number)))
 
 
 def _configuration(endpoint: str, *, listens: bool) -> zenoh.Config:
@@ -347,8 +359,8 @@ class Ros2Server:
         Of the router, or where to listen, as in ``tcp/localhost:7447``.
     listens : bool
     on_event : callable or None
-        Is told what happens, from any thread: ``ros2_waiting`` (``endpoint``, ``reason``) while
-        the router is not there, then ``ros2_connected`` (``endpoint``); ``ros2_refused``
+        Is told what happens, from any thread: ``ros2_waiting`` (``reason``) while the
+        router is not there, then ``ros2_connected`` (``endpoint``); ``ros2_refused``
         (``reason``) of a request that is none; ``ros2_failed`` (``reason``, ``where``) of a defect.
 
     Raises
