@@ -38,6 +38,7 @@ __all__ = [
     "SimulatedEnvironment",
     "as_done",
     "load_environment",
+    "observation_size",
 ]
 
 FloatArray = npt.NDArray[np.float64]
@@ -191,6 +192,17 @@ def as_done(value: object) -> Done | None:
     if isinstance(value, bool | np.bool_):
         return bool(value)
     return "failed" if isinstance(value, str) and value == "failed" else None
+
+
+def observation_size(problem: Problem, sensing_action: int) -> int | None:
+    """Return how many numbers a problem expects of a sensing action; None if it does not say."""
+    if contract.has_general_observations(problem):
+        return None
+    drawn = problem.initial_states(stream(0, 0, 0, Purpose.INITIAL_BELIEF), 1)
+    shape = (1, problem.state_size)
+    state = contract.states_of(problem, "initial_states", drawn, shape)[0]
+    size: int = contract.observation_mean(problem, state, sensing_action).shape[-1]
+    return size
 
 
 class EnvironmentMaker:

@@ -23,12 +23,16 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from holdfast import contract
 from holdfast.errors import EnvironmentFailedError, HoldfastError, InvalidValueError
 from holdfast.outcome import Done
 from holdfast.problems.problem import Problem
-from holdfast.randomness import Purpose, stream
-from holdfast.runtime.environment import DONE_VALUES, Environment, EnvironmentMaker, as_done
+from holdfast.runtime.environment import (
+    DONE_VALUES,
+    Environment,
+    EnvironmentMaker,
+    as_done,
+    observation_size,
+)
 from holdfast.session.events import Acted, Begun, EnvironmentEvent, EnvironmentFailed, Sensed
 from holdfast.user_code import account_of_user_error
 
@@ -257,15 +261,8 @@ class _CheckedEnvironment:
         return observation
 
     def _observation_size(self, sensing_action: int) -> int | None:
-        """Return the size of the observation that the problem expects; None if it does not say."""
         if sensing_action not in self._sizes:
-            size = None
-            if not contract.has_general_observations(self._problem):
-                drawn = self._problem.initial_states(stream(0, 0, 0, Purpose.INITIAL_BELIEF), 1)
-                shape = (1, self._problem.state_size)
-                state = contract.states_of(self._problem, "initial_states", drawn, shape)[0]
-                size = contract.observation_mean(self._problem, state, sensing_action).shape[-1]
-            self._sizes[sensing_action] = size
+            self._sizes[sensing_action] = observation_size(self._problem, sensing_action)
         return self._sizes[sensing_action]
 
     def _reward(self, value: object) -> float | None:

@@ -1,0 +1,85 @@
+"""A node that calls a robot's environment as it is told, line by line, on its standard input.
+
+    {"id": 1, "do": "make", "parameters": {...}, "trial": 0, "resumed": false}
+    {"id": 2, "do": "perform_sensing", "arguments": [0]}
+    {"id": 3, "do": "cancel"}
+
+Each line is answered by one with its id and either ``result`` or ``error``. Calls are made by a
+thread that is not the executor's, as a robot's loop makes them; ``cancel`` is not queued.
+"""
+
+from __future__ import annotations
+
+import json
+import queue
+import sys
+import threading
+import time
+from typing import Any
+
+import numpy as np
+import rclpy
+from rclpy.executors import MultiThreadedExecutor
+from rclpy.node import Node
+
+from holdfast.configuration import load
+from holdfast.errors import HoldfastError
+from holdfast.ros.ros2_environment import cancel_ros_environments, make_ros_environment
+
+
+def _plain(value: Any) -> Any:
+    return value.tolist() if isinstance(value, np.ndarray) else value
+
+
+def main() -> None:
+    configuration = load(sys.argv[1])
+    rclpy.init()
+    node = Node("driver")
+    executor = MultiThreadedExecutor(num_threads=4)
+    executor.add_node(node)
+    threading.Thread(target=executor.spin, daemon=True).start()
+    commands: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
+    environment: Any = None
+
+    def do(command: dict[str, Any]) -> Any:
+        nonlocal environment
+        if command["do"] == "make":
+            environment = make_ros_environment(
+                node,
+                command.get("parameters", {}),
+                configuration.problem,
+                0,
+                command.get("trial", 0),
+                command.get("resumed", False),
+            )
+            return type(environment).__name__
+        arguments = command.get("arguments", [])
+        if command["do"] == "perform":
+            arguments = [np.array(arguments[0])]
+        return _plain(getattr(environment, command["do"])(*arguments))
+
+    def work() -> None:
+        while True:
+            command = commands.get()
+            begun = time.monotonic()
+            try:
+                answer = {"result": do(command)}
+            except HoldfastError as error:
+                answer = {"error": f"{type(error).__name__}: {error}"}
+            except Exception as error:  # noqa: BLE001 - a test must hear of it
+                answer = {"error": f"unexpected {type(error).__name__}: {error}"}
+            took_s = time.monotonic() - begun
+            print(json.dumps({"id": command["id"], "took_s": took_s, **answer}), flush=True)
+
+    threading.Thread(target=work, daemon=True).start()
+    for line in sys.stdin:
+        command = json.loads(line)
+        if command["do"] == "cancel":
+            cancel_ros_environments(node)
+            print(json.dumps({"id": command["id"], "result": None}), flush=True)
+        else:
+            commands.put(command)
+
+
+if __name__ == "__main__":
+    main()
