@@ -175,10 +175,10 @@ class _Place:
             else:
                 if not hasattr(holder, "__len__") or isinstance(holder, str | bytes):
                     raise _NoSuchFieldError(f"has no array {_written(path[:depth])}")
-                there = len(holder)
-                if part >= there and not (grow and _grow(holder, part + 1, declared)):
+                size = len(holder)
+                if part >= size and not (grow and _grow(holder, part + 1, declared)):
                     raise _NoSuchFieldError(
-                        f"has {there} elements in {_written(path[:depth])}, and "
+                        f"has {size} elements in {_written(path[:depth])}, and "
                         f"{_written(path[: depth + 1])} is meant"
                     )
                 declared = _element(declared)
@@ -217,8 +217,8 @@ def _fitting(old: Any, value: Any) -> Any:
             raise ValueError(f"{old.size} numbers are needed")
         return values.astype(old.dtype) if old.dtype.kind == "f" else _all_whole(values, old.dtype)
     if isinstance(old, array.array):
-        values = value if isinstance(value, list | tuple) else [value]
-        return array.array(old.typecode, map(float if old.typecode in "fd" else _whole, values))
+        several = value if isinstance(value, list | tuple) else [value]
+        return array.array(old.typecode, map(float if old.typecode in "fd" else _whole, several))
     if isinstance(old, list):
         return list(value) if isinstance(value, list | tuple) else [value]
     raise ValueError(f"a {type(old).__name__} stands there; name one of its fields")

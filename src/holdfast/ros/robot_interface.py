@@ -52,7 +52,8 @@ _DEFAULT_NAMES = {
 _OF_ALL: Mapping[str, tuple[object, str]] = {
     "name": (
         "",
-        "Name of the service, the action or (done alone) the topic; empty: as said above, none: not there.",
+        "Name of the service, the action or (done alone) the topic. 'none': not there; empty: "
+        "the ready-made one, or not there if sense or act has a type of its own.",
     ),
     "type": ("", "Its type, package/srv/Type, package/action/Type or (done) package/msg/Type."),
     "timeout_ms": (
@@ -213,9 +214,9 @@ class RobotInterface:
     Parameters
     ----------
     parameters : mapping of str to object
-        By whole name, such as ``environment.sense.name``; sections may be mappings themselves.
-        What does not begin with ``environment`` is not looked at, nor are the keys of the settings'
-        own section ``environment``.
+        Those of :data:`ROBOT_PARAMETERS`, by name, with or without ``environment.`` before it;
+        sections may be mappings themselves. Of the settings' own section ``environment``
+        ``timeout_ms`` is read, and its other keys are left alone.
     sensing_actions : sequence of str
         The problem's labels.
     action_size : int
@@ -485,31 +486,36 @@ class _Values:
         if value is None:
             return []
         entries = list(value) if isinstance(value, Sequence) else [value]
-        if isinstance(value, str) or not all(map(_is_number, entries)):
+        numbers = [_number(entry) for entry in entries]
+        if isinstance(value, str) or None in numbers:
             raise ConfigurationError(f"{key} is {value!r:.80}; it must be a list of finite numbers")
-        return [float(entry) for entry in entries]
+        return [number for number in numbers if number is not None]
 
     def positive(self, key: str, default: float) -> float:
         value = self._given.get(key)
         if value is None or (value == 0 and ROBOT_PARAMETERS.get(key, (1,))[0] == 0):
             return default
-        if not _is_number(value) or not float(value) > 0.0:  # type: ignore[arg-type]
+        number = _number(value)
+        if number is None or not number > 0.0:
             raise ConfigurationError(f"{key} is {value!r:.80}; it must be a number above 0")
-        return float(value)  # type: ignore[arg-type]
+        return number
 
 
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+def _number(value: object) -> float | None:
+    """Return a finite number; None if it is anything else."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        return None
+    return float(value)
 
 
-def _flat(parameters: Mapping[str, object], prefix: str = "") -> dict[str, object]:
+def _flat(parameters: Mapping[str, object], prefix: str = "environment.") -> dict[str, object]:
     """Return the parameters of the environment by their whole names."""
     flat: dict[str, object] = {}
     for key, value in parameters.items():
-        name = f"{prefix}{key}"
-        if name.split(".")[0] != "environment":
-            continue
-        if isinstance(value, Mapping):
+        name = f"{prefix}{key.removeprefix('environment.')}"
+        if key == "environment" and isinstance(value, Mapping):
+            flat.update(_flat(value))
+        elif isinstance(value, Mapping):
             flat.update(_flat(value, f"{name}."))
         else:
             flat[name] = value

@@ -32,18 +32,20 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from holdfast import contract
+from holdfast.configuration import Configuration
 from holdfast.errors import EnvironmentFailedError
 from holdfast.outcome import Done
 from holdfast.problems.problem import Problem
 from holdfast.ros.field_paths import read_field, read_numbers, write
 from holdfast.ros.robot_interface import RobotCall, RobotInterface, observation_path
-from holdfast.runtime.environment import observation_size
+from holdfast.runtime.environment import EnvironmentMaker, observation_size
 
 __all__ = [
-    "CountingRosEnvironment",
-    "RosEnvironment",
+    "CountingRos2Environment",
+    "Ros2Environment",
     "cancel_ros_environments",
     "make_ros_environment",
+    "make_ros_environment_maker",
 ]
 
 FloatArray = npt.NDArray[np.float64]
@@ -70,11 +72,8 @@ def make_ros_environment(
     seed: int,
     trial: int,
     resumed: bool = False,
-) -> RosEnvironment:
+) -> Ros2Environment:
     """Make the environment of a trial: a robot that is reached through ROS.
-
-    A node makes one for each trial; ``functools.partial(make_ros_environment, node, parameters)``
-    is what :class:`~holdfast.runtime.environment.EnvironmentMaker` takes for a class.
 
     Parameters
     ----------
@@ -94,8 +93,8 @@ def make_ros_environment(
 
     Returns
     -------
-    RosEnvironment
-        A :class:`CountingRosEnvironment` if the robot tells its count.
+    Ros2Environment
+        A :class:`CountingRos2Environment` if the robot tells its count.
 
     Raises
     ------
@@ -107,22 +106,61 @@ def make_ros_environment(
     """
     del seed
     interface = RobotInterface(parameters, problem.sensing_actions, problem.action_size)
-    made = CountingRosEnvironment if "steps" in interface.calls else RosEnvironment
+    made = CountingRos2Environment if "steps" in interface.calls else Ros2Environment
     return made(node, interface, problem, trial, resumed=resumed)
 
 
-def cancel_ros_environments(node: Node) -> None:
-    """Cancel what the environments of a node are doing; see :meth:`RosEnvironment.cancel`.
+def make_ros_environment_maker(
+    node: Node, parameters: Mapping[str, object], configuration: Configuration
+) -> EnvironmentMaker:
+    """Return what makes the environment of each trial of a run: a robot reached through ROS.
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+    parameters : mapping of str to object
+        As of :func:`make_ros_environment`; ``environment.timeout_ms`` is the configuration's.
+    configuration : Configuration
+
+    Raises
+    ------
+    ConfigurationError
+        If a parameter cannot be used; nobody is called yet.
+    """
+    timeout_ms = configuration.environment.timeout_ms
+    mapping = {**parameters, "environment.timeout_ms": timeout_ms}
+    # It is used by the environment's thread, while the robot's own is by the loop's.
+    problem = Configuration.from_plain(configuration.plain()).problem
+    RobotInterface(mapping, problem.sensing_actions, problem.action_size)
+
+    def make(problem: Problem, seed: int, trial: int, resumed: bool) -> Ros2Environment:
+        return make_ros_environment(node, mapping, problem, seed, trial, resumed)
+
+    # Whatever has these parameters is a class to it.
+    made: Any = make
+    return EnvironmentMaker(
+        "the robot in ROS", problem, configuration.simulator.seed, timeout_ms, made
+    )
+
+
+def cancel_ros_environments(node: Node, why: str = "cancelled") -> None:
+    """Cancel what the environments of a node are doing; see :meth:`Ros2Environment.cancel`.
 
     For a node that is deactivated, from any thread. Environments made afterwards are not concerned.
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+    why : str, optional
+        For the message of the error.
     """
     connections = _CONNECTIONS.get(node)
     if connections is not None:
         for environment in list(connections.environments):
-            environment.cancel()
+            environment.cancel(why)
 
 
-class RosEnvironment:
+class Ros2Environment:
     """A robot that is reached through ROS.
 
     Parameters
@@ -145,7 +183,7 @@ class RosEnvironment:
         self._observation_sizes: dict[int, int | None] = {}
         # Guards nothing but the waits: whoever brings an answer, or cancels, notifies.
         self._news = threading.Condition()
-        self._cancelled = False
+        self._cancelled: str | None = None
         self._connections = _connections(node)
         self._connections.environments.add(self)
         self._clients = {
@@ -246,11 +284,11 @@ class RosEnvironment:
         answer = self._call(call, request)
         self._check_success(call, answer)
         self._step += 1
-        path = call.path("reward")
-        if path is None:
+        reward_path = call.path("reward")
+        if reward_path is None:
             return None
         with _Named(f"{call}: {call.key('reward')}"):
-            reward = self._number(read_field(answer, path))
+            reward = self._number(read_field(answer, reward_path))
         if np.isinf(reward):
             raise EnvironmentFailedError(
                 f"{call} answered with the reward {reward} ({call.key('reward')}); it must be "
@@ -297,18 +335,24 @@ class RosEnvironment:
                     return meaning  # type: ignore[return-value]
         return False
 
-    def cancel(self) -> None:
+    def cancel(self, why: str = "cancelled") -> None:
         """End the call that goes on, from any thread; one of an action is cancelled at the robot.
 
-        The call raises, as does every later one.
+        The call raises, as does every later one. A task action that is cut off may have been
+        performed: without ``environment.steps`` nobody can tell, and the trial cannot be resumed.
+
+        Parameters
+        ----------
+        why : str, optional
+            For the message of the error.
         """
         with self._news:
-            self._cancelled = True
+            self._cancelled = self._cancelled or why
             self._news.notify_all()
 
     def close(self) -> None:
         """Leave the robot where it is."""
-        self.cancel()
+        self.cancel("closed")
         self._connections.environments.discard(self)
 
     def _count(self) -> int:
@@ -430,12 +474,12 @@ class RosEnvironment:
         self, call: RobotCall, client: Any, request: Any, limit: _Limit, absent: _Absence, what: str
     ) -> Any:
         if self._cancelled:
-            raise EnvironmentFailedError(f"{call} was not called: cancelled")
+            raise EnvironmentFailedError(f"{call} was not called: {self._cancelled}")
         while not client.service_is_ready():
             # It may be on its way up again. Nothing has been sent yet.
             if absent.is_over() or self._wait(limit, client.service_is_ready, _LOOK_S):
                 if self._cancelled:
-                    raise _UnansweredError(f"{call} was not called: cancelled")
+                    raise _UnansweredError(f"{call} was not called: {self._cancelled}")
                 self._nobody(call, _Limit(limit.deadline, absent.key))
         with _Named(f"{call} could not be called"):
             future = _sent(client, request)
@@ -449,7 +493,9 @@ class RosEnvironment:
                     )
                 if self._wait(limit, future.done, _LOOK_S):
                     if self._cancelled:
-                        raise _UnansweredError(f"{call}: cancelled while {what} was waited for")
+                        raise _UnansweredError(
+                            f"{call}: {self._cancelled} while {what} was waited for"
+                        )
                     raise _UnansweredError(
                         f"{call} has not said {what} within "
                         f"{limit.deadline.limit_s:g} s ({limit.key})"
@@ -468,7 +514,7 @@ class RosEnvironment:
         with self._news:
             if not self._cancelled and not ready():
                 limit.deadline.wait(self._news, at_most_s)
-            return self._cancelled or (limit.deadline.is_over() and not ready())
+            return self._cancelled is not None or (limit.deadline.is_over() and not ready())
 
     def _cancel_goal(self, call: RobotCall, clients: _Clients, goal_id: Any) -> str:
         """Cancel a goal at the robot, accepted or not, and return what came of it."""
@@ -519,7 +565,9 @@ class RosEnvironment:
         found = f"topic {topic.name} (environment.observation.topic)"
         when = "requested" if topic.taken_during else "answered"
         if self._cancelled:
-            raise EnvironmentFailedError(f"{found}: cancelled while a message was waited for")
+            raise EnvironmentFailedError(
+                f"{found}: {self._cancelled} while a message was waited for"
+            )
         raise EnvironmentFailedError(
             f"{found} brought no message of type {topic.type_name} that was taken after the "
             f"sensing action was {when}, within {deadline.limit_s:g} s ({limit.key}); "
@@ -531,7 +579,7 @@ class RosEnvironment:
         )
 
 
-class CountingRosEnvironment(RosEnvironment):
+class CountingRos2Environment(Ros2Environment):
     """A robot that tells how many task actions it has performed, whoever asks and when."""
 
     def steps_performed(self) -> int:
@@ -687,7 +735,7 @@ class _Connections:
         self._group = ReentrantCallbackGroup()
         self._clients: dict[tuple[str, str], _Clients] = {}
         self._topics: dict[tuple[str, str], _Topic] = {}
-        self.environments: weakref.WeakSet[RosEnvironment] = weakref.WeakSet()
+        self.environments: weakref.WeakSet[Ros2Environment] = weakref.WeakSet()
 
     def clients(self, call: RobotCall) -> _Clients:
         key = (call.name, call.type_name)
