@@ -23,7 +23,7 @@ from rclpy.executors import MultiThreadedExecutor
 from rclpy.node import Node
 
 from holdfast.configuration import load
-from holdfast.errors import HoldfastError
+from holdfast.errors import ConfigurationError, EnvironmentFailedError
 from holdfast.ros.ros2_environment import cancel_ros_environments, make_ros_environment
 
 
@@ -64,8 +64,11 @@ def main() -> None:
             begun = time.monotonic()
             try:
                 answer = {"result": do(command)}
-            except HoldfastError as error:
-                answer = {"error": f"{type(error).__name__}: {error}"}
+            except (ConfigurationError, EnvironmentFailedError) as error:
+                public = next(
+                    kind for kind in type(error).__mro__ if not kind.__name__.startswith("_")
+                )
+                answer = {"error": f"{public.__name__}: {error}"}
             except Exception as error:  # noqa: BLE001 - a test must hear of it
                 answer = {"error": f"unexpected {type(error).__name__}: {error}"}
             took_s = time.monotonic() - begun

@@ -68,7 +68,7 @@ class OddRobot(Node):
         if self._done:
             latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
             self._dones = self.create_publisher(std_msgs.msg.Bool, "arm/done", latched)
-            self._dones.publish(std_msgs.msg.Bool(data=self._done == "true"))
+            self._dones.publish(std_msgs.msg.Bool(data=self._done == "succeeded"))
         say("ready")
 
     # -- ready-made ------------------------------------------------------------------------------
@@ -88,8 +88,8 @@ class OddRobot(Node):
             "well": [1.5],
             "size": [1.0, 2.0],
             "nothing": [],
-            "nan": [math.nan],
-            "infinite": [math.inf],
+            "not_a_number": [math.nan],
+            "endless": [math.inf],
         }[self._sense]
         if self._topic == "during":
             self.publish()
@@ -164,7 +164,7 @@ class OddRobot(Node):
         self._steps = 0
         say("home")
         response.success = True
-        if self._done == "true":
+        if self._done == "succeeded":
             self._dones.publish(std_msgs.msg.Bool(data=False))
         return response
 

@@ -9,10 +9,10 @@ An action is three services: one takes the goal, one gives the result when the m
 cancels. They are called as such. So a goal has a name that was chosen here and can be cancelled
 before the robot has said that it accepts it.
 
-What was asked and not answered may have been done all the same. Sensing, ``done`` and ``steps``
-change nothing. A task action is never sent twice: the call fails, and when the run is resumed the
-robot's own count (``environment.steps``) says whether it was performed. Without that count the
-trial ends there.
+What was asked and not answered may have been done all the same. A task action is never sent twice:
+the call fails, and when the run is resumed the robot's own count (``environment.steps``) says
+whether it was performed. Without that count the trial ends there. All else (sensing, ``done``,
+``steps``, ``reset``) may be asked for again, and is when another server appears during the call.
 """
 
 from __future__ import annotations
@@ -481,17 +481,28 @@ class Ros2Environment:
                 if self._cancelled:
                     raise _UnansweredError(f"{call} was not called: {self._cancelled}")
                 self._nobody(call, _Limit(limit.deadline, absent.key))
-        with _Named(f"{call} could not be called"):
-            future = _sent(client, request)
-        future.add_done_callback(self._notify)
+        futures: list[Any] = []
+
+        def answered() -> bool:
+            return any(future.done() for future in futures)
+
+        known = -1
         try:
-            while not future.done():
+            while not answered():
+                servers = self._node.count_services(client.service_name)
+                if not futures or (servers != known and call.role != "act"):
+                    # A robot that was killed and started again has not got what was sent before it
+                    # was found; the dead one is still taken to be there for some seconds.
+                    with _Named(f"{call} could not be called"):
+                        futures.append(_sent(client, request))
+                    futures[-1].add_done_callback(self._notify)
+                    known = servers
                 if absent.is_over():
                     raise _UnansweredError(
                         f"{call} has vanished while {what} was waited for; nobody has offered it "
                         f"for {absent.limit_s:g} s ({absent.key})"
                     )
-                if self._wait(limit, future.done, _LOOK_S):
+                if self._wait(limit, answered, _LOOK_S):
                     if self._cancelled:
                         raise _UnansweredError(
                             f"{call}: {self._cancelled} while {what} was waited for"
@@ -501,8 +512,9 @@ class Ros2Environment:
                         f"{limit.deadline.limit_s:g} s ({limit.key})"
                     )
         finally:
-            client.remove_pending_request(future)
-        return future.result()
+            for future in futures:
+                client.remove_pending_request(future)
+        return next(future.result() for future in futures if future.done())
 
     def _notify(self, future: Any) -> None:
         del future
@@ -550,7 +562,7 @@ class Ros2Environment:
         received.condition = self._news
 
         def newer() -> bool:
-            return received.number > seen
+            return received.number > seen + 1
 
         while True:
             for item in list(received.messages):
