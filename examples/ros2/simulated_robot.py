@@ -1,3 +1,4 @@
+#!/usr/bin/env python3
 """Plays a robot in ROS 2: a node of its own, to try things with and to copy from.
 
 It offers what holdfast's node calls when it is told nothing else:

@@ -279,7 +279,7 @@ class TestObservationsAsMessages:
         error = driver.error("perform_sensing", 0)
         assert "topic arm/touch (environment.observation.topic)" in error
         assert "within 2 s (environment.sense.timeout_ms)" in error
-        assert "were older, the last by 1e+03 s" in error
+        assert "were older, the last by" in error
 
     def test_one_taken_while_sensing_counts_if_that_is_said(
         self, driver: Driver, odd: Start
