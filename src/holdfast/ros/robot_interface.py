@@ -471,7 +471,7 @@ class _Values:
 
     def texts(self, key: str, default: object = ()) -> list[str]:
         value = self._given.get(key)
-        if value is None or (not isinstance(value, str) and not self.is_given(key)):
+        if not self.is_given(key):
             value = default
         if isinstance(value, str):
             return [value] if value else []
