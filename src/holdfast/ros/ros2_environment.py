@@ -32,20 +32,18 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from holdfast import contract
-from holdfast.configuration import Configuration
 from holdfast.errors import EnvironmentFailedError
 from holdfast.outcome import Done
 from holdfast.problems.problem import Problem
 from holdfast.ros.field_paths import read_field, read_numbers, write
 from holdfast.ros.robot_interface import RobotCall, RobotInterface, observation_path
-from holdfast.runtime.environment import EnvironmentMaker, observation_size
+from holdfast.runtime.environment import observation_size
 
 __all__ = [
     "CountingRos2Environment",
     "Ros2Environment",
     "cancel_ros_environments",
     "make_ros_environment",
-    "make_ros_environment_maker",
 ]
 
 FloatArray = npt.NDArray[np.float64]
@@ -108,39 +106,6 @@ def make_ros_environment(
     interface = RobotInterface(parameters, problem.sensing_actions, problem.action_size)
     made = CountingRos2Environment if "steps" in interface.calls else Ros2Environment
     return made(node, interface, problem, trial, resumed=resumed)
-
-
-def make_ros_environment_maker(
-    node: Node, parameters: Mapping[str, object], configuration: Configuration
-) -> EnvironmentMaker:
-    """Return what makes the environment of each trial of a run: a robot reached through ROS.
-
-    Parameters
-    ----------
-    node : rclpy.node.Node
-    parameters : mapping of str to object
-        As of :func:`make_ros_environment`; ``environment.timeout_ms`` is the configuration's.
-    configuration : Configuration
-
-    Raises
-    ------
-    ConfigurationError
-        If a parameter cannot be used; nobody is called yet.
-    """
-    timeout_ms = configuration.environment.timeout_ms
-    mapping = {**parameters, "environment.timeout_ms": timeout_ms}
-    # It is used by the environment's thread, while the robot's own is by the loop's.
-    problem = Configuration.from_plain(configuration.plain()).problem
-    RobotInterface(mapping, problem.sensing_actions, problem.action_size)
-
-    def make(problem: Problem, seed: int, trial: int, resumed: bool) -> Ros2Environment:
-        return make_ros_environment(node, mapping, problem, seed, trial, resumed)
-
-    # Whatever has these parameters is a class to it.
-    made: Any = make
-    return EnvironmentMaker(
-        "the robot in ROS", problem, configuration.simulator.seed, timeout_ms, made
-    )
 
 
 def cancel_ros_environments(node: Node, why: str = "cancelled") -> None:
