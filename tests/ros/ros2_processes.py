@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-WAIT_S = 60.0
+WAIT_S = 120.0
 """Longer than anything here may take, on a machine that is busy with other things."""
 
 
