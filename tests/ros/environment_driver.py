@@ -31,6 +31,12 @@ def _plain(value: Any) -> Any:
     return value.tolist() if isinstance(value, np.ndarray) else value
 
 
+def say(answer: dict[str, Any]) -> None:
+    # In one piece: two threads say something.
+    sys.stdout.write(f"{json.dumps(answer)}\n")
+    sys.stdout.flush()
+
+
 def main() -> None:
     configuration = load(sys.argv[1])
     rclpy.init()
@@ -72,14 +78,14 @@ def main() -> None:
             except Exception as error:  # noqa: BLE001 - a test must hear of it
                 answer = {"error": f"unexpected {type(error).__name__}: {error}"}
             took_s = time.monotonic() - begun
-            print(json.dumps({"id": command["id"], "took_s": took_s, **answer}), flush=True)
+            say({"id": command["id"], "took_s": took_s, **answer})
 
     threading.Thread(target=work, daemon=True).start()
     for line in sys.stdin:
         command = json.loads(line)
         if command["do"] == "cancel":
             cancel_ros_environments(node)
-            print(json.dumps({"id": command["id"], "result": None}), flush=True)
+            say({"id": command["id"], "result": None})
         else:
             commands.put(command)
 

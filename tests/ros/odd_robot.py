@@ -125,6 +125,8 @@ class OddRobot(Node):
                     result.message = "stopped"
                     return result
                 time.sleep(0.05)
+        if self._act == "long":
+            time.sleep(2.0)
         self._steps += 1
         result.success = True
         result.reward = math.inf if self._act == "infinite" else -1.0

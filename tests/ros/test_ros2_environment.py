@@ -36,10 +36,20 @@ def surroundings(ros2: Ros2) -> Iterator[dict[str, str]]:
 
 
 @pytest.fixture
-def driver(ros2: Ros2, surroundings: dict[str, str], processes: list[Process]) -> Driver:
-    made = Driver(ros2.python, surroundings, CONFIGURATION)
-    processes.append(made)
-    return made
+def start_driver(
+    ros2: Ros2, surroundings: dict[str, str], processes: list[Process]
+) -> Callable[[], Driver]:
+    def start() -> Driver:
+        made = Driver(ros2.python, surroundings, CONFIGURATION)
+        processes.append(made)
+        return made
+
+    return start
+
+
+@pytest.fixture
+def driver(start_driver: Callable[[], Driver]) -> Driver:
+    return start_driver()
 
 
 @pytest.fixture
@@ -135,6 +145,19 @@ class TestReadyMade:
         expected.perform(np.array(ACTION))
         assert driver.do("perform_sensing", 1) == list(expected.perform_sensing(1))
         assert driver.do("steps_performed") == 1
+
+    def test_whoever_is_killed_while_the_robot_moves_is_told_the_count_when_it_stands(
+        self, driver: Driver, start_driver: Callable[[], Driver], odd: Start
+    ) -> None:
+        robot = odd(act="long")
+        driver.do("make")
+        driver.begin("perform", ACTION)
+        assert robot.next_line().startswith("moving")
+        driver.kill()
+        again = start_driver()
+        # This robot answers while it moves, and counts a task action at its end.
+        again.do("make", resumed=True)
+        assert again.do("steps_performed") == 1
 
     def test_failed_is_said(self, driver: Driver, odd: Start) -> None:
         odd(done="failed")

@@ -60,7 +60,13 @@ _CANCEL_S = 1.0
 _GOAL_ENDED = {4: "succeeded", 5: "was cancelled", 6: "was aborted"}
 """``action_msgs/msg/GoalStatus`` of a goal that has ended."""
 
-_MESSAGES_KEPT = 100
+_GOAL_ACTIVE = (1, 2, 3)
+"""Of one that is accepted, executing or being cancelled."""
+
+_STATUS_S = 1.0
+"""How long to wait for what a server says of its goals; it may have had none."""
+
+_MESSAGES_KEPT = 10
 
 
 def make_ros_environment(
@@ -121,7 +127,9 @@ def cancel_ros_environments(node: Node, why: str = "cancelled") -> None:
     """
     connections = _CONNECTIONS.get(node)
     if connections is not None:
-        for environment in list(connections.environments):
+        with _CONNECTIONS_LOCK:
+            environments = list(connections.environments)
+        for environment in environments:
             environment.cancel(why)
 
 
@@ -150,7 +158,8 @@ class Ros2Environment:
         self._news = threading.Condition()
         self._cancelled: str | None = None
         self._connections = _connections(node)
-        self._connections.environments.add(self)
+        with _CONNECTIONS_LOCK:
+            self._connections.environments.add(self)
         self._clients = {
             role: self._connections.clients(call)
             for role, call in interface.calls.items()
@@ -173,6 +182,7 @@ class Ros2Environment:
             self._check_success(reset, self._call(reset, self._request(reset), deadline))
             self._wait_until_not_done(reset, deadline)
         if resumed and "steps" in interface.calls:
+            self._wait_until_it_stands()
             self._step = self._count()
 
     # -- what the robot's loop calls -------------------------------------------------------------
@@ -261,6 +271,38 @@ class Ros2Environment:
             )
         return None if np.isnan(reward) else reward
 
+    def _wait_until_it_stands(self) -> None:
+        """Wait for a goal that was sent before this process: the count is right when it has ended.
+
+        Raises
+        ------
+        EnvironmentFailedError
+            If it has not ended within the time for a task action.
+        """
+        act = self._interface.calls["act"]
+        if act.kind != "action":
+            return
+        status = self._connections.topic(
+            f"{act.name}/_action/status", act.type.Impl.GoalStatusMessage, latched=True
+        )
+        # It is latched, but a server that has had no goal has nothing to say.
+        first = _Limit(_Deadline(_STATUS_S), "")
+        while not status.messages and not self._wait(first, lambda: False, 0.02):
+            pass
+        limit = _Limit(_Deadline(act.timeout_s), act.key("timeout_ms"))
+        while status.messages and any(
+            goal.status in _GOAL_ACTIVE for goal in status.messages[-1].message.status_list
+        ):
+            if self._wait(limit, lambda: False, 0.02):
+                raise EnvironmentFailedError(
+                    f"{act} is still busy with a goal of before"
+                    + (
+                        f": {self._cancelled}"
+                        if self._cancelled
+                        else f", {limit.deadline.limit_s:g} s later ({limit.key})"
+                    )
+                )
+
     def _wait_until_not_done(self, reset: RobotCall, deadline: _Deadline) -> None:
         """Wait until a topic does not tell any more how the last trial ended."""
         limit = _Limit(deadline, reset.key("timeout_ms"))
@@ -318,7 +360,8 @@ class Ros2Environment:
     def close(self) -> None:
         """Leave the robot where it is."""
         self.cancel("closed")
-        self._connections.environments.discard(self)
+        with _CONNECTIONS_LOCK:
+            self._connections.environments.discard(self)
 
     def _count(self) -> int:
         call = self._interface.calls["steps"]
@@ -741,7 +784,7 @@ class _Connections:
                     durability=DurabilityPolicy.TRANSIENT_LOCAL,
                 )
                 if latched
-                else QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
+                else QoSProfile(depth=_MESSAGES_KEPT, reliability=ReliabilityPolicy.BEST_EFFORT)
             )
 
             def take(message: Any, info: Mapping[str, int]) -> None:
