@@ -138,9 +138,9 @@ def test_the_launch_file_names_what_is_installed(bring_up: BringUp) -> None:
     path = bring_up.share / "launch" / "holdfast.launch.py"
     tree = ast.parse(path.read_text())
     compile(tree, str(path), "exec")
-    nodes = [
+    nodes: list[dict[str, str]] = [
         {
-            word.arg: word.value.value
+            str(word.arg): str(word.value.value)
             for word in call.keywords
             if isinstance(word.value, ast.Constant)
         }
