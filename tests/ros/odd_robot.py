@@ -30,7 +30,7 @@ def say(text: str) -> None:
     print(text, flush=True)
 
 
-class OddRobot(Node):
+class OddRobot(Node):  # type: ignore[misc]
     def __init__(self) -> None:
         super().__init__("odd_robot")
         self._sense = self.declare_parameter("sense", "well").value

@@ -315,9 +315,27 @@ class TestObservationsAsMessages:
 
     def test_a_topic_that_nobody_publishes_is_an_error(self, driver: Driver, odd: Start) -> None:
         odd()
-        mapping = {**self.TOUCH, "environment.observation.topic": "arm/nothing"}
+        nothing = {
+            "environment.observation.topic": "arm/nothing",
+            "environment.discovery_timeout_ms": 1000,
+        }
+        error = driver.error("make", parameters={**self.TOUCH, **nothing})
+        assert "nobody publishes topic arm/nothing (environment.observation.topic)" in error
+
+    def test_so_is_one_of_which_nothing_comes(self, driver: Driver, odd: Start) -> None:
+        odd()
+        driver.do("make", parameters=self.TOUCH)
+        assert "none came, and 1 publish it" in driver.error("perform_sensing", 0)
+
+    def test_nobody_need_be_asked(self, driver: Driver, odd: Start) -> None:
+        odd(topic="fresh")
+        mapping = {
+            key: value
+            for key, value in self.TOUCH.items()
+            if not key.startswith("environment.sense")
+        }
         driver.do("make", parameters=mapping)
-        assert "none came, and 0 publish it" in driver.error("perform_sensing", 0)
+        assert driver.do("perform_sensing", 0) == [0.0]
 
 
 class TestDoneAsAMessage:

@@ -144,6 +144,9 @@ _READY_MADE: Mapping[tuple[str, str], Mapping[str, object]] = {
 }
 _READY_MADE_ANSWER = {"success": "success", "message": "message"}
 
+_PART = 0.45
+"""Of ``environment.timeout_ms``: it is for a task action and for asking whether it was the last."""
+
 _OF_THE_SETTINGS = ("kind", "object", "directory", "timeout_ms")
 """Keys of the section ``environment`` that are not about ROS; so are those in ``arguments``."""
 
@@ -227,6 +230,8 @@ class RobotInterface:
     calls : dict of str to RobotCall
         By role; those that are not there are missing.
     observation : ObservationTopic or None
+    timeout_s : float
+        For an observation that nobody is asked for, and for each call by default.
     discovery_timeout_s : float
 
     Raises
@@ -244,6 +249,7 @@ class RobotInterface:
         self._action_size = action_size
         self._values = _Values(given)
         self._timeout_ms = self._values.positive("environment.timeout_ms", 60_000.0)
+        self.timeout_s = 1e-3 * _PART * self._timeout_ms
         discovery_ms = self._values.positive("environment.discovery_timeout_ms", 5000.0)
         self.discovery_timeout_s = 1e-3 * discovery_ms
         self.observation = self._observation_topic()
@@ -333,7 +339,7 @@ class RobotInterface:
             for path in paths.get(key, ()):
                 check_path(answers, path, f"{section}{key}")
         self._check_observation(answers, texts.get("observation", []), f"{section}observation")
-        default_ms = 0.45 * self._timeout_ms
+        default_ms = _PART * self._timeout_ms
         call = RobotCall(
             role,
             name,

@@ -171,11 +171,13 @@ class Ros2Environment:
             if done is None or done.kind != "msg"
             else self._connections.topic(done.name, done.type, latched=True)
         )
+        topic = interface.observation
+        self._observations = (
+            None
+            if topic is None
+            else self._connections.topic(topic.name, topic.type, latched=False)
+        )
         self._find_everybody()
-        self._observations = None
-        if interface.observation is not None:
-            topic = interface.observation
-            self._observations = self._connections.topic(topic.name, topic.type, latched=False)
         reset = interface.calls.get("reset")
         if reset is not None and not resumed:
             deadline = _Deadline(reset.timeout_s)
@@ -198,7 +200,7 @@ class Ros2Environment:
         call = self._interface.calls.get("sense")
         topic = self._interface.observation
         begun = self._now()
-        deadline = _Deadline(60.0 if call is None else call.timeout_s)
+        deadline = _Deadline(self._interface.timeout_s if call is None else call.timeout_s)
         label = self._problem.sensing_actions[sensing_action]
         answer: Any = None
         if call is not None:
@@ -436,6 +438,13 @@ class Ros2Environment:
             while not clients.are_ready():
                 if self._wait(limit, lambda: False, 0.02):
                     self._nobody(calls[role], limit)
+        topic = self._interface.observation
+        while topic is not None and not self._node.count_publishers(topic.name):
+            if self._wait(limit, lambda: False, 0.02):
+                raise EnvironmentFailedError(
+                    f"nobody publishes topic {topic.name} (environment.observation.topic); waited "
+                    f"{deadline.waited_s():.3g} s ({limit.key})"
+                )
         while self._done_topic is not None and not self._done_topic.messages:
             if self._wait(limit, lambda: False, 0.02):
                 raise EnvironmentFailedError(
@@ -563,7 +572,7 @@ class Ros2Environment:
             deadline,
             "environment.sense.timeout_ms"
             if "sense" in self._interface.calls
-            else "environment.timeout_ms",
+            else "0.45 times environment.timeout_ms",
         )
         refused, seen = 0, -1
         age_s = 0.0
