@@ -1,0 +1,445 @@
+"""The typed service in ROS 1, seen from the robot: a way to it that keeps its deadlines.
+
+rospy's own proxies ask the master at each call, wait for ever for a process that stands still, and
+``wait_for_service`` cannot tell a service that has died from one that is slow. Here a connection
+stands. The master is asked only when there is none, and where it does not answer, the service is
+looked for where it was last. Who refuses a connection is dead, and that is known at once.
+
+This needs neither rospy nor a node. In a node of rospy's it can be used as well.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import ipaddress
+import queue
+import socket
+import struct
+import threading
+from collections.abc import Callable
+from time import monotonic
+from typing import TYPE_CHECKING, Any, Final, Self
+from urllib.parse import urlsplit
+
+import numpy as np
+
+from holdfast.errors import TransportError
+from holdfast.ros.active_sensing import Answer, ErrorCode, Kind, Request
+from holdfast.ros.client import ActiveSensingClient
+from holdfast.ros.messages import MAX_BYTES, decode_answer, encode_request, md5_sum
+from holdfast.session.status import Status
+from holdfast.transport.endpoints import host_and_port, system_words
+from holdfast.transport.ros1_calls import CallError, GoneError, call
+from holdfast.transport.ros1_node import RosNode, Topic, TopicType
+from holdfast.transport.tcpros import (
+    MAX_HEADER_BYTES,
+    ServiceType,
+    Surroundings,
+    decode_header,
+    encode_header,
+    encode_message,
+    place_of_service,
+)
+
+if TYPE_CHECKING:
+    from rosbags.typesys.store import Typestore
+
+__all__ = ["SERVICE_TYPE", "STATUS_WORDS", "Ros1Client", "Ros1Service", "service_type"]
+
+SERVICE_TYPE: Final = "holdfast_interfaces/ActiveSensing"
+"""As ROS 1 writes it."""
+
+STATUS_WORDS: Final = {
+    Status.STANDARD: "standard",
+    Status.LOCAL_RECOVERY: "local recovery",
+    Status.KEEP_ALIVE: "keep alive",
+}
+"""How the first implementation spells the statuses."""
+
+_LOOKUP_S: Final = 1.0
+"""For the master, where the service is known to have been somewhere."""
+
+_START_S: Final = 5.0
+_MAX_WAITING: Final = 256
+
+
+def service_type() -> ServiceType:
+    """Return the typed service's name and digest in ROS 1."""
+    return ServiceType(SERVICE_TYPE, md5_sum())
+
+
+class _LostError(TransportError):
+    """The connection has ended."""
+
+
+class Ros1Service:
+    """A way to one service; see :class:`~holdfast.ros.client.Service`.
+
+    Parameters
+    ----------
+    name : str
+        Of the service, such as ``cloud_active_sensing``.
+    surroundings : Surroundings or None
+        None: what ROS's variables say.
+    caller : str
+        As whom the service is asked.
+
+    Raises
+    ------
+    TransportError
+        If the name is none.
+    """
+
+    def __init__(
+        self, name: str, surroundings: Surroundings | None = None, caller: str = "holdfast_robot"
+    ) -> None:
+        self._surroundings = surroundings or Surroundings.of()
+        self.name = self._surroundings.resolved(name)
+        self._caller = self._surroundings.resolved(caller)
+        self._digest = md5_sum()
+        self._last_place: tuple[str, int] | None = None
+        self._socket: socket.socket | None = None
+        self._is_closed = False
+        self._lock = threading.Lock()
+
+    def ask(self, request: Request, deadline_s: float) -> Answer:
+        """Ask, and wait for the answer for so long at most.
+
+        Raises
+        ------
+        TransportError
+            If there is no answer; the message says why.
+        """
+        until = monotonic() + deadline_s
+        message = encode_message(encode_request(request, "ros1"))
+        try:
+            return decode_answer(self._exchange(message, until), "ros1")
+        except TimeoutError:
+            self._disconnect()
+            raise TransportError(f"no answer in {deadline_s:g} s") from None
+        except TransportError:
+            self._disconnect()
+            raise
+        except OSError as error:
+            self._disconnect()
+            raise TransportError(system_words(error.errno)) from error
+
+    def close(self) -> None:
+        """End what is being asked; may be called from another thread, and repeated."""
+        self._is_closed = True
+        self._disconnect()
+
+    def _exchange(self, message: bytes, until: float) -> bytes:
+        if self._socket is not None:
+            # The service may have been started again since. What it is asked changes nothing
+            # there, so it can be asked twice.
+            with contextlib.suppress(_LostError, ConnectionError):
+                return self._exchange_over(self._socket, message, until)
+            self._disconnect()
+        return self._exchange_over(self._connected(until), message, until)
+
+    def _exchange_over(self, stream: socket.socket, message: bytes, until: float) -> bytes:
+        _send(stream, message, until)
+        is_done = _receive(stream, 1, until) == b"\x01"
+        answer = _receive_message(stream, MAX_BYTES, until)
+        if not is_done:
+            raise TransportError(f"it answers: {answer[:500].decode(errors='replace')}")
+        return answer
+
+    # -- the connection ----------------------------------------------------------------------------
+
+    def _connected(self, until: float) -> socket.socket:
+        place, where = self._found(until)
+        stream = socket.socket(socket.AF_INET6 if ":" in place[0] else socket.AF_INET)
+        try:
+            stream.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            stream.settimeout(_left(until))
+            try:
+                stream.connect(place)
+            except ConnectionRefusedError:
+                raise TransportError(
+                    f"nobody listens at {host_and_port(*place)}, where {where}: it is dead"
+                ) from None
+            with self._lock:
+                if self._is_closed:
+                    raise TransportError("it is not asked any more")
+                self._socket = stream
+            fields = {
+                "callerid": self._caller,
+                "service": self.name,
+                "md5sum": self._digest,
+                "type": SERVICE_TYPE,
+                "persistent": "1",
+            }
+            _send(stream, encode_header(fields), until)
+            header = decode_header(_receive_message(stream, MAX_HEADER_BYTES, until))
+        except BaseException:
+            stream.close()
+            raise
+        if "error" in header:
+            raise TransportError(f"it refuses: {header['error']:.500}")
+        self._last_place = place
+        return stream
+
+    def _found(self, until: float) -> tuple[tuple[str, int], str]:
+        """Return where the service is, and who says so."""
+        last = self._last_place
+        within_s = _left(until)
+        if last is not None:
+            within_s = min(within_s / 2, _LOOKUP_S)
+        try:
+            host, port = place_of_service(self._looked_up(within_s))
+        except GoneError:
+            reason = f"there is no master at {self._surroundings.master}"
+        except CallError as error:
+            reason = str(error)
+        else:
+            return (_address(host, until), port), "the master says it is"
+        if last is None:
+            raise TransportError(reason)
+        return last, f"it was last ({reason})"
+
+    def _looked_up(self, within_s: float) -> str:
+        surroundings = self._surroundings
+        parts = urlsplit(surroundings.master)
+        until = monotonic() + within_s
+        assert parts.hostname is not None and parts.port is not None
+        master = f"http://{host_and_port(_address(parts.hostname, until), parts.port)}/"
+        loop = asyncio.new_event_loop()
+        try:
+            asked = call(
+                master, "lookupService", self.name, within_s=_left(until), caller=self._caller
+            )
+            return str(loop.run_until_complete(asked))
+        finally:
+            loop.close()
+
+    def _disconnect(self) -> None:
+        with self._lock:
+            stream, self._socket = self._socket, None
+        if stream is not None:
+            with contextlib.suppress(OSError):
+                stream.shutdown(socket.SHUT_RDWR)  # wakes whoever waits for it
+            stream.close()
+
+
+def _left(until: float) -> float:
+    left = until - monotonic()
+    if left <= 0:
+        raise TimeoutError
+    return left
+
+
+def _address(host: str, until: float) -> str:
+    """Return the address of a host; a name's look-up, which nothing can break off, is left behind.
+
+    Raises
+    ------
+    TimeoutError
+        If it takes too long.
+    TransportError
+        If there is none.
+    """
+    with contextlib.suppress(ValueError):
+        return str(ipaddress.ip_address(host))
+    found: queue.SimpleQueue[str] = queue.SimpleQueue()
+
+    def look_up() -> None:
+        try:
+            # As all of ROS 1 does where it is not told to speak IPv6.
+            found.put(socket.getaddrinfo(host, None, socket.AF_INET)[0][4][0])  # type: ignore[arg-type]
+        except (OSError, UnicodeError):
+            found.put("")
+
+    threading.Thread(target=look_up, name="holdfast-resolve", daemon=True).start()
+    try:
+        address = found.get(timeout=_left(until))
+    except queue.Empty:
+        raise TimeoutError from None
+    if not address:
+        raise TransportError(f"host name not found: {host}")
+    return address
+
+
+def _send(stream: socket.socket, data: bytes, until: float) -> None:
+    stream.settimeout(_left(until))
+    stream.sendall(data)
+
+
+def _receive(stream: socket.socket, size: int, until: float) -> bytes:
+    data = bytearray(size)
+    view = memoryview(data)
+    place = 0
+    while place < size:
+        stream.settimeout(_left(until))
+        received = stream.recv_into(view[place:])
+        if not received:
+            raise _LostError("it has ended the connection")
+        place += received
+    return bytes(data)
+
+
+def _receive_message(stream: socket.socket, max_bytes: int, until: float) -> bytes:
+    (size,) = struct.unpack("<I", _receive(stream, 4, until))
+    if size > max_bytes:
+        raise TransportError(f"it answers with {size} bytes; {max_bytes} are allowed")
+    return _receive(stream, size, until)
+
+
+class _Talker:
+    """A node on a thread of its own, which publishes what a robot decides."""
+
+    def __init__(self, name: str, surroundings: Surroundings, client: str) -> None:
+        from rosbags.typesys import Stores, get_typestore
+
+        self._store: Typestore = get_typestore(Stores.ROS1_NOETIC)
+        self._loop = asyncio.new_event_loop()
+        self._node = RosNode(name, surroundings)
+        self._waiting = 0
+        self._topics: dict[str, tuple[Topic, str]] = {}
+        for topic, kind, latched in (
+            ("status", "std_msgs/msg/String", True),
+            ("decided_by", "std_msgs/msg/String", True),
+            ("sensing_action", "std_msgs/msg/UInt32", False),
+            ("task_actions", "std_msgs/msg/Float64MultiArray", False),
+        ):
+            definition, digest = self._store.generate_msgdef(kind)
+            type_ = TopicType(kind.replace("/msg/", "/"), digest, definition)
+            published = self._node.publish(f"{client}/{topic}", type_, latched=latched)
+            self._topics[topic] = published, kind
+        self._started = threading.Event()
+        self._failure: BaseException | None = None
+        self._thread = threading.Thread(target=self._run, name="holdfast-ros1", daemon=True)
+        self._thread.start()
+        self._started.wait(_START_S)
+        if self._failure is not None:
+            raise self._failure
+
+    def send(self, topic: str, **fields: Any) -> None:
+        """Publish; never waits, and what nobody takes in time is left out."""
+        to, kind = self._topics[topic]
+        message = self._store.types[kind](**fields)
+        data = bytes(self._store.serialize_ros1(message, kind))
+        if self._waiting >= _MAX_WAITING:
+            return
+        self._waiting += 1
+
+        def send() -> None:
+            self._waiting -= 1
+            to.send(data)
+
+        with contextlib.suppress(RuntimeError):  # it is closed
+            self._loop.call_soon_threadsafe(send)
+
+    def array(self, numbers: np.ndarray[Any, np.dtype[np.float64]]) -> dict[str, Any]:
+        """Return the fields of a Float64MultiArray."""
+        types = self._store.types
+        dimension = types["std_msgs/msg/MultiArrayDimension"]
+        rows, columns = numbers.shape
+        layout = types["std_msgs/msg/MultiArrayLayout"](
+            dim=[
+                dimension(label="action", size=rows, stride=rows * columns),
+                dimension(label="coordinate", size=columns, stride=columns),
+            ],
+            data_offset=0,
+        )
+        return {"layout": layout, "data": np.ascontiguousarray(numbers, np.float64).ravel()}
+
+    def close(self) -> None:
+        """Take leave of the master, for a second at most."""
+        with contextlib.suppress(RuntimeError):
+            self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join(_START_S)
+
+    def _run(self) -> None:
+        loop = self._loop
+        asyncio.set_event_loop(loop)
+        try:
+            loop.run_until_complete(self._node.start())
+            self._started.set()
+            loop.run_forever()
+            loop.run_until_complete(self._node.close())
+        except TransportError as error:
+            self._failure = error
+        finally:
+            self._started.set()
+            loop.close()
+
+
+class Ros1Client:
+    """The thesis's client: asks the cloud, and the recovery service when the cloud fails.
+
+    It is a node that publishes ``status`` and ``decided_by`` (``std_msgs/String``),
+    ``sensing_action`` (``std_msgs/UInt32``) and ``task_actions`` (``std_msgs/Float64MultiArray``,
+    one action after another), each under the node's name.
+
+    Parameters
+    ----------
+    name : str
+        Of the node.
+    cloud, recovery : str
+        Names of the services.
+    deadline_s : float
+        A service that has not answered by then is given up for this decision.
+    surroundings : Surroundings or None
+        None: what ROS's variables say.
+    on_event : callable or None
+        As for :class:`~holdfast.ros.client.ActiveSensingClient`.
+    """
+
+    def __init__(
+        self,
+        name: str = "active_sensing",
+        cloud: str = "cloud_active_sensing",
+        recovery: str = "cloud_active_sensing_recovery",
+        deadline_s: float = 1.0,
+        surroundings: Surroundings | None = None,
+        on_event: Callable[..., None] | None = None,
+    ) -> None:
+        surroundings = surroundings or Surroundings.of()
+        self._on_event = on_event
+        services = [Ros1Service(each, surroundings, name) for each in (cloud, recovery)]
+        self._talker = _Talker(name, surroundings, name)
+        self._talker.send("status", data=STATUS_WORDS[Status.STANDARD])
+        self._client = ActiveSensingClient(*services, deadline_s, self._changed)
+        self._decided_by = ""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Ask nobody any more, and take leave of the master."""
+        self._client.close()
+        self._talker.close()
+
+    @property
+    def status(self) -> Status:
+        """Who decides."""
+        return self._client.status
+
+    @property
+    def decided_by(self) -> str:
+        """Name of the service that gave the last answer."""
+        return self._client.decided_by
+
+    def decide(self, request: Request, give_up_s: float | None = None) -> Answer:
+        """Return what a service answers; see :meth:`ActiveSensingClient.decide`."""
+        answer = self._client.decide(request, give_up_s)
+        if self.decided_by != self._decided_by:
+            self._decided_by = self.decided_by
+            self._talker.send("decided_by", data=self.decided_by)
+        if answer.error is ErrorCode.OK and request.kind == Kind.CHOOSE_SENSING_ACTION:
+            self._talker.send("sensing_action", data=answer.sensing_action)
+        elif len(answer.task_actions):
+            self._talker.send("task_actions", **self._talker.array(answer.task_actions))
+        return answer
+
+    def _changed(self, name: str, **fields: object) -> None:
+        if name == "status":
+            self._talker.send("status", data=STATUS_WORDS[Status(fields["status"])])
+        if self._on_event is not None:
+            self._on_event(name, **fields)

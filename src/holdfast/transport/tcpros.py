@@ -1,0 +1,190 @@
+"""What ROS 1 says over TCP, as bytes: connection headers, requests and answers. No socket here.
+
+A connection begins with a header from each end, fields NAME=VALUE that say which service or topic
+is meant and by which digest both know its type. Then a caller sends requests, each after its
+length, and gets an answer to each in the same order: a byte that says whether it was done, then a
+message or, in words, why there is none. A topic's connection has messages alone.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import socket
+import struct
+from collections.abc import Mapping
+from typing import NamedTuple, Self
+from urllib.parse import urlsplit
+
+from holdfast.errors import TransportError
+
+__all__ = [
+    "ANY_TYPE",
+    "MAX_HEADER_BYTES",
+    "ServiceType",
+    "Surroundings",
+    "decode_header",
+    "encode_answer",
+    "encode_header",
+    "encode_message",
+    "encode_refusal",
+    "place_of_service",
+]
+
+MAX_HEADER_BYTES = 64 * 1024
+"""Bound on a connection header; a topic's has the whole definition of its type."""
+
+ANY_TYPE = "*"
+"""Stands for any type's digest."""
+
+_LENGTH = struct.Struct("<I")
+_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*)*")
+_MAX_NAME = 200
+
+
+class ServiceType(NamedTuple):
+    """A service's type.
+
+    Attributes
+    ----------
+    name : str
+        Such as ``std_srvs/Trigger``.
+    digest : str
+        Its MD5, by which both ends know that they mean the same.
+    """
+
+    name: str
+    digest: str
+
+
+def encode_header(fields: Mapping[str, str]) -> bytes:
+    """Write a connection header."""
+    parts = []
+    for name, value in fields.items():
+        field = f"{name}={value}".encode()
+        parts += [_LENGTH.pack(len(field)), field]
+    return encode_message(b"".join(parts))
+
+
+def decode_header(data: bytes) -> dict[str, str]:
+    """Read a connection header, without its length.
+
+    Raises
+    ------
+    TransportError
+        If it is none; the rest of a sentence about whoever has sent it.
+    """
+    fields = {}
+    place = 0
+    while place < len(data):
+        if place + 4 > len(data):
+            raise TransportError("has sent a connection header that is cut off")
+        (size,) = _LENGTH.unpack_from(data, place)
+        field = data[place + 4 : place + 4 + size]
+        name, equals, value = field.decode(errors="replace").partition("=")
+        if len(field) != size or not equals:
+            raise TransportError("has sent no connection header of ROS 1")
+        fields[name] = value
+        place += 4 + size
+    return fields
+
+
+def encode_message(payload: bytes) -> bytes:
+    """Write a request, or a message of a topic."""
+    return _LENGTH.pack(len(payload)) + payload
+
+
+def encode_answer(payload: bytes) -> bytes:
+    """Write an answer."""
+    return b"\x01" + encode_message(payload)
+
+
+def encode_refusal(reason: str) -> bytes:
+    """Write that there is no answer."""
+    return b"\x00" + encode_message(reason.encode())
+
+
+def place_of_service(uri: object) -> tuple[str, int]:
+    """Return host and port of a service.
+
+    Parameters
+    ----------
+    uri : str
+        As a master has it, ``rosrpc://HOST:PORT``.
+
+    Raises
+    ------
+    TransportError
+        If it is none.
+    """
+    try:
+        parts = urlsplit(str(uri))
+        host, port = parts.hostname, parts.port
+    except ValueError:
+        host = port = None
+    if not host or not port or parts.scheme != "rosrpc":
+        raise TransportError(f"the master says that it is at {uri!r:.200}, which is no place")
+    return host, port
+
+
+class Surroundings(NamedTuple):
+    """Where a process is in ROS 1.
+
+    Attributes
+    ----------
+    master : str
+        URI of the master.
+    host : str
+        By which others reach this machine.
+    bind : str
+        The address at which to listen.
+    namespace : str
+        Before names that do not begin with a slash; ends with one.
+    """
+
+    master: str
+    host: str
+    bind: str
+    namespace: str
+
+    @classmethod
+    def of(cls, environment: Mapping[str, str] = os.environ) -> Self:
+        """Return what ``ROS_MASTER_URI``, ``ROS_HOSTNAME``, ``ROS_IP`` and ``ROS_NAMESPACE`` say.
+
+        Raises
+        ------
+        TransportError
+            If the master's URI is none.
+        """
+        master = environment.get("ROS_MASTER_URI") or "http://localhost:11311"
+        try:
+            parts = urlsplit(master)
+            is_place = parts.scheme == "http" and bool(parts.hostname) and bool(parts.port)
+        except ValueError:
+            is_place = False
+        if not is_place:
+            raise TransportError(f"ROS_MASTER_URI is {master!r:.200}; expected http://HOST:PORT")
+        own = environment.get("ROS_HOSTNAME") or environment.get("ROS_IP") or ""
+        is_local = own == "localhost" or own.startswith("127.")
+        namespace = environment.get("ROS_NAMESPACE", "").strip("/")
+        return cls(
+            master,
+            own or socket.gethostname(),
+            "127.0.0.1" if is_local else "0.0.0.0",
+            f"/{namespace}/" if namespace else "/",
+        )
+
+    def resolved(self, name: str) -> str:
+        """Return a name as the master knows it.
+
+        Raises
+        ------
+        TransportError
+            If it is no name.
+        """
+        if len(name) > _MAX_NAME or not _NAME.fullmatch(name.removeprefix("/")):
+            raise TransportError(
+                f"{name!r:.220} is no name in ROS 1: words of letters, digits and '_', each "
+                f"beginning with a letter, with '/' between them, {_MAX_NAME} characters at most"
+            )
+        return name if name.startswith("/") else self.namespace + name

@@ -1,0 +1,425 @@
+"""The typed service in a real ROS 1: stock tools and clients use it, and a run loses nothing."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import signal
+import socket
+import struct
+import subprocess
+import threading
+from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+from tests.ros.ros1_processes import SYSTEM_PYTHON, Ros1, ros1_in, until
+from tests.unit.test_active_sensing import in_process
+
+from holdfast.configuration import Configuration, load
+from holdfast.errors import TransportError
+from holdfast.ros.active_sensing import ErrorCode, Kind, Request
+from holdfast.ros.messages import md5_sum
+from holdfast.ros.ros1 import Ros1Service
+from holdfast.ros.ros1_service import MAX_WAITING, Ros1ActiveSensing
+from holdfast.transport.tcpros import Surroundings, decode_header, encode_header
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "peg_in_hole_2d.yaml"
+CLOUD, RECOVERY = "cloud_active_sensing", "cloud_active_sensing_recovery"
+
+
+@pytest.fixture
+def around(ros1: Mapping[str, str], tmp_path: Path) -> Iterator[Ros1]:
+    yield from ros1_in(ros1, tmp_path)
+
+
+@pytest.fixture
+def here(around: Ros1) -> Surroundings:
+    return Surroundings.of(around.environment)
+
+
+@pytest.fixture
+def configuration() -> Configuration:
+    return load(EXAMPLE)
+
+
+def test_the_tools_of_ros_know_the_service(around: Ros1) -> None:
+    around.serve(CLOUD, EXAMPLE)
+    assert f"/{CLOUD}" in around.run("rosservice", "list").split()
+    assert around.run("rosservice", "type", f"/{CLOUD}").split() == [
+        "holdfast_interfaces/ActiveSensing"
+    ]
+    info = around.run("rosservice", "info", f"/{CLOUD}")
+    assert f"Node: /{CLOUD}" in info
+    assert "Args: kind configuration seed trial state" in info
+    assert f"/{CLOUD}" in around.run("rosnode", "list").split()
+    assert f"* /{CLOUD}" in around.run("rosnode", "info", f"/{CLOUD}")
+    assert "xmlrpc reply" in around.run("rosnode", "ping", "-c", "1", f"/{CLOUD}")
+    shown = around.run("rossrv", "show", "holdfast_interfaces/ActiveSensing")
+    assert "uint8 CHOOSE_TASK_ACTIONS=2" in shown
+    assert around.run("rossrv", "md5", "holdfast_interfaces/ActiveSensing").strip() == md5_sum()
+    called = around.run("rosservice", "call", f"/{CLOUD}", "{kind: 0, seed: 3, trial: 0}")
+    assert "error: 0" in called
+    refused = around.run("rosservice", "call", f"/{CLOUD}", "{kind: 7}")
+    assert "kind 7: there are 0 INITIALIZE, 1 CHOOSE_SENSING_ACTION" in refused
+
+
+STOCK = """
+import json, rospy, sys
+from holdfast_interfaces.srv import ActiveSensing, ActiveSensingRequest
+
+rospy.init_node("stock")
+rospy.wait_for_service("cloud_active_sensing", 10)
+said = []
+for persistent in (False, True):
+    ask = rospy.ServiceProxy("cloud_active_sensing", ActiveSensing, persistent=persistent)
+    state = ask(ActiveSensingRequest(kind=0, seed=4, trial=1)).state
+    chosen = ask(ActiveSensingRequest(kind=1, state=state))
+    acted = ask(ActiveSensingRequest(
+        kind=2, state=state, sensing_action=chosen.sensing_action, observation=[0.1]))
+    state.belief.weights = [1.0] * len(state.belief.weights)
+    spoilt = ask(ActiveSensingRequest(kind=1, state=state))
+    other = ask(ActiveSensingRequest(kind=0, configuration="another"))
+    said.append([chosen.sensing_action, list(chosen.entropies), acted.error, acted.message,
+        list(acted.task_actions), spoilt.error, spoilt.message, other.error, other.message])
+print(json.dumps(said))
+"""
+
+
+def test_a_stock_client_in_rospy_asks_and_is_told_its_mistakes(
+    around: Ros1, here: Surroundings
+) -> None:
+    around.serve(CLOUD, EXAMPLE)
+    once, standing = json.loads(around.run(SYSTEM_PYTHON, "-c", STOCK))
+    assert once == standing
+    chosen, entropies, error, message, actions, *mistakes = once
+    service = Ros1Service(CLOUD, here)
+    state = service.ask(Request(Kind.INITIALIZE, seed=4, trial=1), 30.0).state
+    answer = service.ask(Request(Kind.CHOOSE_SENSING_ACTION, state=state), 30.0)
+    assert (chosen, entropies) == (answer.sensing_action, answer.entropies.tolist())
+    assert (error, message) == (ErrorCode.OK, "")
+    assert len(actions) > 0
+    assert mistakes[0] == ErrorCode.BAD_REQUEST
+    assert "weights" in mistakes[1]
+    assert mistakes[2] == ErrorCode.OTHER_CONFIGURATION
+    assert "'another'" in mistakes[3]
+    service.close()
+
+
+ROBOT = """
+import json, sys
+import rospy
+from holdfast.configuration import load
+from holdfast.ros.active_sensing import Kind, Request
+from holdfast.ros.ros1 import Ros1Client
+from holdfast.runtime.environment import SimulatedEnvironment
+
+settings = load(sys.argv[1])
+simulator = settings.simulator
+rospy.init_node("executive")
+made, statuses = [], []
+with Ros1Client(
+    "active_sensing", deadline_s=float(sys.argv[2]),
+    on_event=lambda name, **fields: statuses.append(fields.get("status", name)),
+) as client:
+    world = SimulatedEnvironment(settings.problem, simulator.seed, 0)
+    state = client.decide(Request(Kind.INITIALIZE, seed=simulator.seed, trial=0)).state
+    done = False
+    while not done:
+        # Whoever watches may do harm here, and says when it is done.
+        print(len(made), flush=True)
+        sys.stdin.readline()
+        chosen = client.decide(Request(Kind.CHOOSE_SENSING_ACTION, state=state)).sensing_action
+        made.append(chosen)
+        answer = client.decide(Request(
+            Kind.CHOOSE_TASK_ACTIONS, state=state, sensing_action=chosen,
+            observation=world.perform_sensing(chosen)))
+        state = answer.state
+        for action in answer.task_actions:
+            world.perform(action)
+            made.append(tuple(action))
+            done = world.is_done()
+            if done:
+                break
+print(json.dumps([made, statuses]), flush=True)
+"""
+
+
+class Robot:
+    """A node in rospy, of the system's Python, that runs a trial step by step."""
+
+    def __init__(self, around: Ros1, deadline_s: float) -> None:
+        command = [around.python, "-c", ROBOT, str(EXAMPLE), str(deadline_s)]
+        self._process = around.start(
+            *command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=None, text=True
+        )
+
+    def next(self) -> int | list[object]:
+        """Return how many decisions there are, or at the end what they were."""
+        assert self._process.stdout is not None
+        line = self._process.stdout.readline()
+        assert line, "the robot has ended"
+        said: int | list[object] = json.loads(line)
+        return said
+
+    def go_on(self) -> None:
+        assert self._process.stdin is not None
+        self._process.stdin.write("\n")
+        self._process.stdin.flush()
+
+
+def test_a_run_decides_as_in_process_whatever_happens_to_the_cloud(
+    around: Ros1, configuration: Configuration
+) -> None:
+    cloud = around.serve(CLOUD, EXAMPLE)
+    around.serve(RECOVERY, EXAMPLE)
+    robot = Robot(around, 0.5)
+    steps = 0
+    echo = None
+    while isinstance(said := robot.next(), int):
+        steps += 1
+        match steps:
+            case 1:
+                echo = around.start(
+                    *("rostopic", "echo", "-p", "/active_sensing/status"),
+                    stdout=subprocess.PIPE,
+                    text=True,
+                )
+                assert echo.stdout is not None
+                assert echo.stdout.readline() == "%time,field.data\n"
+                assert echo.stdout.readline().endswith(",standard\n")
+            case 2:
+                cloud.kill()
+                cloud.wait()
+            case 4:
+                cloud = around.serve(CLOUD, EXAMPLE)
+            case 6:
+                cloud.send_signal(signal.SIGSTOP)
+            case 8:
+                cloud.send_signal(signal.SIGCONT)
+            case 10:
+                cloud.terminate()
+                cloud.wait()
+        robot.go_on()
+    made, statuses = said
+    assert steps > 10
+    assert made == json.loads(json.dumps(in_process(configuration, 0)))
+    assert echo is not None and echo.stdout is not None
+    seen = [echo.stdout.readline().strip().rpartition(",")[2] for _ in range(3)]
+    assert seen == ["local recovery", "keep alive", "local recovery"]
+    assert statuses[:3] == ["local_recovery", "keep_alive", "local_recovery"]
+
+
+def test_a_dead_service_that_the_master_still_lists_is_found_without_waiting(
+    around: Ros1, here: Surroundings
+) -> None:
+    cloud = around.serve(CLOUD, EXAMPLE)
+    standing, new = Ros1Service(CLOUD, here), Ros1Service(CLOUD, here)
+    standing.ask(Request(Kind.INITIALIZE), 30.0)
+    cloud.kill()
+    cloud.wait()
+    assert around.service_uri(CLOUD) is not None
+    for service in (standing, new):
+        with pytest.raises(TransportError, match=r"nobody listens at .* the master says it is"):
+            service.ask(Request(Kind.INITIALIZE), 3600.0)
+    around.serve(CLOUD, EXAMPLE)
+    for service in (standing, new):
+        assert service.ask(Request(Kind.INITIALIZE), 30.0).error is ErrorCode.OK
+        service.close()
+
+
+def test_a_stopped_service_costs_no_more_than_the_deadline(
+    around: Ros1, here: Surroundings
+) -> None:
+    cloud = around.serve(CLOUD, EXAMPLE)
+    standing, new = Ros1Service(CLOUD, here), Ros1Service(CLOUD, here)
+    standing.ask(Request(Kind.INITIALIZE), 30.0)
+    cloud.send_signal(signal.SIGSTOP)
+    for service in (standing, new, standing):
+        with pytest.raises(TransportError, match=r"no answer in 0\.2 s"):
+            service.ask(Request(Kind.INITIALIZE), 0.2)
+    cloud.send_signal(signal.SIGCONT)
+    for service in (standing, new):
+        assert service.ask(Request(Kind.INITIALIZE), 30.0).error is ErrorCode.OK
+        service.close()
+
+
+def test_a_question_that_hangs_ends_when_its_asker_is_closed(
+    around: Ros1, here: Surroundings
+) -> None:
+    cloud = around.serve(CLOUD, EXAMPLE)
+    service = Ros1Service(CLOUD, here)
+    service.ask(Request(Kind.INITIALIZE), 30.0)
+    cloud.send_signal(signal.SIGSTOP)
+    said: list[str] = []
+
+    def ask() -> None:
+        with pytest.raises(TransportError) as caught:
+            service.ask(Request(Kind.INITIALIZE), 3600.0)
+        said.append(str(caught.value))
+
+    asking = threading.Thread(target=ask)
+    asking.start()
+    until(lambda: cloud.poll() is None, "it is stopped")
+    service.close()
+    asking.join(30.0)
+    assert not asking.is_alive()
+    assert said
+    cloud.send_signal(signal.SIGCONT)
+
+
+class TestTheMasterDies:
+    def test_calls_to_a_service_that_lives_go_on(self, around: Ros1, here: Surroundings) -> None:
+        around.serve(CLOUD, EXAMPLE)
+        service = Ros1Service(CLOUD, here)
+        service.ask(Request(Kind.INITIALIZE), 30.0)
+        assert around.master is not None
+        around.master.kill()
+        around.master.wait()
+        assert service.ask(Request(Kind.INITIALIZE), 30.0).error is ErrorCode.OK
+        # Even over a new connection: it is where it was.
+        service._disconnect()
+        assert service.ask(Request(Kind.INITIALIZE), 30.0).error is ErrorCode.OK
+        service.close()
+        never_seen = Ros1Service(CLOUD, here)
+        with pytest.raises(TransportError, match=f"there is no master at .*{around.port}"):
+            never_seen.ask(Request(Kind.INITIALIZE), 30.0)
+
+    def test_a_master_that_knows_nothing_is_told_again(
+        self, around: Ros1, here: Surroundings
+    ) -> None:
+        around.serve(CLOUD, EXAMPLE)
+        assert around.master is not None
+        for _ in range(2):
+            around.master.kill()
+            around.master.wait()
+            around.start_master()
+            until(lambda: around.service_uri(CLOUD), "the service is listed again")
+            assert f"/{CLOUD}" in around.run("rosservice", "list").split()
+
+    def test_a_master_that_stands_still_holds_up_no_call(
+        self, around: Ros1, here: Surroundings
+    ) -> None:
+        cloud = around.serve(CLOUD, EXAMPLE)
+        service = Ros1Service(CLOUD, here)
+        service.ask(Request(Kind.INITIALIZE), 30.0)
+        assert around.master is not None
+        around.master.send_signal(signal.SIGSTOP)
+        service._disconnect()
+        assert service.ask(Request(Kind.INITIALIZE), 30.0).error is ErrorCode.OK
+        never_seen = Ros1Service(CLOUD, here)
+        with pytest.raises(TransportError, match=r"no answer"):
+            never_seen.ask(Request(Kind.INITIALIZE), 0.3)
+        around.master.send_signal(signal.SIGCONT)
+        assert never_seen.ask(Request(Kind.INITIALIZE), 30.0).error is ErrorCode.OK
+        assert cloud.poll() is None
+        service.close()
+        never_seen.close()
+
+    def test_a_service_can_be_started_before_its_master(
+        self, around: Ros1, here: Surroundings
+    ) -> None:
+        assert around.master is not None
+        around.master.kill()
+        around.master.wait()
+        around.start(
+            *(around.python, "-m", "holdfast.ros.ros1_service"),
+            *("--configuration", str(EXAMPLE)),
+        )
+        around.start_master()
+        until(lambda: around.service_uri(CLOUD), "the service is listed")
+
+
+def test_rosnode_kill_ends_it(around: Ros1) -> None:
+    cloud = around.serve(CLOUD, EXAMPLE)
+    around.run("rosnode", "kill", f"/{CLOUD}")
+    assert cloud.wait(30.0) == 0
+    assert around.service_uri(CLOUD) is None
+
+
+def place_of(around: Ros1) -> tuple[str, int]:
+    uri = around.service_uri(CLOUD)
+    assert uri is not None
+    host, _, port = uri.removeprefix("rosrpc://").rpartition(":")
+    return host, int(port)
+
+
+@pytest.mark.parametrize(
+    "said",
+    [
+        b"GET / HTTP/1.1\r\n\r\n",
+        b"\xff" * 64,
+        struct.pack("<I", 3) + b"abc",
+        encode_header({"hello": "world"}),
+        encode_header({"service": f"/{CLOUD}", "md5sum": "*", "persistent": "1"})
+        + struct.pack("<I", 1 << 31),
+    ],
+    ids=["http", "length", "cut_off", "neither", "large_request"],
+)
+def test_who_speaks_otherwise_is_hung_up_on_and_nobody_else(
+    around: Ros1, here: Surroundings, said: bytes
+) -> None:
+    around.serve(CLOUD, EXAMPLE)
+    with socket.create_connection(place_of(around), 30.0) as stream:
+        stream.sendall(said)
+        while stream.recv(4096):
+            pass
+    service = Ros1Service(CLOUD, here)
+    assert service.ask(Request(Kind.INITIALIZE), 30.0).error is ErrorCode.OK
+    service.close()
+
+
+@pytest.mark.parametrize(
+    ("fields", "reason"),
+    [
+        ({"service": "/other", "md5sum": "*"}, "has no service [/other]"),
+        ({"service": f"/{CLOUD}", "md5sum": "0" * 32}, "of type holdfast_interfaces/ActiveSensing"),
+        ({"topic": "/other", "md5sum": "*"}, "does not publish [/other]"),
+    ],
+)
+def test_what_is_not_there_is_refused_in_words(
+    around: Ros1, fields: dict[str, str], reason: str
+) -> None:
+    around.serve(CLOUD, EXAMPLE)
+    with socket.create_connection(place_of(around), 30.0) as stream:
+        stream.sendall(encode_header({"callerid": "/test", **fields}))
+        heard = b""
+        while data := stream.recv(4096):
+            heard += data
+    assert reason in decode_header(heard[4:])["error"]
+
+
+def test_a_request_that_is_no_message_is_answered_with_the_reason(around: Ros1) -> None:
+    around.serve(CLOUD, EXAMPLE)
+    with socket.create_connection(place_of(around), 30.0) as stream:
+        stream.sendall(encode_header({"service": f"/{CLOUD}", "md5sum": "*"}))
+        stream.sendall(struct.pack("<I", 3) + b"abc")
+        heard = b""
+        while data := stream.recv(65536):
+            heard += data
+    assert b"3 bytes are no holdfast_interfaces/srv/ActiveSensing_Request" in heard
+
+
+async def test_too_many_requests_at_once_are_told_so(
+    around: Ros1, here: Surroundings, configuration: Configuration
+) -> None:
+    service = Ros1ActiveSensing(configuration, surroundings=here)
+    hold = threading.Event()
+    service._thread.submit(hold.wait)
+    assert await service.start()
+    loop = asyncio.get_running_loop()
+    asked = [Ros1Service(CLOUD, here) for _ in range(MAX_WAITING + 1)]
+    with ThreadPoolExecutor(len(asked)) as askers:
+        answers = [
+            loop.run_in_executor(askers, each.ask, Request(Kind.INITIALIZE), 60.0)
+            for each in asked
+        ]
+        (busy,), _ = await asyncio.wait(answers, return_when=asyncio.FIRST_COMPLETED)
+        hold.set()
+        errors = [answer.error for answer in await asyncio.gather(*answers)]
+    assert (await busy).message == f"{MAX_WAITING} requests wait, and {MAX_WAITING} are allowed"
+    assert sorted(errors) == [ErrorCode.OK] * MAX_WAITING + [ErrorCode.BUSY]
+    for each in asked:
+        each.close()
+    await service.close()
