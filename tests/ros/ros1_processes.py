@@ -6,6 +6,7 @@ import contextlib
 import os
 import subprocess
 import sys
+import threading
 import time
 import xmlrpc.client
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -26,6 +27,17 @@ def until(condition: Callable[[], object], what: str) -> None:
         if time.monotonic() > deadline:
             raise AssertionError(f"not in {PATIENCE_S} s: {what}")
         time.sleep(0.02)
+
+
+def line_of(process: subprocess.Popen[str]) -> str:
+    """Return the next line that a process writes; one that writes none in time is ended."""
+    assert process.stdout is not None
+    timer = threading.Timer(PATIENCE_S, process.kill)
+    timer.start()
+    try:
+        return process.stdout.readline()
+    finally:
+        timer.cancel()
 
 
 class Ros1:
@@ -62,7 +74,7 @@ class Ros1:
 
     def start(
         self, *command: str, environment: Mapping[str, str] | None = None, **options: Any
-    ) -> subprocess.Popen[bytes]:
+    ) -> subprocess.Popen[Any]:
         """Start a process of this ROS."""
         process = subprocess.Popen(
             command,
@@ -115,7 +127,7 @@ class Ros1:
         self._stack.close()
 
 
-def _end(process: subprocess.Popen[bytes]) -> None:
+def _end(process: subprocess.Popen[Any]) -> None:
     with contextlib.suppress(ProcessLookupError):
         process.kill()
     process.communicate()

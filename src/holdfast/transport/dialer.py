@@ -28,6 +28,7 @@ import threading
 from collections.abc import Callable
 from typing import Any, Final, TypeAlias
 
+from holdfast.errors import TransportError
 from holdfast.transport.endpoints import Endpoint, system_words
 from holdfast.transport.links import Link
 
@@ -52,6 +53,9 @@ _REFUSED_PAUSE_S: Final = 1.0
 
 _RESOLVE_AGAIN_S: Final = 1.0
 """After the last answer: while nobody is reached, a name may come to stand for somebody else."""
+
+_LOOK_UP_AGAIN_S: Final = 0.1
+"""After a ROS 1 master's last answer."""
 
 _Address: TypeAlias = str | tuple[Any, ...]
 
@@ -97,6 +101,8 @@ class Dialer:
         self._addresses: list[tuple[socket.AddressFamily, _Address]] = []
         if endpoint.is_local_socket:
             self._addresses = [(socket.AF_UNIX, endpoint.host)]
+        elif endpoint.is_ros1:
+            pass  # the master knows it
         elif "%" not in endpoint.host:  # the interface that it names may come later
             with contextlib.suppress(ValueError):
                 version = ipaddress.ip_address(endpoint.host).version
@@ -248,10 +254,22 @@ class Dialer:
     def _resolve(self) -> None:
         """Look up the host's addresses; on a thread of its own."""
         endpoint = self._endpoint
+        host, port = endpoint.host, endpoint.port
+        family, again_s = socket.AF_UNSPEC, _RESOLVE_AGAIN_S
+        reason = ""
+        found: list[Any] = []
         try:
-            found = socket.getaddrinfo(endpoint.host, endpoint.port, type=socket.SOCK_STREAM)
+            if endpoint.is_ros1:
+                from holdfast.transport.ros1 import look_up
+
+                # A service that is started again is at another port; and ROS 1 speaks IPv4.
+                family, again_s = socket.AF_INET, _LOOK_UP_AGAIN_S
+                host, port = look_up(endpoint)
+            found = socket.getaddrinfo(host, port, family, type=socket.SOCK_STREAM)
+        except TransportError as error:
+            reason = str(error)
         except (OSError, UnicodeError):
-            found = []
+            reason = f"host name not found: {host}"
         addresses: list[tuple[socket.AddressFamily, _Address]] = [
             (entry[0], entry[4]) for entry in found
         ]
@@ -260,11 +278,11 @@ class Dialer:
         addresses.sort(key=lambda each: (kinds.index(each[0]), self._place_of(each[1])))
 
         def take() -> None:
-            self._resolve_at = self._loop.time() + _RESOLVE_AGAIN_S
+            self._resolve_at = self._loop.time() + again_s
             # Without new ones, those of before may still be right.
             self._addresses = addresses or self._addresses
             if not self._addresses:
-                self._on_failed(f"host name not found: {endpoint.host}")
+                self._on_failed(reason)
             elif self._next is not None and not self._attempts and not self._links:
                 self._next.cancel()
                 self._attempt()

@@ -1,7 +1,7 @@
 """Where a service is: which endpoints there are, and which of them would be unsafe.
 
 An endpoint is a protocol and a place: ``tcp/127.0.0.1:7447``, ``tls/planner.example:7447``,
-``udp/planner.example:7447``, ``unix//run/holdfast/robot.sock``. Every endpoint is read here before
+``udp/planner.example:7447``, ``unix//run/holdfast/robot.sock``, ``ros1/cloud_active_sensing``. Every endpoint is read here before
 anything is opened, and what cannot work is refused with the reason.
 """
 
@@ -45,7 +45,7 @@ __all__ = [
     "why_not_bound",
 ]
 
-PROTOCOLS = ("tcp", "tls", "udp", "unix")
+PROTOCOLS = ("tcp", "tls", "udp", "unix", "ros1")
 """What an endpoint may begin with."""
 
 ENCRYPTED_PROTOCOLS = frozenset({"tls", "udp"})
@@ -58,6 +58,7 @@ AUTHORITY_FILE, CERTIFICATE_FILE, KEY_FILE = "authority.pem", "certificate.pem",
 """Names of the credentials' files."""
 
 _UNIX = "unix"
+_ROS1 = "ros1"
 
 _RENAMED = {
     "quic": "over UDP, services are at udp/HOST:PORT",
@@ -108,9 +109,10 @@ class Endpoint(NamedTuple):
     protocol : str
         One of :data:`PROTOCOLS`.
     host : str
-        Name or address, an IPv6 address without its brackets; for ``unix`` the path.
+        Name or address, an IPv6 address without its brackets; for ``unix`` the path, for ``ros1``
+        the name in ROS 1.
     port : int
-        0 means any free port, where something listens; for ``unix`` always 0.
+        0 means any free port, where something listens; for ``unix`` and ``ros1`` always 0.
     """
 
     protocol: str
@@ -118,7 +120,7 @@ class Endpoint(NamedTuple):
     port: int
 
     def __str__(self) -> str:
-        if self.protocol == _UNIX:
+        if self.protocol in (_UNIX, _ROS1):
             return f"{self.protocol}/{self.host}"
         return f"{self.protocol}/{host_and_port(self.host, self.port)}"
 
@@ -133,6 +135,11 @@ class Endpoint(NamedTuple):
         return self.protocol == _UNIX
 
     @property
+    def is_ros1(self) -> bool:
+        """Whether a ROS 1 master knows where it is."""
+        return self.protocol == _ROS1
+
+    @property
     def is_loopback(self) -> bool:
         """Whether only this machine can reach it.
 
@@ -141,6 +148,10 @@ class Endpoint(NamedTuple):
         """
         if self.is_local_socket:
             return True
+        if self.is_ros1:
+            from holdfast.transport.tcpros import Surroundings
+
+            return _is_loopback_address(ipaddress.ip_address(Surroundings.of().bind))
         address = _address_of(self.host)
         if address is not None:
             return _is_loopback_address(address)
@@ -287,7 +298,7 @@ def parse_endpoint(text: str) -> Endpoint:
     Parameters
     ----------
     text : str
-        ``PROTOCOL/HOST:PORT``, with an IPv6 address in brackets, or ``unix/PATH``.
+        ``PROTOCOL/HOST:PORT``, with an IPv6 address in brackets, ``unix/PATH`` or ``ros1/NAME``.
 
     Raises
     ------
@@ -323,6 +334,8 @@ def parse_endpoint(text: str) -> Endpoint:
         )
     if protocol == _UNIX:
         return _local_socket(text, place)
+    if protocol == _ROS1:
+        return _name_in_ros1(text, place)
     host, colon, port_text = place.rpartition(":")
     if not colon or place.endswith("]"):
         raise TransportError(
@@ -410,7 +423,8 @@ def check_endpoint(text: str, *, listens: bool) -> Endpoint:
         If it is none, or is to be connected to and has port 0.
     """
     endpoint = parse_endpoint(text)
-    if not listens and endpoint.port == 0 and not endpoint.is_local_socket:
+    has_port = not (endpoint.is_local_socket or endpoint.is_ros1)
+    if not listens and endpoint.port == 0 and has_port:
         raise TransportError(
             f"endpoint {endpoint}: port 0 is for listening; to connect, give the port, "
             f"as in {endpoint.with_port(7447)}"
@@ -424,8 +438,13 @@ def check_direction(endpoint: Endpoint, *, service_listens: bool) -> None:
     Raises
     ------
     TransportError
-        If robots are to be called over ``udp``.
+        If robots are to be called over ``udp`` or ``ros1``.
     """
+    if endpoint.is_ros1 and not service_listens:
+        raise TransportError(
+            f"endpoint {endpoint}: in ROS 1 it is the service that is offered and the robot that "
+            f"calls it"
+        )
     if endpoint.protocol == "udp" and not service_listens:
         raise TransportError(
             f"endpoint {endpoint}: over udp it is the service that listens and the robot that "
@@ -492,6 +511,16 @@ def _local_socket(text: str, path: str) -> Endpoint:
             f"{MAX_SOCKET_PATH_BYTES}"
         )
     return Endpoint(_UNIX, path, 0)
+
+
+def _name_in_ros1(text: str, name: str) -> Endpoint:
+    from holdfast.transport.tcpros import Surroundings
+
+    try:
+        Surroundings.of().resolved(name)
+    except TransportError as error:
+        raise TransportError(f"endpoint {text!r}: {error}") from error
+    return Endpoint(_ROS1, name, 0)
 
 
 def _address_of(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:

@@ -289,10 +289,14 @@ class Link(asyncio.BufferedProtocol):
         """Whether short messages go beside the stream."""
         return False
 
+    def protocol(self) -> asyncio.BaseProtocol:
+        """Return what asyncio is to connect: the link itself, unless something is in between."""
+        return self
+
     async def connect(self, stream: socket.socket) -> None:
         """Begin to speak over a connection; never raises."""
         try:
-            await self._loop.create_connection(lambda: self, sock=stream)
+            await self._loop.create_connection(self.protocol, sock=stream)
         except OSError as error:
             stream.close()
             self.connection_lost(error)

@@ -331,6 +331,10 @@ class _Service:
 
             assert tls is not None
             link = RobotDatagramLink(self, self._robot.settings, tls=tls)
+        elif self.endpoint.is_ros1:
+            from holdfast.transport.ros1 import RobotRosLink
+
+            link = RobotRosLink(self, self._robot.settings, self.endpoint)
         else:
             link = Link(
                 self,

@@ -32,6 +32,7 @@ from holdfast.transport.tcpros import (
     encode_header,
     encode_message,
     encode_refusal,
+    header_of_service,
 )
 
 __all__ = ["RosNode", "ServiceHandler", "Topic", "TopicType", "UnansweredError"]
@@ -402,7 +403,7 @@ class RosNode:
                 f"{offer.type.digest}; {header.get('md5sum')!r:.60} was asked for",
             )
             return
-        writer.write(encode_header(self.header_of(header["service"], offer.type)))
+        writer.write(encode_header(header_of_service(self.name, header["service"], offer.type)))
         if header.get("probe") == "1":
             await writer.drain()
             return
@@ -416,17 +417,6 @@ class RosNode:
             await writer.drain()
             if header.get("persistent") != "1":
                 return
-
-    def header_of(self, service: str, type_: ServiceType) -> dict[str, str]:
-        """Return what a caller is told of a service."""
-        return {
-            "callerid": self.name,
-            "service": service,
-            "type": type_.name,
-            "md5sum": type_.digest,
-            "request_type": f"{type_.name}Request",
-            "response_type": f"{type_.name}Response",
-        }
 
     async def _serve_subscriber(
         self, header: Mapping[str, str], reader: asyncio.StreamReader, writer: asyncio.StreamWriter

@@ -49,6 +49,7 @@ if TYPE_CHECKING:
 
 if TYPE_CHECKING:
     from holdfast.transport.datagrams import DatagramSockets
+    from holdfast.transport.ros1_node import RosNode
 
 __all__ = ["MAX_LINKS", "MAX_UNKNOWN", "StreamServiceTransport"]
 
@@ -228,6 +229,7 @@ class StreamServiceTransport:
         self._links: dict[Link, set[_StreamCall]] = {}
         self._closing: set[asyncio.Future[None]] = set()
         self._gone: asyncio.Future[None] | None = None
+        self._node: RosNode | None = None
 
     @property
     def endpoints(self) -> tuple[str, ...]:
@@ -249,15 +251,33 @@ class StreamServiceTransport:
         try:
             for endpoint, listening in zip(self._listen, self._listening, strict=True):
                 accepted = partial(self._accepted, endpoint)
-                self._listeners.append(Listener(endpoint, accepted, listening=listening))
+                place = endpoint
+                if endpoint.is_ros1:
+                    from holdfast.transport.ros1 import place_to_listen
+
+                    place = place_to_listen()
+                self._listeners.append(Listener(place, accepted, listening=listening))
         except TransportError:
             self._stop_listening()
             raise
-        self._listen = [listener.endpoint for listener in self._listeners]
+        ports = {
+            endpoint: listener.endpoint.port
+            for endpoint, listener in zip(self._listen, self._listeners, strict=True)
+            if endpoint.is_ros1
+        }
+        self._listen = [
+            endpoint if endpoint.is_ros1 else listener.endpoint
+            for endpoint, listener in zip(self._listen, self._listeners, strict=True)
+        ]
         for endpoint in self._connect:
             dialer = Dialer(endpoint, partial(self._make_dialled, endpoint))
             self._dialers[endpoint] = dialer
             dialer.start()
+        if ports:
+            from holdfast.transport.ros1 import make_node
+
+            self._node = make_node(ports, self._on_event)
+            await self._node.start()
 
     def dismiss(self) -> asyncio.Future[None]:
         """Take no new links, and ask the robots to go elsewhere.
@@ -301,8 +321,12 @@ class StreamServiceTransport:
             link.end(_SERVICE_ENDS, goodbye="")
         for link in list(self._ungreeted):
             link.end("")
-        if self._closing:
-            await asyncio.wait(set(self._closing), timeout=timeout_s)
+        node, self._node = self._node, None
+        closing = set(self._closing)
+        if node is not None:
+            closing.add(asyncio.ensure_future(node.close(timeout_s)))
+        if closing:
+            await asyncio.wait(closing, timeout=timeout_s)
         if self._sockets is not None:
             self._sockets.close()
 
@@ -385,6 +409,10 @@ class StreamServiceTransport:
 
             assert tls is not None and self._sockets is not None
             link = ServiceDatagramLink(self, self._settings, tls=tls, sockets=self._sockets)
+        elif endpoint.is_ros1:
+            from holdfast.transport.ros1 import ServiceRosLink
+
+            link = ServiceRosLink(self, self._settings, endpoint)
         else:
             link = Link(self, self._settings, speaks_first=dialled and tls is None, tls=tls)
         if len(self._ungreeted) >= _MAX_UNGREETED:

@@ -28,6 +28,7 @@ __all__ = [
     "encode_header",
     "encode_message",
     "encode_refusal",
+    "header_of_service",
     "place_of_service",
 ]
 
@@ -64,6 +65,18 @@ def encode_header(fields: Mapping[str, str]) -> bytes:
         field = f"{name}={value}".encode()
         parts += [_LENGTH.pack(len(field)), field]
     return encode_message(b"".join(parts))
+
+
+def header_of_service(node: str, service: str, type_: ServiceType) -> dict[str, str]:
+    """Return what a caller is told of a service."""
+    return {
+        "callerid": node,
+        "service": service,
+        "type": type_.name,
+        "md5sum": type_.digest,
+        "request_type": f"{type_.name}Request",
+        "response_type": f"{type_.name}Response",
+    }
 
 
 def decode_header(data: bytes) -> dict[str, str]:
