@@ -418,8 +418,7 @@ async def test_too_many_requests_at_once_are_told_so(
     asked = [Ros1Service(CLOUD, here) for _ in range(MAX_WAITING + 1)]
     with ThreadPoolExecutor(len(asked)) as askers:
         answers = [
-            loop.run_in_executor(askers, each.ask, Request(Kind.INITIALIZE), 60.0)
-            for each in asked
+            loop.run_in_executor(askers, each.ask, Request(Kind.INITIALIZE), 60.0) for each in asked
         ]
         (busy,), _ = await asyncio.wait(answers, return_when=asyncio.FIRST_COMPLETED)
         hold.set()

@@ -30,6 +30,7 @@ from holdfast.transport.ros1 import EXCHANGE
 from holdfast.transport.service_end import StreamServiceTransport
 
 TestEveryWire = contract.TestEveryWire
+_OF_PROCESSES = contract.TestProcesses
 
 
 class RosWire(StreamWire):
@@ -40,16 +41,12 @@ class RosWire(StreamWire):
 
 
 @pytest.fixture(scope="module")
-def around(
-    ros1: Mapping[str, str], tmp_path_factory: pytest.TempPathFactory
-) -> Iterator[Ros1]:
+def around(ros1: Mapping[str, str], tmp_path_factory: pytest.TempPathFactory) -> Iterator[Ros1]:
     yield from ros1_in(ros1, tmp_path_factory.mktemp("ros1"))
 
 
 @pytest.fixture
-def wire(
-    around: Ros1, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> RosWire:
+def wire(around: Ros1, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> RosWire:
     for name in ("ROS_MASTER_URI", "ROS_HOSTNAME"):
         monkeypatch.setenv(name, around.environment[name])
     return RosWire("ros1", tmp_path)
@@ -63,14 +60,10 @@ class TestProcesses:
         wire.lease_ms = LEASE_MS
         return lambda boot: service_process(wire.endpoint("cloud"), boot)
 
-    test_kill = contract.TestProcesses.test_kill_in_mid_call_ends_the_call_and_the_next_process_is_seen
-    test_stop = contract.TestProcesses.test_a_stopped_process_is_lost_after_the_lease_and_found_again
-    test_large = (
-        contract.TestProcesses.test_a_large_request_to_a_stopped_process_ends_and_holds_nobody_up
-    )
-    test_go_on = (
-        contract.TestProcesses.test_a_service_that_goes_on_just_when_it_was_given_up_answers_again
-    )
+    test_kill = _OF_PROCESSES.test_kill_in_mid_call_ends_the_call_and_the_next_process_is_seen
+    test_stop = _OF_PROCESSES.test_a_stopped_process_is_lost_after_the_lease_and_found_again
+    test_large = _OF_PROCESSES.test_a_large_request_to_a_stopped_process_ends_and_holds_nobody_up
+    test_go_on = _OF_PROCESSES.test_a_service_that_goes_on_just_when_it_was_given_up_answers_again
 
 
 def test_the_tools_of_ros_know_the_service(around: Ros1, wire: RosWire) -> None:

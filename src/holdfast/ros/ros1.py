@@ -27,6 +27,7 @@ import numpy as np
 from holdfast.errors import TransportError
 from holdfast.ros.active_sensing import Answer, ErrorCode, Kind, Request
 from holdfast.ros.client import ActiveSensingClient
+from holdfast.ros.loop_thread import LoopThread
 from holdfast.ros.messages import MAX_BYTES, decode_answer, encode_request, md5_sum
 from holdfast.session.status import Status
 from holdfast.transport.endpoints import host_and_port, system_words
@@ -61,6 +62,7 @@ _LOOKUP_S: Final = 1.0
 """For the master, where the service is known to have been somewhere."""
 
 _START_S: Final = 5.0
+_CLOSE_S: Final = 1.0
 _MAX_WAITING: Final = 256
 
 
@@ -161,10 +163,7 @@ class Ros1Service:
                 raise TransportError(
                     f"nobody listens at {host_and_port(*place)}, where {where}: it is dead"
                 ) from None
-            with self._lock:
-                if self._is_closed:
-                    raise TransportError("it is not asked any more")
-                self._socket = stream
+            self._take(stream)
             fields = {
                 "callerid": self._caller,
                 "service": self.name,
@@ -181,6 +180,13 @@ class Ros1Service:
             raise TransportError(f"it refuses: {header['error']:.500}")
         self._last_place = place
         return stream
+
+    def _take(self, stream: socket.socket) -> None:
+        """Have a connection that :meth:`close` ends."""
+        with self._lock:
+            if self._is_closed:
+                raise TransportError("it is not asked any more")
+            self._socket = stream
 
     def _found(self, until: float) -> tuple[tuple[str, int], str]:
         """Return where the service is, and who says so."""
@@ -294,9 +300,9 @@ class _Talker:
         from rosbags.typesys import Stores, get_typestore
 
         self._store: Typestore = get_typestore(Stores.ROS1_NOETIC)
-        self._loop = asyncio.new_event_loop()
         self._node = RosNode(name, surroundings)
         self._waiting = 0
+        self._is_closed = False
         self._topics: dict[str, tuple[Topic, str]] = {}
         for topic, kind, latched in (
             ("status", "std_msgs/msg/String", True),
@@ -308,13 +314,12 @@ class _Talker:
             type_ = TopicType(kind.replace("/msg/", "/"), digest, definition)
             published = self._node.publish(f"{client}/{topic}", type_, latched=latched)
             self._topics[topic] = published, kind
-        self._started = threading.Event()
-        self._failure: BaseException | None = None
-        self._thread = threading.Thread(target=self._run, name="holdfast-ros1", daemon=True)
-        self._thread.start()
-        self._started.wait(_START_S)
-        if self._failure is not None:
-            raise self._failure
+        self._thread = LoopThread("holdfast-ros1")
+        try:
+            self._thread.run(self._node.start(), _START_S)
+        except BaseException:
+            self._thread.close(_START_S)
+            raise
 
     def send(self, topic: str, **fields: Any) -> None:
         """Publish; never waits, and what nobody takes in time is left out."""
@@ -329,8 +334,7 @@ class _Talker:
             self._waiting -= 1
             to.send(data)
 
-        with contextlib.suppress(RuntimeError):  # it is closed
-            self._loop.call_soon_threadsafe(send)
+        self._thread.call(send)
 
     def array(self, numbers: np.ndarray[Any, np.dtype[np.float64]]) -> dict[str, Any]:
         """Return the fields of a Float64MultiArray."""
@@ -347,24 +351,12 @@ class _Talker:
         return {"layout": layout, "data": np.ascontiguousarray(numbers, np.float64).ravel()}
 
     def close(self) -> None:
-        """Take leave of the master, for a second at most."""
-        with contextlib.suppress(RuntimeError):
-            self._loop.call_soon_threadsafe(self._loop.stop)
-        self._thread.join(_START_S)
-
-    def _run(self) -> None:
-        loop = self._loop
-        asyncio.set_event_loop(loop)
-        try:
-            loop.run_until_complete(self._node.start())
-            self._started.set()
-            loop.run_forever()
-            loop.run_until_complete(self._node.close())
-        except TransportError as error:
-            self._failure = error
-        finally:
-            self._started.set()
-            loop.close()
+        """Take leave of the master, for a second at most; may be repeated."""
+        if not self._is_closed:
+            self._is_closed = True
+            with contextlib.suppress(TransportError):
+                self._thread.run(self._node.close(_CLOSE_S), 2 * _CLOSE_S)
+            self._thread.close(_CLOSE_S)
 
 
 class Ros1Client:

@@ -7,18 +7,22 @@ asks while too many wait is told so, and can ask the other service.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 from holdfast.configuration import Configuration
-from holdfast.errors import HoldfastError
+from holdfast.errors import HoldfastError, TransportError
 from holdfast.ros.active_sensing import ActiveSensing, Answer, ErrorCode
+from holdfast.ros.loop_thread import LoopThread
 from holdfast.ros.messages import MAX_BYTES, decode_request, encode_answer
 from holdfast.ros.ros1 import service_type
 from holdfast.transport.ros1_node import RosNode
 from holdfast.transport.tcpros import Surroundings
 
-__all__ = ["MAX_WAITING", "Ros1ActiveSensing"]
+__all__ = ["MAX_WAITING", "Ros1ActiveSensing", "Ros1Server"]
+
+_START_S = 5.0
 
 MAX_WAITING = 64
 """Requests that wait to be answered; who asks then is told that this service is busy."""
@@ -65,12 +69,22 @@ class Ros1ActiveSensing:
         )
         self._node.offer(name, service_type(), self._answer)
         self._waiting = 0
+        self._takes_more = True
         self._thread = ThreadPoolExecutor(1, "holdfast-ros1")
 
     @property
     def name(self) -> str:
         """Of the service, as the master knows it."""
         return self._node.name
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether it owes answers."""
+        return self._waiting > 0
+
+    def take_no_more(self) -> None:
+        """Answer what is owed, and tell who asks from now on to ask somebody else."""
+        self._takes_more = False
 
     async def start(self) -> bool:
         """Be there; return whether the master knows it, which is told again until it does.
@@ -88,6 +102,8 @@ class Ros1ActiveSensing:
         self._thread.shutdown(wait=False, cancel_futures=True)
 
     async def _answer(self, request: bytes) -> bytes:
+        if not self._takes_more:
+            return self._encoded(self._answers.refusal(ErrorCode.BUSY, "this service ends"))
         if self._waiting >= MAX_WAITING:
             return self._encoded(
                 self._answers.refusal(
@@ -121,42 +137,67 @@ class Ros1ActiveSensing:
 
 
 def _on_loop(loop: asyncio.AbstractEventLoop, callback: Callable[[], None]) -> None:
-    try:
+    with contextlib.suppress(RuntimeError):  # the loop is closed
         loop.call_soon_threadsafe(callback)
-    except RuntimeError:
-        pass  # the loop is closed
 
 
-def main() -> int:
-    """Run the typed service in ROS 1 until it is told to stop."""
-    import argparse
-    import signal
-    from pathlib import Path
+class Ros1Server:
+    """The typed service in ROS 1, for whoever has no loop: it runs on threads of its own.
 
-    from holdfast.configuration import load
+    Parameters
+    ----------
+    configuration, name, surroundings, on_shutdown, on_event
+        As of :class:`Ros1ActiveSensing`.
+    """
 
-    parser = argparse.ArgumentParser(prog="python -m holdfast.ros.ros1_service")
-    parser.add_argument("--configuration", type=Path, required=True)
-    parser.add_argument("--ros1-name", default="cloud_active_sensing")
-    options = parser.parse_args()
-    configuration = load(options.configuration)
-
-    async def run() -> None:
-        loop = asyncio.get_running_loop()
-        stopped = asyncio.Event()
-        for number in (signal.SIGINT, signal.SIGTERM):
-            loop.add_signal_handler(number, stopped.set)
-        service = Ros1ActiveSensing(
-            configuration, options.ros1_name, on_shutdown=lambda _: stopped.set()
+    def __init__(
+        self,
+        configuration: Configuration,
+        name: str = "cloud_active_sensing",
+        surroundings: Surroundings | None = None,
+        *,
+        on_shutdown: Callable[[str], None] | None = None,
+        on_event: Callable[..., None] | None = None,
+    ) -> None:
+        self._service = Ros1ActiveSensing(
+            configuration, name, surroundings, on_shutdown=on_shutdown, on_event=on_event
         )
-        await service.start()
-        print(f"{service.name} is in ROS 1", flush=True)
-        await stopped.wait()
-        await service.close()
+        self._thread: LoopThread | None = None
 
-    asyncio.run(run())
-    return 0
+    @property
+    def name(self) -> str:
+        """Of the service, as the master knows it."""
+        return self._service.name
 
+    @property
+    def is_busy(self) -> bool:
+        """Whether it owes answers."""
+        return self._service.is_busy
 
-if __name__ == "__main__":
-    raise SystemExit(main())
+    def start(self) -> bool:
+        """Be there; return whether the master knows it.
+
+        Raises
+        ------
+        TransportError
+            If it cannot listen.
+        """
+        self._thread = LoopThread("holdfast-ros1")
+        try:
+            return self._thread.run(self._service.start(), _START_S)
+        except BaseException:
+            self._thread.close(_START_S)
+            raise
+
+    def take_no_more(self) -> None:
+        """Answer what is owed, and tell who asks from now on to ask somebody else."""
+        if self._thread is not None:
+            self._thread.call(self._service.take_no_more)
+
+    def close(self, timeout_s: float) -> None:
+        """End within this time; may be repeated."""
+        thread, self._thread = self._thread, None
+        if thread is not None:
+            with contextlib.suppress(TransportError):
+                thread.run(self._service.close(timeout_s / 2), timeout_s)
+            thread.close(timeout_s)

@@ -1,8 +1,9 @@
 """Where a service is: which endpoints there are, and which of them would be unsafe.
 
 An endpoint is a protocol and a place: ``tcp/127.0.0.1:7447``, ``tls/planner.example:7447``,
-``udp/planner.example:7447``, ``unix//run/holdfast/robot.sock``, ``ros1/cloud_active_sensing``. Every endpoint is read here before
-anything is opened, and what cannot work is refused with the reason.
+``udp/planner.example:7447``, ``unix//run/holdfast/robot.sock``, ``ros1/cloud_active_sensing``.
+Every endpoint is read here before anything is opened, and what cannot work is refused with the
+reason.
 """
 
 from __future__ import annotations

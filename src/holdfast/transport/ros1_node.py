@@ -309,16 +309,12 @@ class RosNode:
 
     # -- what others ask a node --------------------------------------------------------------------
 
-    async def _serve_node(
-        self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
-    ) -> None:
+    async def _serve_node(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         with self._connected(writer) as is_welcome:
             while is_welcome and await self._answer_one(reader, writer):
                 pass
 
-    async def _answer_one(
-        self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
-    ) -> bool:
+    async def _answer_one(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> bool:
         """Answer one question; return whether another one may follow."""
         head = (await reader.readuntil(b"\r\n\r\n")).decode("latin-1")
         async with asyncio.timeout(_OPENING_S):

@@ -1,0 +1,64 @@
+"""An asyncio loop on a thread of its own, for what must go on while others wait or compute."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import threading
+from collections.abc import Callable, Coroutine
+from typing import Any, TypeVar
+
+from holdfast.errors import TransportError
+
+__all__ = ["LoopThread"]
+
+_T = TypeVar("_T")
+
+
+class LoopThread:
+    """A loop that runs until it is closed.
+
+    Parameters
+    ----------
+    name : str
+        Of the thread.
+    """
+
+    def __init__(self, name: str) -> None:
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self._thread.start()
+
+    def run(self, coroutine: Coroutine[Any, Any, _T], within_s: float) -> _T:
+        """Run a coroutine there, and wait for its result for so long.
+
+        Raises
+        ------
+        TransportError
+            If it takes longer.
+        """
+        future = asyncio.run_coroutine_threadsafe(coroutine, self._loop)
+        try:
+            return future.result(within_s)
+        except TimeoutError:
+            future.cancel()
+            raise TransportError(f"it took longer than {within_s:g} s") from None
+
+    def call(self, function: Callable[..., object], *arguments: object) -> None:
+        """Have something called there; nothing happens once it is closed."""
+        with contextlib.suppress(RuntimeError):
+            self._loop.call_soon_threadsafe(function, *arguments)
+
+    def close(self, timeout_s: float) -> None:
+        """End the loop; may be repeated."""
+        self.call(self._loop.stop)
+        self._thread.join(timeout_s)
+
+    def _run(self) -> None:
+        asyncio.set_event_loop(self._loop)
+        try:
+            self._loop.run_forever()
+            # What was cancelled just now still hears of it.
+            self._loop.run_until_complete(asyncio.sleep(0))
+        finally:
+            self._loop.close()
