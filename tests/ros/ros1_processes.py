@@ -18,6 +18,7 @@ from tests.ros.conftest import ROOT, left_out
 
 PATIENCE_S = 30.0
 SYSTEM_PYTHON = "/usr/bin/python3"
+HOLDFAST = str(Path(sys.executable).with_name("holdfast"))
 
 
 def until(condition: Callable[[], object], what: str) -> None:
@@ -100,8 +101,8 @@ class Ros1:
         """Start a typed service, and wait until the master knows it."""
         before = self.service_uri(name)
         process = self.start(
-            *(sys.executable, "-m", "holdfast.ros.ros1_service"),
-            *("--configuration", str(configuration), "--ros1-name", name, *more),
+            *(HOLDFAST, "serve", "--ros1", "--ros1-name", name),
+            *("--configuration", str(configuration), *more),
         )
         until(lambda: self.service_uri(name) not in (None, before), f"the master knows {name}")
         return process

@@ -330,8 +330,8 @@ class TestTheMasterDies:
         around.master.kill()
         around.master.wait()
         around.start(
-            *(around.python, "-m", "holdfast.ros.ros1_service"),
-            *("--configuration", str(EXAMPLE)),
+            # The system's Python, as the robot has it.
+            *(around.python, "-m", "holdfast", "serve", "--ros1", "--configuration", str(EXAMPLE)),
         )
         around.start_master()
         until(lambda: around.service_uri(CLOUD), "the service is listed")

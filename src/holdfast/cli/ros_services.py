@@ -5,12 +5,15 @@ The service's own package knows nothing of ROS, so the command line brings the t
 
 from __future__ import annotations
 
+import os
+import signal
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
-from holdfast.errors import InvalidValueError
+from holdfast.errors import InvalidValueError, TransportError
 
 if TYPE_CHECKING:
+    from holdfast.configuration import Configuration
     from holdfast.ros.active_sensing import ActiveSensing
     from holdfast.service.beside import Beside
     from holdfast.service.options import Options
@@ -34,6 +37,8 @@ def make_ros_services(options: Options) -> Sequence[Beside]:
     services: list[Beside] = []
     if options.ros2_domain is not None:
         services.append(_Ros2(ActiveSensing(configuration), options))
+    if options.ros1:
+        services.append(_Ros1(configuration, options))
     return services
 
 
@@ -76,6 +81,58 @@ class _Ros2:
 
     def close(self, timeout_s: float) -> None:
         self._server.close(timeout_s)
+
+    def _tell(self, name: str, **fields: object) -> None:
+        if self._on_event is not None:
+            self._on_event(name, **fields)
+
+
+class _Ros1:
+    """The service in ROS 1."""
+
+    def __init__(self, configuration: Configuration, options: Options) -> None:
+        from holdfast.ros.ros1_service import Ros1Server
+        from holdfast.transport.tcpros import Surroundings
+
+        surroundings = Surroundings.of()
+        if surroundings.bind != "127.0.0.1" and not options.insecure:
+            raise InvalidValueError(
+                "--ros1: other machines can reach this service, and in ROS 1 nobody has to prove "
+                "who he is; set ROS_HOSTNAME=127.0.0.1 for nodes of this machine alone, or say "
+                "--insecure"
+            )
+        try:
+            self._server = Ros1Server(
+                configuration,
+                options.ros1_name,
+                surroundings,
+                on_shutdown=self._end,
+                on_event=self._tell,
+            )
+        except TransportError as error:
+            raise TransportError(f"--ros1-name: {error}") from None
+        self._where = f"{self._server.name} (master {surroundings.master})"
+        self._on_event: Callable[..., None] | None = None
+
+    @property
+    def is_busy(self) -> bool:
+        return self._server.is_busy
+
+    def start(self, on_event: Callable[..., None]) -> Mapping[str, str]:
+        self._on_event = on_event
+        self._server.start()
+        return {"ros1": self._where}
+
+    def take_no_more(self) -> None:
+        self._server.take_no_more()
+
+    def close(self, timeout_s: float) -> None:
+        self._server.close(timeout_s)
+
+    def _end(self, reason: str) -> None:
+        """End this process, as ROS asks a node to; it has the time that SIGTERM leaves."""
+        self._tell("ros_shutdown", reason=reason)
+        os.kill(os.getpid(), signal.SIGTERM)
 
     def _tell(self, name: str, **fields: object) -> None:
         if self._on_event is not None:

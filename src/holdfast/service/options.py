@@ -54,6 +54,8 @@ class Options(argparse.Namespace):
     ros2_name: str
     ros2_router: str | None
     ros2_listen: str | None
+    ros1: bool
+    ros1_name: str
     until_stdin_closes: bool
     supervised: tuple[int, int] | None
     sockets: list[int]
@@ -70,7 +72,7 @@ class Options(argparse.Namespace):
     @property
     def has_beside(self) -> bool:
         """Whether something else is to be offered, besides the service."""
-        return self.ros2_domain is not None
+        return self.ros2_domain is not None or self.ros1
 
 
 def parse_options(arguments: Sequence[str]) -> Options:
@@ -87,6 +89,8 @@ def parse_options(arguments: Sequence[str]) -> Options:
         for option, given in (
             ("--connect", options.connect),
             ("--ros2-domain", options.ros2_domain is not None),
+            ("--ros1", options.ros1),
+            ("--listen ros1/NAME", any(each.startswith("ros1/") for each in options.listen)),
             ("--until-stdin-closes", options.until_stdin_closes),
         ):
             if given:
@@ -115,14 +119,17 @@ def _check_beside(options: Options) -> None:
         )
     elif not options.ros2_listen:
         options.ros2_router = options.ros2_router or _DEFAULT_ROUTER
+    if not options.ros1 and options.ros1_name != DEFAULT_NAME:
+        raise InvalidValueError("--ros1-name: goes with --ros1 only")
     if options.has_beside and options.configuration is None:
         raise InvalidValueError(
-            "--ros2-domain: --configuration is missing; it says for which problem and with which "
-            "settings this service decides in ROS"
+            f"{'--ros1' if options.ros1 else '--ros2-domain'}: --configuration is missing; it says "
+            "for which problem and with which settings this service decides in ROS"
         )
     if options.configuration is not None and not options.has_beside:
         raise InvalidValueError(
-            "--configuration: goes with --ros2-domain only; other robots bring theirs along"
+            "--configuration: goes with --ros2-domain or --ros1 only; other robots bring theirs "
+            "along"
         )
 
 
@@ -378,6 +385,18 @@ def _parser() -> _Parser:
         "--ros2-listen",
         metavar="ENDPOINT",
         help="where nodes of ROS 2 can connect, instead of a router",
+    )
+    add(
+        "--ros1",
+        action="store_true",
+        help="offer a service in ROS 1, too, where ROS_MASTER_URI and the like say; it needs no "
+        "ROS (pip install 'holdfast[ros]'). Then nothing else listens here unless --listen says so",
+    )
+    add(
+        "--ros1-name",
+        default=DEFAULT_NAME,
+        metavar="NAME",
+        help=f"name of that service and of its node in ROS 1 (default: {DEFAULT_NAME})",
     )
     # For the processes that a supervisor starts: its number, and the descriptors that they inherit.
     add("--supervised", type=_whole_numbers, help=argparse.SUPPRESS)

@@ -44,7 +44,7 @@ _CLOSE_TIMEOUT_S = 0.7
 _LOOK_S = 0.01
 _STDIN = 0
 
-_OFFERED = ("health", "metrics", "ros2")
+_OFFERED = ("health", "metrics", "ros2", "ros1")
 """What the ready line may say that is offered, and where."""
 
 
