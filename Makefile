@@ -14,6 +14,8 @@ INSTALLED_COMPILED := $(COMPILED)/.installed
 
 # The wheels of a real ROS 2, for tests alone.
 ROS2 ?= $(CURDIR)/.ros2
+# holdfast in the system's Python, which ROS 1 needs; its packages are Debian's.
+ROS1 ?= $(CURDIR)/.ros1
 
 DIST ?= dist
 # Seconds since 1970 that archives bear, so that they come out the same whenever they are made.
@@ -62,7 +64,8 @@ test-deploy-slow: $(INSTALLED_DEV) ## those of them that take minutes
 test-ros: $(INSTALLED_DEV) ## a real ROS 1 and ROS 2, which tests/ros/set_up_ros2 installs the first time
 	tests/ros/set_up_ros2 $(ROS2) $(PYTHON)
 	tests/ros/set_up_peers $(ROS2) $(PYTHON)
-	ROS2=$(ROS2) $(BIN)/pytest -q -m "ros and not slow" -n 2 --dist loadfile tests/ros
+	if [ -e /usr/bin/rosmaster ]; then tests/ros/set_up_ros1 $(ROS1); fi
+	ROS1=$(ROS1) ROS2=$(ROS2) $(BIN)/pytest -q -m "ros and not slow" -n 2 --dist loadfile tests/ros
 
 fuzz: $(INSTALLED_DEV) ## 1,000,000 hostile messages to a live service; some 15 minutes
 	$(BIN)/python -m tests.fuzz.live --messages 1000000 --seed 1

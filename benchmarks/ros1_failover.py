@@ -136,6 +136,7 @@ class Robot:
         line = process.stdout.readline()
         timer.cancel()
         if not line:
+            process.wait()
             return Seen(math.inf, math.inf, "")
         known, decided, by = json.loads(line)
         return Seen(
@@ -215,6 +216,7 @@ def written(times: list[float], limit_s: float) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--repetitions", type=int, default=10)
+    parser.add_argument("--faults", nargs="+", choices=FAULTS, default=list(FAULTS))
     parser.add_argument("--limit-s", type=float, default=12.0)
     parser.add_argument("--json", type=Path, help="every single time")
     options = parser.parse_args()
@@ -223,7 +225,8 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as directory, contextlib.ExitStack() as stack:
         scene = Scene(Path(directory))
         stack.callback(scene.ros.close)
-        for fault, words in FAULTS.items():
+        for fault in options.faults:
+            words = FAULTS[fault]
             for way, its_words in WAYS.items():
                 each = [
                     scene.measure(way, fault, options.limit_s) for _ in range(options.repetitions)

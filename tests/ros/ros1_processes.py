@@ -121,7 +121,7 @@ class Ros1:
     def ask(self, method: str, *arguments: object) -> Sequence[Any]:
         """Ask the master."""
         with xmlrpc.client.ServerProxy(self.environment["ROS_MASTER_URI"]) as master:
-            return list(getattr(master, method)("/test", *arguments))  # type: ignore[call-overload]
+            return list(getattr(master, method)("/test", *arguments))
 
     def close(self) -> None:
         """End all processes."""

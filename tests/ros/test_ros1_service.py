@@ -12,6 +12,7 @@ import threading
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import pytest
 from tests.ros.ros1_processes import SYSTEM_PYTHON, Ros1, line_of, ros1_in, until
@@ -159,12 +160,11 @@ class Robot:
             *command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=None, text=True
         )
 
-    def next(self) -> int | list[object]:
+    def next(self) -> Any:
         """Return how many decisions there are, or at the end what they were."""
         line = line_of(self._process)
         assert line, "the robot has ended"
-        said: int | list[object] = json.loads(line)
-        return said
+        return json.loads(line)
 
     def go_on(self, told: str) -> None:
         assert self._process.stdin is not None

@@ -391,10 +391,10 @@ class Ros1Client:
     ) -> None:
         surroundings = surroundings or Surroundings.of()
         self._on_event = on_event
-        services = [Ros1Service(each, surroundings, name) for each in (cloud, recovery)]
+        first, second = (Ros1Service(each, surroundings, name) for each in (cloud, recovery))
         self._talker = _Talker(name, surroundings, name)
         self._talker.send("status", data=STATUS_WORDS[Status.STANDARD])
-        self._client = ActiveSensingClient(*services, deadline_s, self._changed)
+        self._client = ActiveSensingClient(first, second, deadline_s, self._changed)
         self._decided_by = ""
 
     def __enter__(self) -> Self:

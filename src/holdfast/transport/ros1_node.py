@@ -338,7 +338,7 @@ class RosNode:
             await writer.drain()
         return not ends
 
-    def _answer(self, method: str, arguments: tuple[Any, ...]) -> tuple[int, str, object]:
+    def _answer(self, method: str, arguments: tuple[Any, ...]) -> tuple[int, str, Any]:
         match method:
             case "getPid":
                 return _OK, "", os.getpid()
