@@ -14,6 +14,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from tests.ros.ros1_processes import SYSTEM_PYTHON, Ros1, line_of, ros1_in, until
 from tests.unit.test_active_sensing import in_process
@@ -22,7 +23,7 @@ from holdfast.configuration import Configuration, load
 from holdfast.errors import TransportError
 from holdfast.ros.active_sensing import ErrorCode, Kind, Request
 from holdfast.ros.messages import md5_sum
-from holdfast.ros.ros1 import Ros1Service
+from holdfast.ros.ros1 import Ros1Client, Ros1Service
 from holdfast.ros.ros1_service import MAX_WAITING, Ros1ActiveSensing
 from holdfast.transport.tcpros import Surroundings, decode_header, encode_header
 
@@ -342,6 +343,48 @@ def test_rosnode_kill_ends_it(around: Ros1) -> None:
     around.run("rosnode", "kill", f"/{CLOUD}")
     assert cloud.wait(30.0) == 0
     assert around.service_uri(CLOUD) is None
+
+
+def test_what_a_robot_decides_can_be_watched(around: Ros1, here: Surroundings) -> None:
+    around.serve(CLOUD, EXAMPLE)
+    with Ros1Client("arm", surroundings=here, deadline_s=30.0) as client:
+        until(lambda: "/arm" in around.run("rosnode", "list").split(), "the node is listed")
+        kinds = {
+            "status": "std_msgs/String",
+            "decided_by": "std_msgs/String",
+            "sensing_action": "std_msgs/UInt32",
+            "task_actions": "std_msgs/Float64MultiArray",
+        }
+        info = around.run("rosnode", "info", "/arm")
+        for topic, kind in kinds.items():
+            assert f"* /arm/{topic} [{kind}]" in info
+        echoes = {
+            topic: around.start(
+                "rostopic", "echo", "-p", f"/arm/{topic}", stdout=subprocess.PIPE, text=True
+            )
+            for topic in ("sensing_action", "task_actions")
+        }
+        until(
+            lambda: all(client.topic(each).num_subscribers for each in echoes),
+            "both are subscribed",
+        )
+        state = client.decide(Request(Kind.INITIALIZE, seed=4)).state
+        chosen = client.decide(Request(Kind.CHOOSE_SENSING_ACTION, state=state)).sensing_action
+        answer = client.decide(
+            Request(
+                Kind.CHOOSE_TASK_ACTIONS,
+                state=state,
+                sensing_action=chosen,
+                observation=np.array([0.1]),
+            )
+        )
+        shown = {topic: [line_of(echo) for _ in range(2)][1] for topic, echo in echoes.items()}
+        assert shown["sensing_action"].strip().endswith(f",{chosen}")
+        numbers = [float(each) for each in shown["task_actions"].split(",")[1:] if "." in each]
+        assert numbers == pytest.approx(answer.task_actions.ravel())
+        assert f'data: "/{CLOUD}"' in around.run("rostopic", "echo", "-n", "1", "/arm/decided_by")
+        assert 'data: "standard"' in around.run("rostopic", "echo", "-n", "1", "/arm/status")
+    assert "/arm" not in around.run("rosnode", "list").split()
 
 
 def place_of(around: Ros1) -> tuple[str, int]:

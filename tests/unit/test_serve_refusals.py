@@ -35,6 +35,12 @@ from holdfast.transport.key_ring import make_credentials
         (["--lis", "tcp/127.0.0.1:0"], ["--lis"]),
         (["--processes", "2", "--connect", "tcp/127.0.0.1:1"], ["--connect"]),
         (["--processes", "2", "--until-stdin-closes"], ["--until-stdin-closes"]),
+        (["--processes", "2", "--listen", "ros1/cloud"], ["--listen ros1/NAME", "one process"]),
+        (["--processes", "2", "--ros1", "--configuration", "x.yaml"], ["--ros1: goes with one"]),
+        (["--listen", "ros1/a b"], ["--listen", "'a b' is no name in ROS 1"]),
+        (["--connect", "ros1/robot", "--insecure"], ["--connect", "it is the service that is off"]),
+        (["--ros1"], ["--ros1: --configuration is missing"]),
+        (["--ros1-name", "planner"], ["--ros1-name: goes with --ros1 only"]),
         (["--processes", "2", "--health", "here"], ["here"]),
         *(
             (

@@ -321,6 +321,10 @@ class _Talker:
             self._thread.close(_START_S)
             raise
 
+    def topic(self, name: str) -> Topic:
+        """Return a topic by the last part of its name."""
+        return self._topics[name][0]
+
     def send(self, topic: str, **fields: Any) -> None:
         """Publish; never waits, and what nobody takes in time is left out."""
         to, kind = self._topics[topic]
@@ -417,6 +421,10 @@ class Ros1Client:
     def decided_by(self) -> str:
         """Name of the service that gave the last answer."""
         return self._client.decided_by
+
+    def topic(self, name: str) -> Topic:
+        """Return one of the topics that are published."""
+        return self._talker.topic(name)
 
     def decide(self, request: Request, give_up_s: float | None = None) -> Answer:
         """Return what a service answers; see :meth:`ActiveSensingClient.decide`."""

@@ -12,9 +12,10 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import os
+import socket
 import struct
 import xmlrpc.client
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Iterator, Mapping
 from typing import Any, Final, NamedTuple
 from xml.parsers.expat import ExpatError
 
@@ -44,6 +45,9 @@ MAX_CONNECTIONS: Final = 1024
 """From clients, subscribers and tools together."""
 
 _OPENING_S: Final = 5.0
+_IDLE_S: Final = 60.0
+"""A connection for questions to a node on which nothing is asked for so long is closed."""
+
 _MASTER_S: Final = 1.0
 """For one question to the master."""
 
@@ -99,6 +103,11 @@ class Topic:
         self._subscribers.add(writer)
         if self._last is not None:
             self._write(writer, self._last)
+
+    @property
+    def num_subscribers(self) -> int:
+        """How many there are."""
+        return len(self._subscribers)
 
     def remove(self, writer: asyncio.StreamWriter) -> None:
         """Send a subscriber nothing more."""
@@ -316,7 +325,8 @@ class RosNode:
 
     async def _answer_one(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> bool:
         """Answer one question; return whether another one may follow."""
-        head = (await reader.readuntil(b"\r\n\r\n")).decode("latin-1")
+        async with asyncio.timeout(_IDLE_S):
+            head = (await reader.readuntil(b"\r\n\r\n")).decode("latin-1")
         async with asyncio.timeout(_OPENING_S):
             fields = {}
             for line in head.split("\r\n")[1:]:
@@ -447,12 +457,15 @@ class RosNode:
             topic.remove(writer)
 
     @contextlib.contextmanager
-    def _connected(self, writer: asyncio.StreamWriter) -> Any:
+    def _connected(self, writer: asyncio.StreamWriter) -> Iterator[bool]:
         """Hold a connection, and close it whatever happens on it."""
         task = asyncio.current_task()
         assert task is not None
         is_welcome = len(self._connections) < MAX_CONNECTIONS
         self._connections.add(task)
+        # A machine that is switched off says nothing, and leaves no connection here for ever.
+        stream = writer.get_extra_info("socket")
+        stream.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
         try:
             yield is_welcome
         except (
