@@ -21,7 +21,7 @@ from tests.unit.test_active_sensing import in_process
 
 from holdfast.configuration import Configuration, load
 from holdfast.errors import TransportError
-from holdfast.ros.active_sensing import ErrorCode, Kind, Request
+from holdfast.ros.active_sensing import Answer, ErrorCode, Kind, Request
 from holdfast.ros.messages import md5_sum
 from holdfast.ros.ros1 import Ros1Client, Ros1Service
 from holdfast.ros.ros1_service import MAX_WAITING, Ros1ActiveSensing
@@ -470,4 +470,28 @@ async def test_too_many_requests_at_once_are_told_so(
     assert sorted(errors) == [ErrorCode.OK] * MAX_WAITING + [ErrorCode.BUSY]
     for each in asked:
         each.close()
+    await service.close()
+
+
+async def test_a_defect_costs_its_request_alone(
+    around: Ros1, here: Surroundings, configuration: Configuration
+) -> None:
+    told: list[str] = []
+    service = Ros1ActiveSensing(
+        configuration, surroundings=here, on_event=lambda name, **_: told.append(name)
+    )
+    assert await service.start()
+    asker = Ros1Service(CLOUD, here)
+    loop = asyncio.get_running_loop()
+
+    async def ask() -> Answer:
+        return await loop.run_in_executor(None, asker.ask, Request(Kind.INITIALIZE), 30.0)
+
+    answers, service._answers = service._answers, None  # type: ignore[assignment]
+    with pytest.raises(TransportError, match="it answers: the service has failed: AttributeError"):
+        await ask()
+    service._answers = answers
+    assert (await ask()).error is ErrorCode.OK
+    assert told == ["ros_master", "ros_request_failed"]
+    asker.close()
     await service.close()

@@ -36,7 +36,7 @@ from holdfast.transport.tcpros import (
     header_of_service,
 )
 
-__all__ = ["RosNode", "ServiceHandler", "Topic", "TopicType", "UnansweredError"]
+__all__ = ["RosNode", "ServiceHandler", "Topic", "TopicType"]
 
 ServiceHandler = Callable[[bytes], Awaitable[bytes]]
 """Gets a request's bytes and returns the answer's."""
@@ -61,10 +61,6 @@ _MAX_UNREAD_BYTES: Final = 1 << 20
 
 _UNKNOWN: Final = -1
 _OK: Final = 1
-
-
-class UnansweredError(TransportError):
-    """A service has no answer; its text is what the caller gets instead."""
 
 
 class TopicType(NamedTuple):
@@ -136,7 +132,8 @@ class RosNode:
     on_shutdown : callable or None
         Is told why this node is to end: somebody has asked for it, or another one has its name.
     on_event : callable or None
-        Is told ``ros_master`` with ``status`` (``registered``, ``unreachable``) and ``reason``.
+        Is told ``ros_master`` with ``status`` (``registered``, ``unreachable``) and ``reason``, and
+        ``ros_request_failed`` with ``service`` and ``reason``.
     max_message_bytes : int
         Who sends a larger request loses the connection.
     """
@@ -175,7 +172,7 @@ class RosNode:
         name : str
         type_ : ServiceType
         handler : callable
-            Raises :class:`UnansweredError` where there is no answer.
+            What it raises, the caller gets in words, and the log.
         """
         self._services[self._surroundings.resolved(name)] = _Offer(type_, handler)
 
@@ -417,8 +414,11 @@ class RosNode:
             request = await _message(reader, self._max_message_bytes)
             try:
                 answer = encode_answer(await offer.handler(request))
-            except UnansweredError as error:
-                answer = encode_refusal(str(error))
+            except Exception as error:  # noqa: BLE001 - a defect costs its request alone
+                reason = f"{type(error).__name__}: {error}"
+                if self._on_event is not None:
+                    self._on_event("ros_request_failed", service=header["service"], reason=reason)
+                answer = encode_refusal(f"the service has failed: {reason:.500}")
             writer.write(answer)
             await writer.drain()
             if header.get("persistent") != "1":
