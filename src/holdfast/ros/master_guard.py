@@ -418,10 +418,13 @@ class MasterGuard:
         silent = asyncio.create_task(self._silent())
         try:
             await asyncio.wait((ended, silent), return_when=asyncio.FIRST_COMPLETED)
-            if not ended.done():
+            if ended.done():
+                reason = _how_it_ended(ended.result())
+            else:
+                reason = silent.result()
                 await master.end(at_once=True)
             self._own = None
-            return _how_it_ended(ended.result()) if ended.done() else silent.result()
+            return reason
         finally:
             for task in (loading, ended, silent):
                 task.cancel()
