@@ -134,7 +134,13 @@ class Process:
         self.process.stdin.flush()
 
     def account(self) -> str:
-        return f"{self.process.args}: {self.process.poll()}\n{self._out.read_text()[-2000:]}\n{self.errors[-6000:]}"
+        return "\n".join(
+            (
+                f"{self.process.args!r}: {self.process.poll()}",
+                self._out.read_text()[-2000:],
+                self.errors[-6000:],
+            )
+        )
 
     def end(self, number: int = signal.SIGKILL) -> int:
         if self.process.poll() is None:

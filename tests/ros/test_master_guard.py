@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,6 +15,7 @@ from tests.ros.graph import PATIENCE_S, SYSTEM_PYTHON, Graph, Process, wait_for
 
 from holdfast.ros.master_guard import GuardError, MasterAddress
 
+GUARD = (sys.executable, "-m", "holdfast", "ros1-guard")
 KILLS = 10
 TOPIC_TOOLS = Path("/usr/lib/topic_tools")
 """Stock roscpp nodes; /opt/ros has them elsewhere."""
@@ -52,7 +54,7 @@ def replaced(graph: Graph, killed: int) -> None:
 
 
 def start_everything(graph: Graph) -> tuple[Process, Process]:
-    """Start nodes of others; return one that calls all the time, and one that hears all the time."""
+    """Start nodes of others; return one that calls, and one that hears, all the time."""
     graph.node("talker", "/talker", "/chatter")
     graph.node("server", "/server", "/work", "/more_work")
     graph.start(topic_tool("relay"), "/chatter", "/relayed", "__name:=relay")
@@ -400,7 +402,7 @@ def test_it_is_the_stock_master(seed: int, graph: Graph, tmp_path: Path) -> None
 
 class TestWhatCannotBeGuarded:
     def test_another_machine(self) -> None:
-        with pytest.raises(GuardError, match="192.0.2.1 is no address of this machine"):
+        with pytest.raises(GuardError, match=r"192\.0\.2\.1 is no address of this machine"):
             MasterAddress.of({"ROS_MASTER_URI": "http://192.0.2.1:11311"})
 
     @pytest.mark.parametrize(
@@ -411,21 +413,11 @@ class TestWhatCannotBeGuarded:
             MasterAddress.of({"ROS_MASTER_URI": uri})
 
     def test_a_python_without_ros(self, graph: Graph) -> None:
-        guard = graph.start(
-            *(
-                "env",
-                "-u",
-                "PYTHONPATH",
-                os.path.join(os.path.dirname(__import__("sys").executable), "holdfast"),
-            ),
-            *("ros1-guard", "--python", __import__("sys").executable),
-        )
+        guard = graph.start(*GUARD, "--python", sys.executable)
         assert guard.process.wait(PATIENCE_S) == 2
         assert "name ROS's Python with --python" in guard.errors
 
     def test_no_python(self, graph: Graph) -> None:
-        guard = graph.start(
-            __import__("sys").executable, "-m", "holdfast", "ros1-guard", "--python", "/nonexistent"
-        )
+        guard = graph.start(*GUARD, "--python", "/nonexistent")
         assert guard.process.wait(PATIENCE_S) == 2
         assert "--python /nonexistent: cannot be run" in guard.errors

@@ -41,6 +41,7 @@ def ros1_guard(
     silent_s: Annotated[
         float,
         typer.Option(
+            "--silent-s",
             metavar="S",
             parser=number("--silent-s", 0.5, 3600.0, "s"),
             help="A master that has not answered for so long is killed and replaced.",

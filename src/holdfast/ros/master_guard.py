@@ -68,10 +68,10 @@ _START_S = 30.0
 _SPARE_DELAY_S = 0.5
 """The next master is loaded a little after this one began, when the nodes have what they need."""
 
-_STEADY_S = 2.0
+_STEADY_S = 1.0
 """A master that ends earlier than this may have failed at its start."""
 
-_FIRST_DELAY_S, _LAST_DELAY_S = 0.1, 5.0
+_FIRST_DELAY_S, _LAST_DELAY_S = 0.1, 1.0
 _KEPT_S = 5.0
 """Calls are not kept waiting for a master longer than this; then they are refused."""
 

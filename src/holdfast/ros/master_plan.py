@@ -90,6 +90,8 @@ def reconcile(
         if isinstance(answer, NodeReport) and sharing[uri] == 1:
             _add(state, state.publishers, node, uri, answer.publications)
             _add(state, state.subscribers, node, uri, answer.subscriptions)
+    for topic in state.publishers:
+        state.types.setdefault(topic, _ANY_TYPE)
     state.services = {
         service: where
         for service, where in known.services.items()
@@ -127,8 +129,8 @@ def _add(
         registered = registrations.setdefault(topic, [])
         if (node, uri) not in registered:
             registered.append((node, uri))
-        if kind != _ANY_TYPE or topic not in state.types:
-            state.types.setdefault(topic, kind)
+        if kind != _ANY_TYPE and state.types.get(topic, _ANY_TYPE) == _ANY_TYPE:
+            state.types[topic] = kind
 
 
 # -- a master that keeps no journal ----------------------------------------------------------------

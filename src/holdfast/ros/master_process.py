@@ -248,12 +248,13 @@ class Journal:
         """Write down one change; never raises."""
         try:
             record = _encoded(_Change(table, key, value))
+            # A copy, since the master goes on changing what it has; and proof that it can be read.
+            change = _decoded(record[_HEAD.size :])
         except Exception as error:  # noqa: BLE001 (whatever it is, the node gets its answer)
             sys.stderr.write(f"{table} {key}: cannot be written down: {error}\n")
             return
         with self._lock:
-            # A copy: the master goes on changing what it has.
-            self._state.apply(*_decoded(record[_HEAD.size :]))
+            self._state.apply(*change)
             try:
                 if self._descriptor < 0 or self._size > self._limit:
                     self._write_anew()
@@ -261,7 +262,7 @@ class Journal:
                 self._append(record)
             except OSError as error:
                 sys.stderr.write(f"{self._path}: {error}\n")
-                self._close()
+                self.close()
 
     def _append(self, record: bytes) -> None:
         if os.write(self._descriptor, record) < len(record):
@@ -269,12 +270,13 @@ class Journal:
         self._size += len(record)
 
     def _write_anew(self) -> None:
-        self._close()
+        self.close()
         self._size = write_journal(self._path, self._state)
         self._limit = 2 * self._size + _COMPACTED_AFTER_BYTES
         self._descriptor = os.open(self._path, os.O_WRONLY | os.O_APPEND | os.O_CLOEXEC)
 
-    def _close(self) -> None:
+    def close(self) -> None:
+        """Give the file up; a change that is written down opens it anew."""
         if self._descriptor >= 0:
             os.close(self._descriptor)
             self._descriptor = -1
@@ -309,6 +311,12 @@ def _load() -> Any:
             if registrations is self.services:
                 return (*registered[0], registrations.get_service_api(key))
             return list(registered)
+
+        def register_again(
+            self, r: Any, key: str, node: str, uri: str, service_uri: Any = None
+        ) -> None:
+            """Register what is written down already."""
+            super()._register(r, key, node, uri, service_uri)
 
         def _register(
             self, r: Any, key: str, caller_id: str, caller_api: str, service_api: Any = None
@@ -383,8 +391,7 @@ def _load() -> Any:
             self.path = str(path)
 
         def restore(self, manager: Any, state: MasterState) -> None:
-            # The stock methods, which write nothing down and tell nobody.
-            register = super(JournalledRegistrations, manager)._register
+            register = manager.register_again
             for registrations, table in (
                 (self.publishers, state.publishers),
                 (self.subscribers, state.subscribers),
