@@ -125,6 +125,11 @@ class Process:
         return self._out.read_text().split("\n")[:-1]
 
     @property
+    def size(self) -> int:
+        """How many bytes it has printed."""
+        return self._out.stat().st_size
+
+    @property
     def errors(self) -> str:
         return self._errors.read_text()
 

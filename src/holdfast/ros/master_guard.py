@@ -56,6 +56,9 @@ DEFAULT_PORT = 11311
 _ANSWER_S = 0.3
 """How long nodes and services are waited for while there is no master."""
 
+_ANSWERS_S = 1.0
+"""And for all of them together."""
+
 _ASKED_AT_ONCE = 64
 _PROBE_EVERY_S = 0.5
 _PROBE_S = 1.0
@@ -775,13 +778,22 @@ async def _ask(
         async with few:
             nodes[uri] = await _report_of(uri)
 
-    async def ask_service(service: str, uri: str) -> None:
+    async def ask_services(uri: str, names: list[str]) -> None:
+        # One after another: a rospy node lets five wait, and the sixth connects a second later.
         async with few:
-            services[service] = await offers_service(uri, service, within_s=_ANSWER_S)
+            for name in names:
+                services[name] = await offers_service(uri, name, within_s=_ANSWER_S)
+                if services[name] is None:
+                    return
 
+    by_address: dict[str, list[str]] = {}
+    for service, (_, _, uri) in known.services.items():
+        by_address.setdefault(uri, []).append(service)
     questions: list[Awaitable[None]] = [ask_node(uri) for uri in nodes]
-    questions += [ask_service(service, where[2]) for service, where in known.services.items()]
-    await asyncio.gather(*questions)
+    questions += [ask_services(uri, names) for uri, names in by_address.items()]
+    with contextlib.suppress(TimeoutError):
+        async with asyncio.timeout(_ANSWERS_S):
+            await asyncio.gather(*questions)
     return nodes, services
 
 
