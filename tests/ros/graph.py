@@ -245,6 +245,12 @@ class Graph:
         assert isinstance(pid, int)
         return pid
 
+    def rosout_pid(self) -> int:
+        with xmlrpc.client.ServerProxy(self.ask("lookupNode", "/rosout")[2]) as node:
+            pid = node.getPid("/test")[2]  # type: ignore[index]
+        assert isinstance(pid, int)
+        return pid
+
     def kill_master(self) -> int:
         """Kill the master -9, and return which process it was."""
         pid = self.master_pid()

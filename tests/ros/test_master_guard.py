@@ -71,6 +71,14 @@ def start_everything(graph: Graph) -> tuple[Process, Process]:
     return caller, listener
 
 
+def alive(pid: int) -> bool:
+    """Tell whether a process has not ended; who should have waited for it may not have."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
 def settled(graph: Graph) -> dict[str, list[str]]:
     """Return what is listed when nothing has changed for a moment."""
     before = None
@@ -157,7 +165,7 @@ class TestItsOwnMaster:
         wait_for(lambda: graph.events(guard, "master_lost"))
         assert graph.listed() == before
         assert graph.master_pid() != pid
-        assert not Path(f"/proc/{pid}").exists()
+        assert not alive(pid)
         keeps_on(caller)
         keeps_on(listener)
 
@@ -243,6 +251,19 @@ class TestItsOwnMaster:
         keeps_on(caller)
         keeps_on(listener)
 
+    def test_the_guard_that_comes_after_ends_what_it_found(self, graph: Graph) -> None:
+        guard = graph.guard()
+        wait_for(lambda: "/rosout" in graph.registered()["nodes"])
+        rosout = graph.rosout_pid()
+        pid = graph.master_pid()
+        guard.end()
+        second = graph.guard()
+        assert graph.master_pid() == pid
+        assert graph.rosout_pid() == rosout
+        assert second.end(signal.SIGTERM) == 0
+        wait_for(lambda: not alive(pid))
+        wait_for(lambda: not alive(rosout))
+
     def test_guard_and_master_are_killed(self, graph: Graph) -> None:
         guard = graph.guard()
         caller, _ = start_everything(graph)
@@ -261,12 +282,43 @@ class TestItsOwnMaster:
         graph.run("rosparam", "set", "/use_sim_time", "true")
         pid = graph.master_pid()
         assert guard.end(signal.SIGTERM) == 0
-        assert not Path(f"/proc/{pid}").exists()
+        assert not alive(pid)
         # Yesterday's simulated time is not today's.
         second = graph.guard("--no-rosout")
         assert '"master":"started"' in second.lines[0]
         assert "/use_sim_time" not in graph.run("rosparam", "list")
         assert second.end(signal.SIGINT) == 130
+
+    def test_both_are_killed_and_so_are_the_nodes(self, graph: Graph) -> None:
+        guard = graph.guard()
+        server = graph.node("server", "/server", "/work")
+        wait_for(lambda: server.lines and "/rosout" in graph.registered()["nodes"])
+        graph.run("rosparam", "set", "/use_sim_time", "true")
+        rosout, pid = graph.rosout_pid(), graph.master_pid()
+        for process in (guard, server):
+            process.end()
+        os.kill(pid, signal.SIGKILL)
+        second = graph.guard()
+        assert '"master":"started"' in second.lines[0]
+        registered = graph.registered()
+        assert "use_sim_time" not in registered["parameters"]
+        assert registered["nodes"].keys() == {"/rosout"}
+        assert graph.rosout_pid() == rosout
+
+    def test_roslaunch(self, graph: Graph) -> None:
+        graph.guard()
+        (graph.directory / "one.launch").write_text(
+            '<launch><param name="p" value="3"/>'
+            '<node pkg="rosout" type="rosout" name="launched"/></launch>'
+        )
+        launch = graph.start("roslaunch", str(graph.directory / "one.launch"))
+        wait_for(lambda: "/launched" in graph.registered()["nodes"], launch.account)
+        before = settled(graph)
+        replaced(graph, graph.kill_master())
+        assert graph.listed() == before
+        assert launch.process.poll() is None
+        assert launch.end(signal.SIGINT) == 0
+        assert "/launched" not in graph.registered()["nodes"]
 
     def test_a_second_guard_is_refused(self, graph: Graph) -> None:
         guard = graph.guard("--no-rosout")

@@ -126,7 +126,8 @@ class Connection:
         values = []
         for question, answer in zip(asked, answers, strict=True):
             value = None
-            with contextlib.suppress(CallError, IndexError, TypeError):
+            # That of a call that failed is a dict.
+            with contextlib.suppress(CallError, LookupError, TypeError):
                 value = _value_of(answer[0], str(question["methodName"]))
             values.append(value)
         return values

@@ -338,6 +338,9 @@ class MasterGuard:
         self._is_bound = False
         self._spare: asyncio.Task[_Master] | None = None
         self._own: _Master | None = None
+        self._other_pid: int | None = None
+        self._is_inherited = False
+        """Whether the other master is one that an earlier guard has started."""
         self._rosout: asyncio.subprocess.Process | None = None
 
     async def run(self, ready: Callable[[str], None]) -> None:
@@ -388,12 +391,13 @@ class MasterGuard:
             return "found"
         known = read_journal(self._journal) or MasterState()
         nodes, services = await _ask(known)
-        # A journal is of use to those who are still there. Else what it holds is of another day.
-        still = any(isinstance(each, NodeReport) for each in nodes.values())
-        resumes = still or any(services.values())
+        others = {uri for node, uri in known.nodes().items() if node != _ROSOUT}
+        resumes = any(isinstance(nodes[uri], NodeReport) for uri in others)
         if not resumes:
-            known = MasterState()
-            known.parameters["run_id"] = str(uuid.uuid1())
+            # Nobody is there to whom the parameters matter: they are of another day.
+            known.parameters = {"run_id": str(uuid.uuid1())}
+            nodes = {uri: answer or "gone" for uri, answer in nodes.items()}
+            services = {service: bool(offered) for service, offered in services.items()}
         await self._start(reconcile(known, nodes, services))
         return "resumed" if resumes else "started"
 
@@ -434,25 +438,25 @@ class MasterGuard:
 
     async def _watch_other(self) -> str:
         """Wait until a master that somebody else started is no more; say why."""
+        self._other_pid, self._is_inherited = None, False
         watching = [asyncio.create_task(self._closed()), asyncio.create_task(self._silent())]
-        keeps_a_journal, pid = await self._identify()
-        self._events.event(
-            "guarding", service=self._settings.address.uri, pid=pid, journal=keeps_a_journal
-        )
-        polling = None if keeps_a_journal else asyncio.create_task(self._poll())
+        following = asyncio.create_task(self._follow())
         told = False
         try:
             while True:
                 closed, silent = watching
-                await asyncio.wait(watching, return_when=asyncio.FIRST_COMPLETED)
+                unfinished = {closed, silent, *(() if following.done() else (following,))}
+                await asyncio.wait(unfinished, return_when=asyncio.FIRST_COMPLETED)
                 if closed.done():
                     return closed.result()
+                if following.done():
+                    following.result()
+                if not silent.done():
+                    continue
                 # Stopped, or so busy that it is of no use to anybody.
-                if pid is not None and _listens_at(pid, self._settings.address.port):
-                    with contextlib.suppress(OSError):
-                        os.kill(pid, signal.SIGKILL)
-                        await closed
-                        return silent.result()
+                if self._signal_other(signal.SIGKILL):
+                    await closed
+                    return silent.result()
                 if not told:
                     self._events.event(
                         "master_hangs",
@@ -462,20 +466,19 @@ class MasterGuard:
                     told = True
                 watching[1] = asyncio.create_task(self._silent())
         finally:
-            for task in (*watching, *([polling] if polling else [])):
+            for task in (*watching, following):
                 task.cancel()
 
-    async def _identify(self) -> tuple[bool, int | None]:
-        """Return whether the master keeps the journal that is read here, and its process."""
-        connection = Connection(self._uri)
-        journal, pid = None, None
+    def _signal_other(self, number: signal.Signals) -> bool:
+        """Signal the master that somebody else started, if it is this user's, and here."""
+        pid = self._other_pid
+        if pid is None or not _listens_at(pid, self._settings.address.port):
+            return False
         try:
-            with contextlib.suppress(CallError):
-                pid = await connection.call("getPid", within_s=_PROBE_S)
-                journal = await connection.call("getJournal", within_s=_PROBE_S)
-        finally:
-            connection.close()
-        return journal == str(self._journal), pid if isinstance(pid, int) else None
+            os.kill(pid, number)
+        except OSError:
+            return False
+        return True
 
     async def _closed(self) -> str:
         """Wait until nobody listens at the master's port any more.
@@ -523,22 +526,47 @@ class MasterGuard:
         finally:
             connection.close()
 
-    async def _poll(self) -> None:
-        """Ask a stock master again and again what it knows, and write that down."""
+    async def _follow(self) -> None:
+        """Find out which master it is; if it keeps no journal, keep one of what it answers."""
         connection = Connection(self._uri)
-        last = None
         try:
-            while True:
-                asked_at = monotonic()
-                with contextlib.suppress(CallError, OSError, ValueError, TypeError):
-                    state = await _snapshot(connection)
-                    if state != last:
-                        write_journal(self._journal, state)
-                        last = state
-                took = monotonic() - asked_at
-                await asyncio.sleep(max(_POLL_EVERY_S, took / _POLL_SHARE))
+            self._other_pid, journal = await self._identify(connection)
+            self._is_inherited = journal == str(self._journal)
+            self._events.event(
+                "guarding",
+                service=self._settings.address.uri,
+                pid=self._other_pid,
+                journal=self._is_inherited,
+            )
+            if not self._is_inherited:
+                # That of another master is not its.
+                self._journal.unlink(missing_ok=True)
+                await self._poll(connection)
         finally:
             connection.close()
+
+    async def _identify(self, connection: Connection) -> tuple[int, str | None]:
+        """Return the master's process, and where its journal is."""
+        while True:
+            with contextlib.suppress(CallError):
+                pid = await connection.call("getPid", within_s=_PROBE_S)
+                # A stock master answers at once that it has no such call.
+                (journal,) = await connection.calls([("getJournal", ())], within_s=_PROBE_S)
+                return int(pid), journal
+            await asyncio.sleep(_PROBE_EVERY_S)
+
+    async def _poll(self, connection: Connection) -> None:
+        """Ask a stock master again and again what it knows, and write that down."""
+        last = None
+        while True:
+            asked_at = monotonic()
+            with contextlib.suppress(CallError, OSError, ValueError, TypeError):
+                state = await _snapshot(connection)
+                if state != last:
+                    write_journal(self._journal, state)
+                    last = state
+            took = monotonic() - asked_at
+            await asyncio.sleep(max(_POLL_EVERY_S, took / _POLL_SHARE))
 
     # -- replacing ---------------------------------------------------------------------------------
 
@@ -575,7 +603,7 @@ class MasterGuard:
         except BaseException:
             await master.end(at_once=True)
             raise
-        self._own = master
+        self._own, self._is_inherited = master, False
         self._events.event(
             "master_started",
             service=self._settings.address.uri,
@@ -662,7 +690,11 @@ class MasterGuard:
                     stdout=subprocess.DEVNULL,
                     stderr=subprocess.DEVNULL,
                     start_new_session=True,
-                    env={**os.environ, "ROS_MASTER_URI": self._settings.address.uri},
+                    env={
+                        **os.environ,
+                        "ROS_MASTER_URI": self._settings.address.uri,
+                        "ROS_NAMESPACE": "/",
+                    },
                 )
                 code = await self._rosout.wait()
                 self._rosout = None
@@ -704,6 +736,12 @@ class MasterGuard:
     async def _close(self) -> None:
         if self._rosout is not None:
             await _ended(self._rosout, signal.SIGINT)
+        if self._is_inherited:
+            # As the guard that started both would have done.
+            with contextlib.suppress(CallError):
+                uri = await call(self._uri, "lookupNode", _ROSOUT, within_s=_PROBE_S)
+                await call(uri, "shutdown", "the guard ends", within_s=_PROBE_S)
+            self._signal_other(signal.SIGTERM)
         if self._own is not None:
             await self._own.end()
         await self._drop_spare()

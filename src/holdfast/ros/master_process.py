@@ -47,7 +47,7 @@ Registrations = Dict[str, List[Tuple[str, str]]]  # noqa: UP006
 _MAGIC = b"holdfast ROS 1 master 1\n"
 _HEAD = struct.Struct("<II")
 _COMPACTED_AFTER_BYTES = 4 * 1024 * 1024
-_WORKERS = 16
+_WORKERS = 8
 """Threads that tell nodes of changes. One that a stopped node blocks is lost to the others; stock
 masters have three."""
 
@@ -451,7 +451,7 @@ def _serve(listening: socket.socket, master: Any, serving: Any) -> None:
     server.register_multicall_functions()
     server.register_instance(master)
     master._ready(create_local_xmlrpc_uri(listening.getsockname()[1]))
-    threading.Thread(target=server.serve_forever, args=(0.1,), daemon=True).start()
+    threading.Thread(target=server.serve_forever, daemon=True).start()
     serving()
     master.tell_subscribers()
     ended = threading.Event()
