@@ -13,7 +13,7 @@ import pytest
 from tests.ros.conftest import left_out
 from tests.ros.graph import PATIENCE_S, SYSTEM_PYTHON, Graph, Process, wait_for
 
-from holdfast.ros.master_guard import GuardError, MasterAddress
+from holdfast.ros.master.settings import GuardError, MasterAddress
 
 GUARD = (sys.executable, "-m", "holdfast", "ros1-guard")
 KILLS = 10
@@ -377,8 +377,10 @@ class TestAMasterOfOthers:
 JOURNALLED_AS_STOCK = """
 import logging, pathlib, random, sys
 logging.disable()
-sys.path.insert(0, str(pathlib.Path(sys.argv[1]).parent))
-import master_process, rosmaster.master_api
+import importlib.util, rosmaster.master_api
+spec = importlib.util.spec_from_file_location("master_process", sys.argv[1])
+master_process = sys.modules["master_process"] = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(master_process)
 make = master_process._load()
 path = pathlib.Path(sys.argv[2])
 stock, ours = rosmaster.master_api.ROSMasterHandler(1), make(path)
@@ -444,7 +446,7 @@ os._exit(0)
 
 @pytest.mark.parametrize("seed", range(3))
 def test_it_is_the_stock_master(seed: int, graph: Graph, tmp_path: Path) -> None:
-    from holdfast.ros import master_process
+    from holdfast.ros.master import process as master_process
 
     script = str(Path(str(master_process.__file__)))
     journal = str(tmp_path / "journal")

@@ -12,14 +12,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from holdfast.ros.master_plan import (
+from holdfast.ros.master.plan import (
     NodeAnswer,
     NodeReport,
     lookups_of,
     reconcile,
     state_of_snapshot,
 )
-from holdfast.ros.master_process import (
+from holdfast.ros.master.process import (
     Journal,
     MasterState,
     parameter_names,

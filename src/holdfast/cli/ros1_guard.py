@@ -15,7 +15,7 @@ from holdfast.cli.options import location, number, whole_number
 from holdfast.printable import printable
 
 if TYPE_CHECKING:
-    from holdfast.ros.master_guard import GuardSettings
+    from holdfast.ros.master.settings import GuardSettings
 
 __all__ = ["ros1_guard"]
 
@@ -76,7 +76,7 @@ def ros1_guard(
     If the guard is killed, the master lives on: start another guard. If both are, it goes on where
     they stopped, if a node of theirs is still there.
     """
-    from holdfast.ros.master_guard import GuardSettings, MasterAddress
+    from holdfast.ros.master.settings import GuardSettings, MasterAddress
 
     address = MasterAddress.of(os.environ, port)
     raise typer.Exit(_guard(GuardSettings(address, python, directory, silent_s, rosout), log))
@@ -87,7 +87,7 @@ def _guard(settings: GuardSettings, log: _Log) -> int:
     import asyncio
     import signal
 
-    from holdfast.ros.master_guard import MasterGuard
+    from holdfast.ros.master.guard import MasterGuard
     from holdfast.runtime.logs import EventLog
     from holdfast.runtime.service_manager import ServiceManager
 

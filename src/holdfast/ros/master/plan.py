@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Mapping
 from typing import Any, Literal, NamedTuple, TypeAlias
 
-from holdfast.ros.master_process import MasterState
+from holdfast.ros.master.process import MasterState
 
 __all__ = [
     "NodeAnswer",

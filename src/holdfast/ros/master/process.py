@@ -13,7 +13,7 @@ ROS's Python runs this file, which may be older than holdfast's and lacks holdfa
 standard library alone and, once it runs, ``rosmaster``. The guard imports :class:`MasterState` and
 the journal from here.
 
-Started as ``master_process.py SOCKET CONTROL JOURNAL`` (two descriptors and a path) it loads all
+Started as ``process.py SOCKET CONTROL JOURNAL`` (two descriptors and a path) it loads all
 that it needs, says ``warm`` on CONTROL, and waits. On ``go`` it reads the journal, takes the
 connections that come to SOCKET, and says ``serving``. If CONTROL ends before, it ends; afterwards
 it needs nobody.

@@ -7,8 +7,8 @@ When it comes back as stock ROS has it, it knows nothing, and no node tells it a
 The guard holds the port. The socket at which nodes connect belongs to it, and each master inherits
 it, so calls to a master that has just died are not refused: they wait, in the kernel, for the next
 one. That one has been waiting, too: a process that has loaded all it needs. It reads what the last
-one had confirmed (:mod:`holdfast.ros.master_process`), leaves out what has died meanwhile
-(:mod:`holdfast.ros.master_plan`), and answers. To a node the master's death is a call that took a
+one had confirmed (:mod:`holdfast.ros.master.process`), leaves out what has died meanwhile
+(:mod:`holdfast.ros.master.plan`), and answers. To a node the master's death is a call that took a
 little longer.
 
 A master lives on when the guard is killed, and the next guard watches it. A master that somebody
@@ -21,53 +21,43 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import errno
-import fcntl
 import os
 import shutil
 import signal
 import socket
-import stat
 import subprocess
 import uuid
-from collections.abc import Awaitable, Callable, Mapping
-from pathlib import Path
+from collections.abc import Callable, Coroutine
 from time import monotonic
-from typing import NamedTuple, Self
 from urllib.parse import urlsplit
 
-from holdfast.errors import HoldfastError
-from holdfast.ros import master_process
-from holdfast.ros.master_calls import CallError, Connection, GoneError, call, offers_service
-from holdfast.ros.master_plan import (
-    NodeAnswer,
-    NodeReport,
-    Reconciled,
-    lookups_of,
-    reconcile,
-    state_of_snapshot,
+from holdfast.ros.master.calls import CallError, Connection, GoneError, call
+from holdfast.ros.master.plan import NodeReport, Reconciled, reconcile
+from holdfast.ros.master.process import (
+    MasterState,
+    parameter_names,
+    read_journal,
+    write_journal,
 )
-from holdfast.ros.master_process import MasterState, read_journal, write_journal
+from holdfast.ros.master.settings import (
+    GuardError,
+    GuardLock,
+    GuardSettings,
+    listens_at,
+    own_directory,
+)
+from holdfast.ros.master.standby import ChildProcess, MasterProcess
+from holdfast.ros.master.survey import ask_everyone, snapshot
 from holdfast.runtime.logs import EventSink
 
-__all__ = ["DEFAULT_PORT", "GuardError", "GuardSettings", "MasterAddress", "MasterGuard"]
+__all__ = ["MasterGuard"]
 
-DEFAULT_PORT = 11311
-
-_ANSWER_S = 0.3
-"""How long nodes and services are waited for while there is no master."""
-
-_ANSWERS_S = 1.0
-"""And for all of them together."""
-
-_ASKED_AT_ONCE = 64
 _PROBE_EVERY_S = 0.5
 _PROBE_S = 1.0
 _POLL_EVERY_S = 0.25
 _POLL_SHARE = 0.1
 """Of a stock master's time, at most so much is spent on the guard's questions."""
 
-_POLL_S = 5.0
-_START_S = 30.0
 _SPARE_DELAY_S = 0.5
 """The next master is loaded a little after this one began, when the nodes have what they need."""
 
@@ -79,246 +69,9 @@ _KEPT_S = 5.0
 """Calls are not kept waiting for a master longer than this; then they are refused."""
 
 _BACKLOG = 1024
-_END_S = 2.0
 _ROSOUT = "/rosout"
 _ROSOUT_EVERY_S = 1.0
-
-
-class GuardError(HoldfastError):
-    """The master cannot be guarded; the message says why."""
-
-
-class MasterAddress(NamedTuple):
-    """Where a master is.
-
-    Attributes
-    ----------
-    host : str
-        As nodes name it.
-    port : int
-    bind : str
-        The address of this machine at which it listens.
-    """
-
-    host: str
-    port: int
-    bind: str
-
-    @property
-    def uri(self) -> str:
-        """Return what nodes have in ``ROS_MASTER_URI``."""
-        return f"http://{self.host}:{self.port}/"
-
-    @property
-    def own_uri(self) -> str:
-        """Return how this machine reaches it."""
-        near = {"0.0.0.0": "127.0.0.1", "::": "[::1]", "::1": "[::1]"}.get(self.bind, self.bind)
-        return f"http://{near}:{self.port}/"
-
-    @classmethod
-    def of(cls, environment: Mapping[str, str], port: int | None = None) -> Self:
-        """Return what ROS's variables say.
-
-        Parameters
-        ----------
-        environment : mapping
-            ``ROS_MASTER_URI``, ``ROS_HOSTNAME``, ``ROS_IP`` and ``ROS_IPV6`` count.
-        port : int, optional
-            Instead of that of the URI.
-
-        Raises
-        ------
-        GuardError
-            If the URI is none, or names another machine.
-        """
-        text = environment.get("ROS_MASTER_URI") or f"http://localhost:{DEFAULT_PORT}"
-        try:
-            parts = urlsplit(text)
-            host, named = parts.hostname, parts.port
-        except ValueError:
-            host = named = None
-        if parts.scheme != "http" or not host:
-            raise GuardError(f"ROS_MASTER_URI is {text!r:.200}; expected http://HOST:PORT")
-        # As rosgraph.network has it.
-        own = environment.get("ROS_HOSTNAME") or environment.get("ROS_IP") or ""
-        version_6 = environment.get("ROS_IPV6") == "on"
-        if own == "localhost" or own.startswith("127.") or own == "::1":
-            loopback = own if own.startswith("127.") else "127.0.0.1"
-            bind = "::1" if version_6 else loopback
-        else:
-            bind = "::" if version_6 else "0.0.0.0"
-        address = cls(host, port or named or DEFAULT_PORT, bind)
-        if not _is_here(host):
-            raise GuardError(
-                f"ROS_MASTER_URI is {text!r:.200}: {host} is no address of this machine; a guard "
-                "runs where its master runs"
-            )
-        return address
-
-
-def _is_here(host: str) -> bool:
-    """Tell whether a name is this machine's."""
-    try:
-        found = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)
-    except OSError:
-        return False
-    for family, kind, number, _, address in found:
-        with contextlib.suppress(OSError), socket.socket(family, kind, number) as probe:
-            probe.bind(address)
-            return True
-    return False
-
-
-class GuardSettings(NamedTuple):
-    """How to guard a master.
-
-    Attributes
-    ----------
-    address : MasterAddress
-    python : str
-        ROS's Python.
-    directory : Path or None
-        Where the journal is; None for one of this user that goes when the machine is started anew.
-    silent_s : float
-        A master that has not answered for so long is replaced.
-    rosout : bool
-        Whether ``/rosout`` is to run, too, as with ``roscore``.
-    """
-
-    address: MasterAddress
-    python: str = "/usr/bin/python3"
-    directory: Path | None = None
-    silent_s: float = 3.0
-    rosout: bool = True
-
-
-def _own_directory() -> Path:
-    """Return a directory of this user alone, which does not outlive the machine's uptime."""
-    runtime = os.environ.get("XDG_RUNTIME_DIR")
-    directory = Path(runtime) / "holdfast" if runtime else Path(f"/tmp/holdfast-{os.getuid()}")
-    try:
-        directory.mkdir(mode=0o700, exist_ok=True)
-        found = directory.lstat()
-    except OSError as error:
-        raise GuardError(f"{directory}: cannot be made: {error.strerror}") from error
-    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & 0o022:
-        raise GuardError(
-            f"{directory}: is not a directory that you alone can write to; name another one: "
-            "--directory"
-        )
-    return directory
-
-
-class _Master:
-    """A process that is a master, or waits to be one.
-
-    Parameters
-    ----------
-    settings : GuardSettings
-    listening : socket
-        Which it inherits; need not be bound yet.
-    journal : Path
-    """
-
-    def __init__(self, settings: GuardSettings, listening: socket.socket, journal: Path) -> None:
-        self._settings = settings
-        self._listening = listening
-        self._journal = journal
-        self._warm = False
-
-    async def start(self) -> Self:
-        """Start it, and return it."""
-        own, its = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        own.setblocking(False)
-        self._control = own
-        script = str(Path(master_process.__file__).resolve())
-        numbers = (str(self._listening.fileno()), str(its.fileno()))
-        try:
-            self.process = await asyncio.create_subprocess_exec(
-                *(self._settings.python, script, *numbers, str(self._journal)),
-                pass_fds=(self._listening.fileno(), its.fileno()),
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,
-                # It outlives the guard, and Ctrl-C is for the guard alone.
-                start_new_session=True,
-                env={**os.environ, "ROS_MASTER_URI": self._settings.address.uri},
-            )
-        except OSError as error:
-            own.close()
-            raise GuardError(
-                f"--python {self._settings.python}: cannot be run: {error.strerror}"
-            ) from error
-        finally:
-            its.close()
-        return self
-
-    async def warm(self) -> None:
-        """Wait until it has loaded what it needs.
-
-        Raises
-        ------
-        GuardError
-            If it cannot.
-        """
-        if self._warm:
-            return
-        said = await self._hear()
-        if said != "warm":
-            missing = said.removeprefix("missing ") or "it ended at once"
-            raise GuardError(
-                f"{self._settings.python} cannot run a ROS 1 master ({missing}); install ROS 1 "
-                "(on Debian: apt-get install python3-rosmaster rosout), or name ROS's Python with "
-                "--python"
-            )
-        self._warm = True
-
-    async def serve(self) -> None:
-        """Have it be the master from now on, with what the journal holds.
-
-        Raises
-        ------
-        GuardError
-            If it does not begin.
-        """
-        await self.warm()
-        with contextlib.suppress(OSError):
-            await asyncio.get_running_loop().sock_sendall(self._control, b"go")
-        if (said := await self._hear()) != "serving":
-            raise GuardError(f"the new master has not begun ({said or 'it ended'})")
-        self._control.close()
-
-    async def _hear(self) -> str:
-        loop = asyncio.get_running_loop()
-        try:
-            async with asyncio.timeout(_START_S):
-                return (await loop.sock_recv(self._control, 4096)).decode(errors="replace")
-        except TimeoutError:
-            return f"it said nothing for {_START_S:g} s"
-        except OSError:
-            return ""
-
-    async def end(self, *, at_once: bool = False) -> None:
-        """End it; may be repeated."""
-        self._control.close()
-        if at_once:
-            _signal(self.process, signal.SIGKILL)
-        await _ended(self.process, signal.SIGTERM)
-
-
-def _signal(process: asyncio.subprocess.Process, number: int) -> None:
-    with contextlib.suppress(ProcessLookupError):
-        process.send_signal(number)
-
-
-async def _ended(process: asyncio.subprocess.Process, number: int) -> None:
-    """End a process, politely at first."""
-    if process.returncode is None:
-        _signal(process, number)
-        with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(process.wait(), _END_S)
-            return
-        _signal(process, signal.SIGKILL)
-    await process.wait()
+_VERSION_S = 30.0
 
 
 class MasterGuard:
@@ -336,12 +89,12 @@ class MasterGuard:
         self._uri = settings.address.own_uri
         self._listening: socket.socket | None = None
         self._is_bound = False
-        self._spare: asyncio.Task[_Master] | None = None
-        self._own: _Master | None = None
+        self._spare: MasterProcess | None = None
+        self._own: MasterProcess | None = None
         self._other_pid: int | None = None
         self._is_inherited = False
         """Whether the other master is one that an earlier guard has started."""
-        self._rosout: asyncio.subprocess.Process | None = None
+        self._rosout: ChildProcess | None = None
 
     async def run(self, ready: Callable[[str], None]) -> None:
         """Guard until cancelled; a master that was started here is ended then, too.
@@ -357,26 +110,37 @@ class MasterGuard:
         GuardError
             If nothing can be guarded.
         """
-        directory = self._settings.directory or _own_directory()
+        directory = self._settings.directory or own_directory()
         port = self._settings.address.port
         self._journal = directory / f"master-{port}.journal"
-        with _lock(directory / f"master-{port}.lock", port):
+        with GuardLock(directory / f"master-{port}.lock", port):
             helpers: list[asyncio.Task[None]] = []
             try:
                 self._new_socket(0.0)
                 # Whatever is missing is said now, not when the master dies.
-                await (await self._next_master()).warm()
+                await self._next_master().warm()
                 how = await self._begin()
                 ready(how)
                 if self._settings.rosout:
-                    helpers.append(asyncio.create_task(self._keep_rosout()))
+                    helpers.append(asyncio.create_task(self._help(self._keep_rosout())))
                 if how == "started":
-                    helpers.append(asyncio.create_task(self._set_versions()))
+                    helpers.append(asyncio.create_task(self._help(self._set_versions())))
                 await self._watch()
+            except Exception:
+                # The next guard finds them; nobody gains by a master that ends with its guard.
+                self._own = self._rosout = None
+                raise
             finally:
                 for helper in helpers:
                     helper.cancel()
                 await self._close()
+
+    async def _help(self, work: Coroutine[None, None, None]) -> None:
+        """Do what a master is guarded without, too."""
+        try:
+            await work
+        except Exception as error:  # noqa: BLE001 (whatever it is, the master comes first)
+            self._events.event("note", reason=error)
 
     async def _begin(self) -> str:
         """Find a master, or start one."""
@@ -390,7 +154,7 @@ class MasterGuard:
         else:
             return "found"
         known = read_journal(self._journal) or MasterState()
-        nodes, services = await _ask(known)
+        nodes, services = await ask_everyone(known)
         others = {uri for node, uri in known.nodes().items() if node != _ROSOUT}
         resumes = any(isinstance(nodes[uri], NodeReport) for uri in others)
         if not resumes:
@@ -418,7 +182,7 @@ class MasterGuard:
                 await asyncio.sleep(_delay(short_lives - 2))
             await self._replace(noticed_at)
 
-    async def _watch_own(self, master: _Master) -> str:
+    async def _watch_own(self, master: MasterProcess) -> str:
         """Wait until the master that was started here is no more; say why."""
         loading = asyncio.create_task(self._load_spare_later())
         ended = asyncio.create_task(master.process.wait())
@@ -472,7 +236,7 @@ class MasterGuard:
     def _signal_other(self, number: signal.Signals) -> bool:
         """Signal the master that somebody else started, if it is this user's, and here."""
         pid = self._other_pid
-        if pid is None or not _listens_at(pid, self._settings.address.port):
+        if pid is None or not listens_at(pid, self._settings.address.port):
             return False
         try:
             os.kill(pid, number)
@@ -561,7 +325,7 @@ class MasterGuard:
         while True:
             asked_at = monotonic()
             with contextlib.suppress(CallError, OSError, ValueError, TypeError):
-                state = await _snapshot(connection)
+                state = await snapshot(connection)
                 if state != last:
                     write_journal(self._journal, state)
                     last = state
@@ -576,7 +340,7 @@ class MasterGuard:
         while True:
             try:
                 known = read_journal(self._journal) or MasterState()
-                reconciled = reconcile(known, *await _ask(known))
+                reconciled = reconcile(known, *await ask_everyone(known))
                 await self._start(reconciled, noticed_at)
             except _TakenError as error:
                 # Somebody was faster, as a unit that starts roscore again.
@@ -596,7 +360,7 @@ class MasterGuard:
         self._bind()
         state = reconciled.state
         write_journal(self._journal, state)
-        master = await self._next_master()
+        master = self._next_master()
         self._spare = None
         try:
             await master.serve()
@@ -611,39 +375,30 @@ class MasterGuard:
             nodes=len(state.nodes()),
             services=len(state.services),
             topics=len(state.publishers.keys() | state.subscribers.keys()),
-            parameters=len(master_process.parameter_names(state.parameters)),
+            parameters=len(parameter_names(state.parameters)),
             gone=list(reconciled.gone) or None,
             silent=list(reconciled.silent) or None,
             lost_services=list(reconciled.lost_services) or None,
             duration_ms=(monotonic() - begun_at) * 1e3,
         )
 
-    async def _next_master(self) -> _Master:
+    def _next_master(self) -> MasterProcess:
         """Return the process that waits to be the master, or a new one."""
-        if self._spare is None:
-            self._load_spare()
-        assert self._spare is not None
-        spare = await asyncio.shield(self._spare)
-        if spare.process.returncode is not None:
-            self._load_spare()
-            spare = await asyncio.shield(self._spare)
-        return spare
-
-    def _load_spare(self) -> None:
-        assert self._listening is not None
-        master = _Master(self._settings, self._listening, self._journal)
-        self._spare = asyncio.create_task(master.start())
+        if self._spare is None or self._spare.process.ended.done():
+            assert self._listening is not None
+            self._spare = MasterProcess(self._settings, self._listening, self._journal)
+        return self._spare
 
     async def _load_spare_later(self) -> None:
         await asyncio.sleep(_SPARE_DELAY_S)
-        if self._spare is None:
-            self._load_spare()
+        # Without one, the next master takes a little longer, and says what is wrong.
+        with contextlib.suppress(GuardError):
+            self._next_master()
 
     async def _drop_spare(self) -> None:
         spare, self._spare = self._spare, None
         if spare is not None:
-            with contextlib.suppress(GuardError):
-                await (await spare).end(at_once=True)
+            await spare.end(at_once=True)
 
     def _new_socket(self, keep_s: float) -> None:
         """Make the socket anew at which masters listen, unless calls may still wait at it."""
@@ -684,17 +439,10 @@ class MasterGuard:
                     self._events.event("note", reason="no rosrun here, so no /rosout")
                     return
                 begun_at = monotonic()
-                self._rosout = await asyncio.create_subprocess_exec(
-                    *(rosrun, "rosout", "rosout", "__name:=rosout"),
-                    stdin=subprocess.DEVNULL,
-                    stdout=subprocess.DEVNULL,
-                    stderr=subprocess.DEVNULL,
-                    start_new_session=True,
-                    env={
-                        **os.environ,
-                        "ROS_MASTER_URI": self._settings.address.uri,
-                        "ROS_NAMESPACE": "/",
-                    },
+                self._rosout = ChildProcess(
+                    (rosrun, "rosout", "rosout", "__name:=rosout"),
+                    {"ROS_MASTER_URI": self._settings.address.uri, "ROS_NAMESPACE": "/"},
+                    errors=subprocess.DEVNULL,
                 )
                 code = await self._rosout.wait()
                 self._rosout = None
@@ -725,17 +473,17 @@ class MasterGuard:
                     stderr=subprocess.DEVNULL,
                 )
                 try:
-                    said, _ = await asyncio.wait_for(process.communicate(), _START_S)
+                    said, _ = await asyncio.wait_for(process.communicate(), _VERSION_S)
                 finally:
                     if process.returncode is None:
-                        _signal(process, signal.SIGKILL)
+                        process.kill()
                 if said and process.returncode == 0:
                     value = said.decode(errors="replace")
                     await call(self._uri, "setParam", f"/{name}", value, within_s=_PROBE_S)
 
     async def _close(self) -> None:
         if self._rosout is not None:
-            await _ended(self._rosout, signal.SIGINT)
+            await self._rosout.end(signal.SIGINT)
         if self._is_inherited:
             # As the guard that started both would have done.
             with contextlib.suppress(CallError):
@@ -762,135 +510,3 @@ def _how_it_ended(code: int) -> str:
         with contextlib.suppress(ValueError):
             return f"it was ended by {signal.Signals(-code).name}"
     return f"it ended with exit code {code}"
-
-
-class _lock:  # noqa: N801 (used as a function)
-    """Keeps a second guard of the same master away.
-
-    Parameters
-    ----------
-    path : Path
-    port : int
-
-    Raises
-    ------
-    GuardError
-        If there is one already.
-    """
-
-    def __init__(self, path: Path, port: int) -> None:
-        try:
-            self._descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
-        except OSError as error:
-            raise GuardError(f"{path}: cannot be written: {error.strerror}") from error
-        try:
-            fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            who = os.pread(self._descriptor, 20, 0).decode(errors="replace").strip()
-            os.close(self._descriptor)
-            raise GuardError(
-                f"the master at port {port} has a guard already: process {who or 'unknown'}"
-            ) from error
-        os.ftruncate(self._descriptor, 0)
-        os.pwrite(self._descriptor, f"{os.getpid()}\n".encode(), 0)
-
-    def __enter__(self) -> None:
-        pass
-
-    def __exit__(self, *_: object) -> None:
-        os.close(self._descriptor)
-
-
-# -- questions -------------------------------------------------------------------------------------
-
-
-async def _ask(
-    known: MasterState,
-) -> tuple[dict[str, NodeAnswer], dict[str, bool | None]]:
-    """Ask all nodes and services of a master that is no more whether they are there, at once."""
-    nodes: dict[str, NodeAnswer] = dict.fromkeys(known.nodes().values())
-    services: dict[str, bool | None] = dict.fromkeys(known.services)
-    few = asyncio.Semaphore(_ASKED_AT_ONCE)
-
-    async def ask_node(uri: str) -> None:
-        async with few:
-            nodes[uri] = await _report_of(uri)
-
-    async def ask_services(uri: str, names: list[str]) -> None:
-        # One after another: a rospy node lets five wait, and the sixth connects a second later.
-        async with few:
-            for name in names:
-                services[name] = await offers_service(uri, name, within_s=_ANSWER_S)
-                if services[name] is None:
-                    return
-
-    by_address: dict[str, list[str]] = {}
-    for service, (_, _, uri) in known.services.items():
-        by_address.setdefault(uri, []).append(service)
-    questions: list[Awaitable[None]] = [ask_node(uri) for uri in nodes]
-    questions += [ask_services(uri, names) for uri, names in by_address.items()]
-    with contextlib.suppress(TimeoutError):
-        async with asyncio.timeout(_ANSWERS_S):
-            await asyncio.gather(*questions)
-    return nodes, services
-
-
-async def _report_of(uri: str) -> NodeAnswer:
-    try:
-        publications, subscriptions = await asyncio.gather(
-            call(uri, "getPublications", within_s=_ANSWER_S),
-            call(uri, "getSubscriptions", within_s=_ANSWER_S),
-        )
-        return NodeReport(
-            {str(topic): str(kind) for topic, kind in publications},
-            {str(topic): str(kind) for topic, kind in subscriptions},
-        )
-    except GoneError:
-        return "gone"
-    except (CallError, TypeError, ValueError):
-        return None
-
-
-async def _snapshot(connection: Connection) -> MasterState:
-    """Return what a stock master knows."""
-    system_state, types, parameters = await connection.calls(
-        [("getSystemState", ()), ("getTopicTypes", ()), ("getParam", ("/",))], within_s=_POLL_S
-    )
-    names, services = lookups_of(system_state)
-    uris = await connection.calls(
-        [
-            *(("lookupNode", (name,)) for name in names),
-            *(("lookupService", (service,)) for service in services),
-        ],
-        within_s=_POLL_S,
-    )
-    return state_of_snapshot(
-        system_state,
-        types,
-        parameters,
-        dict(zip(names, uris, strict=False)),
-        dict(zip(services, uris[len(names) :], strict=True)),
-    )
-
-
-def _listens_at(pid: int, port: int) -> bool:
-    """Tell whether a process, which this user may look into, listens at a port of this machine.
-
-    A master names its process, but a container has numbers of its own.
-    """
-    sockets = set()
-    for table in ("tcp", "tcp6"):
-        with contextlib.suppress(OSError):
-            for line in Path(f"/proc/self/net/{table}").read_text().splitlines()[1:]:
-                fields = line.split()
-                if fields[3] == "0A" and int(fields[1].rpartition(":")[2], 16) == port:
-                    sockets.add(f"socket:[{fields[9]}]")
-    try:
-        descriptors = list(Path(f"/proc/{pid}/fd").iterdir())
-    except OSError:
-        return False
-    for descriptor in descriptors:
-        with contextlib.suppress(OSError):
-            if str(descriptor.readlink()) in sockets:
-                return True
-    return False
