@@ -180,14 +180,32 @@ class TestItsOwnMaster:
         os.kill(pid, signal.SIGKILL)
         doomed.process.wait()
         replaced(graph, pid)
-        registered = graph.registered()
-        assert "/doomed" not in registered["nodes"]
-        assert "/doomed_work" not in registered["services"]
-        assert {"/work", "/mux/select"} <= registered["services"].keys()
+        # It may have been about to die when it was asked; then it is asked again.
+        wait_for(lambda: "/doomed" not in graph.registered()["nodes"])
+        wait_for(lambda: "/doomed_work" not in graph.registered()["services"])
+        assert {"/work", "/mux/select"} <= graph.registered()["services"].keys()
         (_, started) = graph.events(guard, "master_started")
-        assert started["gone"] == ["/doomed"]
-        assert "/doomed_work" in started["lost_services"]
+        gone = [started, *graph.events(guard, "nodes_gone")]
+        assert [name for event in gone for name in event.get("gone") or ()] == ["/doomed"]
         keeps_on(caller)
+
+    def test_a_node_that_is_stopped_is_kept_and_one_that_dies_meanwhile_is_not(
+        self, graph: Graph
+    ) -> None:
+        guard = graph.guard("--no-rosout")
+        stopped = [graph.node("server", f"/stopped_{each}", f"/work_{each}") for each in ("a", "b")]
+        wait_for(lambda: all(server.lines for server in stopped))
+        before = graph.registered()
+        for server in stopped:
+            os.kill(server.process.pid, signal.SIGSTOP)
+        replaced(graph, graph.kill_master())
+        assert graph.registered()["services"] == before["services"]
+        assert graph.events(guard, "master_started")[1]["silent"] == ["/stopped_a", "/stopped_b"]
+        stopped[0].end()
+        wait_for(lambda: "/stopped_a" not in graph.registered()["nodes"])
+        assert [event["gone"] for event in graph.events(guard, "nodes_gone")] == [["/stopped_a"]]
+        os.kill(stopped[1].process.pid, signal.SIGCONT)
+        graph.run("rosservice", "call", "/work_b")
 
     def test_while_nodes_start(self, graph: Graph) -> None:
         graph.guard("--no-rosout")

@@ -18,6 +18,7 @@ from holdfast.ros.master.plan import (
     lookups_of,
     reconcile,
     state_of_snapshot,
+    unregistrations,
 )
 from holdfast.ros.master.process import (
     Journal,
@@ -118,6 +119,29 @@ class TestReconcile:
         said = NodeReport({"/scan": "x/Y", "/more": "x/Y"}, {})
         reconcile(before, {ARM: said, BASE: "gone"}, {})
         assert before == known()
+
+
+class TestWhoDidNotAnswer:
+    def test_only_their_part_is_doubtful(self) -> None:
+        found = reconcile(known(), {**reports(), ARM: None}, {**SERVED, "/stop": None}).doubtful
+        expected = MasterState()
+        expected.publishers = {"/joints": [("/arm", ARM)]}
+        expected.subscribers = {"/scan": [("/arm", ARM)]}
+        expected.parameter_subscribers = known().parameter_subscribers
+        expected.services = {"/stop": known().services["/stop"]}
+        assert found == expected
+        assert reconcile(known(), reports(), SERVED).doubtful == MasterState()
+
+    def test_what_is_no_more_is_taken_back(self) -> None:
+        before = reconcile(known(), {**reports(), ARM: None}, {**SERVED, "/grip": None}).doubtful
+        assert unregistrations(before, before) == []
+        after = reconcile(before, {ARM: "gone"}, {"/grip": False})
+        assert unregistrations(before, after.state) == [
+            ("unregisterPublisher", ("/arm", "/joints", ARM)),
+            ("unregisterSubscriber", ("/arm", "/scan", ARM)),
+            ("unsubscribeParam", ("/arm", ARM, "/arm/speed/")),
+            ("unregisterService", ("/arm", "/grip", "rosrpc://robot:11")),
+        ]
 
 
 class TestSnapshot:

@@ -111,14 +111,19 @@ class Connection:
     ) -> list[Any]:
         """Ask several things at once; the answer to one that is refused is None.
 
+        Parameters
+        ----------
+        questions : iterable
+            Methods and their arguments, the caller's name as well.
+        within_s : float
+
         Raises
         ------
         CallError
             As :meth:`call`.
         """
         asked = [
-            {"methodName": method, "params": [CALLER, *arguments]}
-            for method, arguments in questions
+            {"methodName": method, "params": list(arguments)} for method, arguments in questions
         ]
         answers = await self._answer("system.multicall", (asked,), within_s)
         if not isinstance(answers, list) or len(answers) != len(asked):

@@ -31,8 +31,8 @@ from collections.abc import Callable, Coroutine
 from time import monotonic
 from urllib.parse import urlsplit
 
-from holdfast.ros.master.calls import CallError, Connection, GoneError, call
-from holdfast.ros.master.plan import NodeReport, Reconciled, reconcile
+from holdfast.ros.master.calls import CALLER, CallError, Connection, GoneError, call
+from holdfast.ros.master.plan import NodeReport, Reconciled, reconcile, unregistrations
 from holdfast.ros.master.process import (
     MasterState,
     parameter_names,
@@ -61,6 +61,7 @@ _POLL_SHARE = 0.1
 _SPARE_DELAY_S = 0.5
 """The next master is loaded a little after this one began, when the nodes have what they need."""
 
+_SECOND_LOOK_S = 1.0
 _STEADY_S = 1.0
 """A master that ends earlier than this may have failed at its start."""
 
@@ -94,6 +95,8 @@ class MasterGuard:
         self._other_pid: int | None = None
         self._is_inherited = False
         """Whether the other master is one that an earlier guard has started."""
+        self._doubtful = MasterState()
+        """Who did not answer when the master began."""
         self._rosout: ChildProcess | None = None
 
     async def run(self, ready: Callable[[str], None]) -> None:
@@ -185,6 +188,7 @@ class MasterGuard:
     async def _watch_own(self, master: MasterProcess) -> str:
         """Wait until the master that was started here is no more; say why."""
         loading = asyncio.create_task(self._load_spare_later())
+        looking = asyncio.create_task(self._help(self._look_again()))
         ended = asyncio.create_task(master.process.wait())
         silent = asyncio.create_task(self._silent())
         try:
@@ -197,7 +201,7 @@ class MasterGuard:
             self._own = None
             return reason
         finally:
-            for task in (loading, ended, silent):
+            for task in (loading, looking, ended, silent):
                 task.cancel()
 
     async def _watch_other(self) -> str:
@@ -315,7 +319,7 @@ class MasterGuard:
             with contextlib.suppress(CallError):
                 pid = await connection.call("getPid", within_s=_PROBE_S)
                 # A stock master answers at once that it has no such call.
-                (journal,) = await connection.calls([("getJournal", ())], within_s=_PROBE_S)
+                (journal,) = await connection.calls([("getJournal", (CALLER,))], within_s=_PROBE_S)
                 return int(pid), journal
             await asyncio.sleep(_PROBE_EVERY_S)
 
@@ -368,6 +372,7 @@ class MasterGuard:
             await master.end(at_once=True)
             raise
         self._own, self._is_inherited = master, False
+        self._doubtful = reconciled.doubtful
         self._events.event(
             "master_started",
             service=self._settings.address.uri,
@@ -394,6 +399,26 @@ class MasterGuard:
         # Without one, the next master takes a little longer, and says what is wrong.
         with contextlib.suppress(GuardError):
             self._next_master()
+
+    async def _look_again(self) -> None:
+        """Ask those once more who did not answer when the master began.
+
+        A node that died along with the master may have been about to.
+        """
+        await asyncio.sleep(_SECOND_LOOK_S)
+        before = self._doubtful
+        found = reconcile(before, *await ask_everyone(before))
+        if calls := unregistrations(before, found.state):
+            connection = Connection(self._uri)
+            try:
+                await connection.calls(calls, within_s=_PROBE_S)
+            finally:
+                connection.close()
+            self._events.event(
+                "nodes_gone",
+                gone=list(found.gone) or None,
+                lost_services=list(found.lost_services) or None,
+            )
 
     async def _drop_spare(self) -> None:
         spare, self._spare = self._spare, None

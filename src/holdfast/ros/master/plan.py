@@ -21,9 +21,17 @@ __all__ = [
     "lookups_of",
     "reconcile",
     "state_of_snapshot",
+    "unregistrations",
 ]
 
 _ANY_TYPE = "*"
+
+_REGISTRATIONS = {
+    "publishers": "unregisterPublisher",
+    "subscribers": "unregisterSubscriber",
+    "parameter_subscribers": "unsubscribeParam",
+}
+"""Tables of a master, and how a node takes back what it has in them."""
 
 
 class NodeReport(NamedTuple):
@@ -49,12 +57,15 @@ class Reconciled(NamedTuple):
         Nodes that did not answer, which are kept.
     lost_services : tuple of str
         Services that nobody offers any more.
+    doubtful : MasterState
+        That part of the state of which nobody could say that it is still so.
     """
 
     state: MasterState
     gone: tuple[str, ...]
     silent: tuple[str, ...]
     lost_services: tuple[str, ...]
+    doubtful: MasterState
 
 
 def reconcile(
@@ -76,7 +87,7 @@ def reconcile(
     state = MasterState()
     state.parameters = known.parameters
     state.types = dict(known.types)
-    for table in ("publishers", "subscribers", "parameter_subscribers"):
+    for table in _REGISTRATIONS:
         kept = getattr(state, table)
         for key, registered in getattr(known, table).items():
             staying = [
@@ -102,7 +113,47 @@ def reconcile(
         gone=tuple(node for node, uri in uris.items() if nodes.get(uri) == "gone"),
         silent=tuple(node for node, uri in uris.items() if nodes.get(uri) is None),
         lost_services=tuple(known.services.keys() - state.services.keys()),
+        doubtful=_doubtful(known, nodes, services),
     )
+
+
+def _doubtful(
+    known: MasterState, nodes: Mapping[str, NodeAnswer], services: Mapping[str, bool | None]
+) -> MasterState:
+    part = MasterState()
+    for table in _REGISTRATIONS:
+        for key, registered in getattr(known, table).items():
+            silent = [(node, uri) for node, uri in registered if nodes.get(uri) is None]
+            if silent:
+                getattr(part, table)[key] = silent
+    part.services = {
+        service: where for service, where in known.services.items() if services.get(service) is None
+    }
+    return part
+
+
+def unregistrations(before: MasterState, after: MasterState) -> list[tuple[str, tuple[str, ...]]]:
+    """Return the calls to a master that take back what is in one state and not in another.
+
+    Each call names the address, too: of a node that has been started again meanwhile, at another
+    one, it takes nothing back.
+
+    Returns
+    -------
+    list of tuple
+        Methods and their arguments, the first of which is the node's name.
+    """
+    calls: list[tuple[str, tuple[str, ...]]] = []
+    for table, method in _REGISTRATIONS.items():
+        for key, registered in getattr(before, table).items():
+            for node, uri in registered:
+                if (node, uri) not in getattr(after, table).get(key, ()):
+                    by_key = (node, uri, key) if table == "parameter_subscribers" else None
+                    calls.append((method, by_key or (node, key, uri)))
+    for service, (node, _, own_uri) in before.services.items():
+        if service not in after.services:
+            calls.append(("unregisterService", (node, service, own_uri)))
+    return calls
 
 
 def _still(table: str, key: str, answer: NodeAnswer) -> bool:

@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 from collections.abc import Awaitable
 
-from holdfast.ros.master.calls import CallError, Connection, GoneError, call, offers_service
+from holdfast.ros.master.calls import CALLER, CallError, Connection, GoneError, call, offers_service
 from holdfast.ros.master.plan import NodeAnswer, NodeReport, lookups_of, state_of_snapshot
 from holdfast.ros.master.process import MasterState
 
@@ -72,13 +72,18 @@ async def _report_of(uri: str) -> NodeAnswer:
 async def snapshot(connection: Connection) -> MasterState:
     """Return what a stock master knows."""
     system_state, types, parameters = await connection.calls(
-        [("getSystemState", ()), ("getTopicTypes", ()), ("getParam", ("/",))], within_s=_SNAPSHOT_S
+        [
+            ("getSystemState", (CALLER,)),
+            ("getTopicTypes", (CALLER,)),
+            ("getParam", (CALLER, "/")),
+        ],
+        within_s=_SNAPSHOT_S,
     )
     names, services = lookups_of(system_state)
     uris = await connection.calls(
         [
-            *(("lookupNode", (name,)) for name in names),
-            *(("lookupService", (service,)) for service in services),
+            *(("lookupNode", (CALLER, name)) for name in names),
+            *(("lookupService", (CALLER, service)) for service in services),
         ],
         within_s=_SNAPSHOT_S,
     )
