@@ -11,7 +11,7 @@ import subprocess
 import sys
 import time
 import xmlrpc.client
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -222,9 +222,9 @@ class Graph:
             SYSTEM_PYTHON, "-c", NODES[kind], *words, name=kind, reads=kind == "server"
         )
 
-    def guard(self, *words: str) -> Process:
+    def guard(self, *words: str, before: Sequence[str] = ()) -> Process:
         """Start a guard, and wait until it guards."""
-        command = [sys.executable, "-m", "holdfast", "ros1-guard", "--log", "json", *words]
+        command = [*before, sys.executable, "-m", "holdfast", "ros1-guard", "--log", "json", *words]
         self._guard = guard = self.start(*command, name="guard")
         wait_for(lambda: guard.lines or guard.process.poll() is not None, guard.account)
         assert guard.process.poll() is None, guard.account()

@@ -254,6 +254,22 @@ class TestItsOwnMaster:
             replaced(graph, graph.kill_master())
             assert graph.registered()["parameters"] == before
 
+    def test_what_there_is_no_room_for_costs_no_answer(self, graph: Graph) -> None:
+        # No file may be larger than this, in units of 1024 bytes.
+        graph.guard("--no-rosout", before=("bash", "-c", 'ulimit -f 64; exec "$@"', "bash"))
+        server = graph.node("server", "/server", "/work")
+        wait_for(lambda: server.lines)
+        assert graph.ask("setParam", "/large", "x" * 100_000)[0] == 1
+        assert graph.ask("setParam", "/small", "x")[0] == 1
+        assert graph.registered()["parameters"]["small"] == "x"
+        # What there was room for is there again.
+        replaced(graph, graph.kill_master())
+        assert "/work" in graph.registered()["services"]
+        assert graph.ask("setParam", "/small", "y")[0] == 1
+        replaced(graph, graph.kill_master())
+        assert "/work" in graph.registered()["services"]
+        assert graph.registered()["parameters"]["small"] == "y"
+
     def test_the_guard_is_killed(self, graph: Graph) -> None:
         guard = graph.guard()
         caller, listener = start_everything(graph)

@@ -363,7 +363,11 @@ class MasterGuard:
         begun_at = monotonic() if noticed_at is None else noticed_at
         self._bind()
         state = reconciled.state
-        write_journal(self._journal, state)
+        try:
+            write_journal(self._journal, state)
+        except OSError as error:
+            # The one before is still there; it lists the dead, too, but is better than no master.
+            self._events.event("note", reason=f"{self._journal}: {error.strerror}")
         master = self._next_master()
         self._spare = None
         try:

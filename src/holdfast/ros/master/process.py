@@ -226,8 +226,8 @@ class Journal:
     """What a running master writes into; any thread may.
 
     It has a copy of its own of all that it has written, so that it can be written anew, shorter,
-    whoever changes what meanwhile. If the disk is full, the master goes on, and with the next
-    change the journal is written anew.
+    whoever changes what meanwhile. If the disk is full, the master goes on, and with every change
+    it is tried again to write the journal anew.
 
     Parameters
     ----------
@@ -242,7 +242,10 @@ class Journal:
         self._lock = threading.Lock()
         self._descriptor = -1
         self._size = self._limit = 0
-        self._write_anew()
+        try:
+            self._write_anew()
+        except OSError as error:
+            self._give_up(error)
 
     def write(self, table: str, key: str | None, value: Any) -> None:
         """Write down one change; never raises."""
@@ -261,8 +264,11 @@ class Journal:
                     return
                 self._append(record)
             except OSError as error:
-                sys.stderr.write(f"{self._path}: {error}\n")
-                self.close()
+                self._give_up(error)
+
+    def _give_up(self, error: OSError) -> None:
+        sys.stderr.write(f"{self._path}: {error}\n")
+        self.close()
 
     def _append(self, record: bytes) -> None:
         if os.write(self._descriptor, record) < len(record):
