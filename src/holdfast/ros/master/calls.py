@@ -25,6 +25,7 @@ __all__ = [
     "CallError",
     "Connection",
     "GoneError",
+    "SilentError",
     "call",
     "offers_service",
 ]
@@ -39,6 +40,10 @@ _MAX_HANDSHAKE_BYTES = 1024 * 1024
 
 class CallError(HoldfastError):
     """No usable answer came."""
+
+
+class SilentError(CallError):
+    """No answer came in time."""
 
 
 class GoneError(CallError):
@@ -101,8 +106,10 @@ class Connection:
         ------
         GoneError
             If nobody listens there.
+        SilentError
+            If no answer came in time.
         CallError
-            If no answer came in time, or one that says no.
+            If another one came, or one that says no.
         """
         return _value_of(await self._answer(method, (CALLER, *arguments), within_s), method)
 
@@ -144,7 +151,7 @@ class Connection:
                 return await self._exchange(body)
         except TimeoutError as error:
             self.close()
-            raise CallError(f"{self.uri}: {method}: no answer within {within_s:g} s") from error
+            raise SilentError(f"{self.uri}: {method}: no answer within {within_s:g} s") from error
         except xmlrpc.client.Fault as fault:
             raise CallError(f"{self.uri}: {method}: {fault.faultString:.500}") from fault
         except (OSError, EOFError, ValueError, ExpatError, xmlrpc.client.Error) as error:

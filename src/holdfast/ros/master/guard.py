@@ -31,7 +31,7 @@ from collections.abc import Callable, Coroutine
 from time import monotonic
 from urllib.parse import urlsplit
 
-from holdfast.ros.master.calls import CALLER, CallError, Connection, GoneError, call
+from holdfast.ros.master.calls import CALLER, CallError, Connection, GoneError, SilentError, call
 from holdfast.ros.master.plan import NodeReport, Reconciled, reconcile, unregistrations
 from holdfast.ros.master.process import (
     MasterState,
@@ -95,6 +95,7 @@ class MasterGuard:
         self._other_pid: int | None = None
         self._is_inherited = False
         """Whether the other master is one that an earlier guard has started."""
+        self._written_down: MasterState | None = None
         self._doubtful = MasterState()
         """Who did not answer when the master began."""
         self._rosout: ChildProcess | None = None
@@ -147,15 +148,21 @@ class MasterGuard:
 
     async def _begin(self) -> str:
         """Find a master, or start one."""
+        connection = Connection(self._uri)
         try:
-            await Connection(self._uri).call("getPid", within_s=self._settings.silent_s)
+            await connection.call("getPid", within_s=self._settings.silent_s)
+            await self._recognise(connection)
         except GoneError:
             pass
-        except CallError as error:
-            self._events.event("note", reason=f"what is at {self._uri} does not answer: {error}")
+        except SilentError as error:
+            self._events.event("note", reason=str(error))
             return "found"
+        except CallError as error:
+            raise GuardError(f"what is there is no ROS 1 master: {error}") from error
         else:
             return "found"
+        finally:
+            connection.close()
         known = read_journal(self._journal) or MasterState()
         nodes, services = await ask_everyone(known)
         others = {uri for node, uri in known.nodes().items() if node != _ROSOUT}
@@ -206,7 +213,6 @@ class MasterGuard:
 
     async def _watch_other(self) -> str:
         """Wait until a master that somebody else started is no more; say why."""
-        self._other_pid, self._is_inherited = None, False
         watching = [asyncio.create_task(self._closed()), asyncio.create_task(self._silent())]
         following = asyncio.create_task(self._follow())
         told = False
@@ -216,6 +222,7 @@ class MasterGuard:
                 unfinished = {closed, silent, *(() if following.done() else (following,))}
                 await asyncio.wait(unfinished, return_when=asyncio.FIRST_COMPLETED)
                 if closed.done():
+                    self._forget_other()
                     return closed.result()
                 if following.done():
                     following.result()
@@ -224,6 +231,7 @@ class MasterGuard:
                 # Stopped, or so busy that it is of no use to anybody.
                 if self._signal_other(signal.SIGKILL):
                     await closed
+                    self._forget_other()
                     return silent.result()
                 if not told:
                     self._events.event(
@@ -236,6 +244,9 @@ class MasterGuard:
         finally:
             for task in (*watching, following):
                 task.cancel()
+
+    def _forget_other(self) -> None:
+        self._other_pid, self._is_inherited = None, False
 
     def _signal_other(self, number: signal.Signals) -> bool:
         """Signal the master that somebody else started, if it is this user's, and here."""
@@ -295,46 +306,47 @@ class MasterGuard:
             connection.close()
 
     async def _follow(self) -> None:
-        """Find out which master it is; if it keeps no journal, keep one of what it answers."""
+        """Of a master that keeps no journal, keep one of what it answers."""
         connection = Connection(self._uri)
         try:
-            self._other_pid, journal = await self._identify(connection)
-            self._is_inherited = journal == str(self._journal)
-            self._events.event(
-                "guarding",
-                service=self._settings.address.uri,
-                pid=self._other_pid,
-                journal=self._is_inherited,
-            )
-            if not self._is_inherited:
-                # That of another master is not its.
-                self._journal.unlink(missing_ok=True)
-                await self._poll(connection)
+            while self._other_pid is None:
+                with contextlib.suppress(CallError):
+                    await self._recognise(connection)
+                await asyncio.sleep(_PROBE_EVERY_S)
+            while not self._is_inherited:
+                asked_at = monotonic()
+                with contextlib.suppress(CallError):
+                    await self._write_down(connection)
+                took = monotonic() - asked_at
+                await asyncio.sleep(max(_POLL_EVERY_S, took / _POLL_SHARE))
         finally:
             connection.close()
 
-    async def _identify(self, connection: Connection) -> tuple[int, str | None]:
-        """Return the master's process, and where its journal is."""
-        while True:
-            with contextlib.suppress(CallError):
-                pid = await connection.call("getPid", within_s=_PROBE_S)
-                # A stock master answers at once that it has no such call.
-                (journal,) = await connection.calls([("getJournal", (CALLER,))], within_s=_PROBE_S)
-                return int(pid), journal
-            await asyncio.sleep(_PROBE_EVERY_S)
+    async def _recognise(self, connection: Connection) -> None:
+        """Find out which master somebody else has started."""
+        pid = int(await connection.call("getPid", within_s=_PROBE_S))
+        # A stock master answers at once that it has no such call.
+        (journal,) = await connection.calls([("getJournal", (CALLER,))], within_s=_PROBE_S)
+        inherited = journal == str(self._journal)
+        if not inherited:
+            # That of another master is not its.
+            self._journal.unlink(missing_ok=True)
+            self._written_down = None
+            await self._write_down(connection)
+        self._other_pid, self._is_inherited = pid, inherited
+        self._events.event(
+            "guarding", service=self._settings.address.uri, pid=pid, journal=inherited
+        )
 
-    async def _poll(self, connection: Connection) -> None:
-        """Ask a stock master again and again what it knows, and write that down."""
-        last = None
-        while True:
-            asked_at = monotonic()
-            with contextlib.suppress(CallError, OSError, ValueError, TypeError):
-                state = await snapshot(connection)
-                if state != last:
-                    write_journal(self._journal, state)
-                    last = state
-            took = monotonic() - asked_at
-            await asyncio.sleep(max(_POLL_EVERY_S, took / _POLL_SHARE))
+    async def _write_down(self, connection: Connection) -> None:
+        """Write down what a stock master knows, if that has changed."""
+        try:
+            state = await snapshot(connection)
+            if state != self._written_down:
+                write_journal(self._journal, state)
+                self._written_down = state
+        except (OSError, TypeError, ValueError) as error:
+            raise CallError(f"{self._uri}: cannot be written down: {error}") from error
 
     # -- replacing ---------------------------------------------------------------------------------
 
@@ -375,7 +387,7 @@ class MasterGuard:
         except BaseException:
             await master.end(at_once=True)
             raise
-        self._own, self._is_inherited = master, False
+        self._own = master
         self._doubtful = reconciled.doubtful
         self._events.event(
             "master_started",
