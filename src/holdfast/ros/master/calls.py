@@ -16,7 +16,6 @@ import xmlrpc.client
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 from urllib.parse import urlsplit
-from xml.parsers.expat import ExpatError
 
 from holdfast.errors import HoldfastError
 
@@ -154,10 +153,14 @@ class Connection:
             raise SilentError(f"{self.uri}: {method}: no answer within {within_s:g} s") from error
         except xmlrpc.client.Fault as fault:
             raise CallError(f"{self.uri}: {method}: {fault.faultString:.500}") from fault
-        except (OSError, EOFError, ValueError, ExpatError, xmlrpc.client.Error) as error:
+        except CallError:
+            self.close()
+            raise
+        except Exception as error:
+            # Whatever somebody answers, and however the parser takes it, is no answer.
             self.close()
             raise CallError(f"{self.uri}: {method}: {error or type(error).__name__}") from error
-        except BaseException:
+        except asyncio.CancelledError:
             self.close()
             raise
 
