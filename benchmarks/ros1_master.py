@@ -16,6 +16,9 @@ the client until everything was listed.
 
 ``--by stock`` has a stock master instead that the guard has found (``rosmaster``), which is killed
 once a guard: the first master is then of others, and only that kill is measured.
+
+ros1_master.csv holds 40 kills of the first kind and 10 of the second, on two cores that others were
+using as well (load 3 to 4).
 """
 
 from __future__ import annotations
