@@ -33,6 +33,8 @@ NUMBERS = [
     ["keys", "mine", "--days"],
     ["export", "run", "--trials"],
     ["export", "run", "--rate"],
+    ["ros1-guard", "--port"],
+    ["ros1-guard", "--silent-s"],
     ["serve", "--workers"],
     ["serve", "--lease-ms"],
     ["serve", "--max-sessions"],
@@ -55,6 +57,7 @@ PATHS = [
     ["export", "run", "--mcap"],
     ["export", "run", "--csv"],
     ["keys"],
+    ["ros1-guard", "--directory"],
     ["serve", "--tls"],
     ["serve", "--problem-directory"],
 ]
@@ -172,7 +175,7 @@ def test_every_number_and_path_of_the_commands_is_in_these_tables() -> None:
     listed = {(words[0], words[-1]) for words in [*NUMBERS, *PATHS] if words[-1].startswith("--")}
     for command in app.registered_commands:
         assert command.callback is not None
-        name = command.callback.__name__
+        name = command.name or command.callback.__name__
         for parameter in inspect.signature(command.callback, eval_str=True).parameters.values():
             for info in getattr(parameter.annotation, "__metadata__", ()):
                 if isinstance(info, typer.models.ArgumentInfo):

@@ -19,6 +19,7 @@ from holdfast.cli.endings import EXIT_ERROR
 from holdfast.cli.experiment import experiment
 from holdfast.cli.export import export
 from holdfast.cli.keys import keys
+from holdfast.cli.ros1_guard import ros1_guard
 from holdfast.cli.run import run
 from holdfast.cli.serve import serve
 from holdfast.cli.simulate import simulate
@@ -60,6 +61,7 @@ app.command(no_args_is_help=True, short_help="Write a run for RViz, Foxglove, or
 )
 app.command(short_help="Search for faults that change a decision.")(simulate)
 app.command(no_args_is_help=True, short_help="Make keys for robots and services.")(keys)
+app.command("ros1-guard", short_help="Have a ROS 1 master that may die.")(ros1_guard)
 
 
 def run_application(arguments: list[str]) -> None:

@@ -1,0 +1,506 @@
+"""A ROS 1 master that writes down what it has been told, before it says that it was told.
+
+A stock master keeps everything in memory: who publishes, who subscribes, which services there are,
+which parameters. Killed, it takes that along. This one is the stock master (``rosmaster``, same
+code, same answers) with a journal: a file that gets every change before the node that asked for it
+is answered. A master that is started from the journal knows all that the last one has confirmed,
+those who watch parameters too, whom no call to a master can read.
+
+The file is written to the page cache only. It outlives the master's process, not the machine, and
+that is what is wanted: the nodes do not outlive the machine either.
+
+ROS's Python runs this file, which may be older than holdfast's and lacks holdfast: it imports the
+standard library alone and, once it runs, ``rosmaster``. The guard imports :class:`MasterState` and
+the journal from here.
+
+Started as ``process.py SOCKET CONTROL JOURNAL`` (two descriptors and a path) it loads all
+that it needs, says ``warm`` on CONTROL, and waits. On ``go`` it reads the journal, takes the
+connections that come to SOCKET, and says ``serving``. If CONTROL ends before, it ends; afterwards
+it needs nobody.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import pickle
+import socket
+import struct
+import sys
+import threading
+from pathlib import Path
+from typing import Any, Dict, List, NamedTuple, NoReturn, Optional, Tuple  # noqa: UP035 (older Python)
+from zlib import crc32
+
+__all__ = [
+    "Journal",
+    "MasterState",
+    "parameter_names",
+    "read_journal",
+    "write_journal",
+]
+
+Registrations = Dict[str, List[Tuple[str, str]]]  # noqa: UP006
+"""Of each topic or parameter the nodes: name and URI of the node's XML-RPC server."""
+
+_MAGIC = b"holdfast ROS 1 master 1\n"
+_HEAD = struct.Struct("<II")
+_COMPACTED_AFTER_BYTES = 4 * 1024 * 1024
+_WORKERS = 8
+"""Threads that tell nodes of changes. One that a stopped node blocks is lost to the others; stock
+masters have three."""
+
+_TABLES = ("publishers", "subscribers", "services", "types", "parameter_subscribers")
+
+
+class MasterState:
+    """All that a master knows.
+
+    Attributes
+    ----------
+    parameters : dict
+        The tree; a namespace is a dict.
+    publishers, subscribers, parameter_subscribers : dict
+        Registrations by topic, or by parameter.
+    services : dict
+        Of each service the node's name, the URI of its XML-RPC server, and the service's own URI.
+    types : dict
+        Of each topic the type of its messages.
+    """
+
+    def __init__(self) -> None:
+        self.parameters: dict[str, Any] = {}
+        self.publishers: Registrations = {}
+        self.subscribers: Registrations = {}
+        self.services: dict[str, tuple[str, str, str]] = {}
+        self.types: dict[str, str] = {}
+        self.parameter_subscribers: Registrations = {}
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, MasterState) and vars(self) == vars(other)
+
+    __hash__ = None  # type: ignore[assignment]  # it changes
+
+    def apply(self, table: str, key: str | None, value: Any) -> None:
+        """Make one change.
+
+        Parameters
+        ----------
+        table : str
+            One of the attributes.
+        key : str or None
+            What in it changes; None for all of it.
+        value
+            What it is from now on; None if it is nothing any more.
+        """
+        if table == "parameters":
+            self._set_parameter(key or "/", value)
+        elif key is None:
+            setattr(self, table, value)
+        elif value is None:
+            getattr(self, table).pop(key, None)
+        else:
+            getattr(self, table)[key] = value
+
+    def _set_parameter(self, key: str, value: Any) -> None:
+        *spaces, last = [part for part in key.split("/") if part] or [""]
+        if not last:
+            self.parameters = value
+            return
+        tree = self.parameters
+        for space in spaces:
+            inner = tree.get(space)
+            # As in the master: a value gives way to a namespace.
+            if not isinstance(inner, dict):
+                inner = tree[space] = {}
+            tree = inner
+        if value is None:
+            tree.pop(last, None)
+        else:
+            tree[last] = value
+
+    def nodes(self) -> dict[str, str]:
+        """Return the URI of the XML-RPC server of every node that has registered something."""
+        found: dict[str, str] = {}
+        for table in (self.publishers, self.subscribers, self.parameter_subscribers):
+            for registered in table.values():
+                found.update(registered)
+        found.update((node, uri) for node, uri, _ in self.services.values())
+        return found
+
+
+def parameter_names(tree: dict[str, Any], space: str = "/") -> list[str]:
+    """Return the names of all parameters in a tree."""
+    names: list[str] = []
+    for key, value in tree.items():
+        if isinstance(value, dict):
+            names += parameter_names(value, f"{space}{key}/")
+        else:
+            names.append(space + key)
+    return names
+
+
+# -- the journal -----------------------------------------------------------------------------------
+
+
+class _Change(NamedTuple):
+    table: str
+    key: Optional[str]  # noqa: UP045
+    value: Any
+
+
+class _PlainData(pickle.Unpickler):
+    """Reads what parameters can be, and no code."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        if (module, name) in {
+            ("xmlrpc.client", "Binary"),
+            ("xmlrpc.client", "DateTime"),
+            ("datetime", "datetime"),
+        }:
+            return super().find_class(module, name)
+        raise pickle.UnpicklingError(f"{module}.{name} is no parameter")
+
+
+def _encoded(change: _Change) -> bytes:
+    data = pickle.dumps(tuple(change), protocol=4)
+    return _HEAD.pack(len(data), crc32(data)) + data
+
+
+def _decoded(data: bytes) -> _Change:
+    return _Change(*_PlainData(io.BytesIO(data)).load())
+
+
+def _records_of(state: MasterState) -> bytes:
+    changes = [_Change("parameters", None, state.parameters)]
+    changes += [_Change(table, None, getattr(state, table)) for table in _TABLES]
+    return b"".join(map(_encoded, changes))
+
+
+def read_journal(path: Path) -> MasterState | None:
+    """Return what a journal holds; None if there is none.
+
+    A last record that is not whole is left out: nobody was told that it is there.
+    """
+    try:
+        content = path.read_bytes()
+    except OSError:
+        return None
+    if not content.startswith(_MAGIC):
+        return None
+    state = MasterState()
+    place = len(_MAGIC)
+    while place + _HEAD.size <= len(content):
+        size, checksum = _HEAD.unpack_from(content, place)
+        place += _HEAD.size
+        data = content[place : place + size]
+        place += size
+        if len(data) < size or crc32(data) != checksum:
+            break
+        try:
+            state.apply(*_decoded(data))
+        except (pickle.UnpicklingError, EOFError, TypeError, AttributeError, ValueError):
+            break
+    return state
+
+
+def write_journal(path: Path, state: MasterState) -> int:
+    """Write a journal anew, in one piece, and return its size in bytes.
+
+    Raises
+    ------
+    OSError
+        If it cannot be written; the one before is still there then.
+    """
+    content = _MAGIC + _records_of(state)
+    new = path.with_name(f"{path.name}.new")
+    descriptor = os.open(new, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
+    with open(descriptor, "wb") as file:  # noqa: PTH123 (a descriptor)
+        file.write(content)
+    new.replace(path)
+    return len(content)
+
+
+class Journal:
+    """What a running master writes into; any thread may.
+
+    It has a copy of its own of all that it has written, so that it can be written anew, shorter,
+    whoever changes what meanwhile. If the disk is full, the master goes on, and with every change
+    it is tried again to write the journal anew.
+
+    Parameters
+    ----------
+    path : Path
+    state : MasterState
+        What the master knows at its start; kept.
+    """
+
+    def __init__(self, path: Path, state: MasterState) -> None:
+        self._path = path
+        self._state = state
+        self._lock = threading.Lock()
+        self._descriptor = -1
+        self._size = self._limit = 0
+        try:
+            self._write_anew()
+        except OSError as error:
+            self._give_up(error)
+
+    def write(self, table: str, key: str | None, value: Any) -> None:
+        """Write down one change; never raises."""
+        try:
+            record = _encoded(_Change(table, key, value))
+            # A copy, since the master goes on changing what it has; and proof that it can be read.
+            change = _decoded(record[_HEAD.size :])
+        except Exception as error:  # noqa: BLE001 (whatever it is, the node gets its answer)
+            sys.stderr.write(f"{table} {key}: cannot be written down: {error}\n")
+            return
+        with self._lock:
+            self._state.apply(*change)
+            try:
+                if self._descriptor < 0 or self._size > self._limit:
+                    self._write_anew()
+                    return
+                self._append(record)
+            except OSError as error:
+                self._give_up(error)
+
+    def _give_up(self, error: OSError) -> None:
+        sys.stderr.write(f"{self._path}: {error}\n")
+        self.close()
+
+    def _append(self, record: bytes) -> None:
+        if os.write(self._descriptor, record) < len(record):
+            raise OSError("there is no room for a whole record")
+        self._size += len(record)
+
+    def _write_anew(self) -> None:
+        self.close()
+        self._size = write_journal(self._path, self._state)
+        self._limit = 2 * self._size + _COMPACTED_AFTER_BYTES
+        self._descriptor = os.open(self._path, os.O_WRONLY | os.O_APPEND | os.O_CLOEXEC)
+
+    def close(self) -> None:
+        """Give the file up; a change that is written down opens it anew."""
+        if self._descriptor >= 0:
+            os.close(self._descriptor)
+            self._descriptor = -1
+
+
+# -- the master ------------------------------------------------------------------------------------
+
+
+def _load() -> Any:
+    """Import the stock master, and return a function that makes one with a journal."""
+    import rosmaster.master_api
+    import rosmaster.paramserver
+    import rosmaster.registrations
+
+    class JournalledRegistrations(rosmaster.registrations.RegistrationManager):  # type: ignore[misc, name-defined, unused-ignore]
+        """Writes down what a registration has changed; the master holds its lock meanwhile."""
+
+        journal: Journal
+
+        def tables(self) -> dict[str, Any]:
+            return {
+                "publishers": self.publishers,
+                "subscribers": self.subscribers,
+                "services": self.services,
+                "parameter_subscribers": self.param_subscribers,
+            }
+
+        def value(self, registrations: Any, key: str) -> Any:
+            registered = registrations.map.get(key)
+            if not registered:
+                return None
+            if registrations is self.services:
+                return (*registered[0], registrations.get_service_api(key))
+            return list(registered)
+
+        def register_again(
+            self, r: Any, key: str, node: str, uri: str, service_uri: Any = None
+        ) -> None:
+            """Register what is written down already."""
+            super()._register(r, key, node, uri, service_uri)
+
+        def _register(
+            self, r: Any, key: str, caller_id: str, caller_api: str, service_api: Any = None
+        ) -> None:
+            before = self.nodes.get(caller_id)
+            super()._register(r, key, caller_id, caller_api, service_api)
+            if before is not None and before.api != caller_api:
+                # It was started again, and all that it had registered before is gone.
+                for table, registrations in self.tables().items():
+                    everything = {key: self.value(registrations, key) for key in registrations.map}
+                    self.journal.write(table, None, everything)
+            else:
+                self._write(r, key)
+
+        def _unregister(
+            self, r: Any, key: str, caller_id: str, caller_api: str, service_api: Any = None
+        ) -> Any:
+            answer = super()._unregister(r, key, caller_id, caller_api, service_api)
+            self._write(r, key)
+            return answer
+
+        def _write(self, changed: Any, key: str) -> None:
+            for table, registrations in self.tables().items():
+                if registrations is changed:
+                    self.journal.write(table, key, self.value(registrations, key))
+
+    class JournalledParameters(rosmaster.paramserver.ParamDictionary):  # type: ignore[misc, name-defined, unused-ignore]
+        """Writes down parameters in the order in which they are set."""
+
+        journal: Journal
+
+        def set_param(
+            self, key: str, value: Any, notify_task: Any = None, caller_id: Any = None
+        ) -> None:
+            with self.lock:
+                super().set_param(key, value, notify_task, caller_id)
+                self.journal.write("parameters", key, value)
+
+        def delete_param(self, key: str, notify_task: Any = None) -> None:
+            with self.lock:
+                super().delete_param(key, notify_task)
+                self.journal.write("parameters", key, None)
+
+    class JournalledTypes(Dict[str, str]):  # noqa: UP006
+        """Writes down a topic's type."""
+
+        journal: Journal
+
+        def __setitem__(self, topic: str, kind: str) -> None:
+            changed = self.get(topic) != kind
+            super().__setitem__(topic, kind)
+            if changed:
+                self.journal.write("types", topic, kind)
+
+    class JournalledMaster(rosmaster.master_api.ROSMasterHandler):  # type: ignore[misc, name-defined, unused-ignore]
+        """The stock master's calls, and one more."""
+
+        def __init__(self, path: Path) -> None:
+            super().__init__(_WORKERS)
+            state = read_journal(path) or MasterState()
+            manager = self.reg_manager = JournalledRegistrations(self.thread_pool)
+            self.publishers = manager.publishers
+            self.subscribers = manager.subscribers
+            self.services = manager.services
+            self.param_subscribers = manager.param_subscribers
+            self.param_server = JournalledParameters(manager)
+            self.topics_types = JournalledTypes(state.types)
+            self.restore(manager, state)
+            # A file of its own from here on, and a state that shares nothing with the master's.
+            journal = Journal(path, read_journal(path) or MasterState())
+            self.topics_types.journal = manager.journal = self.param_server.journal = journal
+            self.path = str(path)
+
+        def restore(self, manager: Any, state: MasterState) -> None:
+            register = manager.register_again
+            for registrations, table in (
+                (self.publishers, state.publishers),
+                (self.subscribers, state.subscribers),
+                (self.param_subscribers, state.parameter_subscribers),
+            ):
+                for key, registered in table.items():
+                    for node, uri in registered:
+                        register(registrations, key, node, uri)
+            for service, (node, uri, own_uri) in state.services.items():
+                register(self.services, service, node, uri, own_uri)
+            self.param_server.parameters = state.parameters
+
+        def tell_subscribers(self) -> None:
+            """Tell every subscriber of the publishers there are, all at once.
+
+            A roscpp node gives up the publishers that it is not told of, so it must never be told
+            of a part.
+            """
+            with self.ps_lock:
+                for topic in list(self.subscribers.map):
+                    publishers = self.publishers.get_apis(topic)
+                    subscribers = self.subscribers.get_apis(topic)
+                    self._notify_topic_subscribers(topic, publishers, subscribers)
+
+        def getJournal(self, caller_id: str) -> Tuple[int, str, str]:  # noqa: N802, UP006
+            """Return where the journal is; a stock master has no such call."""
+            del caller_id
+            return 1, "journal", self.path
+
+    return JournalledMaster
+
+
+def _serve(listening: socket.socket, master: Any, serving: Any) -> None:
+    """Answer calls until one asks for the end."""
+    import socketserver
+    from xmlrpc.server import SimpleXMLRPCServer
+
+    from rosgraph.network import create_local_xmlrpc_uri
+    from rosgraph.xmlrpc import SilenceableXMLRPCRequestHandler
+
+    class Server(socketserver.ThreadingMixIn, SimpleXMLRPCServer):
+        """Each connection has a thread, as in the stock master."""
+
+        daemon_threads = True
+
+        def handle_error(self, request: Any, client_address: Any) -> None:
+            """Forget connections that broke."""
+
+    server = Server(
+        listening.getsockname(),
+        SilenceableXMLRPCRequestHandler,
+        logRequests=False,
+        bind_and_activate=False,
+    )
+    server.socket.close()
+    server.socket = listening
+    server.register_multicall_functions()
+    server.register_instance(master)
+    master._ready(create_local_xmlrpc_uri(listening.getsockname()[1]))
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    serving()
+    master.tell_subscribers()
+    ended = threading.Event()
+    while master._ok():
+        ended.wait(0.1)
+
+
+def main() -> NoReturn:
+    """Be a master; see the top of this file."""
+    descriptor, control_descriptor, journal = sys.argv[1:4]
+    control = socket.socket(fileno=int(control_descriptor))
+    # The guard binds it, which may be later.
+    listening = socket.socket(fileno=int(descriptor))
+    try:
+        make = _load()
+    except ImportError as error:
+        control.sendall(f"missing {error}".encode())
+        sys.exit(1)
+    with contextlib.suppress(Exception):
+        # Without a log, there is still a master.
+        import logging
+
+        from rosgraph.roslogging import configure_logging
+
+        configure_logging("rosmaster", logging.INFO, filename="master.log")
+    control.sendall(b"warm")
+    if control.recv(16) != b"go":
+        sys.exit(0)
+    # What a stock master prints, it prints for nobody here.
+    with open(os.devnull, "wb") as nowhere:  # noqa: PTH123
+        os.dup2(nowhere.fileno(), 1)
+
+    def serving() -> None:
+        with contextlib.suppress(OSError):
+            control.sendall(b"serving")
+        control.close()
+
+    _serve(listening, make(Path(journal)), serving)
+    # Threads of calls that hang must not keep it.
+    os._exit(0)
+
+
+if __name__ == "__main__":
+    # What stands beside this file is not for ROS's Python.
+    sys.path[:] = [place for place in sys.path if Path(place or ".") != Path(__file__).parent]
+    main()

@@ -1,0 +1,212 @@
+"""Where a master is, and where its guard keeps what it needs."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import socket
+import stat
+from collections.abc import Mapping
+from pathlib import Path
+from typing import NamedTuple, Self
+from urllib.parse import urlsplit
+
+from holdfast.errors import HoldfastError
+
+__all__ = [
+    "DEFAULT_PORT",
+    "GuardError",
+    "GuardLock",
+    "GuardSettings",
+    "MasterAddress",
+    "listens_at",
+    "own_directory",
+]
+
+DEFAULT_PORT = 11311
+
+
+class GuardError(HoldfastError):
+    """The master cannot be guarded; the message says why."""
+
+
+class MasterAddress(NamedTuple):
+    """Where a master is.
+
+    Attributes
+    ----------
+    host : str
+        As nodes name it.
+    port : int
+    bind : str
+        The address of this machine at which it listens.
+    """
+
+    host: str
+    port: int
+    bind: str
+
+    @property
+    def uri(self) -> str:
+        """Return what nodes have in ``ROS_MASTER_URI``."""
+        return f"http://{self.host}:{self.port}/"
+
+    @property
+    def own_uri(self) -> str:
+        """Return how this machine reaches it."""
+        near = {"0.0.0.0": "127.0.0.1", "::": "[::1]", "::1": "[::1]"}.get(self.bind, self.bind)
+        return f"http://{near}:{self.port}/"
+
+    @classmethod
+    def of(cls, environment: Mapping[str, str], port: int | None = None) -> Self:
+        """Return what ROS's variables say.
+
+        Parameters
+        ----------
+        environment : mapping
+            ``ROS_MASTER_URI``, ``ROS_HOSTNAME``, ``ROS_IP`` and ``ROS_IPV6`` count.
+        port : int, optional
+            Instead of that of the URI.
+
+        Raises
+        ------
+        GuardError
+            If the URI is none, or names another machine.
+        """
+        text = environment.get("ROS_MASTER_URI") or f"http://localhost:{DEFAULT_PORT}"
+        try:
+            parts = urlsplit(text)
+            host, named = parts.hostname, parts.port
+        except ValueError:
+            host = named = None
+        if parts.scheme != "http" or not host:
+            raise GuardError(f"ROS_MASTER_URI is {text!r:.200}; expected http://HOST:PORT")
+        # As rosgraph.network has it.
+        own = environment.get("ROS_HOSTNAME") or environment.get("ROS_IP") or ""
+        version_6 = environment.get("ROS_IPV6") == "on"
+        if own == "localhost" or own.startswith("127.") or own == "::1":
+            loopback = own if own.startswith("127.") else "127.0.0.1"
+            bind = "::1" if version_6 else loopback
+        else:
+            bind = "::" if version_6 else "0.0.0.0"
+        address = cls(host, port or named or DEFAULT_PORT, bind)
+        if not _is_here(host):
+            raise GuardError(
+                f"ROS_MASTER_URI is {text!r:.200}: {host} is no address of this machine; a guard "
+                "runs where its master runs"
+            )
+        return address
+
+
+def _is_here(host: str) -> bool:
+    """Tell whether a name is this machine's."""
+    try:
+        found = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)
+    except OSError:
+        return False
+    for family, kind, number, _, address in found:
+        with contextlib.suppress(OSError), socket.socket(family, kind, number) as probe:
+            probe.bind(address)
+            return True
+    return False
+
+
+class GuardSettings(NamedTuple):
+    """How to guard a master.
+
+    Attributes
+    ----------
+    address : MasterAddress
+    python : str
+        ROS's Python.
+    directory : Path or None
+        Where the journal is; None for one of this user that goes when the machine is started anew.
+    silent_s : float
+        A master that has not answered for so long is replaced.
+    rosout : bool
+        Whether ``/rosout`` is to run, too, as with ``roscore``.
+    """
+
+    address: MasterAddress
+    python: str = "/usr/bin/python3"
+    directory: Path | None = None
+    silent_s: float = 3.0
+    rosout: bool = True
+
+
+def own_directory() -> Path:
+    """Return a directory of this user alone, which does not outlive the machine's uptime."""
+    runtime = os.environ.get("XDG_RUNTIME_DIR")
+    directory = Path(runtime) / "holdfast" if runtime else Path(f"/tmp/holdfast-{os.getuid()}")
+    try:
+        directory.mkdir(mode=0o700, exist_ok=True)
+        found = directory.lstat()
+    except OSError as error:
+        raise GuardError(f"{directory}: cannot be made: {error.strerror}") from error
+    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & 0o022:
+        raise GuardError(
+            f"{directory}: is not a directory that you alone can write to; name another one: "
+            "--directory"
+        )
+    return directory
+
+
+class GuardLock:
+    """Keeps a second guard of the same master away.
+
+    Parameters
+    ----------
+    path : Path
+    port : int
+
+    Raises
+    ------
+    GuardError
+        If there is one already.
+    """
+
+    def __init__(self, path: Path, port: int) -> None:
+        try:
+            self._descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        except OSError as error:
+            raise GuardError(f"{path}: cannot be written: {error.strerror}") from error
+        try:
+            fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            who = os.pread(self._descriptor, 20, 0).decode(errors="replace").strip()
+            os.close(self._descriptor)
+            raise GuardError(
+                f"the master at port {port} has a guard already: process {who or 'unknown'}"
+            ) from error
+        os.ftruncate(self._descriptor, 0)
+        os.pwrite(self._descriptor, f"{os.getpid()}\n".encode(), 0)
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, *_: object) -> None:
+        os.close(self._descriptor)
+
+
+def listens_at(pid: int, port: int) -> bool:
+    """Tell whether a process, which this user may look into, listens at a port of this machine.
+
+    A master names its process, but a container has numbers of its own.
+    """
+    sockets = set()
+    for table in ("tcp", "tcp6"):
+        with contextlib.suppress(OSError):
+            for line in Path(f"/proc/self/net/{table}").read_text().splitlines()[1:]:
+                fields = line.split()
+                if fields[3] == "0A" and int(fields[1].rpartition(":")[2], 16) == port:
+                    sockets.add(f"socket:[{fields[9]}]")
+    try:
+        descriptors = list(Path(f"/proc/{pid}/fd").iterdir())
+    except OSError:
+        return False
+    for descriptor in descriptors:
+        with contextlib.suppress(OSError):
+            if str(descriptor.readlink()) in sockets:
+                return True
+    return False

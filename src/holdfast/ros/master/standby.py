@@ -1,0 +1,181 @@
+"""Processes that live on if this one dies: masters, and those that wait to be one."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import signal
+import socket
+import subprocess
+import threading
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from holdfast.ros.master import process as master_process
+from holdfast.ros.master.settings import GuardError, GuardSettings
+
+__all__ = ["ChildProcess", "MasterProcess"]
+
+_START_S = 30.0
+_END_S = 2.0
+
+
+class ChildProcess:
+    """A process whose end is told at once, and which nothing but a signal ends.
+
+    The standard library's own coroutines for processes end them along with the event loop.
+
+    Parameters
+    ----------
+    words : sequence of str
+    environment : mapping
+        What differs from this process's.
+    pass_fds : sequence of int
+        Descriptors that it inherits.
+    errors : int or None
+        Where its standard error goes; None: where this process's goes.
+
+    Attributes
+    ----------
+    pid : int
+    ended : asyncio.Future of int
+        Its exit code, or the negative number of the signal that ended it.
+
+    Raises
+    ------
+    OSError
+        If it cannot be started.
+    """
+
+    def __init__(
+        self,
+        words: Sequence[str],
+        environment: Mapping[str, str],
+        *,
+        pass_fds: Sequence[int] = (),
+        errors: int | None = None,
+    ) -> None:
+        self._loop = asyncio.get_running_loop()
+        self.ended: asyncio.Future[int] = self._loop.create_future()
+        self._process = subprocess.Popen(
+            words,
+            pass_fds=pass_fds,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=errors,
+            # Ctrl-C is for the guard alone.
+            start_new_session=True,
+            env={**os.environ, **environment},
+        )
+        self.pid = self._process.pid
+        threading.Thread(target=self._wait, daemon=True).start()
+
+    def _wait(self) -> None:
+        code = self._process.wait()
+        # The loop may be closed by then.
+        with contextlib.suppress(RuntimeError):
+            self._loop.call_soon_threadsafe(self._tell, code)
+
+    def _tell(self, code: int) -> None:
+        if not self.ended.done():
+            self.ended.set_result(code)
+
+    async def wait(self) -> int:
+        """Wait for its end; may be cancelled."""
+        return await asyncio.shield(self.ended)
+
+    async def end(self, number: signal.Signals) -> None:
+        """End it by a signal, and if that is of no use, for certain; may be repeated."""
+        for each in (number, signal.SIGKILL):
+            if not self.ended.done():
+                with contextlib.suppress(ProcessLookupError):
+                    self._process.send_signal(each)
+                await asyncio.wait((self.ended,), timeout=_END_S)
+
+
+class MasterProcess:
+    """A process that is a master, or waits to be one.
+
+    Parameters
+    ----------
+    settings : GuardSettings
+    listening : socket
+        Which it inherits; need not be bound yet.
+    journal : Path
+
+    Raises
+    ------
+    GuardError
+        If it cannot be started.
+    """
+
+    def __init__(self, settings: GuardSettings, listening: socket.socket, journal: Path) -> None:
+        self._python = settings.python
+        self._warm = False
+        self._control, its = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._control.setblocking(False)
+        script = str(Path(master_process.__file__).resolve())
+        descriptors = (listening.fileno(), its.fileno())
+        try:
+            self.process = ChildProcess(
+                (settings.python, script, *map(str, descriptors), str(journal)),
+                {"ROS_MASTER_URI": settings.address.uri},
+                pass_fds=descriptors,
+            )
+        except OSError as error:
+            self._control.close()
+            raise GuardError(
+                f"--python {settings.python}: cannot be run: {error.strerror}"
+            ) from error
+        finally:
+            its.close()
+
+    async def warm(self) -> None:
+        """Wait until it has loaded what it needs.
+
+        Raises
+        ------
+        GuardError
+            If it cannot.
+        """
+        if self._warm:
+            return
+        said = await self._hear()
+        if said != "warm":
+            missing = said.removeprefix("missing ") or "it ended at once"
+            raise GuardError(
+                f"{self._python} cannot run a ROS 1 master ({missing}); install ROS 1 (on Debian: "
+                "apt-get install python3-rosmaster rosout), or name ROS's Python with --python"
+            )
+        self._warm = True
+
+    async def serve(self) -> None:
+        """Have it be the master from now on, with what the journal holds.
+
+        Raises
+        ------
+        GuardError
+            If it does not begin.
+        """
+        await self.warm()
+        with contextlib.suppress(OSError):
+            await asyncio.get_running_loop().sock_sendall(self._control, b"go")
+        if (said := await self._hear()) != "serving":
+            raise GuardError(f"the new master has not begun ({said or 'it ended'})")
+        self._control.close()
+
+    async def _hear(self) -> str:
+        loop = asyncio.get_running_loop()
+        try:
+            async with asyncio.timeout(_START_S):
+                return (await loop.sock_recv(self._control, 4096)).decode(errors="replace")
+        except TimeoutError:
+            return f"it said nothing for {_START_S:g} s"
+        except OSError:
+            return ""
+
+    async def end(self, *, at_once: bool = False) -> None:
+        """End it; may be repeated."""
+        self._control.close()
+        await self.process.end(signal.SIGKILL if at_once else signal.SIGTERM)

@@ -1,0 +1,326 @@
+"""A ROS 1 graph of its own: a guard, masters, and nodes of others, each of which ends with it."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+import xmlrpc.client
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from tests.ports import free_port
+
+PATIENCE_S = 60.0
+SYSTEM_PYTHON = "/usr/bin/python3"
+
+NODES = {
+    # Publishes 1, 2, 3, ... fifty times a second.
+    "talker": """
+import sys, rospy
+from std_msgs.msg import UInt64
+rospy.init_node(sys.argv[1].strip("/"))
+publisher = rospy.Publisher(sys.argv[2], UInt64, queue_size=1000)
+rate, number = rospy.Rate(50), 0
+while not rospy.is_shutdown():
+    number += 1
+    publisher.publish(number)
+    rate.sleep()
+""",
+    # Prints what it hears.
+    "listener": """
+import sys, rospy
+from std_msgs.msg import UInt64
+rospy.init_node(sys.argv[1].strip("/"))
+rospy.Subscriber(sys.argv[2], UInt64, lambda said: print(said.data, flush=True))
+rospy.spin()
+""",
+    # Has services; ends one of them when told on standard input.
+    "server": """
+import sys, rospy
+from roscpp.srv import Empty, EmptyResponse
+rospy.init_node(sys.argv[1].strip("/"))
+services = [rospy.Service(name, Empty, lambda _: EmptyResponse()) for name in sys.argv[2:]]
+print("offers", flush=True)
+for line in sys.stdin:
+    services.pop().shutdown()
+    print("ended one", flush=True)
+rospy.spin()
+""",
+    # Calls over one connection, all the time.
+    "caller": """
+import sys, rospy
+from roscpp.srv import Empty
+rospy.init_node(sys.argv[1].strip("/"))
+rospy.wait_for_service(sys.argv[2])
+call = rospy.ServiceProxy(sys.argv[2], Empty, persistent=True)
+while not rospy.is_shutdown():
+    call()
+    print("answered", flush=True)
+    rospy.sleep(0.01)
+""",
+    # A newcomer: one message, and one call over a connection of its own.
+    "newcomer": """
+import sys, rospy
+from roscpp.srv import Empty
+from std_msgs.msg import UInt64
+rospy.init_node("newcomer", anonymous=True)
+rospy.wait_for_message(sys.argv[1], UInt64, timeout=20)
+rospy.wait_for_service(sys.argv[2], timeout=20)
+rospy.ServiceProxy(sys.argv[2], Empty)()
+""",
+    # Prints a parameter that it keeps a copy of whenever it has another value.
+    "watcher": """
+import sys, rospy
+rospy.init_node(sys.argv[1].strip("/"))
+seen = None
+while not rospy.is_shutdown():
+    now = rospy.get_param_cached(sys.argv[2], None)
+    if now != seen:
+        print(now, flush=True)
+        seen = now
+    rospy.sleep(0.02)
+""",
+}
+
+
+class Process:
+    """A process, what it printed, and its end.
+
+    Parameters
+    ----------
+    words : list of str
+    environment : mapping
+    place : Path
+        A file for what it prints, without its ending.
+    reads : bool
+        Whether it has a standard input to be written to.
+    """
+
+    def __init__(
+        self, words: list[str], environment: Mapping[str, str], place: Path, *, reads: bool = False
+    ) -> None:
+        self._out, self._errors = place.with_suffix(".out"), place.with_suffix(".err")
+        with self._out.open("wb") as out, self._errors.open("wb") as errors:
+            self.process = subprocess.Popen(
+                words,
+                env=dict(environment),
+                stdin=subprocess.PIPE if reads else subprocess.DEVNULL,
+                stdout=out,
+                stderr=errors,
+                cwd=place.parent,
+                start_new_session=True,
+            )
+
+    @property
+    def lines(self) -> list[str]:
+        """The whole lines that it has printed."""
+        return self._out.read_text().split("\n")[:-1]
+
+    @property
+    def size(self) -> int:
+        """How many bytes it has printed."""
+        return self._out.stat().st_size
+
+    @property
+    def errors(self) -> str:
+        return self._errors.read_text()
+
+    def tell(self, line: str) -> None:
+        assert self.process.stdin is not None
+        self.process.stdin.write(f"{line}\n".encode())
+        self.process.stdin.flush()
+
+    def account(self) -> str:
+        return "\n".join(
+            (
+                f"{self.process.args!r}: {self.process.poll()}",
+                self._out.read_text()[-2000:],
+                self.errors[-6000:],
+            )
+        )
+
+    def end(self, number: int = signal.SIGKILL) -> int:
+        if self.process.poll() is None:
+            self.process.send_signal(number)
+        code = self.process.wait(PATIENCE_S)
+        if self.process.stdin is not None:
+            with contextlib.suppress(OSError):
+                self.process.stdin.close()
+        return code
+
+
+class Graph:
+    """Everything at one master's port.
+
+    Parameters
+    ----------
+    directory : Path
+    environment : mapping
+        Of ROS 1.
+    """
+
+    def __init__(self, directory: Path, environment: Mapping[str, str]) -> None:
+        self.directory = directory
+        self.port = free_port()
+        self.environment = {
+            **environment,
+            "ROS_MASTER_URI": f"http://127.0.0.1:{self.port}",
+            "ROS_HOSTNAME": "127.0.0.1",
+            "ROS_LOG_DIR": str(directory / "log"),
+            "ROS_HOME": str(directory / "home"),
+            "XDG_RUNTIME_DIR": str(directory / "run"),
+        }
+        (directory / "run").mkdir()
+        self._processes: list[Process] = []
+        self._masters: set[int] = set()
+        self._guard: Process | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        for process in reversed(self._processes):
+            process.end(signal.SIGTERM if process is self._guard else signal.SIGKILL)
+        # A master that outlived its guard, and a /rosout.
+        for pid in self._left():
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+
+    def _left(self) -> list[int]:
+        """Return the processes that still have this graph's environment."""
+        mine = f"ROS_LOG_DIR={self.environment['ROS_LOG_DIR']}".encode()
+        found = []
+        for path in Path("/proc").iterdir():
+            with contextlib.suppress(OSError):
+                if path.name.isdigit() and mine in (path / "environ").read_bytes().split(b"\0"):
+                    found.append(int(path.name))
+        return found
+
+    def start(self, *words: str, name: str = "", reads: bool = False) -> Process:
+        """Start a process in this graph."""
+        place = self.directory / f"{len(self._processes):02}-{name or Path(words[0]).name}"
+        process = Process(list(words), self.environment, place, reads=reads)
+        self._processes.append(process)
+        return process
+
+    def node(self, kind: str, *words: str) -> Process:
+        """Start a stock rospy node."""
+        return self.start(
+            SYSTEM_PYTHON, "-c", NODES[kind], *words, name=kind, reads=kind == "server"
+        )
+
+    def guard(self, *words: str, before: Sequence[str] = ()) -> Process:
+        """Start a guard, and wait until it guards."""
+        command = [*before, sys.executable, "-m", "holdfast", "ros1-guard", "--log", "json", *words]
+        self._guard = guard = self.start(*command, name="guard")
+        wait_for(lambda: guard.lines or guard.process.poll() is not None, guard.account)
+        assert guard.process.poll() is None, guard.account()
+        return guard
+
+    def events(self, guard: Process, name: str) -> list[dict[str, Any]]:
+        """Return a guard's events of one kind."""
+        events = [json.loads(line) for line in guard.errors.splitlines() if line.startswith("{")]
+        return [event for event in events if event["event"] == name]
+
+    def ask(self, method: str, *arguments: object, caller: str = "/test") -> Any:
+        """Return the master's whole answer: a code, a text and a value."""
+        with xmlrpc.client.ServerProxy(self.environment["ROS_MASTER_URI"]) as master:
+            return getattr(master, method)(caller, *arguments)
+
+    def master_pid(self) -> int:
+        pid = self.ask("getPid")[2]
+        assert isinstance(pid, int)
+        return pid
+
+    def rosout_pid(self) -> int:
+        with xmlrpc.client.ServerProxy(self.ask("lookupNode", "/rosout")[2]) as node:
+            pid = node.getPid("/test")[2]  # type: ignore[index]
+        assert isinstance(pid, int)
+        return pid
+
+    def kill_master(self) -> int:
+        """Kill the master -9, and return which process it was."""
+        pid = self.master_pid()
+        os.kill(pid, signal.SIGKILL)
+        return pid
+
+    def run(self, *words: str, within_s: float = PATIENCE_S) -> str:
+        """Run one of ROS's commands, and return what it prints."""
+        done = subprocess.run(
+            words,
+            env=self.environment,
+            cwd=self.directory,
+            capture_output=True,
+            text=True,
+            timeout=within_s,
+            check=False,
+        )
+        assert done.returncode == 0, f"{words}: {done.returncode}\n{done.stdout}\n{done.stderr}"
+        return done.stdout
+
+    def newcomer(self, topic: str, service: str) -> None:
+        """Have a new node hear a topic and call a service."""
+        self.run(SYSTEM_PYTHON, "-c", NODES["newcomer"], topic, service)
+
+    def listed(self) -> dict[str, list[str]]:
+        """Return what ROS's own commands list."""
+        found = {}
+        for words in (
+            ("rosservice", "list"),
+            ("rostopic", "list", "-v"),
+            ("rosnode", "list"),
+            ("rosparam", "get", "/"),
+        ):
+            lines = self.run(*words).splitlines()
+            found[" ".join(words)] = lines if words[0] == "rosparam" else sorted(lines)
+        return found
+
+    def registered(self) -> dict[str, Any]:
+        """Return what the master knows, names and addresses alike."""
+        publishers, subscribers, services = self.ask("getSystemState")[2]
+        names = {
+            name
+            for table in (publishers, subscribers, services)
+            for _, registered in table
+            for name in registered
+        }
+        return {
+            "publishers": {topic: sorted(registered) for topic, registered in publishers},
+            "subscribers": {topic: sorted(registered) for topic, registered in subscribers},
+            "services": {name: self.ask("lookupService", name)[2] for name, _ in services},
+            "nodes": {name: self.ask("lookupNode", name)[2] for name in names},
+            "types": dict(self.ask("getTopicTypes")[2]),
+            "parameters": self.ask("getParam", "/")[2],
+        }
+
+    def wait_for_node(self, name: str) -> None:
+        wait_for(lambda: self.ask("lookupNode", name)[0] == 1, lambda: f"no {name}")
+
+
+def wait_for(true: Callable[[], object], account: Callable[[], str] = str) -> None:
+    """Wait until something is true; a connection that breaks is not."""
+    begun_at = time.monotonic()
+    while True:
+        with contextlib.suppress(OSError, xmlrpc.client.Error, EOFError):
+            if true():
+                return
+        assert time.monotonic() - begun_at < PATIENCE_S, account()
+        time.sleep(0.01)
+
+
+def anonymous(text: str) -> str:
+    """Return a text without the numbers of nodes that came and went."""
+    return re.sub(r"_\d+_\d+", "_N", text)

@@ -1,0 +1,536 @@
+"""A ROS 1 master that dies, and nodes of others that do not notice: real masters, stock nodes."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from tests.ros.conftest import left_out
+from tests.ros.graph import PATIENCE_S, SYSTEM_PYTHON, Graph, Process, wait_for
+
+from holdfast.ros.master.settings import GuardError, MasterAddress
+
+GUARD = (sys.executable, "-m", "holdfast", "ros1-guard")
+KILLS = 10
+TOPIC_TOOLS = Path("/usr/lib/topic_tools")
+"""Stock roscpp nodes; /opt/ros has them elsewhere."""
+
+
+@pytest.fixture
+def graph(tmp_path: Path, ros1: dict[str, str]) -> Iterator[Graph]:
+    with Graph(tmp_path, ros1) as graph:
+        yield graph
+
+
+def topic_tool(name: str) -> str:
+    path = TOPIC_TOOLS / name
+    if not path.exists():
+        left_out(f"no {path}: apt-get install topic-tools")
+    return str(path)
+
+
+def count(process: Process) -> int:
+    return len(process.lines)
+
+
+def keeps_on(process: Process, more: int = 5) -> None:
+    """Wait until a process has printed some more lines."""
+    before = count(process)
+    wait_for(
+        lambda: count(process) >= before + more or process.process.poll() is not None,
+        process.account,
+    )
+    assert process.process.poll() is None, process.account()
+
+
+def replaced(graph: Graph, killed: int) -> None:
+    """Wait until another master answers."""
+    wait_for(lambda: graph.master_pid() != killed)
+
+
+def start_everything(graph: Graph) -> tuple[Process, Process]:
+    """Start nodes of others; return one that calls, and one that hears, all the time."""
+    graph.node("talker", "/talker", "/chatter")
+    graph.node("server", "/server", "/work", "/more_work")
+    graph.start(topic_tool("relay"), "/chatter", "/relayed", "__name:=relay")
+    graph.start(topic_tool("mux"), "/muxed", "/chatter", "/relayed", "__name:=mux")
+    listener = graph.node("listener", "/listener", "/relayed")
+    caller = graph.node("caller", "/caller", "/work")
+    keeps_on(listener)
+    keeps_on(caller)
+    for node in ("/mux", "/relay", "/talker", "/rosout"):
+        graph.wait_for_node(node)
+    graph.run(
+        "rosparam", "set", "/robot", "{name: Ada, joints: [1, 2.5, x], gripper: {open: true}}"
+    )
+    return caller, listener
+
+
+def alive(pid: int) -> bool:
+    """Tell whether a process has not ended; who should have waited for it may not have."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+def settled(graph: Graph) -> dict[str, list[str]]:
+    """Return what is listed when nothing has changed for a moment."""
+    before = None
+    while before != (before := graph.listed()):
+        time.sleep(0.2)
+    return before
+
+
+class TestItsOwnMaster:
+    def test_killed_ten_times(self, graph: Graph) -> None:
+        guard = graph.guard()
+        caller, listener = start_everything(graph)
+        before, registered = settled(graph), graph.registered()
+        assert "/mux/select" in before["rosservice list"]
+        assert "/work" in before["rosservice list"]
+        for _ in range(KILLS):
+            pid = graph.kill_master()
+            assert graph.listed() == before
+            assert graph.registered() == registered
+            assert graph.master_pid() != pid
+            graph.newcomer("/relayed", "/more_work")
+            keeps_on(caller)
+            keeps_on(listener)
+        assert caller.process.poll() is None, caller.account()
+        numbers = [int(line) for line in listener.lines]
+        assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
+        assert len(graph.events(guard, "master_lost")) == KILLS
+        times = [round(event["duration_ms"]) for event in graph.events(guard, "master_started")]
+        print(f"from the death until everything is listed, ms: {times[1:]}")
+
+    def test_nobody_loses_a_publisher(self, graph: Graph) -> None:
+        # A roscpp node gives up the publishers that it is not told of.
+        graph.guard()
+        graph.node("talker", "/first", "/chatter")
+        graph.node("talker", "/second", "/chatter")
+        graph.start(topic_tool("relay"), "/chatter", "/relayed", "__name:=relay")
+        listener = graph.node("listener", "/listener", "/relayed")
+        keeps_on(listener, 20)
+        for node in ("/first", "/second"):
+            graph.wait_for_node(node)
+        wait_for(lambda: len(graph.registered()["publishers"]["/chatter"]) == 2)
+        time.sleep(1.0)
+        begun = count(listener)
+        for _ in range(5):
+            replaced(graph, graph.kill_master())
+            keeps_on(listener, 50)
+        numbers = [int(line) for line in listener.lines[begun:]]
+        ranges = [0, 0]
+        for number in numbers:
+            for each in (0, 1):
+                if ranges[each] in (0, number - 1):
+                    ranges[each] = number
+                    break
+            else:
+                pytest.fail(f"{number} follows neither of {ranges}")
+
+    def test_calls_wait_while_there_is_no_master(self, graph: Graph) -> None:
+        guard = graph.guard("--no-rosout")
+        server = graph.node("server", "/server", "/work", "/more_work")
+        wait_for(lambda: server.lines)
+        # The guard is kept from doing anything, so that there is no master for as long as we like.
+        os.kill(guard.process.pid, signal.SIGSTOP)
+        graph.kill_master()
+        setting = graph.start("rosparam", "set", "/late", "1")
+        listing = graph.start("rosservice", "list")
+        server.tell("end one")
+        time.sleep(1.0)
+        assert setting.process.poll() is None
+        assert listing.process.poll() is None
+        os.kill(guard.process.pid, signal.SIGCONT)
+        for process in (setting, listing):
+            assert process.process.wait(PATIENCE_S) == 0, process.account()
+        assert "/work" in listing.lines
+        assert graph.run("rosparam", "get", "/late") == "1\n"
+        wait_for(lambda: "ended one" in server.lines, server.account)
+        wait_for(lambda: "/more_work" not in graph.registered()["services"])
+
+    def test_one_that_is_stopped_is_replaced(self, graph: Graph) -> None:
+        guard = graph.guard("--silent-s", "1")
+        caller, listener = start_everything(graph)
+        before, pid = settled(graph), graph.master_pid()
+        os.kill(pid, signal.SIGSTOP)
+        wait_for(lambda: graph.events(guard, "master_lost"))
+        assert graph.listed() == before
+        assert graph.master_pid() != pid
+        assert not alive(pid)
+        keeps_on(caller)
+        keeps_on(listener)
+
+    def test_a_node_that_dies_at_the_same_moment(self, graph: Graph) -> None:
+        guard = graph.guard()
+        caller, _ = start_everything(graph)
+        doomed = graph.node("server", "/doomed", "/doomed_work")
+        wait_for(lambda: doomed.lines)
+        assert "/doomed_work" in graph.registered()["services"]
+        pid = graph.master_pid()
+        doomed.process.kill()
+        os.kill(pid, signal.SIGKILL)
+        doomed.process.wait()
+        replaced(graph, pid)
+        # It may have been about to die when it was asked; then it is asked again.
+        wait_for(lambda: "/doomed" not in graph.registered()["nodes"])
+        wait_for(lambda: "/doomed_work" not in graph.registered()["services"])
+        assert {"/work", "/mux/select"} <= graph.registered()["services"].keys()
+        (_, started) = graph.events(guard, "master_started")
+        gone = [started, *graph.events(guard, "nodes_gone")]
+        assert {name for event in gone for name in event.get("gone") or ()} == {"/doomed"}
+        keeps_on(caller)
+
+    def test_a_node_that_is_stopped_is_kept_and_one_that_dies_meanwhile_is_not(
+        self, graph: Graph
+    ) -> None:
+        guard = graph.guard("--no-rosout")
+        stopped = [graph.node("server", f"/stopped_{each}", f"/work_{each}") for each in ("a", "b")]
+        wait_for(lambda: all(server.lines for server in stopped))
+        before = graph.registered()
+        for server in stopped:
+            os.kill(server.process.pid, signal.SIGSTOP)
+        replaced(graph, graph.kill_master())
+        assert graph.registered()["services"] == before["services"]
+        silent = graph.events(guard, "master_started")[1]["silent"]
+        assert sorted(silent) == ["/stopped_a", "/stopped_b"]
+        stopped[0].end()
+        wait_for(lambda: "/stopped_a" not in graph.registered()["nodes"])
+        assert [event["gone"] for event in graph.events(guard, "nodes_gone")] == [["/stopped_a"]]
+        os.kill(stopped[1].process.pid, signal.SIGCONT)
+        graph.run("rosservice", "call", "/work_b")
+
+    def test_while_nodes_start(self, graph: Graph) -> None:
+        graph.guard("--no-rosout")
+        names = [f"/work_{number}" for number in range(100)]
+        servers = [graph.node("server", f"/server_{each}", *names[each::4]) for each in range(4)]
+        kills = 0
+        while not all(server.lines for server in servers):
+            replaced(graph, graph.kill_master())
+            kills += 1
+        assert kills > 0
+        wait_for(lambda: set(names) <= graph.registered()["services"].keys())
+        replaced(graph, graph.kill_master())
+        assert set(names) <= graph.registered()["services"].keys()
+
+    def test_who_watches_a_parameter_still_does(self, graph: Graph) -> None:
+        graph.guard("--no-rosout")
+        graph.run("rosparam", "set", "/speed", "1")
+        watcher = graph.node("watcher", "/watcher", "/speed")
+        wait_for(lambda: watcher.lines == ["1"], watcher.account)
+        for speed in (2, 3):
+            replaced(graph, graph.kill_master())
+            graph.run("rosparam", "set", "/speed", str(speed))
+            wait_for(lambda: watcher.lines[-1] == str(speed), watcher.account)  # noqa: B023
+
+    def test_parameters_of_every_kind(self, graph: Graph) -> None:
+        graph.guard("--no-rosout")
+        values = {
+            "text": "naïve\nlines \u2603",
+            "number": 1e-320,
+            "whole": -(2**31),
+            "list": [1, [2.5, "x"], {"in": "side"}],
+            "data": b"\0\1\xff\r\n",
+            "space": {"deep": {"deeper": True, "": "no name"}},
+            "large": "x" * 5_000_000,
+            "many": {f"key_{number}": number for number in range(20_000)},
+        }
+        for name, value in values.items():
+            assert graph.ask("setParam", f"/all/{name}", value)[0] == 1
+        assert graph.ask("setParam", "relative", 1, caller="/test/ns")[0] == 1
+        assert graph.ask("setParam", "~own", 2)[0] == 1
+        assert graph.ask("deleteParam", "/all/space/deep/deeper")[0] == 1
+        wait_for(lambda: "rosdistro" in graph.registered()["parameters"])
+        before = graph.registered()["parameters"]
+        assert before["test"] == {"relative": 1, "own": 2}
+        for _ in range(2):
+            replaced(graph, graph.kill_master())
+            assert graph.registered()["parameters"] == before
+
+    def test_what_there_is_no_room_for_costs_no_answer(self, graph: Graph) -> None:
+        # No file may be larger than this, in units of 1024 bytes.
+        graph.guard("--no-rosout", before=("bash", "-c", 'ulimit -f 64; exec "$@"', "bash"))
+        server = graph.node("server", "/server", "/work")
+        wait_for(lambda: server.lines)
+        assert graph.ask("setParam", "/large", "x" * 100_000)[0] == 1
+        assert graph.ask("setParam", "/small", "x")[0] == 1
+        assert graph.registered()["parameters"]["small"] == "x"
+        # What there was room for is there again.
+        replaced(graph, graph.kill_master())
+        assert "/work" in graph.registered()["services"]
+        assert graph.ask("setParam", "/small", "y")[0] == 1
+        replaced(graph, graph.kill_master())
+        assert "/work" in graph.registered()["services"]
+        assert graph.registered()["parameters"]["small"] == "y"
+
+    def test_the_guard_is_killed(self, graph: Graph) -> None:
+        guard = graph.guard()
+        caller, listener = start_everything(graph)
+        before, pid = settled(graph), graph.master_pid()
+        guard.end()
+        assert graph.master_pid() == pid
+        keeps_on(caller)
+        second = graph.guard()
+        assert '"master":"found"' in second.lines[0]
+        for _ in range(2):
+            replaced(graph, graph.kill_master())
+            assert graph.listed() == before
+        keeps_on(caller)
+        keeps_on(listener)
+
+    def test_the_guard_that_comes_after_ends_what_it_found(self, graph: Graph) -> None:
+        guard = graph.guard()
+        wait_for(lambda: "/rosout" in graph.registered()["nodes"])
+        rosout = graph.rosout_pid()
+        pid = graph.master_pid()
+        guard.end()
+        second = graph.guard()
+        assert graph.master_pid() == pid
+        assert graph.rosout_pid() == rosout
+        assert second.end(signal.SIGTERM) == 0
+        wait_for(lambda: not alive(pid))
+        wait_for(lambda: not alive(rosout))
+
+    def test_guard_and_master_are_killed(self, graph: Graph) -> None:
+        guard = graph.guard()
+        caller, _ = start_everything(graph)
+        before = settled(graph)
+        pid = graph.master_pid()
+        guard.end()
+        os.kill(pid, signal.SIGKILL)
+        second = graph.guard()
+        assert '"master":"resumed"' in second.lines[0]
+        assert graph.listed() == before
+        keeps_on(caller)
+
+    def test_ended_in_order_it_begins_anew_without_nodes(self, graph: Graph) -> None:
+        guard = graph.guard()
+        wait_for(lambda: "/rosout" in graph.registered()["nodes"])
+        graph.run("rosparam", "set", "/use_sim_time", "true")
+        pid = graph.master_pid()
+        assert guard.end(signal.SIGTERM) == 0
+        assert not alive(pid)
+        # Yesterday's simulated time is not today's.
+        second = graph.guard("--no-rosout")
+        assert '"master":"started"' in second.lines[0]
+        assert "/use_sim_time" not in graph.run("rosparam", "list")
+        assert second.end(signal.SIGINT) == 130
+
+    def test_both_are_killed_and_so_are_the_nodes(self, graph: Graph) -> None:
+        guard = graph.guard()
+        server = graph.node("server", "/server", "/work")
+        wait_for(lambda: server.lines and "/rosout" in graph.registered()["nodes"])
+        graph.run("rosparam", "set", "/use_sim_time", "true")
+        rosout, pid = graph.rosout_pid(), graph.master_pid()
+        for process in (guard, server):
+            process.end()
+        os.kill(pid, signal.SIGKILL)
+        second = graph.guard()
+        assert '"master":"started"' in second.lines[0]
+        registered = graph.registered()
+        assert "use_sim_time" not in registered["parameters"]
+        assert registered["nodes"].keys() == {"/rosout"}
+        assert graph.rosout_pid() == rosout
+
+    def test_roslaunch(self, graph: Graph) -> None:
+        graph.guard()
+        (graph.directory / "one.launch").write_text(
+            '<launch><param name="p" value="3"/>'
+            '<node pkg="rosout" type="rosout" name="launched"/></launch>'
+        )
+        launch = graph.start("roslaunch", str(graph.directory / "one.launch"))
+        wait_for(lambda: "/launched" in graph.registered()["nodes"], launch.account)
+        before = settled(graph)
+        replaced(graph, graph.kill_master())
+        assert graph.listed() == before
+        assert launch.process.poll() is None
+        assert launch.end(signal.SIGINT) == 0
+        assert "/launched" not in graph.registered()["nodes"]
+
+    def test_a_second_guard_is_refused(self, graph: Graph) -> None:
+        guard = graph.guard("--no-rosout")
+        second = graph.start(
+            *(str(word) for word in guard.process.args),  # type: ignore[union-attr]
+            name="second",
+        )
+        assert second.process.wait(PATIENCE_S) == 2
+        assert f"has a guard already: process {guard.process.pid}" in second.errors
+
+
+class TestAMasterOfOthers:
+    def test_rosmaster(self, graph: Graph) -> None:
+        graph.start("rosmaster", "--core", "-p", str(graph.port))
+        wait_for(graph.master_pid)
+        guard = graph.guard()
+        assert '"master":"found"' in guard.lines[0]
+        caller, listener = start_everything(graph)
+        before = settled(graph)
+        for _ in range(3):
+            time.sleep(1.0)  # it is asked four times a second
+            replaced(graph, graph.kill_master())
+            assert graph.listed() == before
+            graph.newcomer("/relayed", "/more_work")
+        keeps_on(caller)
+        keeps_on(listener)
+
+    def test_it_is_guarded_once_the_guard_says_so(self, graph: Graph) -> None:
+        graph.start("rosmaster", "--core", "-p", str(graph.port))
+        wait_for(graph.master_pid)
+        server = graph.node("server", "/server", "/work")
+        wait_for(lambda: server.lines)
+        graph.guard("--no-rosout")
+        replaced(graph, graph.kill_master())
+        assert "/work" in graph.registered()["services"]
+
+    def test_one_that_is_stopped_is_replaced(self, graph: Graph) -> None:
+        master = graph.start("rosmaster", "--core", "-p", str(graph.port))
+        wait_for(graph.master_pid)
+        graph.guard("--silent-s", "1", "--no-rosout")
+        server = graph.node("server", "/server", "/work")
+        wait_for(lambda: server.lines)
+        time.sleep(1.0)  # it is asked four times a second
+        os.kill(master.process.pid, signal.SIGSTOP)
+        assert master.process.wait(PATIENCE_S) == -signal.SIGKILL
+        wait_for(lambda: "/work" in graph.registered()["services"])
+
+    def test_roscore(self, graph: Graph) -> None:
+        roscore = graph.start("roscore", "-p", str(graph.port))
+        wait_for(lambda: "/rosout" in graph.registered()["nodes"], roscore.account)
+        guard = graph.guard()
+        server = graph.node("server", "/server", "/work")
+        wait_for(lambda: server.lines)
+        time.sleep(1.0)
+        run_id = graph.run("rosparam", "get", "/run_id")
+        graph.kill_master()
+        # It takes the master's death for the end of everything, but what is not its goes on.
+        roscore.process.wait(PATIENCE_S)
+        wait_for(lambda: "/rosout" in graph.registered()["nodes"], guard.account)
+        assert "/work" in graph.registered()["services"]
+        assert graph.run("rosparam", "get", "/run_id") == run_id
+        graph.run("rosservice", "call", "/work")
+
+
+JOURNALLED_AS_STOCK = """
+import logging, pathlib, random, sys
+logging.disable()
+import importlib.util, rosmaster.master_api
+spec = importlib.util.spec_from_file_location("master_process", sys.argv[1])
+master_process = sys.modules["master_process"] = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(master_process)
+make = master_process._load()
+path = pathlib.Path(sys.argv[2])
+stock, ours = rosmaster.master_api.ROSMasterHandler(1), make(path)
+draw = random.Random(int(sys.argv[3]))
+
+def apis(handler):
+    tables = [handler.publishers, handler.subscribers, handler.param_subscribers]
+    return (
+        [{key: sorted(table.map[key]) for key in table.map} for table in tables],
+        handler.services.map,
+        {key: handler.services.get_service_api(key) for key in handler.services.map},
+        handler.getTopicTypes("/x"),
+        handler.getParam("/x", "/"),
+        {name: handler.lookupNode("/x", name)[2] for name in nodes
+         if any(name in (who for who, _ in where) for table in tables + [handler.services]
+                for where in table.map.values())},
+    )
+
+nodes = ["/a", "/b", "/ns/c"]
+keys = ["/p", "/p/q", "/p/q/r", "rel", "~own", "/s", "/p/q/"]
+values = [1, 2.5, "x", True, [1, 2], {"k": {"l": 1}}, {}, {"q": 3}]
+for step in range(600):
+    node = draw.choice(nodes)
+    api = "http://127.0.0.1:%d/" % draw.choice([1, 1, 1, 2])
+    topic, service = draw.choice(["/t", "u", "/v"]), draw.choice(["/e", "f"])
+    call = draw.choice([
+        ("registerPublisher", topic, draw.choice(["p/A", "p/B", "*"]), api),
+        ("unregisterPublisher", topic, api),
+        ("registerSubscriber", topic, draw.choice(["p/A", "*"]), api),
+        ("unregisterSubscriber", topic, api),
+        ("registerService", service, "rosrpc://127.0.0.1:%d" % draw.choice([3, 4]), api),
+        ("unregisterService", service, "rosrpc://127.0.0.1:%d" % draw.choice([3, 4])),
+        ("subscribeParam", api, draw.choice(keys)),
+        ("unsubscribeParam", api, draw.choice(keys)),
+        ("setParam", draw.choice(keys), draw.choice(values)),
+        ("deleteParam", draw.choice(keys)),
+        ("setParam", "/", {"p": draw.choice(values)}) if not step % 50 else ("getPid",),
+    ])
+    import copy
+    for handler in (stock, ours):
+        name, *arguments = copy.deepcopy(call)
+        answer = getattr(handler, name)(node, *arguments)
+        if handler is stock:
+            expected = answer
+    assert answer[::2] == expected[::2], (call, answer, expected)
+    if not step % 20:
+        # Another one, from what is written down.
+        (path.parent / "copy").write_bytes(path.read_bytes())
+        again = make(path.parent / "copy")
+        assert apis(again) == apis(ours) == apis(stock), (step, call, apis(again), apis(stock))
+        assert [sorted(map(str, table)) for table in again.getSystemState("/x")[2]] == [
+            sorted(map(str, table)) for table in stock.getSystemState("/x")[2]]
+        again._shutdown()
+        if not step % 100:
+            ours._shutdown()
+            ours = make(path)
+print("the same")
+import os
+sys.stdout.flush()
+os._exit(0)
+"""
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_it_is_the_stock_master(seed: int, graph: Graph, tmp_path: Path) -> None:
+    from holdfast.ros.master import process as master_process
+
+    script = str(Path(str(master_process.__file__)))
+    journal = str(tmp_path / "journal")
+    said = graph.run(SYSTEM_PYTHON, "-c", JOURNALLED_AS_STOCK, script, journal, str(seed))
+    assert said.splitlines()[-1] == "the same"
+
+
+class TestWhatCannotBeGuarded:
+    def test_another_machine(self) -> None:
+        with pytest.raises(GuardError, match=r"192\.0\.2\.1 is no address of this machine"):
+            MasterAddress.of({"ROS_MASTER_URI": "http://192.0.2.1:11311"})
+
+    @pytest.mark.parametrize(
+        "uri", ["localhost:11311", "http://", "http://localhost:x", "https://localhost:1"]
+    )
+    def test_no_address(self, uri: str) -> None:
+        with pytest.raises(GuardError, match="expected http://HOST:PORT"):
+            MasterAddress.of({"ROS_MASTER_URI": uri})
+
+    def test_a_python_without_ros(self, graph: Graph) -> None:
+        guard = graph.start(*GUARD, "--python", sys.executable)
+        assert guard.process.wait(PATIENCE_S) == 2
+        assert "name ROS's Python with --python" in guard.errors
+
+    def test_what_is_no_master(self, graph: Graph) -> None:
+        server = graph.start(
+            *(sys.executable, "-m", "http.server", "--bind", "127.0.0.1", str(graph.port))
+        )
+
+        def listens() -> bool:
+            with socket.create_connection(("127.0.0.1", graph.port)):
+                return True
+
+        wait_for(listens)
+        guard = graph.start(*GUARD)
+        assert guard.process.wait(PATIENCE_S) == 2
+        assert "what is there is no ROS 1 master" in guard.errors
+        assert server.process.poll() is None
+
+    def test_no_python(self, graph: Graph) -> None:
+        guard = graph.start(*GUARD, "--python", "/nonexistent")
+        assert guard.process.wait(PATIENCE_S) == 2
+        assert "--python /nonexistent: cannot be run" in guard.errors
