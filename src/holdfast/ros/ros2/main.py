@@ -1,0 +1,74 @@
+"""The node's process: it spins until a signal ends it, in order.
+
+rclpy's own handlers would end the context at once, and with it all that is still to be said. So
+here the main thread does nothing but wait for a signal, and the executor has another one.
+"""
+
+from __future__ import annotations
+
+import signal
+import sys
+import threading
+from collections.abc import Sequence
+
+__all__ = ["main"]
+
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the node, and return the exit code.
+
+    Parameters
+    ----------
+    arguments : sequence of str, optional
+        Those of the process; ``--ros-args`` is ROS's.
+    """
+    try:
+        import rclpy
+        from rclpy.executors import MultiThreadedExecutor
+        from rclpy.signals import SignalHandlerOptions
+
+        from holdfast.ros.ros2.node import NUM_THREADS, HoldfastNode
+    except ImportError as error:
+        missing = (error.name or "").partition(".")[0]
+        what = (
+            "build and source the package holdfast_interfaces (colcon build --base-paths ros)"
+            if missing == "holdfast_interfaces"
+            else "source your ROS 2 (. /opt/ros/DISTRIBUTION/setup.bash)"
+        )
+        sys.stderr.write(f"holdfast: error: there is no {missing or error}: {what}\n")
+        return 2
+    asked_to_end = threading.Event()
+
+    def end(number: int, frame: object) -> None:
+        del number, frame
+        for handled in saved:
+            signal.signal(handled, signal.SIG_DFL)  # the second one ends it at once
+        asked_to_end.set()
+
+    saved = [number for number in _SIGNALS if signal.getsignal(number) is not signal.SIG_IGN]
+    for number in saved:
+        signal.signal(number, end)
+    rclpy.init(
+        args=None if arguments is None else list(arguments),
+        signal_handler_options=SignalHandlerOptions.NO,
+    )
+    node = HoldfastNode()
+    if (
+        node.autostart
+        and node.trigger_configure() == node.SUCCESS
+        and node.trigger_activate() == node.SUCCESS
+    ):
+        node.get_logger().info("active")
+    executor = MultiThreadedExecutor(num_threads=NUM_THREADS)
+    executor.add_node(node)
+    spinning = threading.Thread(target=executor.spin, name="executor", daemon=True)
+    spinning.start()
+    asked_to_end.wait()
+    node.end()
+    executor.shutdown(timeout_sec=2.0)
+    node.destroy_node()
+    rclpy.try_shutdown()
+    spinning.join(2.0)
+    return 0
