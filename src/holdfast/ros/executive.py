@@ -24,8 +24,7 @@ import numpy.typing as npt
 from holdfast.errors import EnvironmentFailedError, InvalidValueError
 from holdfast.outcome import Done
 from holdfast.problems.problem import Problem
-from holdfast.runtime.environment import EnvironmentMaker
-from holdfast.runtime.performer import observation_size
+from holdfast.runtime.environment import EnvironmentMaker, observation_size
 
 __all__ = ["Call", "Code", "DueDecision", "Executive", "ExecutiveEnvironment", "ExecutiveMaker"]
 

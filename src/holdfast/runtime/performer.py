@@ -36,13 +36,7 @@ from holdfast.runtime.environment import (
 from holdfast.session.events import Acted, Begun, EnvironmentEvent, EnvironmentFailed, Sensed
 from holdfast.user_code import account_of_user_error
 
-__all__ = [
-    "InlinePerformer",
-    "Performer",
-    "ThreadedPerformer",
-    "make_performer",
-    "observation_size",
-]
+__all__ = ["InlinePerformer", "Performer", "ThreadedPerformer", "make_performer"]
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -117,15 +111,6 @@ def make_performer(
     return ThreadedPerformer(
         make, maker.problem, deliver, maker.name, maker.timeout_ms, resumed=resumed
     )
-
-
-def observation_size(problem: Problem, sensing_action: int) -> int | None:
-    """Return the size of the observation that a problem expects; None if it does not say."""
-    if contract.has_general_observations(problem):
-        return None
-    drawn = problem.initial_states(stream(0, 0, 0, Purpose.INITIAL_BELIEF), 1)
-    state = contract.states_of(problem, "initial_states", drawn, (1, problem.state_size))[0]
-    return contract.observation_mean(problem, state, sensing_action).shape[-1]
 
 
 class _CheckedEnvironment:

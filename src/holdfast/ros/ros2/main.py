@@ -61,6 +61,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         and node.trigger_activate() == node.SUCCESS
     ):
         node.get_logger().info("active")
+    if not node.autostart:
+        node.get_logger().info("unconfigured")
     executor = MultiThreadedExecutor(num_threads=NUM_THREADS)
     executor.add_node(node)
     spinning = threading.Thread(target=executor.spin, name="executor", daemon=True)

@@ -30,17 +30,16 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
-from holdfast.configuration import Configuration
 from holdfast.errors import HoldfastError
 from holdfast.planning import PlanningState
 from holdfast.recording.run_directory import RunDirectory
-from holdfast.ros.executive import Call, Code, Executive, ExecutiveMaker
+from holdfast.ros.executive import Call, Code, Executive
 from holdfast.ros.poses import PoseLayout, pose_layout
 from holdfast.ros.ros2 import messages
 from holdfast.ros.ros2.parameters import OWN, Parameters, known_parameters, read_parameters
 from holdfast.ros.ros2.part import Ending, Part, PartOfRun
 from holdfast.ros.ros2.telemetry import Shown, Telemetry
-from holdfast.ros.ros2.worlds import World, make_world
+from holdfast.ros.ros2.worlds import make_world
 from holdfast.runtime.links import check_services
 from holdfast.session.effects import Act, Sense
 
@@ -123,7 +122,6 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
         self._active = False
         self._part: PartOfRun | None = None
         self._telemetry: Telemetry | None = None
-        self._world: World | None = None
         self._executive: Executive | None = None
         self._goal: Any = None
         self._last_part: Part | None = None
@@ -209,7 +207,7 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
             read = read_parameters(self._values())
             check_services(read.configuration)
             layout = pose_layout(read.configuration.problem)
-            world = make_world(self, read)
+            make_world(self, read)
             # Whether a run can begin there, or go on.
             RunDirectory.resume_if_begun(read.run_directory, read.configuration).close()
         except HoldfastError as error:
@@ -221,7 +219,6 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
         with self._changed:
             self._parameters_read = read
             self._layout = layout
-            self._world = world
             self._last_part = None
             self.diverged = False
         self.get_logger().info(
@@ -278,11 +275,8 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
 
     def _forget(self) -> None:
         with self._changed:
-            world, self._world = self._world, None
             self._parameters_read = None
             self._last_part = None
-        if world is not None:
-            world.close()
 
     def end(self) -> None:
         """End in order, whatever the state: for a process that was told to end."""
@@ -295,24 +289,10 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
 
     def _begin_part(self) -> PartOfRun:
         """Start the next part of the run; the caller holds the lock."""
-        read, world = self._parameters_read, self._world
+        read = self._parameters_read
         assert read is not None
-        assert world is not None
         configuration = read.configuration
-        self._executive = None
-        if read.environment == "executive":
-            another = Configuration.from_plain(configuration.plain()).problem
-            executive = Executive(another, configuration.planning.sensing_interval)
-            maker: Any = ExecutiveMaker(
-                executive, configuration.problem, configuration.environment.timeout_ms
-            )
-            self._executive = executive
-
-            def interrupt(why: str) -> None:
-                executive.end(Code.ENDED, why)
-
-        else:
-            maker, interrupt = world.maker, world.interrupt
+        world = make_world(self, read)
         telemetry = Telemetry(
             configuration,
             self._show_order,
@@ -328,14 +308,15 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
         part = PartOfRun(
             configuration,
             read.run_directory,
-            maker,
+            world.maker,
             rate_hz=read.rate_hz,
             sink=_Events(self, telemetry),
             on_order=on_order,
             on_timing=telemetry.time,
             on_end=self._part_ended,
-            interrupt=interrupt,
+            interrupt=world.interrupt,
         )
+        self._executive = world.executive
         self._telemetry = telemetry
         self._part = part
         part.start()

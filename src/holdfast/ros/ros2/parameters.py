@@ -70,7 +70,7 @@ _BOUNDS = {
 
 _OBJECTS = {
     "executive": "holdfast.ros.executive:ExecutiveEnvironment",
-    "ros": "holdfast.ros.ros2_environment:Ros2Environment",
+    "ros": "holdfast.ros.ros2_environment:RosEnvironment",
 }
 """What the run's configuration names, so that no other world goes on with that run."""
 
@@ -88,7 +88,7 @@ class Parameters(NamedTuple):
     environment : str
         One of :data:`KINDS`.
     mapping : dict
-        Parameters below ``environment.`` that are no settings, without that prefix.
+        What says how the robot is reached through ROS, by the parameters' names.
     decide_timeout_s, pause_timeout_s, belief_rate_hz : float
     publish_entropies : bool
     """
@@ -142,7 +142,7 @@ def read_parameters(values: Mapping[str, Any]) -> Parameters:
             arguments = overrides.setdefault("environment.arguments", {})
             arguments[name.removeprefix("environment.arguments.")] = value
         elif name.startswith(_ENVIRONMENT) and environment == "ros":
-            mapping[name.removeprefix(_ENVIRONMENT)] = value
+            mapping[name] = value
         else:
             raise _unknown(name)
     for index, assignment in enumerate(own["assignments"]):
@@ -164,7 +164,7 @@ def read_parameters(values: Mapping[str, Any]) -> Parameters:
         own["rate_hz"] or None,
         own["frame_id"],
         environment,
-        mapping,
+        mapping | {"environment.timeout_ms": configuration.environment.timeout_ms},
         own["decide_timeout_s"],
         own["pause_timeout_s"],
         own["belief_rate_hz"],
