@@ -13,6 +13,7 @@ except for that of the goal that is running, which has a thread of the executor 
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Mapping
 from typing import Any
 
@@ -26,6 +27,7 @@ import std_msgs.msg
 from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
+from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
@@ -56,6 +58,9 @@ NUM_THREADS = 4 + _MOST_CALLS
 """Of the executor: a goal and the calls may keep theirs for a while, the rest is always free."""
 
 _DIAGNOSTICS_S = 1.0
+
+_RESULT_S = 0.5
+"""At the end of the process: for the client that waits for its result to get it."""
 
 _TOLD_AT_ONCE = frozenset(
     (
@@ -159,7 +164,11 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
             cancel_callback=self._cancel,
         )
         self._diagnostics_timer = self.create_timer(
-            _DIAGNOSTICS_S, self._tell_diagnostics, callback_group=MutuallyExclusiveCallbackGroup()
+            _DIAGNOSTICS_S,
+            self._tell_diagnostics,
+            callback_group=MutuallyExclusiveCallbackGroup(),
+            # Simulated time may stand still; the diagnostics are to come all the same.
+            clock=Clock(clock_type=ClockType.STEADY_TIME),
         )
         self.add_on_set_parameters_callback(self._judge_parameters)
 
@@ -280,10 +289,12 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
 
     def end(self) -> None:
         """End in order, whatever the state: for a process that was told to end."""
+        is_asked = not self._goals_ended.is_set()
         if self._state_machine.current_state[1] in ("unconfigured", "inactive", "active"):
             self.trigger_shutdown()
-        # A client that waits for its result gets it.
-        self._goals_ended.wait(2.0)
+        if is_asked and self._goals_ended.wait(_RESULT_S):
+            # rclpy sends the result some turns of the executor later, and does not say when.
+            time.sleep(_RESULT_S)
 
     # -- runs ------------------------------------------------------------------------------------
 
@@ -298,8 +309,9 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
             self._show_order,
             self._show_belief,
             self._tell_diagnostics,
+            self._tell_failure,
             belief_rate_hz=read.belief_rate_hz,
-            entropies=read.publish_entropies,
+            wants_entropies=self._wants_entropies,
         )
 
         def on_order(state: PlanningState, order: Act | Sense) -> None:
@@ -474,13 +486,24 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
             finished = 0 if part is None else part.num_finished
             goal.publish_feedback(_Run.Feedback(finished=finished, decision=message))
 
+    def _wants_entropies(self) -> bool:
+        read = self._parameters_read
+        heard = self._goal is not None or self._decision_publisher.get_subscription_count() > 0
+        return heard and read is not None and read.publish_entropies
+
+    def _tell_failure(self, error: Exception) -> None:
+        self.get_logger().warning(
+            f"not all is published of what the robot decides: {type(error).__name__}: {error}"
+        )
+
     def _show_belief(self, state: PlanningState) -> None:
         read, layout = self._parameters_read, self._layout
         if read is None or not self._active:
             return
         now = self.get_clock().now().to_msg()
-        self._belief_publisher.publish(messages.belief_message(state, read.frame_id, now))
-        if layout is not None:
+        if self._belief_publisher.get_subscription_count():
+            self._belief_publisher.publish(messages.belief_message(state, read.frame_id, now))
+        if layout is not None and self._cloud_publisher.get_subscription_count():
             poses = layout.poses(state.belief.states)
             self._cloud_publisher.publish(messages.pose_array(poses, read.frame_id, now))
 

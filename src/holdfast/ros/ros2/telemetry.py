@@ -24,7 +24,6 @@ import numpy.typing as npt
 
 from holdfast import planning
 from holdfast.configuration import Configuration
-from holdfast.errors import HoldfastError
 from holdfast.planning import PlanningState
 from holdfast.session.effects import Act, Sense, Timing
 
@@ -38,6 +37,9 @@ _MAX_STATES = 4
 _MAX_NOTES = 1000
 
 _NICENESS = 10
+
+_ENTROPIES = ("action_entropy", "state_entropy", "action_covariance")
+"""Methods that compute something for each sensing action; the others only choose."""
 
 
 class Shown(NamedTuple):
@@ -87,10 +89,12 @@ class Telemetry:
         Shows a belief.
     on_notice : callable
         Is called when there is something else that changed.
+    on_failure : callable
+        Gets the first error that any of this came to: to look on must not end a run.
     belief_rate_hz : float
         Beliefs shown a second, at most.
-    entropies : bool
-        Whether to compute them.
+    wants_entropies : callable
+        Tells whether to compute them.
     """
 
     def __init__(
@@ -99,20 +103,19 @@ class Telemetry:
         on_order: Callable[[Shown], None],
         on_belief: Callable[[PlanningState], None],
         on_notice: Callable[[], None],
+        on_failure: Callable[[Exception], None],
         *,
         belief_rate_hz: float,
-        entropies: bool,
+        wants_entropies: Callable[[], bool],
     ) -> None:
         self._problem = Configuration.from_plain(configuration.plain()).problem
         self._settings = configuration.planning
         self._on_order = on_order
         self._on_belief = on_belief
         self._on_notice = on_notice
+        self._on_failure = on_failure
         self._belief_every_s = 1.0 / belief_rate_hz if belief_rate_hz > 0.0 else np.inf
-        self._computes = entropies and configuration.planning.selector.method not in (
-            "random",
-            "fixed",
-        )
+        self._wants_entropies = wants_entropies
         self._changed = threading.Condition()
         self._notes: deque[_Note] = deque()
         self._with_state: deque[_Note] = deque()
@@ -121,6 +124,7 @@ class Telemetry:
         self._decided_by = {"sensing": "", "task": ""}
         self._next_belief = 0.0
         self.dropped_decisions = 0
+        self.has_failed = False
         self._thread = threading.Thread(target=self._work, name="telemetry", daemon=True)
         self._thread.start()
 
@@ -187,20 +191,25 @@ class Telemetry:
                     return
                 if note is not None and self._with_state and self._with_state[0] is note:
                     self._with_state.popleft()
-            if notice:
-                self._on_notice()
-            if note is not None:
-                self._show(note.shown)
+            try:
+                if notice:
+                    self._on_notice()
+                if note is not None:
+                    self._show(note.shown)
+            except Exception as error:  # noqa: BLE001 - the problem is anybody's code
+                if not self.has_failed:
+                    self.has_failed = True
+                    self._on_failure(error)
 
     def _show(self, shown: Shown) -> None:
         state = shown.state
         if state is not None and monotonic() >= self._next_belief:
             self._next_belief = monotonic() + self._belief_every_s
             self._on_belief(state)
-        if state is not None and shown.sensing_action is not None and self._computes:
-            # The problem is anybody's code; what it raised here it raises for the robot as well.
-            with contextlib.suppress(HoldfastError, ArithmeticError, LookupError, ValueError):
-                _, info = planning.choose_sensing_action(self._problem, self._settings, state)
-                if info.entropies is not None:
-                    shown = shown._replace(entropies=info.entropies)
+        sensing = state is not None and shown.sensing_action is not None
+        if sensing and self._settings.selector.method in _ENTROPIES and self._wants_entropies():
+            assert state is not None
+            _, info = planning.choose_sensing_action(self._problem, self._settings, state)
+            if info.entropies is not None:
+                shown = shown._replace(entropies=info.entropies)
         self._on_order(shown)
