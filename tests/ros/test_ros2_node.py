@@ -17,13 +17,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from ports import free_port
+from tests.ports import free_port
+from tests.ros.conftest import Ros2
+from tests.ros.domains import own_domain
 
 from holdfast.configuration import load
 from holdfast.ros.poses import pose_layout
 from holdfast.runtime.trial import run_trial
-from tests.ros.conftest import Ros2
-from tests.ros.domains import own_domain
 
 ROOT = Path(__file__).parents[2]
 CONFIGURATION = ROOT / "examples" / "peg_in_hole_2d.yaml"
@@ -216,8 +216,10 @@ class TestARun:
 
         steps = sum(trial[2] for trial in result["trials"])
         seen = peer.wait_seen(
-            lambda seen: sum(order[2] for order in seen["decisions"]) == steps
-            and seen["statuses"][-1] == "finished"
+            lambda seen: (
+                sum(order[2] for order in seen["decisions"]) == steps
+                and seen["statuses"][-1] == "finished"
+            )
         )
         sensing = [order for order in seen["decisions"] if order[2] == 0]
         acting = [order for order in seen["decisions"] if order[2] == 1]
@@ -408,8 +410,8 @@ class TestLifecycle:
     def test_every_order(self, ros: Ros) -> None:
         node = ros.node(autostart="false", environment__kind="executive")
         peer = ros.peer()
-        states = {
-            "unconfigured": {"configure": "inactive", "unconfigured_shutdown": None},
+        states: dict[str, dict[str, str]] = {
+            "unconfigured": {"configure": "inactive"},
             "inactive": {"activate": "active", "cleanup": "unconfigured"},
             "active": {"deactivate": "inactive"},
         }

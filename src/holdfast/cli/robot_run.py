@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 __all__ = ["RobotRun", "is_robot_run", "run_as_robot"]
 
+
 class RobotRun(NamedTuple):
     """What there is to say of a run besides its results.
 

@@ -152,12 +152,11 @@ class Executive:
             if self._end is None:
                 self._due = due
                 self._changed.notify_all()
-            while self._answer is None and self._end is None:
-                self._changed.wait()
-            if self._answer is None:
-                assert self._end is not None
-                raise EnvironmentFailedError(self._end.message)
-            return self._answer
+            self._changed.wait_for(lambda: self._answer or self._end)
+            answer: Call | None = self._answer
+            if answer is None:
+                raise EnvironmentFailedError("" if self._end is None else self._end.message)
+            return answer
 
     def call(self, call: Call, within_s: float) -> Reply:
         """Take what came of a decision, and return the next one.
@@ -190,9 +189,8 @@ class Executive:
 
     def _precedes(self, named: tuple[int, int], due: DueDecision) -> bool:
         """Tell whether a decision is the one before the one that is due."""
-        trial, number = named
         if due.number <= 1 or (due.number == 2 and not self._senses_at(0)):
-            return trial == due.trial - 1
+            return named[0] == due.trial - 1
         by_sensing = due.sensing_action is None and self._senses_at(due.step)
         return named == (due.trial, due.number - 1 if by_sensing else 2 * due.step)
 
@@ -309,5 +307,6 @@ class ExecutiveMaker(EnvironmentMaker):
         self, trial: int, *, resumed: bool = False, performed: object = ()
     ) -> ExecutiveEnvironment:
         """Make the environment of a trial."""
+        del resumed
         assert isinstance(performed, list | tuple)
         return ExecutiveEnvironment(self._executive, trial, len(performed))

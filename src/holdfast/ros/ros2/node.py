@@ -421,11 +421,11 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
         with self._changed:
             read, last = self._parameters_read, self._last_part
             reason = self._no_calls()
+            part: PartOfRun | None = None
+            executive: Executive | None = None
             if reason is None and (last is None or last.ending != Ending.FINISHED):
                 part = self._part or self._begin_part()
                 executive = self._executive
-            else:
-                part = executive = None
         if reason is not None:
             response.code, response.message = Code.INACTIVE, reason
             return response
@@ -557,4 +557,3 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
 def _plain(value: Any) -> Any:
     """Return a parameter's value as plain data."""
     return value if value is None or isinstance(value, bool | int | float | str) else list(value)
-

@@ -209,6 +209,6 @@ def _unknown(name: str) -> ConfigurationError:
     known = known_parameters()
     close = difflib.get_close_matches(name, known, n=1)
     hint = f"; did you mean {close[0]}?" if close else ""
-    if name.startswith(_ENVIRONMENT) and not close:
+    if name.startswith(_ENVIRONMENT) and "." in name.removeprefix(_ENVIRONMENT):
         hint = "; this one needs environment.kind ros"
     return ConfigurationError(f"{name} is no parameter of this node{hint}")

@@ -64,7 +64,12 @@ def make_world(node: Any, parameters: Parameters) -> World:
     RobotInterface(parameters.mapping, problem.sensing_actions, problem.action_size)
     make: Any = functools.partial(make_ros_environment, node, parameters.mapping)
     maker = EnvironmentMaker("the robot", problem, configuration.simulator.seed, timeout_ms, make)
-    return World(maker, lambda why: cancel_ros_environments(node))
+
+    def interrupt(why: str) -> None:
+        del why
+        cancel_ros_environments(node)
+
+    return World(maker, interrupt)
 
 
 def _nothing(why: str) -> None:
