@@ -327,6 +327,7 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
             on_timing=telemetry.time,
             on_end=self._part_ended,
             interrupt=world.interrupt,
+            interrupt_at_once=world.interrupt_at_once,
         )
         self._executive = world.executive
         self._telemetry = telemetry

@@ -36,6 +36,9 @@ __all__ = ["MAX_TRIALS_TOLD", "Ending", "Part", "PartOfRun"]
 MAX_TRIALS_TOLD = 10_000
 """Of a result; ``trials.csv`` has all."""
 
+_INTERRUPTED_S = 2.0
+"""For a call of the environment that was interrupted to end."""
+
 _CANNOT_GO_ON = (UnknownPerformanceError, LostJournalError, StaleEpochError)
 
 
@@ -86,6 +89,9 @@ class PartOfRun:
         Gets what it came to, on the thread of the run.
     interrupt : callable
         Ends the call of the environment that may be going on, if that can be; given the reason.
+    interrupt_at_once : bool
+        Whether a pause does so without waiting for the call to end by itself. It costs nothing only
+        where what was interrupted is asked for again.
 
     Attributes
     ----------
@@ -108,6 +114,7 @@ class PartOfRun:
         on_timing: Callable[[Timing], None],
         on_end: Callable[[Part], None],
         interrupt: Callable[[str], None],
+        interrupt_at_once: bool = False,
     ) -> None:
         self._configuration = configuration
         self._path = path
@@ -118,6 +125,7 @@ class PartOfRun:
         self._on_timing = on_timing
         self._on_end = on_end
         self._interrupt = interrupt
+        self._interrupt_at_once = interrupt_at_once
         self._changed = threading.Lock()
         self._process: RobotProcess | None = None
         self._why_paused: str | None = None
@@ -149,15 +157,33 @@ class PartOfRun:
         return 0 if process is None else process.unexplained_observations
 
     def pause(self, why: str, within_s: float) -> None:
-        """End in order, from any thread: :attr:`ended` says when; may be repeated."""
+        """End in order, from any thread: :attr:`ended` says when. Only the first call counts.
+
+        Parameters
+        ----------
+        why : str
+        within_s : float
+            So long the environment may take to end the call that is going on; then it is
+            interrupted, and left alone if that does not help.
+        """
         with self._changed:
-            if self._why_paused is None:
-                self._why_paused = why
-                self._pause_within_s = within_s
+            if self._why_paused is not None:
+                return
+            self._why_paused = why
+            self._pause_within_s = within_s + _INTERRUPTED_S
             process = self._process
         if process is not None:
-            process.pause(within_s)
-        self._interrupt(why)
+            process.pause(self._pause_within_s)
+        if self._interrupt_at_once:
+            self._interrupt(why)
+        else:
+            threading.Thread(
+                target=self._interrupt_later, args=(why, within_s), name="pause", daemon=True
+            ).start()
+
+    def _interrupt_later(self, why: str, within_s: float) -> None:
+        if not self.ended.wait(within_s):
+            self._interrupt(why)
 
     def _take_process(self, process: RobotProcess) -> None:
         with self._changed:

@@ -22,12 +22,15 @@ class World(NamedTuple):
     maker : EnvironmentMaker
     interrupt : callable
         Ends the call of the environment that goes on, if that can be; given the reason.
+    interrupt_at_once : bool
+        Whether that costs nothing, because what was interrupted is asked for again.
     executive : Executive or None
         Where calls of ``~/decide`` meet the run; None where the node itself performs.
     """
 
     maker: EnvironmentMaker
     interrupt: Callable[[str], None]
+    interrupt_at_once: bool = False
     executive: Executive | None = None
 
 
@@ -55,7 +58,8 @@ def make_world(node: Any, parameters: Parameters) -> World:
         return World(
             ExecutiveMaker(executive, configuration.problem, timeout_ms),
             functools.partial(executive.end, Code.ENDED),
-            executive,
+            interrupt_at_once=True,
+            executive=executive,
         )
     from holdfast.ros.robot_interface import RobotInterface
     from holdfast.ros.ros2_environment import cancel_ros_environments, make_ros_environment
