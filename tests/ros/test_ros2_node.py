@@ -178,6 +178,18 @@ class Ros:
         assert peer.read() == {"ready": True}
         return peer
 
+    def robot(self, motion_s: float) -> Lines:
+        """Start a robot that is another process of ROS."""
+        script = ROOT / "examples" / "ros2" / "simulated_robot.py"
+        configuration = self.directory / "robot.yaml"
+        configuration.write_text(load(CONFIGURATION, seed=SEED).to_yaml())
+        values = {"configuration": configuration, "motion_s": motion_s}
+        words = [word for key, value in values.items() for word in ("-p", f"{key}:={value}")]
+        command = [str(self._ros2.python), str(script), "--ros-args", *words]
+        robot = Lines(command, self.environment, self.directory)
+        self.started.append(robot)
+        return robot
+
     def service(self, port: int) -> Lines:
         endpoint = f"tcp/127.0.0.1:{port}"
         command = [str(self._ros2.python), "-m", "holdfast", "serve", "--listen", endpoint]
@@ -319,6 +331,54 @@ class TestAnExecutive:
         result = peer.do("result")
         assert result["code"] == "FINISHED"
         assert trials(result) == in_process()
+
+
+class TestARobot:
+    """Another process of ROS plays the robot; the node calls its services and actions."""
+
+    def test_is_driven_as_in_process(self, ros: Ros) -> None:
+        ros.robot(motion_s=0.0)
+        ros.node(environment__kind="ros")
+        peer = ros.peer()
+        assert peer.do("goal")
+        result = peer.do("result")
+        assert result["code"] == "FINISHED", result["message"]
+        assert trials(result) == in_process()
+
+    def test_may_be_held_and_the_node_killed_while_it_moves(self, ros: Ros) -> None:
+        ros.robot(motion_s=0.01)
+        node = ros.node(environment__kind="ros")
+        peer = ros.peer()
+        assert peer.do("goal")
+        peer.wait_seen(lambda seen: len(seen["feedback"]) >= 10)
+        assert peer.do("change", transition="deactivate")
+        assert peer.do("result")["code"] == "PAUSED"
+        assert peer.do("change", transition="activate")
+        assert peer.do("goal")
+        peer.wait_seen(lambda seen: len(seen["feedback"]) >= 10)
+        node.kill()
+        ros.node(environment__kind="ros")
+        assert peer.do("goal")
+        result = peer.do("result")
+        assert result["code"] == "FINISHED", result["message"]
+        assert trials(result) == in_process()
+
+    def test_that_is_not_there_holds_the_run(self, ros: Ros) -> None:
+        ros.node(environment__kind="ros", environment__discovery_timeout_ms=300.0)
+        peer = ros.peer()
+        assert peer.do("goal")
+        result = peer.do("result")
+        assert (result["code"], result["status"]) == ("HELD", 6)
+        assert "nobody offers" in result["message"]
+        ros.robot(motion_s=0.0)
+        while peer.do("goal") and (result := peer.do("result"))["code"] == "HELD":
+            assert "nobody offers" in result["message"]
+        assert trials(result) == in_process()
+
+    def test_has_parameters_that_are_checked_at_once(self, ros: Ros) -> None:
+        node = ros.node(wait=False, environment__kind="ros", environment__act__type="a/srv/B")
+        node.wait_for("not configured: ")
+        assert "environment.act.type" in node.said()
 
 
 def statuses(seen: dict[str, Any]) -> list[str]:
