@@ -603,6 +603,12 @@ class TestParameters:
             assert peer.do("change", transition="configure")
         assert node.interrupt() == 0
 
+    def test_what_ros_cannot_read_is_said(self, ros: Ros) -> None:
+        node = ros.node(wait=False, offload__services="[tcp/127.0.0.1:7447]")
+        assert node.end() == 2
+        assert "holdfast: error: " in node.said()
+        assert "Traceback" not in node.said()
+
     def test_what_no_parameter_can_hold_is_assigned(self, ros: Ros) -> None:
         node = ros.node(
             assignments="['selector.resolution=null','model.init_mean=[4, 2, 0]']",

@@ -6,6 +6,7 @@ here the main thread does nothing but wait for a signal, and the executor has an
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 import threading
@@ -50,25 +51,37 @@ def main(arguments: Sequence[str] | None = None) -> int:
     saved = [number for number in _SIGNALS if signal.getsignal(number) is not signal.SIG_IGN]
     for number in saved:
         signal.signal(number, end)
-    rclpy.init(
-        args=None if arguments is None else list(arguments),
-        signal_handler_options=SignalHandlerOptions.NO,
-    )
-    node = HoldfastNode()
-    if (
-        node.autostart
-        and node.trigger_configure() == node.SUCCESS
-        and node.trigger_activate() == node.SUCCESS
-    ):
-        node.get_logger().info("active")
+    try:
+        rclpy.init(
+            args=None if arguments is None else list(arguments),
+            signal_handler_options=SignalHandlerOptions.NO,
+        )
+        node = HoldfastNode()
+    except RuntimeError as error:  # what ROS cannot read on the command line, or in a file
+        sys.stderr.write(f"holdfast: error: {error}\n")
+        return 2
     if not node.autostart:
         node.get_logger().info("unconfigured")
+    elif node.trigger_configure() == node.SUCCESS and node.trigger_activate() == node.SUCCESS:
+        node.get_logger().info("active")
     executor = MultiThreadedExecutor(num_threads=NUM_THREADS)
     executor.add_node(node)
-    spinning = threading.Thread(target=executor.spin, name="executor", daemon=True)
+
+    def spin() -> None:
+        while rclpy.ok() and not asked_to_end.is_set():
+            try:
+                executor.spin()
+            except Exception as error:  # noqa: BLE001 - one callback's must not end all others
+                node.get_logger().error(f"{type(error).__name__}: {error}")
+
+    spinning = threading.Thread(target=spin, name="executor", daemon=True)
     spinning.start()
     asked_to_end.wait()
-    node.end()
+    if not node.end():
+        # A disk that does not answer, say: threads wait for it, and the process would for them.
+        sys.stderr.write("holdfast: error: the run has not ended; its journal has everything\n")
+        sys.stderr.flush()
+        os._exit(1)
     executor.shutdown(timeout_sec=2.0)
     node.destroy_node()
     rclpy.try_shutdown()

@@ -219,11 +219,8 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
             make_world(self, read)
             # Whether a run can begin there, or go on.
             RunDirectory.resume_if_begun(read.run_directory, read.configuration).close()
-        except HoldfastError as error:
-            self.get_logger().error(f"not configured: {error}")
-            return TransitionCallbackReturn.FAILURE
         except Exception as error:  # noqa: BLE001 - rclpy would not say what it was
-            self.get_logger().error(f"not configured: {type(error).__name__}: {error}")
+            self.get_logger().error(f"not configured: {_in_words(error)}")
             return TransitionCallbackReturn.FAILURE
         with self._changed:
             self._parameters_read = read
@@ -287,14 +284,21 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
             self._parameters_read = None
             self._last_part = None
 
-    def end(self) -> None:
-        """End in order, whatever the state: for a process that was told to end."""
+    def end(self) -> bool:
+        """End in order, whatever the state: for a process that was told to end.
+
+        Returns
+        -------
+        bool
+            Whether the run has ended.
+        """
         is_asked = not self._goals_ended.is_set()
         if self._state_machine.current_state[1] in ("unconfigured", "inactive", "active"):
             self.trigger_shutdown()
         if is_asked and self._goals_ended.wait(_RESULT_S):
             # rclpy sends the result some turns of the executor later, and does not say when.
             time.sleep(_RESULT_S)
+        return self._part is None
 
     # -- runs ------------------------------------------------------------------------------------
 
@@ -376,8 +380,12 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
             elif self._goal is not None:
                 refusal = "another goal is running; cancel it, or wait for its result"
             else:
-                # One that a call of ~/decide has begun is gone on with.
-                part = self._part or self._begin_part()
+                try:
+                    # One that a call of ~/decide has begun is gone on with.
+                    part = self._part or self._begin_part()
+                except Exception as error:  # noqa: BLE001 - rclpy would call it finished
+                    goal.abort()
+                    return _Run.Result(code=_Run.Result.HELD, message=_in_words(error))
                 self._goal = goal
                 self._goals_ended.clear()
         if part is None or read is None:
@@ -415,6 +423,9 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
             return response
         try:
             return self._decide_one(request, response)
+        except Exception as error:  # noqa: BLE001 - else there is no answer at all
+            response.code, response.message = Code.ENDED, _in_words(error)
+            return response
         finally:
             self._calls.release()
 
@@ -494,7 +505,7 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
 
     def _tell_failure(self, error: Exception) -> None:
         self.get_logger().warning(
-            f"not all is published of what the robot decides: {type(error).__name__}: {error}"
+            f"not all is published of what the robot decides: {_in_words(error)}"
         )
 
     def _show_belief(self, state: PlanningState) -> None:
@@ -553,6 +564,10 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
         message.header.stamp = self.get_clock().now().to_msg()
         self._diagnostics_publisher.publish(message)
         self._status_publisher.publish(std_msgs.msg.String(data=str(facts["status"] or word)))
+
+
+def _in_words(error: Exception) -> str:
+    return str(error) if isinstance(error, HoldfastError) else f"{type(error).__name__}: {error}"
 
 
 def _plain(value: Any) -> Any:
