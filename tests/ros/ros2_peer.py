@@ -173,7 +173,15 @@ class Peer:
         if not self.runner.wait_for_server(within_s):
             raise TimeoutError("there is no action server")
         take = self.taker("feedback")
-        goal = self.wait(self.runner.send_goal_async(Run.Goal(), take), within_s)
+        deadline = monotonic() + within_s
+        while True:
+            # One that was killed is still known for a while: what is sent to it has no answer.
+            try:
+                goal = self.wait(self.runner.send_goal_async(Run.Goal(), take), 5.0)
+                break
+            except TimeoutError:
+                if monotonic() > deadline:
+                    raise
         if goal.accepted:
             self.goal = goal
             self.outcome = goal.get_result_async()

@@ -238,7 +238,10 @@ class TestARun:
         assert [order[1] for order in acting] == [
             step for trial in result["trials"] for step in range(trial[2])
         ]
-        for order in sensing:
+        # On a busy machine some come too late to be computed.
+        computed = [order for order in sensing if order[4]]
+        assert computed
+        for order in computed:
             assert int(np.argmin(order[4])) == order[3]
         assert {order[6] for order in acting} == {"standard"}
         assert all(len(order[5]) == 3 for order in acting)

@@ -6,6 +6,7 @@ import threading
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from holdfast import planning
 from holdfast.configuration import Configuration, load
@@ -76,7 +77,11 @@ def test_entropies_that_nobody_hears_are_not_computed() -> None:
     assert audience.orders[0].entropies.size == 0
 
 
-def test_who_looks_on_slowly_misses_beliefs_first_and_holds_up_nobody() -> None:
+def test_who_looks_on_slowly_misses_beliefs_first_and_holds_up_nobody(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(module, "_MAX_STATE_BYTES", 0)
+    monkeypatch.setattr(module, "_LATE_S", LONG_S)
     configuration, state = beginning()
     audience = Audience(configuration)
     audience.may_go_on.clear()
@@ -89,7 +94,17 @@ def test_who_looks_on_slowly_misses_beliefs_first_and_holds_up_nobody() -> None:
     assert audience.telemetry.dropped_decisions in (49, 50)
     assert len(audience.orders) == count - audience.telemetry.dropped_decisions
     assert audience.orders[-1].step == count - 1
-    assert len(audience.beliefs) <= module._MAX_STATES + 1
+    assert len(audience.beliefs) <= module._MIN_STATES + 1
+
+
+def test_what_comes_too_late_has_no_belief(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "_LATE_S", -1.0)
+    configuration, state = beginning()
+    audience = Audience(configuration)
+    audience.telemetry.order(state, Sense(0, 0), "standard")
+    audience.telemetry.close(LONG_S)
+    assert audience.beliefs == []
+    assert audience.orders[0].entropies.size == 0
 
 
 def test_an_error_is_told_once_and_ends_nothing() -> None:

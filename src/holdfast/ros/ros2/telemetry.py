@@ -31,8 +31,12 @@ __all__ = ["Shown", "Telemetry"]
 
 FloatArray = npt.NDArray[np.float64]
 
-_MAX_STATES = 4
-"""Notes that still have their state: of large beliefs more would cost too much memory."""
+_MAX_STATE_BYTES = 32 << 20
+_MIN_STATES = 4
+"""Notes keep their states up to this memory, the last four in any case."""
+
+_LATE_S = 1.0
+"""A belief that is older than this is shown no more."""
 
 _MAX_NOTES = 1000
 
@@ -71,10 +75,11 @@ class Shown(NamedTuple):
 
 
 class _Note:
-    __slots__ = ("shown",)
+    __slots__ = ("at", "shown")
 
     def __init__(self, shown: Shown) -> None:
         self.shown = shown
+        self.at = monotonic()
 
 
 class Telemetry:
@@ -152,10 +157,11 @@ class Telemetry:
             state,
         )
         note = _Note(shown)
+        keep = max(_MIN_STATES, _MAX_STATE_BYTES // max(1, state.belief.states.nbytes))
         with self._changed:
             self._notes.append(note)
             self._with_state.append(note)
-            if len(self._with_state) > _MAX_STATES:
+            if len(self._with_state) > min(keep, _MAX_NOTES):
                 old = self._with_state.popleft()
                 old.shown = old.shown._replace(state=None)
             if len(self._notes) > _MAX_NOTES:
@@ -195,7 +201,8 @@ class Telemetry:
                 if notice:
                     self._on_notice()
                 if note is not None:
-                    self._show(note.shown)
+                    is_late = monotonic() > note.at + _LATE_S
+                    self._show(note.shown._replace(state=None) if is_late else note.shown)
             except Exception as error:  # noqa: BLE001 - the problem is anybody's code
                 if not self.has_failed:
                     self.has_failed = True
