@@ -70,6 +70,18 @@ def test_how_a_robot_is_reached_is_handed_on() -> None:
     assert found.mapping == {"environment.sense.name": "look", "environment.timeout_ms": 9.0}
 
 
+def test_the_files_own_world_may_be_another(tmp_path: Path) -> None:
+    (tmp_path / "worlds.py").write_text("class World: ...\n")
+    path = tmp_path / "robot.yaml"
+    path.write_text(
+        "problem: peg_in_hole_2d\n"
+        "environment: {object: 'worlds:World', directory: '.', arguments: {port: 3}}\n"
+    )
+    settings = read(configuration=str(path), environment__kind="executive").configuration
+    assert settings.environment.object == "holdfast.ros.executive:ExecutiveEnvironment"
+    assert settings.environment.arguments == {}
+
+
 @pytest.mark.parametrize(
     ("values", "message"),
     [
@@ -82,7 +94,11 @@ def test_how_a_robot_is_reached_is_handed_on() -> None:
         ({"assignments": "a.b=1"}, "assignments is 'a.b=1'; expected a list of texts"),
         ({"assignments": ["a.b="]}, "assignments[0] is 'a.b='; expected SECTION.KEY=YAML"),
         ({"assignments": ["a.b=1"]}, "a is not a known section"),
-        ({"environment__sense__name": "x"}, "this one needs environment.kind ros"),
+        ({"environment__sense__name": "x"}, "environment.sense.name needs environment.kind ros"),
+        (
+            {"environment__kind": "ros", "environment__object": "a:B"},
+            "environment.object is given, and environment.kind is ros, which needs none",
+        ),
         ({"rate": 3}, "rate is no parameter of this node; did you mean"),
         ({"offload__service": []}, "did you mean offload.services?"),
         ({"particle_filter__num_particles": 0}, "is 0; expected a whole number >= 1 and <= 1000"),

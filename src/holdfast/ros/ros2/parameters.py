@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 
 from holdfast.configuration import Configuration, load, settings_keys
 from holdfast.errors import ConfigurationError
+from holdfast.ros.robot_interface import ROBOT_PARAMETERS
 from holdfast.yaml_document import read
 
 __all__ = ["OWN", "Parameters", "known_parameters", "read_parameters"]
@@ -107,7 +108,8 @@ class Parameters(NamedTuple):
 
 def known_parameters() -> dict[str, str]:
     """Return what each parameter means, by name; those of the problem's own sections excepted."""
-    return {name: own.text for name, own in OWN.items()} | settings_keys()
+    robot = {name: text for name, (_, text) in ROBOT_PARAMETERS.items()}
+    return {name: own.text for name, own in OWN.items()} | settings_keys() | robot
 
 
 def read_parameters(values: Mapping[str, Any]) -> Parameters:
@@ -149,7 +151,15 @@ def read_parameters(values: Mapping[str, Any]) -> Parameters:
         key, value = _assigned(index, assignment)
         overrides[key] = value
     if environment in _OBJECTS:
+        for key in ("object", "directory", "arguments"):
+            if overrides.get(f"environment.{key}"):
+                raise ConfigurationError(
+                    f"environment.{key} is given, and environment.kind is {environment}, which "
+                    "needs none; leave one of the two out"
+                )
+        # What the file says of a world of its own is for other uses of it.
         overrides["environment.object"] = _OBJECTS[environment]
+        overrides |= {"environment.directory": None, "environment.arguments": {}}
     path = own["configuration"]
     if not path:
         raise ConfigurationError(
@@ -206,9 +216,8 @@ def _assigned(index: int, assignment: str) -> tuple[str, Any]:
 
 
 def _unknown(name: str) -> ConfigurationError:
-    known = known_parameters()
-    close = difflib.get_close_matches(name, known, n=1)
+    if name in ROBOT_PARAMETERS:
+        return ConfigurationError(f"{name} needs environment.kind ros: else it would do nothing")
+    close = difflib.get_close_matches(name, known_parameters(), n=1)
     hint = f"; did you mean {close[0]}?" if close else ""
-    if name.startswith(_ENVIRONMENT) and "." in name.removeprefix(_ENVIRONMENT):
-        hint = "; this one needs environment.kind ros"
     return ConfigurationError(f"{name} is no parameter of this node{hint}")
