@@ -47,7 +47,7 @@ from holdfast.settings import (
 from holdfast.user_code import account_of_user_error, in_words
 from holdfast.yaml_document import MAX_BYTES, Document, KeyPath, dotted, read, write
 
-__all__ = ["Configuration", "build_problem", "load"]
+__all__ = ["Configuration", "build_problem", "load", "settings_keys"]
 
 _SETTINGS: Mapping[str, type[msgspec.Struct]] = {
     "particle_filter": ParticleFilterSettings,
@@ -251,6 +251,24 @@ def load(
     return _build(
         document, path, problem, {_section_and_key(name): value for name, value in given.items()}
     )
+
+
+def settings_keys() -> dict[str, str]:
+    """Return every ``section.key`` whose meaning does not depend on the problem.
+
+    Returns
+    -------
+    dict of str
+        What its value may be, and its default, in words.
+    """
+    keys = {}
+    for section, schema in _SETTINGS.items():
+        defaults = msgspec.to_builtins(schema())
+        fields = msgspec.inspect.type_info(schema).fields  # type: ignore[attr-defined]
+        for item in fields:
+            default = json.dumps(defaults[item.encode_name])
+            keys[f"{section}.{item.encode_name}"] = f"{_described(item.type)}; default {default}"
+    return keys
 
 
 def build_problem(

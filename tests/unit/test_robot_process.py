@@ -16,8 +16,8 @@ import pytest
 
 from holdfast.configuration import Configuration, load
 from holdfast.errors import ProblemError, TrialError
-from holdfast.outcome import TrialResult
-from holdfast.planning import Planner
+from holdfast.outcome import SensingDecision, TrialResult
+from holdfast.planning import Planner, PlanningState
 from holdfast.recording.run_directory import RunDirectory
 from holdfast.robot.own_planning import OwnPlanning
 from holdfast.runtime import own_planner, robot_process
@@ -28,9 +28,11 @@ from holdfast.runtime.own_planner import OwnPlanner
 from holdfast.runtime.recovery_launcher import RecoveryExited
 from holdfast.runtime.robot_process import RobotProcess
 from holdfast.runtime.trial import run_trial
-from holdfast.session.effects import Effect, Paused, Plan, Report, Timing
+from holdfast.session.effects import Act, Effect, Paused, Plan, Report, Sense, Timing
 from holdfast.session.events import Acted, Planned, TransportEvent
 from holdfast.session.records import PausedRecord
+from holdfast.session.robot import HeldError
+from holdfast.session.status import Status
 
 PATIENCE_S = 30.0
 """Longest wait for what is sure to come; nothing is measured by it."""
@@ -57,6 +59,8 @@ class Robots:
         self.on_timing: Callable[[Timing], None] = lambda _: None
         self.told: list[tuple[str, dict[str, object]]] = []
         self.path = path
+        self.maker = load_environment(configuration)
+        self.on_order: Callable[[PlanningState, Act | Sense], None] | None = None
 
     @functools.cached_property
     def directory(self) -> RunDirectory:
@@ -72,13 +76,14 @@ class Robots:
             self.links.recovery,
             self.links.transport,
             self.directory.journal,
-            load_environment(configuration),
+            self.maker,
             self,
             self._on_result,
             lambda timing: self.on_timing(timing),
             lambda _: None,
             offload=self.links.offload,
             make_planner=self.links.make_planner,
+            on_order=self.on_order,
         )
 
     def run(self) -> None:
@@ -536,3 +541,90 @@ class TestOwnPlanner:
         assert own.compute_brief()
         assert not own.compute_brief()
         assert come == [2]
+
+
+class TestPause:
+    """What a process does that has something else on its main thread."""
+
+    def test_before_it_runs(self, robots: Robots) -> None:
+        robot = robots.make()
+        robot.pause(PATIENCE_S)
+        robot.run(())
+        assert robots.results == []
+        robots.run()
+        assert robots.digests == plain_digests(robots.configuration)
+
+    def test_in_the_middle_of_a_trial(self, robots: Robots) -> None:
+        robot = robots.make()
+        decisions = 0
+
+        def count(_: Timing) -> None:
+            nonlocal decisions
+            decisions += 1
+            if decisions == 5:
+                threading.Thread(target=robot.pause, args=(PATIENCE_S,)).start()
+
+        robots.on_timing = count
+        robot.run(())
+        unfinished = robots.directory.journal.unfinished()
+        if unfinished is not None:  # else the trial has ended meanwhile
+            assert isinstance(unfinished.records[-1], PausedRecord)
+        assert robot.condition().word == "ending"
+        robots.on_timing = lambda _: None
+        robots.run()
+        assert robots.digests == plain_digests(robots.configuration)
+
+    def test_an_environment_that_does_not_return_is_left_alone(self, robots: Robots) -> None:
+        called, let_go = threading.Event(), threading.Event()
+
+        class Stuck:
+            def perform_sensing(self, sensing_action: int) -> list[float]:
+                called.set()
+                let_go.wait(PATIENCE_S)
+                return [0.0]
+
+            def perform(self, task_action: object) -> None:
+                raise NotImplementedError
+
+            def is_done(self) -> bool:
+                return False
+
+        problem = robots.configuration.problem
+        robots.maker = EnvironmentMaker("stuck", problem, 0, 60_000.0, Stuck)
+        robot = robots.make()
+
+        def pause() -> None:
+            called.wait(PATIENCE_S)
+            robot.pause(0.0)
+
+        threading.Thread(target=pause).start()
+        with pytest.raises(HeldError, match="has not ended its call in 0 s"):
+            robot.run(())
+        let_go.set()
+
+    def test_after_the_end_it_does_nothing(self, robots: Robots) -> None:
+        robot = robots.make()
+        robot.run(())
+        robot.pause(0.0)
+        assert robots.digests == plain_digests(robots.configuration)
+
+
+def test_who_looks_on_sees_each_order_and_its_state(robots: Robots) -> None:
+    seen: list[tuple[int, int, str]] = []
+
+    def look(state: PlanningState, order: Act | Sense) -> None:
+        assert state.step == order.step
+        seen.append((state.trial, state.step, type(order).__name__))
+
+    robots.on_order = look
+    robot = robots.make()
+    robot.run(())
+    expected = []
+    for result in robots.results:
+        assert result.decisions is not None
+        expected += [
+            (result.trial, one.step, "Sense" if isinstance(one, SensingDecision) else "Act")
+            for one in result.decisions
+        ]
+    assert seen == expected
+    assert (robot.status, robot.unexplained_observations) == (Status.STANDARD, 0)

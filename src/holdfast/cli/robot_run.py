@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import sys
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
@@ -15,11 +14,8 @@ if TYPE_CHECKING:
     from holdfast.runtime.logs import EventSink, LogFormat
     from holdfast.runtime.service_manager import ServiceManager
     from holdfast.service.health import HttpAddress
-    from holdfast.session.effects import Verified
 
 __all__ = ["RobotRun", "is_robot_run", "run_as_robot"]
-
-RECOVERY_LOG_NAME = "recovery.log"
 
 
 class RobotRun(NamedTuple):
@@ -112,57 +108,21 @@ def run_as_robot(
     HoldfastError
         If the robot holds still and cannot go on.
     """
-    from holdfast.recording.run_directory import EVENTS_NAME, TIMINGS_NAME, VERIFICATION_NAME
-    from holdfast.recording.timings import TimingTable, VerificationTable, count_verified
-    from holdfast.runtime.links import make_links
-    from holdfast.runtime.logs import BoundedEventLog, EventLog, TeeEventLog
-    from holdfast.runtime.robot_process import RobotProcess
+    from holdfast.recording.robot_run import perform_trials
+    from holdfast.runtime.logs import EventLog
     from holdfast.runtime.robot_watch import RobotWatch
 
-    with contextlib.ExitStack() as stack:
-        # What is only for people on a terminal is kept in the file all the same.
-        reasons = _Reasons()
-        sinks: list[EventSink] = [
-            EventLog(directory.path / EVENTS_NAME, format="json", component="robot"),
-            reasons,
-        ]
-        if not quiet:
-            sinks.append(EventLog(sys.stderr, format=log_format, component="robot"))
-        events = BoundedEventLog(TeeEventLog(*sinks))
-        stack.callback(events.close)
-        links = make_links(configuration, directory.path / RECOVERY_LOG_NAME, events)
-        stack.callback(links.close)
-        timings = TimingTable(directory.path / TIMINGS_NAME)
-        stack.callback(timings.close)
-        on_verified: Callable[[Verified], None] = _ignore
-        distrusted: Collection[str] = ()
-        if configuration.offload.services:
-            earlier = count_verified(directory.path / VERIFICATION_NAME)
-            distrusted = () if earlier is None else earlier.wrong
-            verification = VerificationTable(directory.path / VERIFICATION_NAME)
-            stack.callback(verification.close)
-            on_verified = verification.add
-        robot = RobotProcess(
-            configuration,
-            links.services,
-            links.recovery,
-            links.transport,
-            directory.journal,
-            maker,
-            events,
-            on_result,
-            timings.add,
-            on_verified,
-            rate_hz,
-            links.offload,
-            distrusted,
-            make_planner=links.make_planner,
-            watch=RobotWatch(manager, health, events),
-        )
-        launcher = None if links.launcher is None else links.launcher(robot.deliver)
-        robot.run(directory.journal.finished(), launcher)
-        return RobotRun(robot.missed_ticks, reasons.refusals, reasons.unreachable)
-
-
-def _ignore(verified: Verified) -> None:
-    """Do nothing: a robot that asks no service has nothing to verify."""
+    reasons = _Reasons()
+    sinks: list[EventSink] = [reasons]
+    if not quiet:
+        sinks.append(EventLog(sys.stderr, format=log_format, component="robot"))
+    missed_ticks = perform_trials(
+        configuration,
+        directory,
+        maker,
+        on_result,
+        rate_hz=rate_hz,
+        sinks=sinks,
+        watch=lambda events: RobotWatch(manager, health, events),
+    )
+    return RobotRun(missed_ticks, reasons.refusals, reasons.unreachable)

@@ -25,7 +25,7 @@ from holdfast.runtime.recovery_launcher import RecoveryExited, RecoveryLauncher
 from holdfast.settings import OffloadSettings, PlanningSettings
 from holdfast.transport.contract import RobotTransport
 
-__all__ = ["RECOVERY_SERVICE", "Links", "make_links"]
+__all__ = ["RECOVERY_SERVICE", "Links", "check_services", "make_links"]
 
 RECOVERY_SERVICE = "cloud_active_sensing_recovery"
 """The name of the local service (the thesis's)."""
@@ -59,6 +59,36 @@ class Links(NamedTuple):
     offload: OffloadSettings
     close: Callable[[], None]
     make_planner: Callable[[Problem, PlanningSettings], Planner] = Planner
+
+
+def check_services(configuration: Configuration) -> None:
+    """Check what can be checked of the services before a run: endpoints and credentials.
+
+    Raises
+    ------
+    HoldfastError
+        If one of them cannot be used; the message names its key.
+    """
+    offload = configuration.offload
+    if not offload.services:
+        return
+    from holdfast.transport.credentials import load_credentials
+    from holdfast.transport.endpoints import check_credentials, parse_endpoint
+
+    tls = None
+    if offload.tls is not None:
+        # What is only to be warned of is told when the run begins.
+        tls = load_credentials(Path(offload.tls), "robot", warn=lambda _: None)
+    for index, service in enumerate(offload.services):
+        try:
+            endpoint = parse_endpoint(service)
+            check_credentials(endpoint, tls)
+            if endpoint.protocol == "udp":
+                from holdfast.transport.sealing import require_cryptography
+
+                require_cryptography()
+        except TransportError as error:
+            raise TransportError(f"offload.services[{index}]: {error}") from error
 
 
 def make_links(configuration: Configuration, log_path: Path | None, events: EventSink) -> Links:

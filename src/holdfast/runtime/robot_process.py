@@ -27,7 +27,7 @@ from holdfast import contract
 from holdfast.configuration import Configuration
 from holdfast.errors import HoldfastError, TrialError
 from holdfast.outcome import TrialResult
-from holdfast.planning import Planner
+from holdfast.planning import Planner, PlanningState
 from holdfast.problems.problem import Problem
 from holdfast.problems.registry import problem_class, problem_module
 from holdfast.robot.own_decisions import OwnDecisions
@@ -68,6 +68,7 @@ from holdfast.session.events import (
 from holdfast.session.messages import Opening
 from holdfast.session.records import Record
 from holdfast.session.robot import HeldError, History, Robot, replay
+from holdfast.session.status import Status
 from holdfast.settings import OffloadSettings, PlanningSettings
 from holdfast.source_digest import core_version, problem_digest
 from holdfast.transport.contract import RobotTransport
@@ -143,7 +144,10 @@ class Launcher(Protocol):
 
 
 class _Interrupted(NamedTuple):
-    number: int
+    """The run is to end in order: a signal says so, or :meth:`RobotProcess.pause`."""
+
+    number: int | None
+    within_s: float | None = None
 
 
 _Happening: TypeAlias = (
@@ -197,6 +201,9 @@ class RobotProcess:
         Joins the problem and the settings to the functions that lead from state to state.
     watch : RobotWatch or None
         Tells others how the robot is doing, while it runs.
+    on_order : callable
+        Gets each order to the environment, and the state in which it was decided. It is called on
+        the event loop, so it must return at once.
     """
 
     def __init__(
@@ -216,8 +223,10 @@ class RobotProcess:
         distrusted: Collection[str] = (),
         make_planner: Callable[[Problem, PlanningSettings], Planner] = Planner,
         watch: RobotWatch | None = None,
+        on_order: Callable[[PlanningState, Act | Sense], None] | None = None,
     ) -> None:
         self._watch = watch
+        self._on_order = on_order
         self._configuration = configuration
         self._transport = transport
         self._turn_s = _TURN_WITHOUT_WIRE_S if transport is None else _TURN_S
@@ -245,7 +254,7 @@ class RobotProcess:
         self._verifying = False
         self._ended = False
         self._closing = False
-        self._interrupted: int | None = None
+        self._interrupted: _Interrupted | None = None
         problem = configuration.problem
         simulator = configuration.simulator
         epoch = journal.raise_epoch()
@@ -290,6 +299,16 @@ class RobotProcess:
         """Ticks of the rate that passed while the robot was not ready."""
         return self._robot.missed_ticks
 
+    @property
+    def status(self) -> Status:
+        """Who decides."""
+        return self._robot.status
+
+    @property
+    def unexplained_observations(self) -> int:
+        """Those of the trial that is running; 0 between two."""
+        return self._robot.unexplained_observations
+
     def condition(self) -> Condition:
         """Return how the robot is doing."""
         robot = self._robot
@@ -308,6 +327,22 @@ class RobotProcess:
             with contextlib.suppress(RuntimeError):
                 self._loop.call_soon_threadsafe(self._happens, event, monotonic())
 
+    def pause(self, within_s: float) -> None:
+        """End the run in order, from any thread, before or while it runs; may be repeated.
+
+        :meth:`run` returns when what is being performed has ended and everything is written down.
+
+        Parameters
+        ----------
+        within_s : float
+            If the environment performs for longer than this, it is left alone, and :meth:`run`
+            raises a :class:`~holdfast.session.robot.HeldError`. That can be resumed, too.
+        """
+        self._happened.append((monotonic(), _Interrupted(None, within_s)))
+        if self._loop is not None:
+            with contextlib.suppress(RuntimeError):
+                self._loop.call_soon_threadsafe(self._go_on)
+
     def run(self, finished: Collection[int], launcher: Launcher | None = None) -> None:
         """Run all trials that are not finished, on an event loop of its own.
 
@@ -323,7 +358,8 @@ class RobotProcess:
             If the robot holds still and cannot go on; the journal has everything to resume.
         KeyboardInterrupt
             After Ctrl-C or another signal that ends a process, once everything is written down.
-            (As whoever calls handles these signals.)
+            (As whoever calls handles these signals. In a thread other than the main one no signal
+            is heard: see :meth:`pause`.)
         """
         self._finished = set(finished)
         self._launcher = launcher
@@ -365,8 +401,8 @@ class RobotProcess:
             if launcher is not None:
                 launcher.close()
             loop.close()
-        if self._interrupted is not None:
-            signal.raise_signal(self._interrupted)
+        if self._interrupted is not None and self._interrupted.number is not None:
+            signal.raise_signal(self._interrupted.number)
 
     def _salvage(self) -> None:
         """Write down what is known to have happened, before an error ends the run."""
@@ -470,6 +506,11 @@ class RobotProcess:
         self._error = self._error or error
         self._end()
 
+    def _end_unpaused(self, within_s: float) -> None:
+        self._fail(
+            HeldError(f"{self._where()}: the environment has not ended its call in {within_s:g} s")
+        )
+
     def _raise_error(self) -> None:
         if self._error is not None:
             raise self._error
@@ -501,7 +542,9 @@ class RobotProcess:
     def _handle(self, event: _Happening, now: float) -> None:
         robot = self._robot
         if isinstance(event, _Interrupted):
-            self._interrupted = event.number
+            self._interrupted = self._interrupted or event
+            if event.within_s is not None:
+                self._on_loop().call_later(event.within_s, self._end_unpaused, event.within_s)
             if self._watch is not None:
                 self._watch.ending()
             self._carry_out(robot.pause(now))
@@ -528,9 +571,11 @@ class RobotProcess:
                 self._journal.append(effect.trial, effect.records)
             elif isinstance(effect, Act):
                 assert self._performer is not None
+                self._tell_order(effect)
                 self._performer.perform(effect.step, effect.action)
             elif isinstance(effect, Sense):
                 assert self._performer is not None
+                self._tell_order(effect)
                 self._performer.sense(effect.step, effect.sensing_action)
             elif isinstance(effect, Timing):
                 self._on_timing(effect)
@@ -557,6 +602,10 @@ class RobotProcess:
             elif isinstance(effect, Stop):
                 self._events.event("stopped", reason=str(effect.error))
                 raise effect.error
+
+    def _tell_order(self, order: Act | Sense) -> None:
+        if self._on_order is not None and (state := self._robot.state) is not None:
+            self._on_order(state, order)
 
     def _launch(self, effect: Launch) -> None:
         if self._launcher is None:

@@ -312,6 +312,16 @@ class Robot:
         """The step of the trial that is running, None between two."""
         return None if self._history is None else self._history.state.step
 
+    @property
+    def state(self) -> PlanningState | None:
+        """The state of the trial that is running, None between two."""
+        return None if self._history is None else self._history.state
+
+    @property
+    def unexplained_observations(self) -> int:
+        """Those of the trial that is running; 0 between two."""
+        return 0 if self._history is None else self._history.num_unexplained
+
     def start(self, now: float) -> list[Effect]:
         """Begin the run: from now on services are looked for."""
         self._dispatcher.start(now)

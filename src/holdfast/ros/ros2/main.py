@@ -1,0 +1,89 @@
+"""The node's process: it spins until a signal ends it, in order.
+
+rclpy's own handlers would end the context at once, and with it all that is still to be said. So
+here the main thread does nothing but wait for a signal, and the executor has another one.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+from collections.abc import Sequence
+
+__all__ = ["main"]
+
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the node, and return the exit code.
+
+    Parameters
+    ----------
+    arguments : sequence of str, optional
+        Those of the process; ``--ros-args`` is ROS's.
+    """
+    try:
+        import rclpy
+        from rclpy.executors import MultiThreadedExecutor
+        from rclpy.signals import SignalHandlerOptions
+
+        from holdfast.ros.ros2.node import NUM_THREADS, HoldfastNode
+    except ImportError as error:
+        missing = (error.name or "").partition(".")[0]
+        what = (
+            "build and source the package holdfast_interfaces (colcon build --base-paths ros)"
+            if missing == "holdfast_interfaces"
+            else "source your ROS 2 (. /opt/ros/DISTRIBUTION/setup.bash)"
+        )
+        sys.stderr.write(f"holdfast: error: there is no {missing or error}: {what}\n")
+        return 2
+    asked_to_end = threading.Event()
+
+    def end(number: int, frame: object) -> None:
+        del number, frame
+        for handled in saved:
+            signal.signal(handled, signal.SIG_DFL)  # the second one ends it at once
+        asked_to_end.set()
+
+    saved = [number for number in _SIGNALS if signal.getsignal(number) is not signal.SIG_IGN]
+    for number in saved:
+        signal.signal(number, end)
+    try:
+        rclpy.init(
+            args=None if arguments is None else list(arguments),
+            signal_handler_options=SignalHandlerOptions.NO,
+        )
+        node = HoldfastNode()
+    except RuntimeError as error:  # what ROS cannot read on the command line, or in a file
+        sys.stderr.write(f"holdfast: error: {error}\n")
+        return 2
+    if not node.autostart:
+        node.get_logger().info("unconfigured")
+    elif node.trigger_configure() == node.SUCCESS and node.trigger_activate() == node.SUCCESS:
+        node.get_logger().info("active")
+    executor = MultiThreadedExecutor(num_threads=NUM_THREADS)
+    executor.add_node(node)
+
+    def spin() -> None:
+        while rclpy.ok() and not asked_to_end.is_set():
+            try:
+                executor.spin()
+            except Exception as error:  # noqa: BLE001 - one callback's must not end all others
+                node.get_logger().error(f"{type(error).__name__}: {error}")
+
+    spinning = threading.Thread(target=spin, name="executor", daemon=True)
+    spinning.start()
+    asked_to_end.wait()
+    if not node.end():
+        # A disk that does not answer, say: threads wait for it, and the process would for them.
+        sys.stderr.write("holdfast: error: the run has not ended; its journal has everything\n")
+        sys.stderr.flush()
+        os._exit(1)
+    executor.shutdown(timeout_sec=2.0)
+    node.destroy_node()
+    rclpy.try_shutdown()
+    spinning.join(2.0)
+    return 0

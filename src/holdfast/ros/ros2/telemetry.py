@@ -1,0 +1,222 @@
+"""What a robot decides and believes, for whoever looks on: never at the expense of a decision.
+
+The robot's loop only leaves a note of each order it gives, in a microsecond; a thread of low
+priority makes messages of these notes. If it falls behind, it drops beliefs first (they hold
+memory), and the entropies with them; after that the oldest decisions. The robot never waits.
+
+A service's answer does not have the entropies behind a sensing action. As every decision is a
+function of the state, they are computed once more, here, with an instance of the problem of its
+own.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import threading
+from collections import deque
+from collections.abc import Callable
+from time import monotonic
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from holdfast import planning
+from holdfast.configuration import Configuration
+from holdfast.planning import PlanningState
+from holdfast.session.effects import Act, Sense, Timing
+
+__all__ = ["Shown", "Telemetry"]
+
+FloatArray = npt.NDArray[np.float64]
+
+_MAX_STATE_BYTES = 32 << 20
+_MIN_STATES = 4
+"""Notes keep their states up to this memory, the last four in any case."""
+
+_LATE_S = 1.0
+"""A belief that is older than this is shown no more."""
+
+_MAX_NOTES = 1000
+
+_NICENESS = 10
+
+_ENTROPIES = ("action_entropy", "state_entropy", "action_covariance")
+"""Methods that compute something for each sensing action; the others only choose."""
+
+
+class Shown(NamedTuple):
+    """An order to the environment, for people.
+
+    Attributes
+    ----------
+    trial, step, stage : int
+    sensing_action : int or None
+        None for a task action.
+    entropies : array of shape (J,)
+        Empty if they were not computed.
+    task_action : array of shape (action_size,)
+        Empty for a sensing action.
+    status, decided_by : str
+    state : PlanningState or None
+        In which it was decided; None if there was no time for it.
+    """
+
+    trial: int
+    step: int
+    stage: int
+    sensing_action: int | None
+    entropies: FloatArray
+    task_action: FloatArray
+    status: str
+    decided_by: str
+    state: PlanningState | None
+
+
+class _Note:
+    __slots__ = ("at", "shown")
+
+    def __init__(self, shown: Shown) -> None:
+        self.shown = shown
+        self.at = monotonic()
+
+
+class Telemetry:
+    """Shows orders and beliefs, on a thread of its own.
+
+    Parameters
+    ----------
+    configuration : Configuration
+    on_order : callable
+        Shows an order.
+    on_belief : callable
+        Shows a belief.
+    on_notice : callable
+        Is called when there is something else that changed.
+    on_failure : callable
+        Gets the first error that any of this came to: to look on must not end a run.
+    belief_rate_hz : float
+        Beliefs shown a second, at most.
+    wants_entropies : callable
+        Tells whether to compute them.
+    """
+
+    def __init__(
+        self,
+        configuration: Configuration,
+        on_order: Callable[[Shown], None],
+        on_belief: Callable[[PlanningState], None],
+        on_notice: Callable[[], None],
+        on_failure: Callable[[Exception], None],
+        *,
+        belief_rate_hz: float,
+        wants_entropies: Callable[[], bool],
+    ) -> None:
+        self._problem = Configuration.from_plain(configuration.plain()).problem
+        self._settings = configuration.planning
+        self._on_order = on_order
+        self._on_belief = on_belief
+        self._on_notice = on_notice
+        self._on_failure = on_failure
+        self._belief_every_s = 1.0 / belief_rate_hz if belief_rate_hz > 0.0 else np.inf
+        self._wants_entropies = wants_entropies
+        self._changed = threading.Condition()
+        self._notes: deque[_Note] = deque()
+        self._with_state: deque[_Note] = deque()
+        self._notice = False
+        self._closed = False
+        self._decided_by = {"sensing": "", "task": ""}
+        self._next_belief = 0.0
+        self.dropped_decisions = 0
+        self.has_failed = False
+        self._thread = threading.Thread(target=self._work, name="telemetry", daemon=True)
+        self._thread.start()
+
+    @property
+    def decided_by(self) -> str:
+        """Who chose the last task actions."""
+        return self._decided_by["task"] or self._decided_by["sensing"]
+
+    def time(self, timing: Timing) -> None:
+        """Take note of who decided."""
+        self._decided_by[timing.kind] = timing.service
+
+    def order(self, state: PlanningState, order: Act | Sense, status: str) -> None:
+        """Take note of an order; returns at once."""
+        sensing = isinstance(order, Sense)
+        shown = Shown(
+            state.trial,
+            state.step,
+            state.stage,
+            order.sensing_action if isinstance(order, Sense) else None,
+            np.empty(0),
+            np.empty(0) if isinstance(order, Sense) else order.action,
+            status,
+            self._decided_by["sensing" if sensing else "task"],
+            state,
+        )
+        note = _Note(shown)
+        keep = max(_MIN_STATES, _MAX_STATE_BYTES // max(1, state.belief.states.nbytes))
+        with self._changed:
+            self._notes.append(note)
+            self._with_state.append(note)
+            if len(self._with_state) > min(keep, _MAX_NOTES):
+                old = self._with_state.popleft()
+                old.shown = old.shown._replace(state=None)
+            if len(self._notes) > _MAX_NOTES:
+                self._notes.popleft()
+                self.dropped_decisions += 1
+            self._changed.notify()
+
+    def notice(self) -> None:
+        """Take note that something else has changed; returns at once."""
+        with self._changed:
+            self._notice = True
+            self._changed.notify()
+
+    def close(self, timeout_s: float = 1.0) -> None:
+        """Show what there is, within about this time, and then nothing more; may be repeated."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify()
+        self._thread.join(timeout_s)
+        with self._changed:
+            self._notes.clear()
+
+    def _work(self) -> None:
+        with contextlib.suppress(OSError):  # a thread's own, on Linux
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICENESS)
+        while True:
+            with self._changed:
+                while not (self._notes or self._notice or self._closed):
+                    self._changed.wait()
+                notice, self._notice = self._notice, False
+                note = self._notes.popleft() if self._notes else None
+                if note is None and not notice:
+                    return
+                if note is not None and self._with_state and self._with_state[0] is note:
+                    self._with_state.popleft()
+            try:
+                if notice:
+                    self._on_notice()
+                if note is not None:
+                    is_late = monotonic() > note.at + _LATE_S
+                    self._show(note.shown._replace(state=None) if is_late else note.shown)
+            except Exception as error:  # noqa: BLE001 - the problem is anybody's code
+                if not self.has_failed:
+                    self.has_failed = True
+                    self._on_failure(error)
+
+    def _show(self, shown: Shown) -> None:
+        state = shown.state
+        if state is not None and monotonic() >= self._next_belief:
+            self._next_belief = monotonic() + self._belief_every_s
+            self._on_belief(state)
+        sensing = state is not None and shown.sensing_action is not None
+        if sensing and self._settings.selector.method in _ENTROPIES and self._wants_entropies():
+            assert state is not None
+            _, info = planning.choose_sensing_action(self._problem, self._settings, state)
+            if info.entropies is not None:
+                shown = shown._replace(entropies=info.entropies)
+        self._on_order(shown)

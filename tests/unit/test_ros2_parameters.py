@@ -1,0 +1,117 @@
+"""The node's parameters: the settings' keys and its own, without ROS."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from holdfast.errors import HoldfastError
+from holdfast.ros.ros2.parameters import OWN, Parameters, known_parameters, read_parameters
+
+CONFIGURATION = Path(__file__).parents[2] / "examples" / "peg_in_hole_2d.yaml"
+
+
+def read(**values: Any) -> Parameters:
+    given = {key.replace("__", "."): value for key, value in values.items()}
+    return read_parameters({"configuration": str(CONFIGURATION), **given})
+
+
+def test_without_any_everything_is_the_files_or_the_default() -> None:
+    found = read(**dict.fromkeys(("offload__tls", "simulator__seed", "rate_hz")))
+    assert found.configuration.simulator.seed == 0
+    assert found.run_directory == Path("runs/peg_in_hole_2d-seed0").absolute()
+    assert (found.rate_hz, found.frame_id, found.environment) == (None, "task", "configuration")
+    assert (found.decide_timeout_s, found.publish_entropies) == (1.0, True)
+
+
+def test_a_setting_is_a_parameter_of_its_keys_name() -> None:
+    found = read(
+        particle_filter__num_particles=50,
+        offload__services=["tcp/127.0.0.1:7447"],
+        offload__tls="",
+        offload__detection_timeout_ms=300,
+        model__peg_width=0.9,
+        simulator__seed=7,
+        rate_hz=2,
+        environment__arguments__speed=0.5,
+    )
+    configuration = found.configuration
+    assert configuration.planning.particle_filter.num_particles == 50
+    assert configuration.offload.services == ("tcp/127.0.0.1:7447",)
+    assert configuration.offload.tls is None
+    assert configuration.offload.detection_timeout_ms == 300.0
+    assert configuration.model["peg_width"] == 0.9
+    assert configuration.environment.arguments == {"speed": 0.5}
+    assert found.run_directory.name == "peg_in_hole_2d-seed7"
+    assert found.rate_hz == 2.0
+
+
+def test_what_ros_itself_has_is_left_alone() -> None:
+    read(use_sim_time=True, qos_overrides__topic__depth=3)
+
+
+def test_another_world_is_another_configuration() -> None:
+    """So that no run goes on in another world than the one it began in."""
+    named = {kind: read(environment__kind=kind) for kind in ("configuration", "executive", "ros")}
+    objects = {kind: one.configuration.environment.object for kind, one in named.items()}
+    assert objects == {
+        "configuration": None,
+        "executive": "holdfast.ros.executive:ExecutiveEnvironment",
+        "ros": "holdfast.ros.ros2_environment:RosEnvironment",
+    }
+
+
+def test_how_a_robot_is_reached_is_handed_on() -> None:
+    found = read(
+        environment__kind="ros", environment__sense__name="look", environment__timeout_ms=9
+    )
+    assert found.mapping == {"environment.sense.name": "look", "environment.timeout_ms": 9.0}
+
+
+def test_the_files_own_world_may_be_another(tmp_path: Path) -> None:
+    (tmp_path / "worlds.py").write_text("class World: ...\n")
+    path = tmp_path / "robot.yaml"
+    path.write_text(
+        "problem: peg_in_hole_2d\n"
+        "environment: {object: 'worlds:World', directory: '.', arguments: {port: 3}}\n"
+    )
+    settings = read(configuration=str(path), environment__kind="executive").configuration
+    assert settings.environment.object == "holdfast.ros.executive:ExecutiveEnvironment"
+    assert settings.environment.arguments == {}
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"configuration": ""}, "configuration is empty"),
+        ({"configuration": 3}, "configuration is 3; expected a text"),
+        ({"rate_hz": float("nan")}, "rate_hz is nan; expected a number from 0 to 10000"),
+        ({"rate_hz": True}, "rate_hz is True; expected a number from 0 to 10000"),
+        ({"decide_timeout_s": 61}, "decide_timeout_s is 61; expected a number from 0 to 60"),
+        ({"publish_entropies": 1}, "publish_entropies is 1; expected true or false"),
+        ({"assignments": "a.b=1"}, "assignments is 'a.b=1'; expected a list of texts"),
+        ({"assignments": ["a.b="]}, "assignments[0] is 'a.b='; expected SECTION.KEY=YAML"),
+        ({"assignments": ["a.b=1"]}, "a is not a known section"),
+        ({"environment__sense__name": "x"}, "environment.sense.name needs environment.kind ros"),
+        (
+            {"environment__kind": "ros", "environment__object": "a:B"},
+            "environment.object is given, and environment.kind is ros, which needs none",
+        ),
+        ({"rate": 3}, "rate is no parameter of this node; did you mean"),
+        ({"offload__service": []}, "did you mean offload.services?"),
+        ({"particle_filter__num_particles": 0}, "is 0; expected a whole number >= 1 and <= 1000"),
+    ],
+)
+def test_what_is_wrong_is_said(values: dict[str, Any], message: str) -> None:
+    with pytest.raises(HoldfastError) as raised:
+        read(**values)
+    assert message in str(raised.value)
+
+
+def test_each_is_described() -> None:
+    known = known_parameters()
+    assert set(OWN) < set(known)
+    assert known["particle_filter.num_particles"].endswith("default 300")
+    assert all(known.values())
