@@ -52,11 +52,13 @@ class Ros1:
         The system's Python with rospy and holdfast.
     """
 
-    def __init__(self, environment: Mapping[str, str], directory: Path) -> None:
+    def __init__(
+        self, environment: Mapping[str, str], directory: Path, port: int | None = None
+    ) -> None:
         made = Path(os.environ.get("ROS1", ROOT / ".ros1"))
         if not (made / ".built").exists():
             left_out(f"nothing for ROS 1 in {made}: make test-ros makes it")
-        self.port = free_port()
+        self.port = free_port() if port is None else port
         self.directory = directory
         self.python = str(made / "venv" / "bin" / "python")
         self.environment = {
