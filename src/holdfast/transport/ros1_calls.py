@@ -11,66 +11,121 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import socket
-import struct
 import xmlrpc.client
 from collections.abc import Iterable, Sequence
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple, Self
 from urllib.parse import urlsplit
-from xml.parsers.expat import ExpatError
 
-from holdfast.errors import HoldfastError
+from holdfast.errors import HoldfastError, TransportError
+from holdfast.transport.endpoints import host_and_port
+from holdfast.transport.tcpros import (
+    ANY_TYPE,
+    MAX_HEADER_BYTES,
+    decode_header,
+    encode_header,
+    host_and_port_of,
+)
 
 __all__ = [
     "CALLER",
     "CallError",
     "Connection",
     "GoneError",
+    "HttpHead",
+    "SilentError",
     "call",
+    "message",
     "offers_service",
 ]
 
-CALLER = "/holdfast_guard"
-"""As whom the guard asks."""
+CALLER: Final = "/holdfast"
+"""As whom is asked where no node asks."""
 
-_MAX_ANSWER_BYTES = 256 * 1024 * 1024
-_MAX_HEAD_BYTES = 64 * 1024
-_MAX_HANDSHAKE_BYTES = 1024 * 1024
+_MAX_ANSWER_BYTES: Final = 256 * 1024 * 1024
 
 
 class CallError(HoldfastError):
     """No usable answer came."""
 
 
+class SilentError(CallError):
+    """No answer came in time."""
+
+
 class GoneError(CallError):
     """Nobody listens there, so whoever did has ended."""
 
 
-class _Place(NamedTuple):
-    host: str
-    port: int
+class HttpHead(NamedTuple):
+    """How a request or an answer of HTTP begins.
+
+    Attributes
+    ----------
+    line : str
+        The first one.
+    size : int
+        Of the content, in bytes; -1 if that is not said.
+    ends : bool
+        Whether the connection ends after it.
+    """
+
+    line: str
+    size: int
+    ends: bool
+
+    @classmethod
+    async def read(cls, reader: asyncio.StreamReader) -> Self:
+        """Read one.
+
+        Raises
+        ------
+        ValueError
+            If the size is no number.
+        EOFError, OSError, asyncio.LimitOverrunError
+            If none comes.
+        """
+        line, *lines = (await reader.readuntil(b"\r\n\r\n")).decode("latin-1").split("\r\n")
+        fields = {}
+        for each in lines:
+            name, _, value = each.partition(":")
+            fields[name.strip().lower()] = value.strip()
+        ends = "HTTP/1.0" in line or "close" in fields.get("connection", "").lower()
+        return cls(line, int(fields.get("content-length", "-1")), ends)
 
 
-def _place_of(uri: str) -> _Place:
-    try:
-        parts = urlsplit(uri)
-        host, port = parts.hostname, parts.port
-    except ValueError:
-        host = port = None
-    if not host or not port:
-        raise CallError(f"{uri!r:.200} names no host and port")
-    return _Place(host, port)
+async def message(reader: asyncio.StreamReader, max_bytes: int) -> bytes:
+    """Read what comes after its length: a connection header, or a request.
+
+    Raises
+    ------
+    TransportError
+        If it is larger than allowed; the rest of a sentence about whoever has sent it.
+    EOFError, OSError
+        If none comes.
+    """
+    size = int.from_bytes(await reader.readexactly(4), "little")
+    if size > max_bytes:
+        raise TransportError(f"sends {size} bytes; {max_bytes} are allowed")
+    return await reader.readexactly(size)
 
 
 async def _connect(uri: str) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
-    place = _place_of(uri)
+    host, port = _place_of(uri)
     # ROS 1 speaks IPv6 only if told to, and of a name with several addresses it takes the first.
-    family = socket.AF_INET6 if ":" in place.host else socket.AF_INET
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
-        return await asyncio.open_connection(*place, family=family, limit=_MAX_HEAD_BYTES)
+        return await asyncio.open_connection(host, port, family=family, limit=MAX_HEADER_BYTES)
     except ConnectionRefusedError as error:
         raise GoneError(f"{uri}: nobody listens there") from error
     except OSError as error:
         raise CallError(f"{uri}: {error.strerror or error}") from error
+
+
+def _place_of(uri: str) -> tuple[str, int]:
+    place = host_and_port_of(uri)
+    if place is None:
+        raise CallError(f"{uri!r:.200} names no host and port")
+    return place
 
 
 class Connection:
@@ -104,8 +159,10 @@ class Connection:
         ------
         GoneError
             If nobody listens there.
+        SilentError
+            If no answer came in time.
         CallError
-            If no answer came in time, or one that says no.
+            If another one came, or one that says no.
         """
         return _value_of(await self._answer(method, (self._caller, *arguments), within_s), method)
 
@@ -114,14 +171,19 @@ class Connection:
     ) -> list[Any]:
         """Ask several things at once; the answer to one that is refused is None.
 
+        Parameters
+        ----------
+        questions : iterable
+            Methods and their arguments, the caller's name as well.
+        within_s : float
+
         Raises
         ------
         CallError
             As :meth:`call`.
         """
         asked = [
-            {"methodName": method, "params": [self._caller, *arguments]}
-            for method, arguments in questions
+            {"methodName": method, "params": list(arguments)} for method, arguments in questions
         ]
         answers = await self._answer("system.multicall", (asked,), within_s)
         if not isinstance(answers, list) or len(answers) != len(asked):
@@ -129,7 +191,8 @@ class Connection:
         values = []
         for question, answer in zip(asked, answers, strict=True):
             value = None
-            with contextlib.suppress(CallError, IndexError, TypeError):
+            # That of a call that failed is a dict.
+            with contextlib.suppress(CallError, LookupError, TypeError):
                 value = _value_of(answer[0], str(question["methodName"]))
             values.append(value)
         return values
@@ -141,38 +204,33 @@ class Connection:
                 return await self._exchange(body)
         except TimeoutError as error:
             self.close()
-            raise CallError(f"{self.uri}: {method}: no answer within {within_s:g} s") from error
+            raise SilentError(f"{self.uri}: {method}: no answer within {within_s:g} s") from error
         except xmlrpc.client.Fault as fault:
             raise CallError(f"{self.uri}: {method}: {fault.faultString:.500}") from fault
-        except (OSError, EOFError, ValueError, ExpatError, xmlrpc.client.Error) as error:
+        except BaseException as error:
             self.close()
+            if isinstance(error, CallError) or not isinstance(error, Exception):
+                raise
+            # Whatever somebody answers, and however the parser takes it, is no answer.
             raise CallError(f"{self.uri}: {method}: {error or type(error).__name__}") from error
-        except BaseException:
-            self.close()
-            raise
 
     async def _exchange(self, body: bytes) -> Any:
         if self._streams is None:
             self._streams = await _connect(self.uri)
         reader, writer = self._streams
-        place = _place_of(self.uri)
-        head = (
-            f"POST {urlsplit(self.uri).path or '/'} HTTP/1.1\r\nHost: {place.host}:{place.port}\r\n"
-            f"Content-Type: text/xml\r\nContent-Length: {len(body)}\r\n\r\n"
+        path, where = urlsplit(self.uri).path or "/", host_and_port(*_place_of(self.uri))
+        writer.write(
+            f"POST {path} HTTP/1.1\r\nHost: {where}\r\nContent-Type: text/xml\r\n"
+            f"Content-Length: {len(body)}\r\n\r\n".encode()
+            + body
         )
-        writer.write(head.encode() + body)
-        status, *lines = (await reader.readuntil(b"\r\n\r\n")).decode("latin-1").split("\r\n")
-        headers = {}
-        for line in lines:
-            name, _, value = line.partition(":")
-            headers[name.strip().lower()] = value.strip()
-        size = int(headers.get("content-length", "-1"))
-        if status.split(" ")[1:2] != ["200"]:
-            raise ValueError(f"it answers {status:.100}")
-        if not 0 <= size <= _MAX_ANSWER_BYTES:
-            raise ValueError(f"its answer has {size} bytes; allowed are {_MAX_ANSWER_BYTES}")
-        content = await reader.readexactly(size)
-        if status.startswith("HTTP/1.0") or headers.get("connection", "").lower() == "close":
+        head = await HttpHead.read(reader)
+        if head.line.split(" ")[1:2] != ["200"]:
+            raise ValueError(f"it answers {head.line:.100}")
+        if not 0 <= head.size <= _MAX_ANSWER_BYTES:
+            raise ValueError(f"its answer has {head.size} bytes; allowed are {_MAX_ANSWER_BYTES}")
+        content = await reader.readexactly(head.size)
+        if head.ends:
             self.close()
         values, _ = xmlrpc.client.loads(content)
         return values[0]
@@ -220,40 +278,20 @@ async def offers_service(uri: str, service: str, *, within_s: float) -> bool | N
         None if that could not be found out in time.
     """
     # What `rosservice` sends to learn a service's type; no call is made.
-    fields = f"probe=1\0md5sum=*\0callerid={CALLER}\0service={service}"
-    header = b"".join(
-        struct.pack("<I", len(field)) + field for field in map(str.encode, fields.split("\0"))
-    )
+    asked = {"probe": "1", "md5sum": ANY_TYPE, "callerid": CALLER, "service": service}
     writer = None
     try:
         async with asyncio.timeout(within_s):
             reader, writer = await _connect(uri)
-            writer.write(struct.pack("<I", len(header)) + header)
-            (size,) = struct.unpack("<I", await reader.readexactly(4))
-            if size > _MAX_HANDSHAKE_BYTES:
-                return False
-            answer = await reader.readexactly(size)
-            # The first field of a refusal; each is preceded by its length.
-            return b"error=" not in _names_of(answer)
+            writer.write(encode_header(asked))
+            return "error" not in decode_header(await message(reader, MAX_HEADER_BYTES))
     except GoneError:
         return False
-    except asyncio.IncompleteReadError:
-        # It listens, and hangs up on who asks for this service.
+    except (asyncio.IncompleteReadError, TransportError):
+        # It listens, and hangs up on who asks for this service, or is none of ROS 1.
         return False
-    except (CallError, OSError, struct.error):
+    except (CallError, OSError):
         return None
     finally:
         if writer is not None:
             writer.close()
-
-
-def _names_of(header: bytes) -> set[bytes]:
-    """Return the names of a connection header's fields, each with its equals sign."""
-    names = set()
-    place = 0
-    while place + 4 <= len(header):
-        (size,) = struct.unpack_from("<I", header, place)
-        field = header[place + 4 : place + 4 + size]
-        names.add(field.partition(b"=")[0] + b"=")
-        place += 4 + size
-    return names

@@ -13,7 +13,6 @@ import asyncio
 import contextlib
 import os
 import socket
-import struct
 import xmlrpc.client
 from collections.abc import Awaitable, Callable, Iterator, Mapping
 from typing import Any, Final, NamedTuple
@@ -22,7 +21,7 @@ from xml.parsers.expat import ExpatError
 from holdfast.errors import TransportError
 from holdfast.transport.contract import DEFAULT_MAX_MESSAGE_BYTES
 from holdfast.transport.endpoints import host_and_port, why_not_bound
-from holdfast.transport.ros1_calls import CallError, Connection
+from holdfast.transport.ros1_calls import CallError, Connection, HttpHead, message
 from holdfast.transport.tcpros import (
     ANY_TYPE,
     MAX_HEADER_BYTES,
@@ -285,7 +284,10 @@ class RosNode:
 
     async def _is_known_to_master(self) -> bool:
         services = self._uris_of_services()
-        asked = [("lookupNode", (self.name,)), *(("lookupService", (name,)) for name in services)]
+        asked = [
+            ("lookupNode", (self.name, self.name)),
+            *(("lookupService", (self.name, name)) for name in services),
+        ]
         node, *found = await self._master.calls(asked, within_s=_MASTER_S)
         # What another node has taken over since is that one's.
         return node is not None and None not in found
@@ -304,8 +306,11 @@ class RosNode:
 
     def _farewell(self) -> list[tuple[str, tuple[object, ...]]]:
         return [
-            *(("unregisterService", each) for each in self._uris_of_services().items()),
-            *(("unregisterPublisher", (name, self._uri)) for name in self._topics),
+            *(
+                ("unregisterService", (self.name, *each))
+                for each in self._uris_of_services().items()
+            ),
+            *(("unregisterPublisher", (self.name, name, self._uri)) for name in self._topics),
         ]
 
     def _tell(self, status: str, reason: str) -> None:
@@ -323,27 +328,21 @@ class RosNode:
     async def _answer_one(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> bool:
         """Answer one question; return whether another one may follow."""
         async with asyncio.timeout(_IDLE_S):
-            head = (await reader.readuntil(b"\r\n\r\n")).decode("latin-1")
+            head = await HttpHead.read(reader)
         async with asyncio.timeout(_OPENING_S):
-            fields = {}
-            for line in head.split("\r\n")[1:]:
-                name, _, value = line.partition(":")
-                fields[name.strip().lower()] = value.strip()
-            size = int(fields.get("content-length", "-1"))
-            if not 0 <= size <= _MAX_CALL_BYTES:
+            if not 0 <= head.size <= _MAX_CALL_BYTES:
                 return False
-            arguments, method = xmlrpc.client.loads(await reader.readexactly(size))
+            arguments, method = xmlrpc.client.loads(await reader.readexactly(head.size))
             answer = self._answer(str(method), arguments)
             body = xmlrpc.client.dumps((answer,), methodresponse=True).encode()
-            ends = "close" in fields.get("connection", "").lower() or "HTTP/1.0" in head[:200]
             writer.write(
                 b"HTTP/1.1 200 OK\r\nContent-Type: text/xml\r\n"
-                + (b"Connection: close\r\n" if ends else b"")
+                + (b"Connection: close\r\n" if head.ends else b"")
                 + f"Content-Length: {len(body)}\r\n\r\n".encode()
                 + body
             )
             await writer.drain()
-        return not ends
+        return not head.ends
 
     def _answer(self, method: str, arguments: tuple[Any, ...]) -> tuple[int, str, Any]:
         match method:
@@ -384,7 +383,7 @@ class RosNode:
             if not is_welcome:
                 return
             async with asyncio.timeout(_OPENING_S):
-                header = decode_header(await _message(reader, MAX_HEADER_BYTES))
+                header = decode_header(await message(reader, MAX_HEADER_BYTES))
             if "service" in header:
                 await self._serve_calls(header, reader, writer)
             elif "topic" in header:
@@ -411,7 +410,7 @@ class RosNode:
             await writer.drain()
             return
         while True:
-            request = await _message(reader, self._max_message_bytes)
+            request = await message(reader, self._max_message_bytes)
             try:
                 answer = encode_answer(await offer.handler(request))
             except Exception as error:  # noqa: BLE001 - a defect costs its request alone
@@ -469,7 +468,7 @@ class RosNode:
         try:
             yield is_welcome
         except (
-            *(OSError, EOFError, ValueError, TypeError, struct.error),
+            *(OSError, EOFError, ValueError, TypeError),
             *(TimeoutError, TransportError, ExpatError, xmlrpc.client.Error),
             *(asyncio.LimitOverrunError, asyncio.CancelledError),
         ):
@@ -477,13 +476,6 @@ class RosNode:
         finally:
             self._connections.discard(task)
             writer.close()
-
-
-async def _message(reader: asyncio.StreamReader, max_bytes: int) -> bytes:
-    (size,) = struct.unpack("<I", await reader.readexactly(4))
-    if size > max_bytes:
-        raise TransportError(f"sends {size} bytes; {max_bytes} are allowed")
-    return await reader.readexactly(size)
 
 
 def _refuse(writer: asyncio.StreamWriter, reason: str) -> None:

@@ -29,6 +29,7 @@ __all__ = [
     "encode_message",
     "encode_refusal",
     "header_of_service",
+    "host_and_port_of",
     "place_of_service",
 ]
 
@@ -117,6 +118,16 @@ def encode_refusal(reason: str) -> bytes:
     return b"\x00" + encode_message(reason.encode())
 
 
+def host_and_port_of(uri: str, scheme: str | None = None) -> tuple[str, int] | None:
+    """Return host and port of a URI, or None if it does not name both, by this scheme."""
+    try:
+        parts = urlsplit(uri)
+        host, port = parts.hostname, parts.port
+    except ValueError:
+        return None
+    return (host, port) if host and port and scheme in (None, parts.scheme) else None
+
+
 def place_of_service(uri: object) -> tuple[str, int]:
     """Return host and port of a service.
 
@@ -130,14 +141,10 @@ def place_of_service(uri: object) -> tuple[str, int]:
     TransportError
         If it is none.
     """
-    try:
-        parts = urlsplit(str(uri))
-        host, port = parts.hostname, parts.port
-    except ValueError:
-        host = port = None
-    if not host or not port or parts.scheme != "rosrpc":
+    place = host_and_port_of(str(uri), "rosrpc")
+    if place is None:
         raise TransportError(f"the master says that it is at {uri!r:.200}, which is no place")
-    return host, port
+    return place
 
 
 class Surroundings(NamedTuple):
@@ -170,12 +177,7 @@ class Surroundings(NamedTuple):
             If the master's URI is none.
         """
         master = environment.get("ROS_MASTER_URI") or "http://localhost:11311"
-        try:
-            parts = urlsplit(master)
-            is_place = parts.scheme == "http" and bool(parts.hostname) and bool(parts.port)
-        except ValueError:
-            is_place = False
-        if not is_place:
+        if host_and_port_of(master, "http") is None:
             raise TransportError(f"ROS_MASTER_URI is {master!r:.200}; expected http://HOST:PORT")
         own = environment.get("ROS_HOSTNAME") or environment.get("ROS_IP") or ""
         is_local = own == "localhost" or own.startswith("127.")

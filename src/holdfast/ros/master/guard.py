@@ -31,7 +31,6 @@ from collections.abc import Callable, Coroutine
 from time import monotonic
 from urllib.parse import urlsplit
 
-from holdfast.ros.master.calls import CALLER, CallError, Connection, GoneError, SilentError, call
 from holdfast.ros.master.plan import NodeReport, Reconciled, reconcile, unregistrations
 from holdfast.ros.master.process import (
     MasterState,
@@ -49,6 +48,14 @@ from holdfast.ros.master.settings import (
 from holdfast.ros.master.standby import ChildProcess, MasterProcess
 from holdfast.ros.master.survey import ask_everyone, snapshot
 from holdfast.runtime.logs import EventSink
+from holdfast.transport.ros1_calls import (
+    CALLER,
+    CallError,
+    Connection,
+    GoneError,
+    SilentError,
+    call,
+)
 
 __all__ = ["MasterGuard"]
 

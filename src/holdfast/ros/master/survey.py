@@ -6,9 +6,16 @@ import asyncio
 import contextlib
 from collections.abc import Awaitable
 
-from holdfast.ros.master.calls import CALLER, CallError, Connection, GoneError, call, offers_service
 from holdfast.ros.master.plan import NodeAnswer, NodeReport, lookups_of, state_of_snapshot
 from holdfast.ros.master.process import MasterState
+from holdfast.transport.ros1_calls import (
+    CALLER,
+    CallError,
+    Connection,
+    GoneError,
+    call,
+    offers_service,
+)
 
 __all__ = ["ask_everyone", "snapshot"]
 

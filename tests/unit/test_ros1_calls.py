@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 from tests.ports import free_port
 
-from holdfast.ros.master.calls import (
+from holdfast.transport.ros1_calls import (
     CALLER,
     CallError,
     Connection,
