@@ -31,7 +31,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from tests.ros.conftest import ROOT
-from tests.ros.ros1_processes import SYSTEM_PYTHON, Ros1, until
+from tests.ros.ros1_processes import SYSTEM_PYTHON, Ros1, wait_for
 
 CONFIGURATION = ROOT / "examples" / "peg_in_hole_2d.yaml"
 CLOUD, RECOVERY = "cloud_active_sensing", "cloud_active_sensing_recovery"
@@ -201,8 +201,8 @@ class Scene:
             self.cloud = self.ros.serve(CLOUD, CONFIGURATION)
         else:
             self.ros.start_master()
-            until(lambda: self.ros.service_uri(CLOUD), CLOUD)
-            until(lambda: self.ros.service_uri(RECOVERY), RECOVERY)
+            wait_for(lambda: self.ros.service_uri(CLOUD), CLOUD)
+            wait_for(lambda: self.ros.service_uri(RECOVERY), RECOVERY)
 
 
 def written(times: list[float], limit_s: float) -> str:

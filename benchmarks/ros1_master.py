@@ -42,7 +42,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import itertools
 
-from tests.ros.graph import Graph, Process, wait_for
+from tests.ros.graph import Graph, Process
+from tests.ros.ros1_processes import wait_for
 
 TOPIC_TOOLS = Path("/usr/lib/topic_tools")
 COLUMNS = (

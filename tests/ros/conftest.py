@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import shutil
+import subprocess
+import threading
 from pathlib import Path
 from typing import NoReturn
 
@@ -12,11 +14,25 @@ import pytest
 ROOT = Path(__file__).parents[2]
 
 
+PATIENCE_S = 60.0
+
+
 def left_out(what: str) -> NoReturn:
     """Leave a test out because something is not here; where nothing may be left out, fail."""
     if os.environ.get("CI"):
         pytest.fail(what)
     pytest.skip(what)
+
+
+def line_of(process: subprocess.Popen[str]) -> str:
+    """Return the next line that a process writes; one that writes none in time is ended."""
+    assert process.stdout is not None
+    timer = threading.Timer(PATIENCE_S, process.kill)
+    timer.start()
+    try:
+        return process.stdout.readline()
+    finally:
+        timer.cancel()
 
 
 class Ros2:

@@ -5,21 +5,21 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import re
 import signal
 import subprocess
 import sys
 import time
 import xmlrpc.client
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from tests.ports import free_port
+from tests.ros.conftest import PATIENCE_S, left_out
+from tests.ros.ros1_processes import SYSTEM_PYTHON, AtMaster, wait_for
 
-PATIENCE_S = 60.0
-SYSTEM_PYTHON = "/usr/bin/python3"
+TOPIC_TOOLS = Path("/usr/lib/topic_tools")
+"""Stock roscpp nodes; /opt/ros has them elsewhere."""
 
 NODES = {
     # Publishes 1, 2, 3, ... fifty times a second.
@@ -157,7 +157,7 @@ class Process:
         return code
 
 
-class Graph:
+class Graph(AtMaster):
     """Everything at one master's port.
 
     Parameters
@@ -168,16 +168,12 @@ class Graph:
     """
 
     def __init__(self, directory: Path, environment: Mapping[str, str]) -> None:
-        self.directory = directory
-        self.port = free_port()
-        self.environment = {
-            **environment,
-            "ROS_MASTER_URI": f"http://127.0.0.1:{self.port}",
-            "ROS_HOSTNAME": "127.0.0.1",
-            "ROS_LOG_DIR": str(directory / "log"),
-            "ROS_HOME": str(directory / "home"),
-            "XDG_RUNTIME_DIR": str(directory / "run"),
-        }
+        super().__init__(
+            environment,
+            directory,
+            ROS_HOME=str(directory / "home"),
+            XDG_RUNTIME_DIR=str(directory / "run"),
+        )
         (directory / "run").mkdir()
         self._processes: list[Process] = []
         self._masters: set[int] = set()
@@ -235,11 +231,6 @@ class Graph:
         events = [json.loads(line) for line in guard.errors.splitlines() if line.startswith("{")]
         return [event for event in events if event["event"] == name]
 
-    def ask(self, method: str, *arguments: object, caller: str = "/test") -> Any:
-        """Return the master's whole answer: a code, a text and a value."""
-        with xmlrpc.client.ServerProxy(self.environment["ROS_MASTER_URI"]) as master:
-            return getattr(master, method)(caller, *arguments)
-
     def master_pid(self) -> int:
         pid = self.ask("getPid")[2]
         assert isinstance(pid, int)
@@ -256,20 +247,6 @@ class Graph:
         pid = self.master_pid()
         os.kill(pid, signal.SIGKILL)
         return pid
-
-    def run(self, *words: str, within_s: float = PATIENCE_S) -> str:
-        """Run one of ROS's commands, and return what it prints."""
-        done = subprocess.run(
-            words,
-            env=self.environment,
-            cwd=self.directory,
-            capture_output=True,
-            text=True,
-            timeout=within_s,
-            check=False,
-        )
-        assert done.returncode == 0, f"{words}: {done.returncode}\n{done.stdout}\n{done.stderr}"
-        return done.stdout
 
     def newcomer(self, topic: str, service: str) -> None:
         """Have a new node hear a topic and call a service."""
@@ -310,17 +287,53 @@ class Graph:
         wait_for(lambda: self.ask("lookupNode", name)[0] == 1, lambda: f"no {name}")
 
 
-def wait_for(true: Callable[[], object], account: Callable[[], str] = str) -> None:
-    """Wait until something is true; a connection that breaks is not."""
-    begun_at = time.monotonic()
-    while True:
-        with contextlib.suppress(OSError, xmlrpc.client.Error, EOFError):
-            if true():
-                return
-        assert time.monotonic() - begun_at < PATIENCE_S, account()
-        time.sleep(0.01)
+def topic_tool(name: str) -> str:
+    path = TOPIC_TOOLS / name
+    if not path.exists():
+        left_out(f"no {path}: apt-get install topic-tools")
+    return str(path)
 
 
-def anonymous(text: str) -> str:
-    """Return a text without the numbers of nodes that came and went."""
-    return re.sub(r"_\d+_\d+", "_N", text)
+def count(process: Process) -> int:
+    return len(process.lines)
+
+
+def keeps_on(process: Process, more: int = 5) -> None:
+    """Wait until a process has printed some more lines."""
+    before = count(process)
+    wait_for(
+        lambda: count(process) >= before + more or process.process.poll() is not None,
+        process.account,
+    )
+    assert process.process.poll() is None, process.account()
+
+
+def replaced(graph: Graph, killed: int) -> None:
+    """Wait until another master answers."""
+    wait_for(lambda: graph.master_pid() != killed)
+
+
+def start_everything(graph: Graph) -> tuple[Process, Process]:
+    """Start nodes of others; return one that calls, and one that hears, all the time."""
+    graph.node("talker", "/talker", "/chatter")
+    graph.node("server", "/server", "/work", "/more_work")
+    graph.start(topic_tool("relay"), "/chatter", "/relayed", "__name:=relay")
+    graph.start(topic_tool("mux"), "/muxed", "/chatter", "/relayed", "__name:=mux")
+    listener = graph.node("listener", "/listener", "/relayed")
+    caller = graph.node("caller", "/caller", "/work")
+    keeps_on(listener)
+    keeps_on(caller)
+    for node in ("/mux", "/relay", "/talker", "/rosout"):
+        graph.wait_for_node(node)
+    graph.run(
+        "rosparam", "set", "/robot", "{name: Ada, joints: [1, 2.5, x], gripper: {open: true}}"
+    )
+    return caller, listener
+
+
+def settled(graph: Graph) -> dict[str, list[str]]:
+    """Return what is listed when nothing has changed for a moment."""
+    before = None
+    while before != (before := graph.listed()):
+        time.sleep(0.2)
+    return before

@@ -6,48 +6,91 @@ import contextlib
 import os
 import subprocess
 import sys
-import threading
 import time
 import xmlrpc.client
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from tests.ports import free_port
-from tests.ros.conftest import ROOT, left_out
+from tests.ros.conftest import PATIENCE_S, ROOT, left_out
 
-PATIENCE_S = 30.0
 SYSTEM_PYTHON = "/usr/bin/python3"
 HOLDFAST = str(Path(sys.executable).with_name("holdfast"))
 
 
-def until(condition: Callable[[], object], what: str) -> None:
-    """Wait until something is so."""
+def wait_for(true: Callable[[], object], what: str | Callable[[], str] = "") -> None:
+    """Wait until something is true; a connection that breaks is not."""
     deadline = time.monotonic() + PATIENCE_S
-    while not condition():
+    while True:
+        with contextlib.suppress(OSError, xmlrpc.client.Error, EOFError):
+            if true():
+                return
         if time.monotonic() > deadline:
-            raise AssertionError(f"not in {PATIENCE_S} s: {what}")
-        time.sleep(0.02)
+            raise AssertionError(what if isinstance(what, str) else what())
+        time.sleep(0.01)
 
 
-def line_of(process: subprocess.Popen[str]) -> str:
-    """Return the next line that a process writes; one that writes none in time is ended."""
-    assert process.stdout is not None
-    timer = threading.Timer(PATIENCE_S, process.kill)
-    timer.start()
-    try:
-        return process.stdout.readline()
-    finally:
-        timer.cancel()
+class AtMaster:
+    """What is said to the master at one port.
 
-
-class Ros1:
-    """ROS 1 around one master.
+    Parameters
+    ----------
+    environment : mapping
+        Of ROS 1.
+    directory : Path
+    port : int, optional
+        The master's; None takes a free one.
+    **variables
+        More of the environment.
 
     Attributes
     ----------
     environment : dict of str
-        For its processes.
+        For processes.
+    """
+
+    def __init__(
+        self,
+        environment: Mapping[str, str],
+        directory: Path,
+        port: int | None = None,
+        **variables: str,
+    ) -> None:
+        self.port = free_port() if port is None else port
+        self.directory = directory
+        self.environment = {
+            **environment,
+            "ROS_MASTER_URI": f"http://127.0.0.1:{self.port}",
+            "ROS_LOG_DIR": str(directory / "log"),
+            **variables,
+        }
+
+    def ask(self, method: str, *arguments: object, caller: str = "/test") -> Any:
+        """Return the master's whole answer: a code, a text and a value."""
+        with xmlrpc.client.ServerProxy(self.environment["ROS_MASTER_URI"]) as master:
+            return getattr(master, method)(caller, *arguments)
+
+    def run(self, *words: str) -> str:
+        """Run a command to its end, and return what it prints."""
+        done = subprocess.run(
+            words,
+            env=self.environment,
+            cwd=self.directory,
+            capture_output=True,
+            text=True,
+            timeout=PATIENCE_S,
+            check=False,
+        )
+        assert done.returncode == 0, f"{words}: {done.returncode}\n{done.stdout}\n{done.stderr}"
+        return done.stdout
+
+
+class Ros1(AtMaster):
+    """ROS 1 around one master.
+
+    Attributes
+    ----------
     python : str
         The system's Python with rospy and holdfast.
     """
@@ -58,22 +101,15 @@ class Ros1:
         made = Path(os.environ.get("ROS1", ROOT / ".ros1"))
         if not (made / ".built").exists():
             left_out(f"nothing for ROS 1 in {made}: make test-ros makes it")
-        self.port = free_port() if port is None else port
-        self.directory = directory
+        super().__init__(environment, directory, port, PYTHONPATH=str(made / "python"))
         self.python = str(made / "venv" / "bin" / "python")
-        self.environment = {
-            **environment,
-            "ROS_MASTER_URI": f"http://127.0.0.1:{self.port}",
-            "ROS_LOG_DIR": str(directory / "ros"),
-            "PYTHONPATH": str(made / "python"),
-        }
         self.master: subprocess.Popen[bytes] | None = None
         self._stack = contextlib.ExitStack()
 
     def start_master(self) -> None:
         """Start one that knows nothing."""
         self.master = self.start("rosmaster", "--core", "-p", str(self.port))
-        until(self.knows_anything, "the master answers")
+        wait_for(lambda: self.ask("getPid")[0] == 1, "the master answers")
 
     def start(
         self, *command: str, environment: Mapping[str, str] | None = None, **options: Any
@@ -87,18 +123,6 @@ class Ros1:
         self._stack.callback(_end, process)
         return process
 
-    def run(self, *command: str) -> str:
-        """Run a tool to its end and return what it writes."""
-        done = subprocess.run(
-            command,
-            env=self.environment,
-            capture_output=True,
-            text=True,
-            timeout=PATIENCE_S,
-        )
-        assert done.returncode == 0, f"{command}: {done.stdout}{done.stderr}"
-        return done.stdout
-
     def serve(self, name: str, configuration: Path, *more: str) -> subprocess.Popen[bytes]:
         """Start a typed service, and wait until the master knows it."""
         before = self.service_uri(name)
@@ -106,24 +130,13 @@ class Ros1:
             *(HOLDFAST, "serve", "--ros1", "--ros1-name", name),
             *("--configuration", str(configuration), *more),
         )
-        until(lambda: self.service_uri(name) not in (None, before), f"the master knows {name}")
+        wait_for(lambda: self.service_uri(name) not in (None, before), f"the master knows {name}")
         return process
 
     def service_uri(self, name: str) -> str | None:
         """Return where the master says that a service is."""
         code, _, uri = self.ask("lookupService", f"/{name}")
         return str(uri) if code == 1 else None
-
-    def knows_anything(self) -> bool:
-        """Whether the master answers."""
-        with contextlib.suppress(OSError):
-            return bool(self.ask("getPid")[0] == 1)
-        return False
-
-    def ask(self, method: str, *arguments: object) -> Sequence[Any]:
-        """Ask the master."""
-        with xmlrpc.client.ServerProxy(self.environment["ROS_MASTER_URI"]) as master:
-            return list(getattr(master, method)("/test", *arguments))
 
     def close(self) -> None:
         """End all processes."""

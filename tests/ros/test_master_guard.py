@@ -11,15 +11,14 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from tests.ros.conftest import left_out
-from tests.ros.graph import PATIENCE_S, SYSTEM_PYTHON, Graph, Process, wait_for
+from tests.ros.conftest import PATIENCE_S
+from tests.ros.graph import Graph, count, keeps_on, replaced, settled, start_everything, topic_tool
+from tests.ros.ros1_processes import SYSTEM_PYTHON, wait_for
 
 from holdfast.ros.master.settings import GuardError, MasterAddress
 
 GUARD = (sys.executable, "-m", "holdfast", "ros1-guard")
 KILLS = 10
-TOPIC_TOOLS = Path("/usr/lib/topic_tools")
-"""Stock roscpp nodes; /opt/ros has them elsewhere."""
 
 
 @pytest.fixture
@@ -28,64 +27,12 @@ def graph(tmp_path: Path, ros1: dict[str, str]) -> Iterator[Graph]:
         yield graph
 
 
-def topic_tool(name: str) -> str:
-    path = TOPIC_TOOLS / name
-    if not path.exists():
-        left_out(f"no {path}: apt-get install topic-tools")
-    return str(path)
-
-
-def count(process: Process) -> int:
-    return len(process.lines)
-
-
-def keeps_on(process: Process, more: int = 5) -> None:
-    """Wait until a process has printed some more lines."""
-    before = count(process)
-    wait_for(
-        lambda: count(process) >= before + more or process.process.poll() is not None,
-        process.account,
-    )
-    assert process.process.poll() is None, process.account()
-
-
-def replaced(graph: Graph, killed: int) -> None:
-    """Wait until another master answers."""
-    wait_for(lambda: graph.master_pid() != killed)
-
-
-def start_everything(graph: Graph) -> tuple[Process, Process]:
-    """Start nodes of others; return one that calls, and one that hears, all the time."""
-    graph.node("talker", "/talker", "/chatter")
-    graph.node("server", "/server", "/work", "/more_work")
-    graph.start(topic_tool("relay"), "/chatter", "/relayed", "__name:=relay")
-    graph.start(topic_tool("mux"), "/muxed", "/chatter", "/relayed", "__name:=mux")
-    listener = graph.node("listener", "/listener", "/relayed")
-    caller = graph.node("caller", "/caller", "/work")
-    keeps_on(listener)
-    keeps_on(caller)
-    for node in ("/mux", "/relay", "/talker", "/rosout"):
-        graph.wait_for_node(node)
-    graph.run(
-        "rosparam", "set", "/robot", "{name: Ada, joints: [1, 2.5, x], gripper: {open: true}}"
-    )
-    return caller, listener
-
-
 def alive(pid: int) -> bool:
     """Tell whether a process has not ended; who should have waited for it may not have."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except OSError:
         return False
-
-
-def settled(graph: Graph) -> dict[str, list[str]]:
-    """Return what is listed when nothing has changed for a moment."""
-    before = None
-    while before != (before := graph.listed()):
-        time.sleep(0.2)
-    return before
 
 
 class TestItsOwnMaster:

@@ -26,9 +26,8 @@ from tests.processes.faults import (
     document_of,
     sensing_steps,
 )
-from tests.ros.graph import Graph, wait_for
-from tests.ros.ros1_processes import Ros1, ros1_in, until
-from tests.ros.test_master_guard import keeps_on, settled, start_everything
+from tests.ros.graph import Graph, keeps_on, settled, start_everything
+from tests.ros.ros1_processes import Ros1, ros1_in, wait_for
 from tests.ros.test_ros1_service import CLOUD as TYPED_CLOUD
 from tests.ros.test_ros1_service import EXAMPLE, Robot
 from tests.ros.test_ros1_service import RECOVERY as TYPED_RECOVERY
@@ -100,7 +99,7 @@ def test_the_master_is_killed_and_then_the_cloud(site: RosSite, references: Refe
 
     def start_another() -> None:
         around.start_master()
-        until(lambda: around.service_uri(f"{CLOUD}/exchange"), "the cloud is listed")
+        wait_for(lambda: around.service_uri(f"{CLOUD}/exchange"), "the cloud is listed")
 
     story = Story(site, references, document)
     story.at("sense", steps[1], kill_the_master)

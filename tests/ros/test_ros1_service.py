@@ -16,7 +16,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.ros.ros1_processes import SYSTEM_PYTHON, Ros1, line_of, ros1_in, until
+from tests.ros.conftest import line_of
+from tests.ros.ros1_processes import SYSTEM_PYTHON, Ros1, ros1_in, wait_for
 from tests.unit.test_active_sensing import in_process
 
 from holdfast.configuration import Configuration, load
@@ -268,7 +269,7 @@ def test_a_question_that_hangs_ends_when_its_asker_is_closed(
 
     asking = threading.Thread(target=ask)
     asking.start()
-    until(lambda: cloud.poll() is None, "it is stopped")
+    wait_for(lambda: cloud.poll() is None, "it is stopped")
     service.close()
     asking.join(30.0)
     assert not asking.is_alive()
@@ -302,7 +303,7 @@ class TestTheMasterDies:
             around.master.kill()
             around.master.wait()
             around.start_master()
-            until(lambda: around.service_uri(CLOUD), "the service is listed again")
+            wait_for(lambda: around.service_uri(CLOUD), "the service is listed again")
             assert f"/{CLOUD}" in around.run("rosservice", "list").split()
 
     def test_a_master_that_stands_still_holds_up_no_call(
@@ -335,7 +336,7 @@ class TestTheMasterDies:
             *(around.python, "-m", "holdfast", "serve", "--ros1", "--configuration", str(EXAMPLE)),
         )
         around.start_master()
-        until(lambda: around.service_uri(CLOUD), "the service is listed")
+        wait_for(lambda: around.service_uri(CLOUD), "the service is listed")
 
 
 def test_rosnode_kill_ends_it(around: Ros1) -> None:
@@ -348,7 +349,7 @@ def test_rosnode_kill_ends_it(around: Ros1) -> None:
 def test_what_a_robot_decides_can_be_watched(around: Ros1, here: Surroundings) -> None:
     around.serve(CLOUD, EXAMPLE)
     with Ros1Client("arm", surroundings=here, deadline_s=30.0) as client:
-        until(lambda: "/arm" in around.run("rosnode", "list").split(), "the node is listed")
+        wait_for(lambda: "/arm" in around.run("rosnode", "list").split(), "the node is listed")
         kinds = {
             "status": "std_msgs/String",
             "decided_by": "std_msgs/String",
@@ -364,7 +365,7 @@ def test_what_a_robot_decides_can_be_watched(around: Ros1, here: Surroundings) -
             )
             for topic in ("sensing_action", "task_actions")
         }
-        until(
+        wait_for(
             lambda: all(client.topic(each).num_subscribers for each in echoes),
             "both are subscribed",
         )

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 import pytest
 from tests.ports import free_port
-from tests.ros.conftest import ROOT, left_out
+from tests.ros.conftest import ROOT, left_out, line_of
 from tests.unit.test_active_sensing import EXAMPLE, configuration, decisions, in_process
 
 from holdfast.configuration import Configuration
@@ -59,17 +59,6 @@ def running(*command: str | Path, **options: Any) -> Iterator[subprocess.Popen[s
                 process.wait(10.0)
             except (OSError, subprocess.TimeoutExpired):
                 process.kill()
-
-
-def line_of(process: subprocess.Popen[str]) -> str:
-    """Return the next line of a process, which has so much time for it."""
-    assert process.stdout is not None
-    timer = threading.Timer(PATIENCE_S, process.kill)
-    timer.start()
-    try:
-        return process.stdout.readline()
-    finally:
-        timer.cancel()
 
 
 @pytest.fixture(params=["zenoh_ros2_sdk", "pyzeros"])

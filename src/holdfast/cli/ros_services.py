@@ -8,13 +8,15 @@ from __future__ import annotations
 import os
 import signal
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 from holdfast.errors import InvalidValueError, TransportError
 
 if TYPE_CHECKING:
     from holdfast.configuration import Configuration
     from holdfast.ros.active_sensing import ActiveSensing
+    from holdfast.ros.ros1_service import Ros1Server
+    from holdfast.ros.ros2_wire import Ros2Server
     from holdfast.service.beside import Beside
     from holdfast.service.options import Options
 
@@ -42,8 +44,38 @@ def make_ros_services(options: Options) -> Sequence[Beside]:
     return services
 
 
-class _Ros2:
+class _OfRos:
+    """A server in ROS, and where it is."""
+
+    _server: Ros1Server | Ros2Server
+    _wire: ClassVar[str]
+    _where: str
+    _on_event: Callable[..., None] | None = None
+
+    @property
+    def is_busy(self) -> bool:
+        return self._server.is_busy
+
+    def start(self, on_event: Callable[..., None]) -> Mapping[str, str]:
+        self._on_event = on_event
+        self._server.start()
+        return {self._wire: self._where}
+
+    def take_no_more(self) -> None:
+        self._server.take_no_more()
+
+    def close(self, timeout_s: float) -> None:
+        self._server.close(timeout_s)
+
+    def _tell(self, name: str, **fields: object) -> None:
+        if self._on_event is not None:
+            self._on_event(name, **fields)
+
+
+class _Ros2(_OfRos):
     """The service in ROS 2, with rmw_zenoh's wire."""
+
+    _wire = "ros2"
 
     def __init__(self, service: ActiveSensing, options: Options) -> None:
         from holdfast.ros.ros2_wire import Ros2Server, check_service_name, zenoh_module
@@ -57,7 +89,6 @@ class _Ros2:
             raise InvalidValueError(f"--ros2-domain: {error}") from None
         via = "listening on" if options.ros2_listen else "router"
         self._where = f"/{name} in domain {options.ros2_domain} ({via} {endpoint})"
-        self._on_event: Callable[..., None] | None = None
         self._server = Ros2Server(
             service,
             name,
@@ -67,28 +98,11 @@ class _Ros2:
             on_event=self._tell,
         )
 
-    @property
-    def is_busy(self) -> bool:
-        return self._server.is_busy
 
-    def start(self, on_event: Callable[..., None]) -> Mapping[str, str]:
-        self._on_event = on_event
-        self._server.start()
-        return {"ros2": self._where}
-
-    def take_no_more(self) -> None:
-        self._server.take_no_more()
-
-    def close(self, timeout_s: float) -> None:
-        self._server.close(timeout_s)
-
-    def _tell(self, name: str, **fields: object) -> None:
-        if self._on_event is not None:
-            self._on_event(name, **fields)
-
-
-class _Ros1:
+class _Ros1(_OfRos):
     """The service in ROS 1."""
+
+    _wire = "ros1"
 
     def __init__(self, configuration: Configuration, options: Options) -> None:
         from holdfast.ros.ros1_service import Ros1Server
@@ -112,28 +126,8 @@ class _Ros1:
         except TransportError as error:
             raise TransportError(f"--ros1-name: {error}") from None
         self._where = f"{self._server.name} (master {surroundings.master})"
-        self._on_event: Callable[..., None] | None = None
-
-    @property
-    def is_busy(self) -> bool:
-        return self._server.is_busy
-
-    def start(self, on_event: Callable[..., None]) -> Mapping[str, str]:
-        self._on_event = on_event
-        self._server.start()
-        return {"ros1": self._where}
-
-    def take_no_more(self) -> None:
-        self._server.take_no_more()
-
-    def close(self, timeout_s: float) -> None:
-        self._server.close(timeout_s)
 
     def _end(self, reason: str) -> None:
         """End this process, as ROS asks a node to; it has the time that SIGTERM leaves."""
         self._tell("ros_shutdown", reason=reason)
         os.kill(os.getpid(), signal.SIGTERM)
-
-    def _tell(self, name: str, **fields: object) -> None:
-        if self._on_event is not None:
-            self._on_event(name, **fields)

@@ -398,12 +398,7 @@ class RosNode:
         if offer is None:
             _refuse(writer, f"[{self.name}] has no service [{header['service']:.200}]")
             return
-        if header.get("md5sum") not in (offer.type.digest, ANY_TYPE):
-            _refuse(
-                writer,
-                f"service [{header['service']}] is of type {offer.type.name} with MD5 "
-                f"{offer.type.digest}; {header.get('md5sum')!r:.60} was asked for",
-            )
+        if _means_another_type(header, offer.type, f"service [{header['service']}]", writer):
             return
         writer.write(encode_header(header_of_service(self.name, header["service"], offer.type)))
         if header.get("probe") == "1":
@@ -430,12 +425,7 @@ class RosNode:
         if topic is None:
             _refuse(writer, f"[{self.name}] does not publish [{header['topic']:.200}]")
             return
-        if header.get("md5sum") not in (topic.type.digest, ANY_TYPE):
-            _refuse(
-                writer,
-                f"topic [{topic.name}] is of type {topic.type.name} with MD5 {topic.type.digest}; "
-                f"{header.get('md5sum')!r:.60} was asked for",
-            )
+        if _means_another_type(header, topic.type, f"topic [{topic.name}]", writer):
             return
         writer.write(
             encode_header(
@@ -476,6 +466,23 @@ class RosNode:
         finally:
             self._connections.discard(task)
             writer.close()
+
+
+def _means_another_type(
+    header: Mapping[str, str],
+    type_: ServiceType | TopicType,
+    what: str,
+    writer: asyncio.StreamWriter,
+) -> bool:
+    """Tell whether somebody asks for another type than there is; then refuse."""
+    asked = header.get("md5sum")
+    if asked in (type_.digest, ANY_TYPE):
+        return False
+    _refuse(
+        writer,
+        f"{what} is of type {type_.name} with MD5 {type_.digest}; {asked!r:.60} was asked for",
+    )
+    return True
 
 
 def _refuse(writer: asyncio.StreamWriter, reason: str) -> None:
