@@ -105,7 +105,7 @@ class _Ros1(_OfRos):
     _wire = "ros1"
 
     def __init__(self, configuration: Configuration, options: Options) -> None:
-        from holdfast.ros.ros1_service import Ros1Server
+        from holdfast.ros.ros1_service import Ros1ActiveSensing, Ros1Server
         from holdfast.transport.tcpros import Surroundings
 
         surroundings = Surroundings.of()
@@ -116,7 +116,7 @@ class _Ros1(_OfRos):
                 "--insecure"
             )
         try:
-            self._server = Ros1Server(
+            service = Ros1ActiveSensing(
                 configuration,
                 options.ros1_name,
                 surroundings,
@@ -125,6 +125,7 @@ class _Ros1(_OfRos):
             )
         except TransportError as error:
             raise TransportError(f"--ros1-name: {error}") from None
+        self._server = Ros1Server(service)
         self._where = f"{self._server.name} (master {surroundings.master})"
 
     def _end(self, reason: str) -> None:

@@ -146,22 +146,12 @@ class Ros1Server:
 
     Parameters
     ----------
-    configuration, name, surroundings, on_shutdown, on_event
-        As of :class:`Ros1ActiveSensing`.
+    service : Ros1ActiveSensing
+        Which is not started.
     """
 
-    def __init__(
-        self,
-        configuration: Configuration,
-        name: str = "cloud_active_sensing",
-        surroundings: Surroundings | None = None,
-        *,
-        on_shutdown: Callable[[str], None] | None = None,
-        on_event: Callable[..., None] | None = None,
-    ) -> None:
-        self._service = Ros1ActiveSensing(
-            configuration, name, surroundings, on_shutdown=on_shutdown, on_event=on_event
-        )
+    def __init__(self, service: Ros1ActiveSensing) -> None:
+        self._service = service
         self._thread: LoopThread | None = None
 
     @property
