@@ -165,6 +165,12 @@ def checked_endpoints(options: Options) -> list[Endpoint]:
             except TransportError as error:
                 raise TransportError(f"{option}: {error}") from None
             # Of an encrypted one without credentials the transport says that they are missing.
+            if endpoint.is_ros1 and not (endpoint.is_loopback or options.insecure):
+                raise TransportError(
+                    f"{option}: endpoint {endpoint}: other machines can reach it, and nobody there "
+                    f"has to prove who he is; set ROS_HOSTNAME=127.0.0.1, so that nobody can, or "
+                    f"say --insecure"
+                )
             if not (endpoint.is_loopback or options.insecure or endpoint.is_encrypted):
                 raise TransportError(
                     f"{option}: endpoint {endpoint}: other machines can reach it, and nobody there "

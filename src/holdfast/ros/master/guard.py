@@ -342,7 +342,10 @@ class MasterGuard:
             await self._write_down(connection)
         self._other_pid, self._is_inherited = pid, inherited
         self._events.event(
-            "guarding", service=self._settings.address.uri, pid=pid, journal=inherited
+            "guarding",
+            service=self._settings.address.uri,
+            pid=pid,
+            started_by="an earlier guard" if inherited else "somebody else",
         )
 
     async def _write_down(self, connection: Connection) -> None:
@@ -396,6 +399,8 @@ class MasterGuard:
             raise
         self._own = master
         self._doubtful = reconciled.doubtful
+        # Where nobody is left a master begins anew, and nothing is missed.
+        begins_anew = not state.nodes()
         self._events.event(
             "master_started",
             service=self._settings.address.uri,
@@ -404,9 +409,9 @@ class MasterGuard:
             services=len(state.services),
             topics=len(state.publishers.keys() | state.subscribers.keys()),
             parameters=len(parameter_names(state.parameters)),
-            gone=list(reconciled.gone) or None,
+            gone=None if begins_anew else list(reconciled.gone) or None,
             silent=list(reconciled.silent) or None,
-            lost_services=list(reconciled.lost_services) or None,
+            lost_services=None if begins_anew else list(reconciled.lost_services) or None,
             duration_ms=(monotonic() - begun_at) * 1e3,
         )
 
