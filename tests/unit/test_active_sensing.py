@@ -222,3 +222,57 @@ def test_an_error_of_the_request_is_raised_and_not_asked_again_elsewhere() -> No
     ):
         client.decide(Request(9))
     assert (cloud.asked, recovery.asked) == (1, 0)
+
+
+class Slow(Direct):
+    """A service that takes as long as it is told, or as it is given."""
+
+    takes_s = 0.0
+
+    def ask(self, request: Request, deadline_s: float) -> Answer:
+        self.asked += 1
+        if self.takes_s > deadline_s:
+            threading.Event().wait(deadline_s)
+            raise TransportError("no answer in time")
+        return self._answers.answer(request)
+
+
+def test_a_recovery_service_that_is_slower_than_the_deadline_gets_more_time() -> None:
+    settings = configuration()
+    cloud, recovery = (Slow(name, ActiveSensing(settings)) for name in ("cloud", "recovery"))
+    cloud.fails, cloud.takes_s, recovery.takes_s = True, 60.0, 0.05
+    with ActiveSensingClient(cloud, recovery, 0.01) as client:
+        for _ in range(2):
+            assert client.decide(Request(Kind.INITIALIZE)).error is ErrorCode.OK
+            assert client.decided_by == "recovery"
+    assert recovery.asked == 5  # 10, 20, 40, 80 ms, and once more at once
+
+
+def test_who_waits_for_a_client_that_is_closed_is_told_so() -> None:
+    settings = configuration()
+    cloud, recovery = (Direct(name, ActiveSensing(settings)) for name in ("cloud", "recovery"))
+    cloud.fails = recovery.fails = True
+    holding = threading.Event()
+    client = ActiveSensingClient(cloud, recovery, 0.01, lambda *_, **__: holding.set())
+    told: list[str] = []
+
+    def wait() -> None:
+        with pytest.raises(TransportError, match="closed") as raised:
+            client.decide(Request(Kind.INITIALIZE))
+        told.append(str(raised.value))
+
+    waiting = threading.Thread(target=wait)
+    waiting.start()
+    assert holding.wait(60.0)
+    client.close()
+    waiting.join(60.0)
+    assert told
+    with pytest.raises(TransportError, match="closed"):
+        client.decide(Request(Kind.INITIALIZE))
+
+
+@pytest.mark.parametrize("deadline_s", [0.0, -1.0, float("nan"), float("inf"), 1e12])
+def test_a_deadline_out_of_bounds_is_refused(deadline_s: float) -> None:
+    service = Direct("cloud", ActiveSensing(configuration()))
+    with pytest.raises(InvalidValueError, match="deadline_s"):
+        ActiveSensingClient(service, service, deadline_s)

@@ -843,7 +843,7 @@ class TestRefusals:
         [
             ("nothing", "there is no such directory or journal, so no run to export"),
             ("empty", "holds no journal.sqlite, so no run to export"),
-            ("run.yaml", "run.yaml"),
+            ("run.yaml", "run.yaml: is neither the directory of a run nor its journal"),
         ],
     )
     def test_what_is_no_run(

@@ -60,6 +60,9 @@ __all__ = [
 
 IntArray = npt.NDArray[np.int64]
 
+_SQLITE = b"SQLite format 3\0"
+"""What a journal begins with."""
+
 _NS_PER_S = 1_000_000_000
 _LEAST_GAP_NS = 1_000
 """Between two moments of a trial; of two facts with one time nobody knows which came first."""
@@ -299,6 +302,9 @@ class RecordedRun:
         The number of the latter.
     has_times : bool
         Whether the facts have the robot's times.
+    untimed : tuple of int
+        Trials of which the table of times has nothing, although it has others; then no fact has
+        the robot's times.
     world_is_simulated : bool
 
     Raises
@@ -328,9 +334,13 @@ class RecordedRun:
             self._ends = _trial_ends(self._events)
             # A batch has no rows of its times: then those of other trials are of no use, for all
             # facts have one clock. A trial in which nothing was decided needs none.
-            self.has_times = bool(self._rows) and all(
-                result.trial in self._rows or not result.steps for result in self._journal.results()
-            )
+            lacking = [
+                result.trial
+                for result in self._journal.results()
+                if result.steps and result.trial not in self._rows
+            ]
+            self.has_times = bool(self._rows) and not lacking
+            self.untimed = tuple(lacking) if self._rows else ()
             self._close = stack.pop_all()
 
     def __enter__(self) -> Self:
@@ -882,6 +892,9 @@ def _places(run: Path) -> tuple[Path, Path]:
         raise OutputError(f"{run}: there is no such directory or journal, so no run to export")
     if not run.is_file():
         raise OutputError(f"{run}: is a pipe or device, not a journal")
+    with run.open("rb") as file:
+        if file.read(len(_SQLITE)) not in (_SQLITE, b""):
+            raise OutputError(f"{run}: is neither the directory of a run nor its journal")
     return run.parent, run
 
 

@@ -13,6 +13,7 @@ its deadline.
 
 from __future__ import annotations
 
+import logging
 import queue
 import threading
 from collections.abc import Callable
@@ -27,6 +28,8 @@ __all__ = ["ActiveSensingClient", "Service"]
 
 _AGAIN_S = 0.05
 """A service that failed at once is not asked again before this time has passed."""
+
+_MAX_DEADLINE_S = 3600.0
 
 _ELSEWHERE = (ErrorCode.OTHER_CONFIGURATION, ErrorCode.BUSY)
 """What another service may answer; all other errors are the request's or the problem's own."""
@@ -60,16 +63,34 @@ class _Outcome(NamedTuple):
     number: int
     answer: Answer | None
     reason: str
+    took_s: float
 
 
 class _Asker:
-    """Asks one service, on a thread of its own, one request at a time."""
+    """Asks one service, on a thread of its own, one request at a time.
+
+    Parameters
+    ----------
+    service : Service
+    deadline_s : float
+    outcomes : SimpleQueue
+        Gets what came of each request; None says that there is nothing more.
+    is_last_resort : bool
+        Whether nobody else is left to answer: then a service that is slower than its deadline
+        gets twice the time with each request, since to ask it anew would take longer still.
+    """
 
     def __init__(
-        self, service: Service, deadline_s: float, outcomes: queue.SimpleQueue[_Outcome]
+        self,
+        service: Service,
+        deadline_s: float,
+        outcomes: queue.SimpleQueue[_Outcome | None],
+        *,
+        is_last_resort: bool = False,
     ) -> None:
         self.service = service
         self._deadline_s = deadline_s
+        self._is_last_resort = is_last_resort
         self._outcomes = outcomes
         self._requests: queue.SimpleQueue[tuple[int, Request] | None] = queue.SimpleQueue()
         self.asked = 0
@@ -102,6 +123,7 @@ class _Asker:
     def _work(self) -> None:
         while (asked := self._requests.get()) is not None:
             number, request = asked
+            began = monotonic()
             answer: Answer | None = None
             reason = ""
             try:
@@ -113,7 +135,10 @@ class _Asker:
             if answer is not None and answer.error in _ELSEWHERE:
                 reason = f"{answer.error.name}: {answer.message}"
                 answer = None
-            self._outcomes.put(_Outcome(self, number, answer, reason))
+            took_s = monotonic() - began
+            if answer is None and self._is_last_resort and took_s >= self._deadline_s:
+                self._deadline_s = min(2 * self._deadline_s, _MAX_DEADLINE_S)
+            self._outcomes.put(_Outcome(self, number, answer, reason, took_s))
 
 
 class ActiveSensingClient:
@@ -124,10 +149,13 @@ class ActiveSensingClient:
     cloud, recovery : Service
         They are closed with the client.
     deadline_s : float
-        A service that has not answered by then is given up for this decision.
+        A cloud that has not answered by then is given up for this decision, and is used again when
+        it has answered within this time. The recovery service, after which there is nobody, gets
+        more with each request that takes longer.
     on_event : callable or None
         Is told of each change as ``on_event(name, **fields)``: ``status`` (``status``, ``reason``)
-        and ``holding`` (``reason``) when nobody answers.
+        and ``holding`` (``reason``) when nobody answers. By default they are logged, as warnings
+        of ``holdfast.ros``.
 
     Attributes
     ----------
@@ -138,7 +166,7 @@ class ActiveSensingClient:
     Raises
     ------
     InvalidValueError
-        If ``deadline_s`` is not positive.
+        If ``deadline_s`` is not above 0 and at most 3600.
     """
 
     def __init__(
@@ -148,16 +176,19 @@ class ActiveSensingClient:
         deadline_s: float = 0.5,
         on_event: Callable[..., None] | None = None,
     ) -> None:
-        if not deadline_s > 0:
-            raise InvalidValueError(f"deadline_s {deadline_s}: it must be above 0 s")
+        if not 0 < deadline_s <= _MAX_DEADLINE_S:
+            raise InvalidValueError(
+                f"deadline_s {deadline_s}: it must be above 0 and at most {_MAX_DEADLINE_S:g} s"
+            )
         self.status = Status.STANDARD
         self.decided_by = ""
         self._deadline_s = deadline_s
-        self._on_event = on_event or _ignore
+        self._on_event = on_event or _log
         self._number = 0
-        self._outcomes: queue.SimpleQueue[_Outcome] = queue.SimpleQueue()
+        self._closed = False
+        self._outcomes: queue.SimpleQueue[_Outcome | None] = queue.SimpleQueue()
         self._cloud = _Asker(cloud, deadline_s, self._outcomes)
-        self._recovery = _Asker(recovery, deadline_s, self._outcomes)
+        self._recovery = _Asker(recovery, deadline_s, self._outcomes, is_last_resort=True)
 
     def __enter__(self) -> Self:
         return self
@@ -166,7 +197,9 @@ class ActiveSensingClient:
         self.close()
 
     def close(self) -> None:
-        """Ask nobody any more."""
+        """Ask nobody any more; who waits for a decision gets a TransportError. May be repeated."""
+        self._closed = True
+        self._outcomes.put(None)
         self._cloud.close()
         self._recovery.close()
 
@@ -184,7 +217,7 @@ class ActiveSensingClient:
         InvalidValueError
             If the services say that nobody can answer this, and why.
         TransportError
-            If nobody has answered in time.
+            If nobody has answered in time, or this is closed.
         """
         self._number += 1
         began = monotonic()
@@ -225,9 +258,13 @@ class ActiveSensingClient:
             except queue.Empty:
                 return None
             block = False
+            if outcome is None or self._closed:
+                self._outcomes.put(None)  # for the next one who asks
+                raise TransportError("this client is closed")
             answered = outcome.asker.take(outcome)
             if outcome.asker is self._cloud:
-                if answered and not self._cloud_decides:
+                is_wanted = outcome.number == self._number or outcome.took_s <= self._deadline_s
+                if answered and is_wanted and not self._cloud_decides:
                     self._change(Cause.CLOUD_ANSWERED, "")
                 elif not answered and self._cloud_decides:
                     self._cloud_is_lost(outcome.reason)
@@ -254,5 +291,7 @@ class ActiveSensingClient:
         )
 
 
-def _ignore(_name: str, **_fields: object) -> None:
-    """Do nothing."""
+def _log(name: str, **fields: object) -> None:
+    """Log an event, which without any settings is a line on the standard error."""
+    words = " ".join(f"{key}={value}" for key, value in fields.items() if value)
+    logging.getLogger("holdfast.ros").warning("%s: %s", name, words)
