@@ -26,7 +26,7 @@ PACKAGE_SOURCES := $(shell find cmake src -type f -not -name '*.pyc')
 CPP_FILES := $(shell find cpp -name '*.hpp' -o -name '*.cpp')
 
 .DEFAULT_GOAL := help
-.PHONY: help demo install test test-gate test-real test-defects test-slow test-deploy test-deploy-slow test-ros test-compiled lint format simulate chaos fuzz soak bench results wheel sbom requirements clean
+.PHONY: help demo install test test-gate test-real test-defects test-slow test-deploy test-deploy-slow test-ros test-ros1 test-compiled lint format simulate chaos fuzz soak bench results wheel sbom requirements clean
 
 help: ## what there is to make
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-16s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -66,6 +66,11 @@ test-ros: $(INSTALLED_DEV) ## a real ROS 1 and ROS 2, which tests/ros/set_up_ros
 	tests/ros/set_up_peers $(ROS2) $(PYTHON)
 	if [ -e /usr/bin/rosmaster ]; then tests/ros/set_up_ros1 $(ROS1); fi
 	ROS1=$(ROS1) ROS2=$(ROS2) $(BIN)/pytest -q -m "ros and not slow" -n 2 --dist loadfile tests/ros
+
+test-ros1: $(INSTALLED_DEV) ## those of them that need Debian's ROS 1 alone
+	tests/ros/set_up_ros1 $(ROS1)
+	ROS1=$(ROS1) $(BIN)/pytest -q -m "ros and not slow" -n 2 --dist worksteal \
+	    tests/ros/test_ros1_*.py tests/ros/test_master_guard.py
 
 fuzz: $(INSTALLED_DEV) ## 1,000,000 hostile messages to a live service; some 15 minutes
 	$(BIN)/python -m tests.fuzz.live --messages 1000000 --seed 1

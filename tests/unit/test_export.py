@@ -571,6 +571,16 @@ class TestTimes:
         assert all(later > earlier for earlier, later in itertools.pairwise(times))
         assert times[0] > 1.7e9
 
+    def test_a_table_of_times_that_lacks_trials_is_said(
+        self, capsys: pytest.CaptureFixture[str], tmp_path: Path
+    ) -> None:
+        run = make_run(capsys, tmp_path, PEG, "--rate", "5000")
+        table = run / "timings.csv"
+        lines = table.read_text().splitlines(keepends=True)
+        table.write_text("".join(line for line in lines if not line.startswith("1,")))
+        said = run_here(capsys, tmp_path, "export", "run", "--csv", "tables")
+        assert "timings.csv lacks 1 trial from 1 on; all have one clock" in said.stderr
+
     def test_events_are_told_between_the_steps(
         self, capsys: pytest.CaptureFixture[str], tmp_path: Path
     ) -> None:
