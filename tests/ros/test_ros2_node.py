@@ -233,6 +233,10 @@ class TestARun:
                 and seen["statuses"][-1] == "finished"
             )
         )
+        finished = [item[2] for item in seen["diagnostics"] if item[1] == "finished"]
+        assert {(facts["status"], facts["finished_trials"]) for facts in finished} == {
+            ("standard", str(TRIALS))
+        }
         sensing = [order for order in seen["decisions"] if order[2] == 0]
         acting = [order for order in seen["decisions"] if order[2] == 1]
         assert [order[1] for order in acting] == [
@@ -314,6 +318,10 @@ class TestAnExecutive:
         assert "trial 0, number 9: trial 0, number 1 is to be answered" in wrong["message"]
         done = peer.do("decide", number=1, observation=[0.0], done=7)
         assert done["message"] == "done 7: allowed are 0 to 2"
+        assert (done["code"], done["number"]) == ("BAD_REQUEST", 1)
+        early = peer.do("decide", number=1, observation=[0.0], done=1)
+        assert (early["code"], early["number"]) == ("BAD_REQUEST", 1)
+        assert "number 1 is a sensing action" in early["message"]
         second = peer.do("decide", number=1, observation=[4.0])
         assert (second["code"], second["number"], second["kind"]) == ("OK", 2, 1)
         again = peer.do("decide", number=1, observation=[4.0])
@@ -413,7 +421,9 @@ class TestFaults:
         peer.drive(20)
         seen = peer.wait_seen(lambda seen: "local_recovery" in statuses(seen))
         recovering = [item for item in seen["diagnostics"] if item[2]["status"] == "local_recovery"]
-        assert {item[0] for item in recovering if item[1] == "local_recovery"} == {1}
+        # Also while it holds still until the local service has started.
+        assert {item[0] for item in recovering} == {1}
+        assert all(item[2]["decided_by"] != decided_by for item in recovering)
         ros.service(port)
         while "keep_alive" not in node.said():
             peer.drive(10)
@@ -472,6 +482,7 @@ class TestFaults:
 class TestLifecycle:
     def test_every_order(self, ros: Ros) -> None:
         node = ros.node(autostart="false", environment__kind="executive")
+        node.wait_for("ros2 lifecycle set /holdfast configure, then ros2 lifecycle set /holdfast a")
         peer = ros.peer()
         states: dict[str, dict[str, str]] = {
             "unconfigured": {"configure": "inactive"},
@@ -514,7 +525,7 @@ class TestLifecycle:
         assert node.interrupt() == 0
 
     def test_nothing_is_published_while_inactive(self, ros: Ros) -> None:
-        ros.node(environment__kind="executive")
+        node = ros.node(environment__kind="executive")
         peer = ros.peer()
         peer.drive(20)
         peer.wait_seen(lambda seen: len(seen["decisions"]) >= 20)
@@ -523,6 +534,7 @@ class TestLifecycle:
         peer.do("seen")
         assert peer.do("decide")["code"] == "INACTIVE"
         assert peer.do("goal") is False
+        node.wait_for("takes goals while it is active: ros2 lifecycle set /holdfast activate")
         # More than two periods of the diagnostics.
         threading.Event().wait(2.5)
         assert all(not values for values in peer.do("seen").values())
@@ -631,6 +643,7 @@ class TestParameters:
         other = ros.node(wait=False, particle_filter__num_particles=50)
         other.wait_for("not configured: ")
         assert "particle_filter.num_particles is 100 there and 50 here" in other.said()
+        assert "another directory (run_directory)" in other.said()
 
     def test_another_process_has_the_run(self, ros: Ros) -> None:
         ros.node(environment__kind="executive")

@@ -121,6 +121,8 @@ def test_after_a_crash_the_call_before_is_known_as_such(
         (Call(0, 1, np.zeros(4)), "observation of 4 values: sensing action 0 of peg_in_hole_2d"),
         (Call(0, 1, np.array([np.nan])), "observation[0] is nan: must be a finite number"),
         (Call(0, 1, observation(), np.inf), "reward inf: must be a finite number"),
+        (Call(0, 1, observation(), done=True), "done says that it has succeeded: number 1 is a se"),
+        (Call(0, 1, observation(), done="failed"), "done says that the task has failed: number 1"),
     ],
 )
 def test_a_bad_answer_changes_nothing(robot: Robot, call: Call, message: str) -> None:

@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from holdfast.errors import HoldfastError
-from holdfast.ros.ros2.parameters import OWN, Parameters, known_parameters, read_parameters
+from holdfast.ros.ros2.main import main
+from holdfast.ros.ros2.parameters import (
+    OWN,
+    Parameters,
+    in_parameters,
+    known_parameters,
+    read_parameters,
+)
 
 CONFIGURATION = Path(__file__).parents[2] / "examples" / "peg_in_hole_2d.yaml"
 
@@ -80,6 +88,34 @@ def test_the_files_own_world_may_be_another(tmp_path: Path) -> None:
     settings = read(configuration=str(path), environment__kind="executive").configuration
     assert settings.environment.object == "holdfast.ros.executive:ExecutiveEnvironment"
     assert settings.environment.arguments == {}
+
+
+@pytest.mark.parametrize(
+    ("message", "for_a_node"),
+    [
+        ("use another directory (--out)", "use another directory (run_directory)"),
+        ("no run to resume; give --out", "no run to resume; give run_directory"),
+        ("go on with that run (--resume), or", "go on with that run, or"),
+        ("so simulator.num_trials (--trials) is 3", "so simulator.num_trials is 3"),
+        ("nothing of the command's", "nothing of the command's"),
+    ],
+)
+def test_a_message_names_parameters_instead_of_options(message: str, for_a_node: str) -> None:
+    assert in_parameters(message) == for_a_node
+
+
+@pytest.mark.parametrize("option", ["--help", "-h"])
+def test_help_needs_no_ros_and_names_every_parameter(
+    option: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "rclpy", None)
+    assert main([option]) == 0
+    said = capsys.readouterr().out
+    for name, own in OWN.items():
+        assert f"\n  {name} " in said or f"\n  {name}\n" in said
+        assert own.text.split()[0] in said
+    assert "(default: false)" in said
+    assert max(map(len, said.splitlines())) <= 100
 
 
 @pytest.mark.parametrize(

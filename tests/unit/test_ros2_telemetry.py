@@ -69,6 +69,15 @@ def test_an_order_is_shown_with_entropies_and_belief() -> None:
     assert [belief is state for belief in audience.beliefs] == [True, True]
 
 
+def test_who_decided_in_another_status_is_not_named() -> None:
+    audience = Audience(beginning()[0])
+    assert audience.telemetry.decided_in("standard") == ""
+    audience.telemetry.time(Timing(0, 0, "task", "cloud", "standard", 0.0, 0.0, 0.0))
+    assert audience.telemetry.decided_in("standard") == "cloud"
+    assert audience.telemetry.decided_in("local_recovery") == ""
+    audience.telemetry.close(LONG_S)
+
+
 def test_entropies_that_nobody_hears_are_not_computed() -> None:
     configuration, state = beginning()
     audience = Audience(configuration, entropies=False)

@@ -219,6 +219,12 @@ class Executive:
                     "action, of which there is none"
                 )
             return
+        if call.done is not False:
+            said = "that the task has failed" if call.done == "failed" else "that it has succeeded"
+            raise InvalidValueError(
+                f"done says {said}: number {due.number} is a sensing action, after which the task "
+                "goes on; say so with the task action that it ended with"
+            )
         size = self._observation_size(due.sensing_action)
         if call.observation.size < 1 or size not in (None, call.observation.size):
             raise InvalidValueError(

@@ -59,6 +59,7 @@ __all__ = [
     "LogFormat",
     "NullEventLog",
     "TeeEventLog",
+    "event_in_words",
     "tell_event",
 ]
 
@@ -551,15 +552,15 @@ def _compose_text(now_ns: int, component: str, name: str, fields: Mapping[str, o
     moment = time.strftime("%H:%M:%S", time.localtime(seconds))
     who = (_ROBOT if component == _ROBOT else "service").ljust(_COMPONENT_WIDTH)
     what = _readable(name.replace("_", " "), 100).ljust(_EVENT_WIDTH)
-    line = f"{moment}.{rest_ns // 1_000_000:03d} {who} {what} {_sentence(fields)}".rstrip()
+    line = f"{moment}.{rest_ns // 1_000_000:03d} {who} {what} {event_in_words(fields)}".rstrip()
     data = line.encode()
     if len(data) >= MAX_LINE_BYTES:
         line = data[: MAX_LINE_BYTES - 4].decode("utf-8", "ignore") + "…"
     return line + "\n"
 
 
-def _sentence(fields: Mapping[str, object]) -> str:
-    """Arrange fields: what changed and who (why), the rest, how long it took."""
+def event_in_words(fields: Mapping[str, object]) -> str:
+    """Arrange an event's fields: what changed and who (why), the rest, how long it took."""
     rest = {key: value for key, value in fields.items() if value is not None}
     if "outcome" in rest:
         rest.pop("success", None)  # which it says, too

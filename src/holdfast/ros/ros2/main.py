@@ -9,12 +9,49 @@ from __future__ import annotations
 import os
 import signal
 import sys
+import textwrap
 import threading
 from collections.abc import Sequence
 
 __all__ = ["main"]
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+_USAGE = """\
+usage: python -m holdfast.ros.ros2 [--ros-args [-p NAME:=VALUE]... [--params-file FILE]]
+
+Active sensing for a robot as a lifecycle node of ROS 2 (/holdfast): it decides what to sense and
+what to do, and goes on when the service that decides dies. A goal of ~/run starts the run; or a
+program of yours drives the robot and asks ~/decide.
+
+for example:
+  python -m holdfast.ros.ros2 --ros-args \\
+      -p configuration:=examples/peg_in_hole_2d.yaml -p autostart:=true
+  ros2 action send_goal /holdfast/run holdfast_interfaces/action/Run '{}'
+
+parameters:
+"""
+
+_USAGE_END = """
+Every setting of the configuration file is a parameter as well, by its key (such as
+particle_filter.num_particles): docs/settings.md. Topics, services and how a robot is connected
+(environment.kind ros): docs/ros.md.
+"""
+
+
+def usage() -> str:
+    """Return what ``--help`` prints."""
+    from holdfast.ros.ros2.parameters import OWN
+
+    lines = []
+    for name, (default, text) in OWN.items():
+        shown = str(default).lower() if isinstance(default, bool) else default
+        end = f" (default: {shown})" if shown not in ("", []) else ""
+        indent = " " * 24
+        lines.append(f"  {name:<22}" if len(name) <= 21 else f"  {name}\n{indent}")
+        lines[-1] += textwrap.fill(text + end, 76).replace("\n", f"\n{indent}") + "\n"
+    return _USAGE + "".join(lines) + _USAGE_END
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -25,6 +62,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     arguments : sequence of str, optional
         Those of the process; ``--ros-args`` is ROS's.
     """
+    given = sys.argv[1:] if arguments is None else arguments
+    if "--help" in given or "-h" in given:
+        sys.stdout.write(usage())
+        return 0
     try:
         import rclpy
         from rclpy.executors import MultiThreadedExecutor
@@ -61,7 +102,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stderr.write(f"holdfast: error: {error}\n")
         return 2
     if not node.autostart:
-        node.get_logger().info("unconfigured")
+        node.get_logger().info(
+            f"unconfigured; go on with {node.how_to_activate()}; or start it with "
+            "-p autostart:=true"
+        )
     elif node.trigger_configure() == node.SUCCESS and node.trigger_activate() == node.SUCCESS:
         node.get_logger().info("active")
     executor = MultiThreadedExecutor(num_threads=NUM_THREADS)

@@ -38,11 +38,19 @@ from holdfast.recording.run_directory import RunDirectory
 from holdfast.ros.executive import Call, Code, Executive
 from holdfast.ros.poses import PoseLayout, pose_layout
 from holdfast.ros.ros2 import messages
-from holdfast.ros.ros2.parameters import OWN, Parameters, known_parameters, read_parameters
+from holdfast.ros.ros2.diagnostics import Diagnostics
+from holdfast.ros.ros2.parameters import (
+    OWN,
+    Parameters,
+    in_parameters,
+    known_parameters,
+    read_parameters,
+)
 from holdfast.ros.ros2.part import Ending, Part, PartOfRun
 from holdfast.ros.ros2.telemetry import Shown, Telemetry
 from holdfast.ros.ros2.worlds import make_world
 from holdfast.runtime.links import check_services
+from holdfast.runtime.logs import event_in_words
 from holdfast.session.effects import Act, Sense
 
 __all__ = ["NUM_THREADS", "HoldfastNode"]
@@ -67,6 +75,8 @@ _TOLD_AT_ONCE = frozenset(
         "status",
         "holding",
         "resumed",
+        "launch_failed",
+        "recovery_exited",
         "unexplained",
         "filter_diverged",
         "service_vanished",
@@ -84,18 +94,18 @@ _LOGGED = frozenset(("status", "holding", "resumed", "filter_diverged", "wrong_a
 class _Events:
     """Takes the robot's events, on the robot's loop."""
 
-    def __init__(self, node: HoldfastNode, telemetry: Telemetry) -> None:
+    def __init__(self, node: HoldfastNode, diagnostics: Diagnostics, telemetry: Telemetry) -> None:
         self._node = node
+        self._diagnostics = diagnostics
         self._telemetry = telemetry
 
     def event(self, name: str, /, **fields: object) -> None:
         """Take an event."""
         if name in _TOLD_AT_ONCE:
-            if name == "filter_diverged":
-                self._node.diverged = True
+            self._diagnostics.event(name)
             if name in _LOGGED:
-                words = " ".join(f"{key}={value}" for key, value in fields.items())
-                self._node.get_logger().info(f"{name} {words}")
+                words = in_parameters(event_in_words(fields))
+                self._node.get_logger().info(f"{name.replace('_', ' ')}: {words}")
             self._telemetry.notice()
 
     def close(self) -> None:
@@ -119,7 +129,6 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
             automatically_declare_parameters_from_overrides=True,
         )
         self._declare()
-        self.diverged = False
         # Guards the fields below.
         self._changed = threading.RLock()
         self._parameters_read: Parameters | None = None
@@ -127,6 +136,7 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
         self._active = False
         self._part: PartOfRun | None = None
         self._telemetry: Telemetry | None = None
+        self._diagnostics: Diagnostics | None = None
         self._executive: Executive | None = None
         self._goal: Any = None
         self._last_part: Part | None = None
@@ -208,6 +218,16 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
         """Whether the node is to configure and activate itself."""
         return self.get_parameter("autostart").value is True
 
+    def how_to_activate(self) -> str:
+        """Return what somebody does to have the node active."""
+        set_state = f"ros2 lifecycle set {self.get_fully_qualified_name()}"
+        steps = {
+            "unconfigured": f"{set_state} configure, then {set_state} activate",
+            "inactive": f"{set_state} activate",
+            "finalized": "start it again",
+        }
+        return steps.get(self._state_machine.current_state[1], "wait until it has changed")
+
     # -- lifecycle -------------------------------------------------------------------------------
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -226,7 +246,7 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
             self._parameters_read = read
             self._layout = layout
             self._last_part = None
-            self.diverged = False
+            self._diagnostics = Diagnostics(read.configuration.recovery)
         self.get_logger().info(
             f"configured: {read.configuration.problem_name}, "
             f"{read.configuration.simulator.num_trials} trials in {read.run_directory}"
@@ -283,6 +303,8 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
         with self._changed:
             self._parameters_read = None
             self._last_part = None
+            self._telemetry = None
+            self._diagnostics = None
 
     def end(self) -> bool:
         """End in order, whatever the state: for a process that was told to end.
@@ -304,8 +326,9 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
 
     def _begin_part(self) -> PartOfRun:
         """Start the next part of the run; the caller holds the lock."""
-        read = self._parameters_read
+        read, diagnostics = self._parameters_read, self._diagnostics
         assert read is not None
+        assert diagnostics is not None
         configuration = read.configuration
         world = make_world(self, read)
         telemetry = Telemetry(
@@ -326,7 +349,7 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
             read.run_directory,
             world.maker,
             rate_hz=read.rate_hz,
-            sink=_Events(self, telemetry),
+            sink=_Events(self, diagnostics, telemetry),
             on_order=on_order,
             on_timing=telemetry.time,
             on_end=self._part_ended,
@@ -358,7 +381,11 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
         del request
         if self._active:
             return GoalResponse.ACCEPT
-        self.get_logger().warning("a goal was rejected: the node is not active")
+        state = self._state_machine.current_state[1]
+        self.get_logger().warning(
+            f"a goal of ~/run was rejected: the node is {state}, and takes goals while it is "
+            f"active: {self.how_to_activate()}"
+        )
         return GoalResponse.REJECT
 
     def _cancel(self, goal: Any) -> CancelResponse:
@@ -446,17 +473,19 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
             response.message = "" if last is None else last.message
             return response
         if request.done > _Decide.Request.FAILED:
-            response.code = Code.BAD_REQUEST
-            response.message = f"done {request.done}: allowed are 0 to {_Decide.Request.FAILED}"
-            return response
-        call = Call(
-            request.trial,
-            request.number,
-            np.array(request.observation, dtype=np.float64),
-            request.reward if request.has_reward else None,
-            (False, True, "failed")[request.done],
-        )
-        reply = executive.call(call, read.decide_timeout_s)
+            reply = executive.call(Call(), read.decide_timeout_s)  # asks what is due
+            if reply.code in (Code.OK, Code.HOLDING):
+                message = f"done {request.done}: allowed are 0 to {_Decide.Request.FAILED}"
+                reply = reply._replace(code=Code.BAD_REQUEST, message=message)
+        else:
+            call = Call(
+                request.trial,
+                request.number,
+                np.array(request.observation, dtype=np.float64),
+                request.reward if request.has_reward else None,
+                (False, True, "failed")[request.done],
+            )
+            reply = executive.call(call, read.decide_timeout_s)
         response.code, response.message = reply.code, reply.message
         response.status = part.status
         due = reply.due
@@ -476,7 +505,7 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
         """Return why no call can be answered; None if it can."""
         read = self._parameters_read
         if not self._active or read is None:
-            return "the node is not active"
+            return f"the node is not active: {self.how_to_activate()}"
         if read.environment != "executive":
             return (
                 f"environment.kind is {read.environment}: the node itself performs what it "
@@ -522,52 +551,32 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
     def _tell_diagnostics(self) -> None:
         with self._changed:
             read, part, telemetry = self._parameters_read, self._part, self._telemetry
-            last, active = self._last_part, self._active
-        if read is None or not active:
+            last, active, diagnostics = self._last_part, self._active, self._diagnostics
+        if read is None or diagnostics is None or not active:
             return
-        condition = None if part is None else part.condition()
-        if condition is not None:
-            word, level = condition.word, _Level.OK
-            if word == "holding still":
-                level = _Level.ERROR
-            elif word == "local_recovery" or self.diverged:
-                level = _Level.WARN
-        elif last is not None and part is None:
-            word = last.ending.name.lower()
-            level = _Level.ERROR if last.ending in (Ending.HELD, Ending.FAILED) else _Level.OK
-        else:
-            word, level = "starting" if part is not None else "idle", _Level.OK
-        trial = None if condition is None else condition.trial
-        facts = {
-            "status": "" if part is None else part.status,
-            "decided_by": "" if telemetry is None else telemetry.decided_by,
-            "holding": str(word == "holding still").lower(),
-            "trial": "" if trial is None else trial,
-            "finished_trials": "" if part is None else part.num_finished,
-            "unexplained_observations": 0 if part is None else part.unexplained_observations,
-            "filter_diverged": str(self.diverged).lower(),
-            "decisions_not_published": 0 if telemetry is None else telemetry.dropped_decisions,
-            "run_directory": read.run_directory,
-            "last_error": "" if last is None or level != _Level.ERROR else last.message[:500],
-        }
+        told = diagnostics.tell(part, last, telemetry)
+        facts = told.facts | {"run_directory": str(read.run_directory)}
         status = _Level(
-            level=level,
+            level=bytes((told.level,)),
             name=f"{self.get_name()}: active sensing",
-            message=word,
+            message=told.word,
             hardware_id=read.configuration.offload.name or "",
             values=[
-                diagnostic_msgs.msg.KeyValue(key=key, value=str(value))
-                for key, value in facts.items()
+                diagnostic_msgs.msg.KeyValue(key=key, value=value) for key, value in facts.items()
             ],
         )
         message = diagnostic_msgs.msg.DiagnosticArray(status=[status])
         message.header.stamp = self.get_clock().now().to_msg()
         self._diagnostics_publisher.publish(message)
-        self._status_publisher.publish(std_msgs.msg.String(data=str(facts["status"] or word)))
+        # Who decides; once nobody does any more, how it has ended.
+        word = told.word if part is None else told.facts["status"] or told.word
+        self._status_publisher.publish(std_msgs.msg.String(data=word))
 
 
 def _in_words(error: Exception) -> str:
-    return str(error) if isinstance(error, HoldfastError) else f"{type(error).__name__}: {error}"
+    if isinstance(error, HoldfastError):
+        return in_parameters(str(error))
+    return f"{type(error).__name__}: {error}"
 
 
 def _plain(value: Any) -> Any:

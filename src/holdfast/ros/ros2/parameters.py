@@ -22,7 +22,7 @@ from holdfast.errors import ConfigurationError
 from holdfast.ros.robot_interface import ROBOT_PARAMETERS
 from holdfast.yaml_document import read
 
-__all__ = ["OWN", "Parameters", "known_parameters", "read_parameters"]
+__all__ = ["OWN", "Parameters", "in_parameters", "known_parameters", "read_parameters"]
 
 _SECTIONS_OF_PROBLEMS = ("model.", "state_space_planner.")
 _ENVIRONMENT = "environment."
@@ -76,6 +76,15 @@ _OBJECTS = {
 """What the run's configuration names, so that no other world goes on with that run."""
 
 
+_FOR_OPTIONS = {
+    " (--resume)": "",
+    " (--trials)": "",
+    "(--out)": "(run_directory)",
+    "give --out": "give run_directory",
+}
+"""What a message's words for those who use the command are for those who use the node."""
+
+
 class Parameters(NamedTuple):
     """What the parameters come to.
 
@@ -110,6 +119,13 @@ def known_parameters() -> dict[str, str]:
     """Return what each parameter means, by name; those of the problem's own sections excepted."""
     robot = {name: text for name, (_, text) in ROBOT_PARAMETERS.items()}
     return {name: own.text for name, own in OWN.items()} | settings_keys() | robot
+
+
+def in_parameters(text: str) -> str:
+    """Return a message with the parameters' names for the command's options."""
+    for option, parameter in _FOR_OPTIONS.items():
+        text = text.replace(option, parameter)
+    return text
 
 
 def read_parameters(values: Mapping[str, Any]) -> Parameters:

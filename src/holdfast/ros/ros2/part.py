@@ -23,6 +23,7 @@ from holdfast.planning import PlanningState
 from holdfast.recording.journal import LostJournalError
 from holdfast.recording.robot_run import Onlooker, perform_trials
 from holdfast.recording.run_directory import RunDirectory
+from holdfast.ros.ros2.parameters import in_parameters
 from holdfast.runtime.environment import EnvironmentMaker
 from holdfast.runtime.logs import EventSink
 from holdfast.runtime.robot_process import RobotProcess
@@ -64,11 +65,17 @@ class Part(NamedTuple):
     message : str
     trials : tuple of TrialResult
         All that are finished, of earlier parts too; the first :data:`MAX_TRIALS_TOLD`.
+    status : str
+        Who decided at its end; empty if it had not come so far.
+    num_finished : int
+        Trials, those of earlier parts too.
     """
 
     ending: Ending
     message: str
     trials: tuple[TrialResult, ...]
+    status: str = ""
+    num_finished: int = 0
 
 
 class PartOfRun:
@@ -205,11 +212,12 @@ class PartOfRun:
             else:
                 part = Part(Ending.PAUSED, self._why_paused or "paused", trials)
         except HoldfastError as error:
-            part = Part(self._ending_of(error), str(error), trials)
+            part = Part(self._ending_of(error), in_parameters(str(error)), trials)
             if part.ending == Ending.PAUSED:
                 part = part._replace(message=self._why_paused or part.message)
         except BaseException:  # noqa: BLE001 - who waits for this thread must hear of it
             part = Part(Ending.FAILED, traceback.format_exc(), trials)
+        part = part._replace(status=self.status, num_finished=self.num_finished)
         self.came_to = part
         try:
             self._on_end(part)

@@ -127,20 +127,22 @@ class Telemetry:
         self._notice = False
         self._closed = False
         self._decided_by = {"sensing": "", "task": ""}
+        self._decided_last: Timing | None = None
         self._next_belief = 0.0
         self.dropped_decisions = 0
         self.has_failed = False
         self._thread = threading.Thread(target=self._work, name="telemetry", daemon=True)
         self._thread.start()
 
-    @property
-    def decided_by(self) -> str:
-        """Who chose the last task actions."""
-        return self._decided_by["task"] or self._decided_by["sensing"]
+    def decided_in(self, status: str) -> str:
+        """Return who made the last decision, if that was in this status; else nobody, empty."""
+        timing = self._decided_last
+        return "" if timing is None or timing.status != status else timing.service
 
     def time(self, timing: Timing) -> None:
         """Take note of who decided."""
         self._decided_by[timing.kind] = timing.service
+        self._decided_last = timing
 
     def order(self, state: PlanningState, order: Act | Sense, status: str) -> None:
         """Take note of an order; returns at once."""

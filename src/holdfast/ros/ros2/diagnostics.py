@@ -1,0 +1,137 @@
+"""What ``/diagnostics`` says: how the robot is doing, and how bad that is.
+
+To stand still is no fault yet. Where the only service dies, the robot holds still for as long as
+its local service takes to start, and then goes on: that is what it is built for, and a warning. It
+is an error once that start fails, or takes longer than the settings allow, or where there is no
+local service to start.
+"""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Callable
+from time import monotonic
+from typing import NamedTuple
+
+from holdfast.ros.ros2.part import Ending, Part, PartOfRun
+from holdfast.ros.ros2.telemetry import Telemetry
+from holdfast.settings import RecoverySettings
+
+__all__ = ["Diagnostics", "Level", "Told"]
+
+_HOLDING = "holding still"
+
+
+class Level(enum.IntEnum):
+    """As ROS counts."""
+
+    OK = 0
+    WARN = 1
+    ERROR = 2
+
+
+class Told(NamedTuple):
+    """What is said.
+
+    Attributes
+    ----------
+    level : Level
+    word : str
+        How the robot is doing.
+    facts : dict
+        Value by key.
+    """
+
+    level: Level
+    word: str
+    facts: dict[str, str]
+
+
+class Diagnostics:
+    """Follows the parts of one run.
+
+    Parameters
+    ----------
+    recovery : RecoverySettings
+    clock : callable
+        Returns seconds.
+
+    Attributes
+    ----------
+    diverged : bool
+        Whether the filter has.
+    """
+
+    def __init__(self, recovery: RecoverySettings, clock: Callable[[], float] = monotonic) -> None:
+        self._may_launch = recovery.launch != "never"
+        self._launch_s = 1e-3 * recovery.launch_timeout_ms
+        self._clock = clock
+        self._holding_since: float | None = None
+        self._launch_failed = False
+        self._status = ""
+        self._finished: int | str = ""
+        self.diverged = False
+
+    def event(self, name: str) -> None:
+        """Take note of an event of the robot's, from its thread."""
+        if name == "filter_diverged":
+            self.diverged = True
+        elif name == "holding":
+            self._holding_since = self._clock()
+            self._launch_failed = False
+        elif name == "resumed":
+            self._holding_since = None
+        elif name in ("launch_failed", "recovery_exited"):
+            self._launch_failed = True
+
+    def tell(self, part: PartOfRun | None, last: Part | None, telemetry: Telemetry | None) -> Told:
+        """Return what is to be said now.
+
+        Parameters
+        ----------
+        part : PartOfRun or None
+            The one that runs.
+        last : Part or None
+            What the one before it came to.
+        telemetry : Telemetry or None
+            That of the last part that has begun.
+        """
+        condition = None if part is None else part.condition()
+        if condition is not None:
+            word, level = condition.word, Level.OK
+            if word == _HOLDING:
+                level = self._level_of_holding()
+            elif word == "local_recovery" or self.diverged:
+                level = Level.WARN
+        elif last is not None and part is None:
+            word = last.ending.name.lower()
+            level = Level.ERROR if last.ending in (Ending.HELD, Ending.FAILED) else Level.OK
+        else:
+            word, level = "starting" if part is not None else "idle", Level.OK
+        if part is not None:
+            # Until the next part has one, what is known last is still worth knowing.
+            self._status = part.status or self._status
+            self._finished = part.num_finished
+        elif last is not None:
+            self._status = last.status or self._status
+            self._finished = last.num_finished
+        trial = None if condition is None else condition.trial
+        facts = {
+            "status": self._status,
+            # Who decided before the status changed does so no more.
+            "decided_by": "" if telemetry is None else telemetry.decided_in(self._status),
+            "holding": str(word == _HOLDING).lower(),
+            "trial": "" if trial is None else trial,
+            "finished_trials": self._finished,
+            "unexplained_observations": 0 if part is None else part.unexplained_observations,
+            "filter_diverged": str(self.diverged).lower(),
+            "decisions_not_published": 0 if telemetry is None else telemetry.dropped_decisions,
+            "last_error": "" if last is None or level != Level.ERROR else last.message[:500],
+        }
+        return Told(level, word, {key: str(value) for key, value in facts.items()})
+
+    def _level_of_holding(self) -> Level:
+        since = self._holding_since
+        held_s = 0.0 if since is None else self._clock() - since
+        is_launching = self._may_launch and not self._launch_failed and held_s <= self._launch_s
+        return Level.WARN if is_launching else Level.ERROR

@@ -1,0 +1,111 @@
+"""What /diagnostics says of a run: how bad it is, and what is known last."""
+
+from __future__ import annotations
+
+from typing import Any, cast
+
+import pytest
+
+from holdfast.ros.ros2.diagnostics import Diagnostics, Level, Told
+from holdfast.ros.ros2.part import Ending, Part
+from holdfast.runtime.robot_watch import Condition
+from holdfast.settings import RecoverySettings
+
+
+class Running:
+    """A part of a run, as far as the diagnostics look at it."""
+
+    def __init__(self, word: str, status: str, num_finished: int = 0) -> None:
+        self.word = word
+        self.status = status
+        self.num_finished = num_finished
+        self.unexplained_observations = 0
+
+    def condition(self) -> Condition | None:
+        return None if not self.word else Condition(self.word, True, 1)
+
+
+class Deciders:
+    """Who decided last."""
+
+    dropped_decisions = 0
+
+    def decided_in(self, status: str) -> str:
+        return {"standard": "cloud"}.get(status, "")
+
+
+class Said:
+    """Diagnostics with a clock of the test's."""
+
+    def __init__(self, **settings: Any) -> None:
+        self.now = 100.0
+        self.diagnostics = Diagnostics(RecoverySettings(**settings), lambda: self.now)
+
+    def tell(self, part: Running | None, last: Part | None = None) -> Told:
+        return self.diagnostics.tell(cast(Any, part), last, cast(Any, Deciders()))
+
+
+def part(ending: Ending, **fields: Any) -> Part:
+    return Part(ending, "why", (), **fields)
+
+
+def test_to_hold_while_the_local_service_starts_is_a_warning() -> None:
+    said = Said(launch_timeout_ms=3000.0)
+    holding = Running("holding still", "local_recovery")
+    said.diagnostics.event("holding")
+    assert said.tell(holding)[:2] == (Level.WARN, "holding still")
+    said.now += 3.0
+    assert said.tell(holding).level == Level.WARN
+    said.now += 0.1
+    assert said.tell(holding).level == Level.ERROR
+    said.diagnostics.event("resumed")
+    assert said.tell(Running("local_recovery", "local_recovery")).level == Level.WARN
+    said.diagnostics.event("holding")
+    assert said.tell(holding).level == Level.WARN
+    assert said.tell(holding).facts["holding"] == "true"
+
+
+@pytest.mark.parametrize("event", ["launch_failed", "recovery_exited"])
+def test_to_hold_is_an_error_when_the_local_service_does_not_start(event: str) -> None:
+    said = Said()
+    holding = Running("holding still", "local_recovery")
+    said.diagnostics.event("holding")
+    said.diagnostics.event(event)
+    assert said.tell(holding).level == Level.ERROR
+    said.diagnostics.event("resumed")
+    said.diagnostics.event("holding")
+    assert said.tell(holding).level == Level.WARN
+
+
+def test_to_hold_is_an_error_at_once_where_nothing_is_started() -> None:
+    said = Said(launch="never")
+    said.diagnostics.event("holding")
+    assert said.tell(Running("holding still", "standard")).level == Level.ERROR
+
+
+def test_what_was_known_last_is_still_said_after_the_end() -> None:
+    said = Said()
+    said.tell(Running("standard", "standard", 1))
+    told = said.tell(None, part(Ending.FINISHED, status="local_recovery", num_finished=2))
+    assert told[:2] == (Level.OK, "finished")
+    assert told.facts["status"] == "local_recovery"
+    assert told.facts["finished_trials"] == "2"
+    # The next part has no status before it runs.
+    told = said.tell(Running("", "", 2), part(Ending.FINISHED))
+    assert (told.word, told.facts["status"]) == ("starting", "local_recovery")
+
+
+def test_nobody_decides_in_a_new_status_before_the_first_decision() -> None:
+    said = Said()
+    assert said.tell(Running("standard", "standard")).facts["decided_by"] == "cloud"
+    assert said.tell(Running("local_recovery", "local_recovery")).facts["decided_by"] == ""
+
+
+def test_a_run_that_is_held_is_an_error_with_its_reason() -> None:
+    told = Said().tell(None, part(Ending.HELD))
+    assert (told.level, told.word, told.facts["last_error"]) == (Level.ERROR, "held", "why")
+
+
+def test_before_the_first_part_nothing_is_known() -> None:
+    told = Said().tell(None)
+    assert (told.level, told.word, told.facts["status"]) == (Level.OK, "idle", "")
