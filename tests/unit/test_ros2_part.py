@@ -85,7 +85,9 @@ def test_all_trials(parts: Parts) -> None:
     assert [trial.digest for trial in came_to.trials] == digests(parts.configuration)
     assert (parts.path / "summary.json").exists()
     orders = parts.orders
-    assert parts.run() == came_to
+    assert (came_to.status, came_to.num_finished) == ("standard", 2)
+    # Nobody decides in a part that has nothing to do.
+    assert parts.run() == came_to._replace(status="")
     assert parts.orders == orders
 
 
@@ -107,7 +109,8 @@ def test_paused_before_it_began(parts: Parts) -> None:
     part.pause("at once", PATIENCE_S)
     part.start()
     assert part.ended.wait(PATIENCE_S)
-    assert part.came_to == Part(Ending.PAUSED, "at once", ())
+    assert part.came_to is not None
+    assert part.came_to[:3] == (Ending.PAUSED, "at once", ())
     assert parts.orders == 0
 
 
