@@ -13,6 +13,7 @@ from holdfast.configuration import Configuration, load
 from holdfast.planning import PlanningState
 from holdfast.ros.ros2 import telemetry as module
 from holdfast.ros.ros2.telemetry import Shown, Telemetry
+from holdfast.runtime.links import RECOVERY_SERVICE
 from holdfast.session.effects import Act, Sense, Timing
 
 CONFIGURATION = Path(__file__).parents[2] / "examples" / "peg_in_hole_2d.yaml"
@@ -75,6 +76,11 @@ def test_who_decided_in_another_status_is_not_named() -> None:
     audience.telemetry.time(Timing(0, 0, "task", "cloud", "standard", 0.0, 0.0, 0.0))
     assert audience.telemetry.decided_in("standard") == "cloud"
     assert audience.telemetry.decided_in("local_recovery") == ""
+    # An answer of before, which is used only now.
+    audience.telemetry.time(Timing(0, 1, "task", "cloud", "local_recovery", 0.0, 0.0, 0.0))
+    assert audience.telemetry.decided_in("local_recovery") == ""
+    audience.telemetry.time(Timing(0, 2, "task", RECOVERY_SERVICE, "local_recovery", 0, 0, 0))
+    assert audience.telemetry.decided_in("local_recovery") == RECOVERY_SERVICE
     audience.telemetry.close(LONG_S)
 
 

@@ -25,7 +25,9 @@ import numpy.typing as npt
 from holdfast import planning
 from holdfast.configuration import Configuration
 from holdfast.planning import PlanningState
+from holdfast.runtime.links import RECOVERY_SERVICE
 from holdfast.session.effects import Act, Sense, Timing
+from holdfast.session.status import Status
 
 __all__ = ["Shown", "Telemetry"]
 
@@ -135,9 +137,16 @@ class Telemetry:
         self._thread.start()
 
     def decided_in(self, status: str) -> str:
-        """Return who made the last decision, if that was in this status; else nobody, empty."""
+        """Return who decides in this status; empty before its first decision.
+
+        In local recovery the robot may still use an answer that the service which died had given:
+        it decides no more.
+        """
         timing = self._decided_last
-        return "" if timing is None or timing.status != status else timing.service
+        if timing is None or timing.status != status:
+            return ""
+        is_left = status == Status.LOCAL_RECOVERY.value and timing.service != RECOVERY_SERVICE
+        return "" if is_left else timing.service
 
     def time(self, timing: Timing) -> None:
         """Take note of who decided."""
