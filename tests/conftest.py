@@ -55,6 +55,7 @@ REAL = (
     "unit/test_files.py::test_what_is_no_file_is_refused",
     "unit/test_health.py",
     "unit/test_ros1_calls.py",
+    "unit/test_ros1_node.py",
     "unit/test_performer.py::TestStalls",
     "unit/test_service_listening.py",
     "unit/test_service_shell.py",

@@ -170,6 +170,12 @@ class TestCalls:
                 await call(f"http://127.0.0.1:{port}/", "getPid", within_s=PATIENCE_S)
             assert not isinstance(raised.value, SilentError | GoneError)
 
+    async def test_a_host_that_is_no_name(self) -> None:
+        uri = f"rosrpc://{'x' * 100}.y:1"
+        with pytest.raises(CallError):
+            await call(uri, "getPid", within_s=PATIENCE_S)
+        assert await offers_service(uri, "/x", within_s=PATIENCE_S) is None
+
     @pytest.mark.parametrize("uri", ["", "x", "http://", "http://x", "http://x:y/", "rosrpc://:1"])
     async def test_no_address(self, uri: str) -> None:
         with pytest.raises(CallError, match="names no host and port"):

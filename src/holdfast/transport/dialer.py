@@ -270,6 +270,8 @@ class Dialer:
             reason = str(error)
         except (OSError, UnicodeError):
             reason = f"host name not found: {host}"
+        except Exception as error:  # noqa: BLE001 - else nobody would ever look again
+            reason = f"{type(error).__name__}: {error}"
         addresses: list[tuple[socket.AddressFamily, _Address]] = [
             (entry[0], entry[4]) for entry in found
         ]

@@ -93,8 +93,15 @@ class HttpHead(NamedTuple):
         return cls(line, int(fields.get("content-length", "-1")), ends)
 
 
-async def message(reader: asyncio.StreamReader, max_bytes: int) -> bytes:
+async def message(reader: asyncio.StreamReader, max_bytes: int, begun: bytes = b"") -> bytes:
     """Read what comes after its length: a connection header, or a request.
+
+    Parameters
+    ----------
+    reader : StreamReader
+    max_bytes : int
+    begun : bytes
+        Of the length, what has been read already.
 
     Raises
     ------
@@ -103,7 +110,7 @@ async def message(reader: asyncio.StreamReader, max_bytes: int) -> bytes:
     EOFError, OSError
         If none comes.
     """
-    size = int.from_bytes(await reader.readexactly(4), "little")
+    size = int.from_bytes(begun + await reader.readexactly(4 - len(begun)), "little")
     if size > max_bytes:
         raise TransportError(f"sends {size} bytes; {max_bytes} are allowed")
     return await reader.readexactly(size)
@@ -290,7 +297,7 @@ async def offers_service(uri: str, service: str, *, within_s: float) -> bool | N
     except (asyncio.IncompleteReadError, TransportError):
         # It listens, and hangs up on who asks for this service, or is none of ROS 1.
         return False
-    except (CallError, OSError):
+    except (CallError, OSError, ValueError):  # the last: of a host that is no name
         return None
     finally:
         if writer is not None:

@@ -16,12 +16,17 @@ import socket
 import xmlrpc.client
 from collections.abc import Awaitable, Callable, Iterator, Mapping
 from typing import Any, Final, NamedTuple
-from xml.parsers.expat import ExpatError
 
 from holdfast.errors import TransportError
 from holdfast.transport.contract import DEFAULT_MAX_MESSAGE_BYTES
 from holdfast.transport.endpoints import host_and_port, why_not_bound
-from holdfast.transport.ros1_calls import CallError, Connection, HttpHead, message
+from holdfast.transport.ros1_calls import (
+    CallError,
+    Connection,
+    HttpHead,
+    message,
+    offers_service,
+)
 from holdfast.transport.tcpros import (
     ANY_TYPE,
     MAX_HEADER_BYTES,
@@ -46,6 +51,9 @@ MAX_CONNECTIONS: Final = 1024
 _OPENING_S: Final = 5.0
 _IDLE_S: Final = 60.0
 """A connection for questions to a node on which nothing is asked for so long is closed."""
+
+_REQUEST_S: Final = 10.0
+"""From a request's first byte to its last: who takes longer loses the connection."""
 
 _MASTER_S: Final = 1.0
 """For one question to the master."""
@@ -280,6 +288,9 @@ class RosNode:
             except CallError as error:
                 self._tell("unreachable", str(error))
                 pause_s = _AGAIN_S
+            except Exception as error:  # noqa: BLE001 - nothing ends the node's registration
+                self._tell("unreachable", f"{type(error).__name__}: {error}")
+                pause_s = _LOOK_EVERY_S
             await asyncio.sleep(pause_s)
 
     async def _is_known_to_master(self) -> bool:
@@ -289,8 +300,15 @@ class RosNode:
             *(("lookupService", (self.name, name)) for name in services),
         ]
         node, *found = await self._master.calls(asked, within_s=_MASTER_S)
-        # What another node has taken over since is that one's.
-        return node is not None and None not in found
+        if node is None or None in found:
+            return False
+        # What another node has taken over since is that one's, for as long as it offers it.
+        others = [
+            offers_service(str(uri), name, within_s=_MASTER_S)
+            for (name, own), uri in zip(services.items(), found, strict=True)
+            if uri != own
+        ]
+        return False not in await asyncio.gather(*others)
 
     async def _register(self) -> None:
         calls: list[tuple[str, tuple[object, ...]]] = [
@@ -332,9 +350,15 @@ class RosNode:
         async with asyncio.timeout(_OPENING_S):
             if not 0 <= head.size <= _MAX_CALL_BYTES:
                 return False
-            arguments, method = xmlrpc.client.loads(await reader.readexactly(head.size))
-            answer = self._answer(str(method), arguments)
-            body = xmlrpc.client.dumps((answer,), methodresponse=True).encode()
+            content = await reader.readexactly(head.size)
+            answer: tuple[tuple[int, str, Any]] | xmlrpc.client.Fault
+            try:
+                arguments, method = xmlrpc.client.loads(content)
+                answer = (self._answer(str(method), arguments),)
+            except Exception as error:  # noqa: BLE001 - however the parser takes it, it is none
+                reason = f"{type(error).__name__}: {error}"
+                answer = xmlrpc.client.Fault(1, f"this is no question to a node: {reason:.500}")
+            body = xmlrpc.client.dumps(answer, methodresponse=True).encode()
             writer.write(
                 b"HTTP/1.1 200 OK\r\nContent-Type: text/xml\r\n"
                 + (b"Connection: close\r\n" if head.ends else b"")
@@ -405,7 +429,10 @@ class RosNode:
             await writer.drain()
             return
         while True:
-            request = await message(reader, self._max_message_bytes)
+            # Who has begun no request may wait for ever.
+            first = await reader.readexactly(1)
+            async with asyncio.timeout(_REQUEST_S):
+                request = await message(reader, self._max_message_bytes, first)
             try:
                 answer = encode_answer(await offer.handler(request))
             except Exception as error:  # noqa: BLE001 - a defect costs its request alone
@@ -459,7 +486,7 @@ class RosNode:
             yield is_welcome
         except (
             *(OSError, EOFError, ValueError, TypeError),
-            *(TimeoutError, TransportError, ExpatError, xmlrpc.client.Error),
+            *(TimeoutError, TransportError, LookupError),
             *(asyncio.LimitOverrunError, asyncio.CancelledError),
         ):
             pass  # whoever it was has gone, or does not speak as it should

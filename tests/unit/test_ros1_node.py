@@ -1,0 +1,298 @@
+"""A node of ROS 1 among masters that lie, and among those who do not speak as they should."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import socket
+import struct
+import threading
+import xmlrpc.client
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+from tests.ports import free_port
+
+from holdfast.transport import ros1_node
+from holdfast.transport.endpoints import Endpoint
+from holdfast.transport.ros1 import look_up
+from holdfast.transport.ros1_calls import Connection, HttpHead
+from holdfast.transport.ros1_node import RosNode
+from holdfast.transport.tcpros import ServiceType, Surroundings, encode_header
+
+PATIENCE_S = 30.0
+TYPE = ServiceType("std_srvs/Trigger", "937c9679a518e3a18d831e57125ea522")
+FAULT = {"faultCode": 1, "faultString": "no"}
+
+
+def answer(content: bytes, head: bytes = b"") -> bytes:
+    size = str(len(content)).encode()
+    return b"HTTP/1.1 200 OK\r\n" + head + b"Content-Length: " + size + b"\r\n\r\n" + content
+
+
+def saying(value: object) -> bytes:
+    return answer(xmlrpc.client.dumps((value,), methodresponse=True).encode())
+
+
+MEMBER = b"<struct><member><name>a</name></member></struct>"
+NO_ANSWERS = {
+    "empty": answer(b"<methodResponse><params></params></methodResponse>"),
+    "member": answer(
+        b"<methodResponse><params><param><value>%b</value></param></params></methodResponse>"
+        % MEMBER
+    ),
+    "fault": answer(b"<methodResponse><fault></fault></methodResponse>"),
+    "header": b"HTTP/1.1 200 OK\r\nA: " + b"x" * 200_000 + b"\r\n\r\n",
+    "html": answer(b"<html>hello"),
+    "number": saying(5),
+    "dict": saying(FAULT),
+    "words": saying(["one", "", []]),
+    "size": answer(b"", b"Content-Length: \xb2\r\n"),
+}
+
+
+class Master:
+    """Who answers as it is told to; what it is told, it keeps."""
+
+    def __init__(self) -> None:
+        self.says: Callable[[str], bytes] = self.knows
+        self.asked: list[str] = []
+        self.services: dict[str, str] = {}
+        self.nodes: dict[str, str] = {}
+        self.port = free_port()
+
+    def knows(self, method: str) -> bytes:
+        """Answer as a master does."""
+        raise NotImplementedError
+
+    async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        with contextlib.suppress(EOFError, OSError, asyncio.CancelledError):
+            while True:
+                head = await HttpHead.read(reader)
+                arguments, method = xmlrpc.client.loads(await reader.readexactly(head.size))
+                assert method is not None
+                self.asked.append(method)
+                if self.says == self.knows:
+                    writer.write(saying(self.truth(method, arguments)))
+                else:
+                    writer.write(self.says(method))
+        writer.close()
+
+    def truth(self, method: str, arguments: tuple[Any, ...]) -> Any:
+        if method == "system.multicall":
+            return [
+                [self.truth(each["methodName"], tuple(each["params"]))] for each in arguments[0]
+            ]
+        if method == "registerService":
+            self.nodes[arguments[0]] = arguments[3]
+            self.services[arguments[1]] = arguments[2]
+        known = {"lookupNode": self.nodes, "lookupService": self.services}.get(method)
+        if known is None:
+            return [1, "", 0]
+        return [1, "", known[arguments[1]]] if arguments[1] in known else [-1, "unknown", ""]
+
+
+@pytest.fixture
+def master() -> Iterator[Master]:
+    master, ended = Master(), asyncio.Event()
+    listens = threading.Event()
+    loop = asyncio.new_event_loop()
+
+    async def run() -> None:
+        server = await asyncio.start_server(master.serve, "127.0.0.1", master.port)
+        listens.set()
+        await ended.wait()
+        server.close()
+
+    thread = threading.Thread(target=lambda: loop.run_until_complete(run()))
+    thread.start()
+    assert listens.wait(PATIENCE_S)
+    yield master
+    loop.call_soon_threadsafe(ended.set)
+    thread.join(PATIENCE_S)
+    for task in asyncio.all_tasks(loop):
+        task.cancel()
+    loop.run_until_complete(asyncio.sleep(0.02))  # until the connections are closed
+    loop.close()
+
+
+def around(master: Master) -> Surroundings:
+    return Surroundings(f"http://127.0.0.1:{master.port}", "127.0.0.1", "127.0.0.1", "/")
+
+
+async def until(true: Callable[[], object]) -> None:
+    async with asyncio.timeout(PATIENCE_S):
+        while not true():
+            await asyncio.sleep(0.01)
+
+
+async def echo(request: bytes) -> bytes:
+    return request
+
+
+class TestTheMasterLies:
+    @pytest.mark.parametrize("said", NO_ANSWERS.values(), ids=NO_ANSWERS)
+    async def test_a_node_goes_on_until_one_speaks_the_truth(
+        self, master: Master, said: bytes
+    ) -> None:
+        told: list[str] = []
+        node = RosNode(
+            "cloud", around(master), on_event=lambda _, **fields: told.append(fields["status"])
+        )
+        node.offer("cloud", TYPE, echo)
+        master.says = lambda _: said
+        await node.start(0.0)
+        await until(lambda: len(master.asked) > 2)
+        master.says = master.knows
+        await until(lambda: "/cloud" in master.services)
+        # Now it is asked whether it knows the node, and lies again.
+        await until(lambda: told[-1:] == ["registered"])
+        before = len(master.asked)
+        master.says = lambda _: said
+        await until(lambda: len(master.asked) > before + 1)
+        master.services.clear()
+        master.says = master.knows
+        await until(lambda: "/cloud" in master.services)
+        assert told[:2] == ["unreachable", "registered"]
+        await node.close()
+
+    async def test_a_defect_of_ours_ends_nothing(
+        self, master: Master, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        told: list[tuple[str, str]] = []
+        node = RosNode(
+            "cloud",
+            around(master),
+            on_event=lambda _, **fields: told.append((fields["status"], fields["reason"])),
+        )
+        node.offer("cloud", TYPE, echo)
+        call, fails = Connection.call, True
+
+        async def failing(self: Connection, *arguments: Any, **more: Any) -> Any:
+            if fails:
+                raise KeyError("x")
+            return await call(self, *arguments, **more)
+
+        monkeypatch.setattr(Connection, "call", failing)
+        monkeypatch.setattr(ros1_node, "_LOOK_EVERY_S", 0.01)
+        await node.start(0.1)
+        fails = False
+        await until(lambda: "/cloud" in master.services)
+        assert told[0] == ("unreachable", "KeyError: 'x'")
+        assert [status for status, _ in told][:2] == ["unreachable", "registered"]
+        await node.close()
+
+    @pytest.mark.parametrize("said", NO_ANSWERS.values(), ids=NO_ANSWERS)
+    async def test_a_robot_s_look_up_says_why_it_finds_nobody(
+        self, master: Master, said: bytes, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        from holdfast.errors import TransportError
+
+        monkeypatch.setenv("ROS_MASTER_URI", around(master).master)
+        master.says = lambda _: said
+        with pytest.raises(TransportError, match="does not say where it is"):
+            await asyncio.get_running_loop().run_in_executor(
+                None, look_up, Endpoint("ros1", "cloud", 0)
+            )
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"<methodCall><methodName>getPid</methodName><fault></fault></methodCall>",
+        b"<methodCall><methodName>x</methodName><params><param><value>%b</value></param></params>"
+        b"</methodCall>" % MEMBER,
+        b"<html>",
+        xmlrpc.client.dumps(("/x", "/topic", 7), "requestTopic").encode(),
+        xmlrpc.client.dumps(("/x", ["/topic"], []), "requestTopic").encode(),
+    ],
+)
+async def test_what_is_no_question_to_a_node_is_answered_with_a_fault(
+    master: Master, content: bytes, caplog: pytest.LogCaptureFixture
+) -> None:
+    node = RosNode("cloud", around(master))
+    node.publish("topic", ros1_node.TopicType("std_msgs/String", "0" * 32, "string data"))
+    await node.start(0.0)
+    host, port = node._uri.removeprefix("http://").rstrip("/").split(":")
+    reader, writer = await asyncio.open_connection(host, int(port))
+    for _ in range(2):  # on the same connection
+        size = str(len(content)).encode()
+        writer.write(b"POST / HTTP/1.1\r\nContent-Length: " + size + b"\r\n\r\n" + content)
+        head = await asyncio.wait_for(HttpHead.read(reader), PATIENCE_S)
+        with pytest.raises(xmlrpc.client.Fault):
+            xmlrpc.client.loads(await reader.readexactly(head.size))
+    writer.close()
+    await node.close()
+    assert not caplog.records
+
+
+def address_of(node: RosNode) -> tuple[str, int]:
+    return "127.0.0.1", node._port
+
+
+def header(**more: str) -> bytes:
+    return encode_header({"service": "/cloud", "md5sum": "*", "callerid": "/x", **more})
+
+
+async def test_half_a_request_holds_no_place_for_ever(
+    master: Master, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ros1_node, "_REQUEST_S", 0.05)
+    node = RosNode("cloud", around(master))
+    node.offer("cloud", TYPE, echo)
+    await node.start(0.0)
+    for half in (struct.pack("<I", 100) + b"x", b"\1"):
+        reader, writer = await asyncio.open_connection(*address_of(node))
+        writer.write(header(persistent="1") + half)
+        async with asyncio.timeout(PATIENCE_S):
+            await reader.read()
+        writer.close()
+    # Who has begun none may wait.
+    reader, writer = await asyncio.open_connection(*address_of(node))
+    writer.write(header(persistent="1"))
+    async with asyncio.timeout(PATIENCE_S):
+        await reader.readexactly(int.from_bytes(await reader.readexactly(4), "little"))
+        await asyncio.sleep(0.2)
+        writer.write(struct.pack("<I", 2) + b"ab")
+        assert await reader.readexactly(7) == b"\1" + struct.pack("<I", 2) + b"ab"
+    writer.close()
+    await node.close()
+
+
+class TestAnotherHasTheName:
+    async def test_who_is_dead_is_replaced(self, master: Master) -> None:
+        node = RosNode("cloud", around(master))
+        node.offer("cloud", TYPE, echo)
+        assert await node.start(PATIENCE_S)
+        own = master.services["/cloud"]
+        master.services["/cloud"] = f"rosrpc://127.0.0.1:{free_port()}"
+        await until(lambda: master.services["/cloud"] == own)
+        await node.close()
+
+    async def test_who_lives_is_left_alone(
+        self, master: Master, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(ros1_node, "_LOOK_EVERY_S", 0.01)
+        nodes = [RosNode(name, around(master)) for name in ("first", "second")]
+        for node in nodes:
+            node.offer("cloud", TYPE, echo)
+            assert await node.start(PATIENCE_S)
+            if node is nodes[0]:
+                first = master.services["/cloud"]
+        second = master.services["/cloud"]
+        looks = master.asked.count("system.multicall")
+        await until(lambda: master.asked.count("system.multicall") > looks + 10)
+        assert master.services["/cloud"] == second
+        await nodes[1].close()
+        await until(lambda: master.services["/cloud"] == first)
+        with socket.socket() as hanging:
+            hanging.bind(("127.0.0.1", 0))
+            hanging.listen()
+            silent = f"rosrpc://127.0.0.1:{hanging.getsockname()[1]}"
+            monkeypatch.setattr(ros1_node, "_MASTER_S", 0.2)
+            master.services["/cloud"] = silent
+            looks = master.asked.count("system.multicall")
+            await until(lambda: master.asked.count("system.multicall") > looks + 3)
+            assert master.services["/cloud"] == silent
+        await nodes[0].close()
