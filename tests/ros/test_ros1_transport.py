@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import itertools
 import signal
+import struct
+import subprocess
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
@@ -22,12 +25,14 @@ from tests.contracts.test_transport import (
     service_process,
     until,
 )
-from tests.ros.ros1_processes import Ros1, ros1_in
+from tests.ports import free_port
+from tests.ros.ros1_processes import HOLDFAST, Ros1, ros1_in, wait_for
 
 from holdfast.errors import TransportError
 from holdfast.session.events import Appeared, Ended, Replied, Vanished
 from holdfast.transport.ros1 import EXCHANGE
 from holdfast.transport.service_end import StreamServiceTransport
+from holdfast.transport.tcpros import encode_header
 
 TestEveryWire = contract.TestEveryWire
 _OF_PROCESSES = contract.TestProcesses
@@ -128,6 +133,72 @@ async def test_a_service_that_is_started_again_is_found_at_its_new_port(
             assert await answered(robot, inbox, numbers)
             process.send_signal(signal.SIGKILL)
             await inbox.wait_for(Vanished("cloud", f"b{times}"))
+
+
+async def opened(around: Ros1, wire: RosWire) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+    """Return a connection to the service that is open, as a robot's is before its first frame."""
+    await wire.service("cloud", "b1").start(echo)
+    uri = around.service_uri("cloud/exchange")
+    assert uri is not None
+    host, _, port = uri.removeprefix("rosrpc://").rpartition(":")
+    reader, writer = await asyncio.open_connection(host, int(port))
+    writer.write(encode_header({"service": "/cloud/exchange", "md5sum": EXCHANGE.digest}))
+    await reader.readexactly(int.from_bytes(await reader.readexactly(4), "little"))
+    return reader, writer
+
+
+async def test_requests_without_bytes_and_without_end_are_refused(
+    around: Ros1, wire: RosWire
+) -> None:
+    reader, writer = await opened(around, wire)
+    writer.write(struct.pack("<II", 4, 0) * 100_000)
+    with contextlib.suppress(ConnectionError):
+        assert await reader.read() == b""  # none of them was answered
+    writer.close()
+    assert "sends requests without bytes while 2 wait" in wire.reasons()
+
+
+class TestTwoOfOneName:
+    def serve(self, around: Ros1) -> subprocess.Popen[str]:
+        before = around.service_uri("two/exchange")
+        process = around.start(
+            *(HOLDFAST, "serve", "--insecure", "--listen", "ros1/two"),
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        wait_for(
+            lambda: around.service_uri("two/exchange") not in (None, before), "it is registered"
+        )
+        return process
+
+    def test_rosnode_kill_ends_it(self, around: Ros1) -> None:
+        process = self.serve(around)
+        around.run("rosnode", "kill", "/two/exchange_node")
+        _, log = process.communicate(timeout=60.0)
+        assert process.returncode == 0
+        assert "asked to by ROS (user request)" in log
+        assert around.service_uri("two/exchange") is None
+
+    def test_the_later_one_has_the_name_and_the_earlier_one_ends(self, around: Ros1) -> None:
+        first, second = (self.serve(around) for _ in range(2))
+        assert first.wait(60.0) == 0
+        uri = around.service_uri("two/exchange")
+        assert uri is not None
+        assert second.poll() is None
+        second.terminate()
+        assert second.wait(60.0) == 0
+
+
+async def test_a_name_that_a_dead_process_has_taken_is_taken_back(
+    around: Ros1, wire: RosWire
+) -> None:
+    await wire.service("cloud", "b1").start(echo)
+    own = around.service_uri("cloud/exchange")
+    dead = f"rosrpc://127.0.0.1:{free_port()}"
+    node = f"http://127.0.0.1:{free_port()}/"
+    around.ask("registerService", "/cloud/exchange", dead, node, caller="/other")
+    assert around.service_uri("cloud/exchange") == dead
+    await until(lambda: around.service_uri("cloud/exchange") == own)
 
 
 @pytest.mark.parametrize("name", ["", "a b", "/", "a//b", "7up", "x" * 201])

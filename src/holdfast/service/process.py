@@ -162,6 +162,11 @@ def _serve(
     from holdfast.runtime.descriptors import NEEDED, allow_descriptors
     from holdfast.transport.service_end import MAX_LINKS, MAX_UNKNOWN, StreamServiceTransport
 
+    def end_for_ros(reason: str) -> None:
+        """End as ROS asks a node to, with the time that SIGTERM leaves."""
+        shell.note("ros_shutdown", reason=reason)
+        os.kill(os.getpid(), signal.SIGTERM)
+
     beside = NEEDED + MAX_UNKNOWN
     allowed = allow_descriptors(beside + MAX_LINKS)
     boot = os.urandom(8).hex()
@@ -176,6 +181,7 @@ def _serve(
         max_links=min(MAX_LINKS, max(allowed // 4, allowed - beside)),
         tls=None if credentials is None else credentials.files,
         on_event=lambda event, **fields: shell.note(event, **fields),
+        on_shutdown=end_for_ros,
         needs_endpoint=not others,
     )
 

@@ -93,12 +93,21 @@ def look_up(endpoint: Endpoint) -> tuple[str, int]:
         loop.close()
 
 
-def make_node(ports: Mapping[Endpoint, int], on_event: Callable[..., None] | None) -> RosNode:
+def make_node(
+    ports: Mapping[Endpoint, int],
+    on_event: Callable[..., None] | None,
+    on_shutdown: Callable[[str], None] | None,
+) -> RosNode:
     """Return a node that says where the services behind some endpoints listen."""
     from holdfast.transport.ros1_node import RosNode
 
     first = next(iter(ports))
-    node = RosNode(_node_of(exchange_name(first)), Surroundings.of(), on_event=on_event)
+    node = RosNode(
+        _node_of(exchange_name(first)),
+        Surroundings.of(),
+        on_event=on_event,
+        on_shutdown=on_shutdown,
+    )
     for endpoint, port in ports.items():
         node.offer_at(exchange_name(endpoint), port)
     return node
@@ -118,7 +127,9 @@ class _Stream(asyncio.Transport, asyncio.Protocol):
         self._loop = asyncio.get_running_loop()
         self._below: asyncio.Transport | None = None
         self._is_open = False  # the other end's header has come
-        self._raw = b""  # of what has come, what is not read yet
+        # Of what has come, what is not read yet; from its front bytes go without a copy.
+        self._raw = bytearray()
+        self._is_refused = False
         self._left = 0  # bytes of the link's that are still to come in this message
         self._inbox = bytearray()  # bytes for the link
         self._is_paused = self._is_delivering = False
@@ -132,11 +143,15 @@ class _Stream(asyncio.Transport, asyncio.Protocol):
         self._link.connection_made(self)
 
     def data_received(self, data: bytes) -> None:
+        if self._is_refused:
+            return
         self._raw += data
         try:
             while self._read():
                 pass
         except TransportError as error:
+            self._is_refused = True
+            self._raw.clear()
             self._link.end(str(error), refused=True)
             return
         self._deliver()
@@ -194,8 +209,14 @@ class _Stream(asyncio.Transport, asyncio.Protocol):
         """Read what stands before a message's bytes; return whether it was there."""
         raise NotImplementedError
 
-    def _message_ended(self) -> None:
-        """Take note that a whole message has come."""
+    def _message_ended(self, *, is_empty: bool) -> None:
+        """Take note that a whole message has come.
+
+        Raises
+        ------
+        TransportError
+            If it may not.
+        """
 
     def _read(self) -> bool:
         """Read a part of what has come; return whether there may be more."""
@@ -207,8 +228,8 @@ class _Stream(asyncio.Transport, asyncio.Protocol):
                 raise TransportError("has sent no connection header of ROS 1")
             if len(self._raw) < _COUNT.size + size:
                 return False
-            header = self._raw[_COUNT.size : _COUNT.size + size]
-            self._raw = self._raw[_COUNT.size + size :]
+            header = bytes(self._raw[_COUNT.size : _COUNT.size + size])
+            del self._raw[: _COUNT.size + size]
             self._is_open = True
             self._take_header(decode_header(header))
             return True
@@ -216,20 +237,22 @@ class _Stream(asyncio.Transport, asyncio.Protocol):
             return self._read_head()
         if not self._raw:
             return False
-        part, self._raw = self._raw[: self._left], self._raw[self._left :]
-        self._inbox += part
-        self._left -= len(part)
+        size = min(self._left, len(self._raw))
+        with memoryview(self._raw) as raw:
+            self._inbox += raw[:size]
+        del self._raw[:size]
+        self._left -= size
         if not self._left:
-            self._message_ended()
+            self._message_ended(is_empty=False)
         return True
 
     def _begin_message(self, head: struct.Struct, size: int, count: int) -> None:
         if size != count + _COUNT.size:
             raise TransportError("has sent a message that is not of this service's type")
-        self._raw = self._raw[head.size :]
+        del self._raw[: head.size]
         self._left = count
         if not count:
-            self._message_ended()
+            self._message_ended(is_empty=True)
 
     def _deliver(self) -> None:
         """Hand over to the link what it will take."""
@@ -285,6 +308,8 @@ class _RobotStream(_Stream):
         if len(self._raw) < _ANSWER.size:
             return False
         _, size, count = _ANSWER.unpack_from(self._raw)
+        if not self._unanswered:
+            raise TransportError("answers what was not asked")
         self._unanswered -= 1
         if not self._unanswered:
             self.write(b"")
@@ -351,7 +376,10 @@ class _ServiceStream(_Stream):
         self._begin_message(_REQUEST, size, count)
         return True
 
-    def _message_ended(self) -> None:
+    def _message_ended(self, *, is_empty: bool) -> None:
+        # A robot sends one without bytes only when none waits.
+        if is_empty and self._held >= _MAX_HELD:
+            raise TransportError(f"sends requests without bytes while {_MAX_HELD} wait")
         self._held += 1
         self._flush()
         if self._held > _MAX_HELD and self._below is not None:

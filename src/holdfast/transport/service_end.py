@@ -158,6 +158,8 @@ class StreamServiceTransport:
         Is told what is worth a line of a log: ``link_refused`` with ``reason`` and, if it is known,
         ``robot``; ``robot_connected`` with ``robot``; ``robot_disconnected`` with ``robot`` and
         ``reason``. Each has the robot's ``address``, None over a local socket.
+    on_shutdown : callable or None
+        Is told why this process is to end where ROS asks that, or another one takes its name there.
 
     Raises
     ------
@@ -178,6 +180,7 @@ class StreamServiceTransport:
         max_links: int | None = None,
         tls: TlsFiles | None = None,
         on_event: Callable[..., None] | None = None,
+        on_shutdown: Callable[[str], None] | None = None,
         needs_endpoint: bool = True,
     ) -> None:
         check_name("name of a service", name)
@@ -219,6 +222,7 @@ class StreamServiceTransport:
             must_read=True,
         )
         self._on_event = on_event
+        self._on_shutdown = on_shutdown
         self._deliver: Callable[[IncomingCall], None] | None = None
         self._started = False
         self._takes_links = True
@@ -276,7 +280,7 @@ class StreamServiceTransport:
         if ports:
             from holdfast.transport.ros1 import make_node
 
-            self._node = make_node(ports, self._on_event)
+            self._node = make_node(ports, self._on_event, self._on_shutdown)
             await self._node.start()
 
     def dismiss(self) -> asyncio.Future[None]:
