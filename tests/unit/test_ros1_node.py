@@ -31,7 +31,7 @@ def answer(content: bytes, head: bytes = b"") -> bytes:
     return b"HTTP/1.1 200 OK\r\n" + head + b"Content-Length: " + size + b"\r\n\r\n" + content
 
 
-def saying(value: object) -> bytes:
+def saying(value: Any) -> bytes:
     return answer(xmlrpc.client.dumps((value,), methodresponse=True).encode())
 
 
