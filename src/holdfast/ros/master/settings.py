@@ -77,10 +77,10 @@ class MasterAddress(NamedTuple):
         text = environment.get("ROS_MASTER_URI") or f"http://localhost:{DEFAULT_PORT}"
         try:
             parts = urlsplit(text)
-            host, named = parts.hostname, parts.port
+            scheme, host, named = parts.scheme, parts.hostname, parts.port
         except ValueError:
-            host = named = None
-        if parts.scheme != "http" or not host:
+            scheme, host, named = "", None, None
+        if scheme != "http" or not host:
             raise GuardError(f"ROS_MASTER_URI is {text!r:.200}; expected http://HOST:PORT")
         # As rosgraph.network has it.
         own = environment.get("ROS_HOSTNAME") or environment.get("ROS_IP") or ""
@@ -179,8 +179,10 @@ class GuardLock:
             raise GuardError(
                 f"the master at port {port} has a guard already: process {who or 'unknown'}"
             ) from error
-        os.ftruncate(self._descriptor, 0)
-        os.pwrite(self._descriptor, f"{os.getpid()}\n".encode(), 0)
+        # What locks is the file, not what is in it, for which the disk may have no room.
+        with contextlib.suppress(OSError):
+            os.ftruncate(self._descriptor, 0)
+            os.pwrite(self._descriptor, f"{os.getpid()}\n".encode(), 0)
 
     def __enter__(self) -> None:
         pass
