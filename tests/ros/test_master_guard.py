@@ -254,7 +254,7 @@ class TestItsOwnMaster:
 
     def test_the_spare_ends_quietly(self, graph: Graph) -> None:
         guard = graph.guard("--no-rosout")
-        spares = []
+        spares: list[int] = []
 
         def has_spare() -> bool:
             children = Path(f"/proc/{guard.process.pid}/task/{guard.process.pid}/children")

@@ -28,6 +28,7 @@ from holdfast.ros.master.process import (
     read_journal,
     write_journal,
 )
+from holdfast.ros.master.settings import GuardError, GuardLock
 
 ARM, BASE, LIDAR = "http://robot:1/", "http://robot:2/", "http://robot:3/"
 
@@ -178,6 +179,25 @@ class TestParameters:
         assert parameter_names(state.parameters) == ["/a/b", "/a/c/d"]
         state.apply("parameters", "/", {"f": 5})
         assert state.parameters == {"f": 5}
+
+
+class TestLock:
+    def test_a_second_guard_is_kept_away_even_if_the_file_is_removed(self, tmp_path: Path) -> None:
+        path = tmp_path / "lock"
+        with GuardLock(path, 11311) as lock:
+            path.unlink()
+            lock.keep()
+            with pytest.raises(GuardError, match=f"has a guard already: process {os.getpid()}"):
+                GuardLock(path, 11311)
+        with GuardLock(path, 11311):
+            pass
+
+    def test_it_is_kept_young(self, tmp_path: Path) -> None:
+        path = tmp_path / "lock"
+        with GuardLock(path, 11311) as lock:
+            os.utime(path, (0, 0))
+            lock.keep()
+            assert path.stat().st_mtime > 0
 
 
 class TestJournal:

@@ -77,6 +77,7 @@ _FIRST_DELAY_S, _LAST_DELAY_S = 0.1, 1.0
 _KEPT_S = 5.0
 """Calls are not kept waiting for a master longer than this; then they are refused."""
 
+_LOCKED_EVERY_S = 1.0
 _BACKLOG = 1024
 _ROSOUT = "/rosout"
 _ROSOUT_EVERY_S = 1.0
@@ -130,8 +131,8 @@ class MasterGuard:
         directory = self._settings.directory or own_directory()
         port = self._settings.address.port
         self._journal = directory / f"master-{port}.journal"
-        with GuardLock(directory / f"master-{port}.lock", port):
-            helpers: list[asyncio.Task[None]] = []
+        with GuardLock(directory / f"master-{port}.lock", port) as lock:
+            helpers = [asyncio.create_task(_keep_lock(lock))]
             try:
                 self._new_socket(0.0)
                 # Whatever is missing is said now, not when the master dies.
@@ -635,6 +636,12 @@ class MasterGuard:
         self._let_go()
         if self._listening is not None:
             self._listening.close()
+
+
+async def _keep_lock(lock: GuardLock) -> None:
+    while True:
+        lock.keep()
+        await asyncio.sleep(_LOCKED_EVERY_S)
 
 
 def _words_of(error: Exception) -> str:
