@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import socket
 import sys
@@ -218,6 +219,56 @@ class TestItsOwnMaster:
         assert "/work" in graph.registered()["services"]
         assert graph.registered()["parameters"]["small"] == "y"
 
+    @pytest.mark.parametrize("loss", ["file", "directory"])
+    @pytest.mark.parametrize("at_once", [True, False])
+    def test_its_journal_is_removed(self, graph: Graph, loss: str, at_once: bool) -> None:
+        guard = graph.guard("--no-rosout")
+        server = graph.node("server", "/server", "/work")
+        wait_for(lambda: server.lines)
+        graph.run("rosparam", "set", "/speed", "1")
+        journal = Path(graph.ask("getJournal")[2])
+        if loss == "file":
+            journal.unlink()
+        else:
+            shutil.rmtree(journal.parent)
+        if not at_once:
+            wait_for(journal.exists)
+        replaced(graph, graph.kill_master())
+        assert "/work" in graph.registered()["services"]
+        assert graph.registered()["parameters"]["speed"] == 1
+        assert journal.exists()
+        if at_once:
+            assert "nothing is lost" in graph.events(guard, "journal_failed")[0]["reason"]
+
+    def test_a_journal_that_cannot_be_read_is_kept(self, graph: Graph) -> None:
+        journal = graph.directory / f"master-{graph.port}.journal"
+        journal.write_text("not what it was")
+        guard = graph.guard("--no-rosout", "--directory", str(graph.directory))
+        (event,) = graph.events(guard, "journal_failed")
+        aside = journal.with_name(f"{journal.name}.unread")
+        assert str(aside) in event["reason"]
+        assert aside.read_text() == "not what it was"
+        graph.run("rosparam", "set", "/speed", "1")
+        replaced(graph, graph.kill_master())
+        assert graph.registered()["parameters"]["speed"] == 1
+
+    def test_the_spare_ends_quietly(self, graph: Graph) -> None:
+        guard = graph.guard("--no-rosout")
+        spares: list[int] = []
+
+        def has_spare() -> bool:
+            children = Path(f"/proc/{guard.process.pid}/task/{guard.process.pid}/children")
+            spares[:] = {int(pid) for pid in children.read_text().split()} - {graph.master_pid()}
+            return bool(spares)
+
+        wait_for(has_spare)
+        time.sleep(1.0)  # it says that it is warm, which the guard does not read
+        pid = graph.master_pid()
+        guard.end()
+        os.kill(pid, signal.SIGKILL)
+        wait_for(lambda: not any(map(alive, spares)))
+        assert "Traceback" not in guard.errors
+
     def test_the_guard_is_killed(self, graph: Graph) -> None:
         guard = graph.guard()
         caller, listener = start_everything(graph)
@@ -337,6 +388,45 @@ class TestAMasterOfOthers:
         replaced(graph, graph.kill_master())
         assert "/work" in graph.registered()["services"]
 
+    def test_what_cannot_be_written_down_is_known_to_the_next_one(self, graph: Graph) -> None:
+        graph.start("rosmaster", "--core", "-p", str(graph.port))
+        wait_for(graph.master_pid)
+        guard = graph.guard("--no-rosout")
+        directory = graph.directory / "run" / "holdfast"
+        shutil.rmtree(directory)
+        directory.touch()
+        graph.run("rosparam", "set", "/speed", "1")
+        wait_for(lambda: graph.events(guard, "journal_failed"))
+        time.sleep(1.0)
+        assert len(graph.events(guard, "journal_failed")) == 1
+        replaced(graph, graph.kill_master())
+        assert graph.registered()["parameters"]["speed"] == 1
+        directory.unlink()
+        wait_for(lambda: "written down again" in guard.errors)
+
+    def test_when_it_can_be_written_down_again(self, graph: Graph) -> None:
+        graph.start("rosmaster", "--core", "-p", str(graph.port))
+        wait_for(graph.master_pid)
+        guard = graph.guard("--no-rosout")
+        directory = graph.directory / "run" / "holdfast"
+        shutil.rmtree(directory)
+        directory.touch()
+        wait_for(lambda: graph.events(guard, "journal_failed"))
+        directory.unlink()
+        wait_for(lambda: graph.events(guard, "journal_written"))
+        assert list(directory.glob("*.journal"))
+
+    def test_what_cannot_be_written_down_at_the_start_is_said(self, graph: Graph) -> None:
+        graph.start("rosmaster", "--core", "-p", str(graph.port))
+        wait_for(graph.master_pid)
+        # Nothing can be put at the place of a directory.
+        journal = graph.directory / f"master-{graph.port}.journal"
+        journal.mkdir()
+        guard = graph.start(*GUARD, "--directory", str(graph.directory))
+        assert guard.process.wait(PATIENCE_S) == 2
+        assert f"{journal}: what the master knows cannot be written down" in guard.errors
+        assert "no ROS 1 master" not in guard.errors
+
     def test_one_that_is_stopped_is_replaced(self, graph: Graph) -> None:
         master = graph.start("rosmaster", "--core", "-p", str(graph.port))
         wait_for(graph.master_pid)
@@ -451,7 +541,8 @@ class TestWhatCannotBeGuarded:
             MasterAddress.of({"ROS_MASTER_URI": "http://192.0.2.1:11311"})
 
     @pytest.mark.parametrize(
-        "uri", ["localhost:11311", "http://", "http://localhost:x", "https://localhost:1"]
+        "uri",
+        ["localhost:11311", "http://", "http://localhost:x", "https://localhost:1", "http://[::1"],
     )
     def test_no_address(self, uri: str) -> None:
         with pytest.raises(GuardError, match="expected http://HOST:PORT"):

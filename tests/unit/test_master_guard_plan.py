@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import os
 import pickle
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,7 @@ from holdfast.ros.master.process import (
     read_journal,
     write_journal,
 )
+from holdfast.ros.master.settings import GuardError, GuardLock
 
 ARM, BASE, LIDAR = "http://robot:1/", "http://robot:2/", "http://robot:3/"
 
@@ -179,13 +181,104 @@ class TestParameters:
         assert state.parameters == {"f": 5}
 
 
+class TestLock:
+    def test_a_second_guard_is_kept_away_even_if_the_file_is_removed(self, tmp_path: Path) -> None:
+        path = tmp_path / "lock"
+        with GuardLock(path, 11311) as lock:
+            path.unlink()
+            lock.keep()
+            with pytest.raises(GuardError, match=f"has a guard already: process {os.getpid()}"):
+                GuardLock(path, 11311)
+        with GuardLock(path, 11311):
+            pass
+
+    def test_it_is_kept_young(self, tmp_path: Path) -> None:
+        path = tmp_path / "lock"
+        with GuardLock(path, 11311) as lock:
+            os.utime(path, (0, 0))
+            lock.keep()
+            assert path.stat().st_mtime > 0
+
+
 class TestJournal:
     def test_there_is_none(self, tmp_path: Path) -> None:
         assert read_journal(tmp_path / "none") is None
+
+    def test_what_is_there_and_cannot_be_read_is_said(self, tmp_path: Path) -> None:
         (tmp_path / "other").write_bytes(b"something else")
-        assert read_journal(tmp_path / "other") is None
+        with pytest.raises(ValueError, match="no journal"):
+            read_journal(tmp_path / "other")
         (tmp_path / "empty").touch()
-        assert read_journal(tmp_path / "empty") is None
+        with pytest.raises(ValueError, match="no journal"):
+            read_journal(tmp_path / "empty")
+        with pytest.raises(IsADirectoryError):
+            read_journal(tmp_path)
+
+    @pytest.mark.parametrize("by", ["a look", "a change"])
+    @pytest.mark.parametrize("loss", ["file", "directory", "truncated", "another"])
+    def test_it_is_written_anew_when_it_is_gone(self, tmp_path: Path, loss: str, by: str) -> None:
+        path = tmp_path / "guard" / "journal"
+        journal = Journal(path, known())
+        if loss == "file":
+            path.unlink()
+        elif loss == "directory":
+            shutil.rmtree(path.parent)
+        elif loss == "truncated":
+            os.truncate(path, 10)
+        else:
+            path.unlink()
+            path.write_bytes(b"another")
+        expected = known()
+        if by == "a look":
+            journal.look()
+        else:
+            journal.write("types", "/a", "x/Y")
+            expected.types["/a"] = "x/Y"
+        journal.close()
+        assert read_journal(path) == expected
+        assert path.parent.stat().st_mode & 0o777 == 0o700
+
+    def test_a_look_keeps_it_young(self, tmp_path: Path) -> None:
+        journal = Journal(tmp_path / "journal", known())
+        os.utime(tmp_path / "journal", (0, 0))
+        journal.look()
+        journal.close()
+        assert (tmp_path / "journal").stat().st_mtime > 0
+
+    def test_a_removed_one_that_is_open_can_be_read(self, tmp_path: Path) -> None:
+        write_journal(tmp_path / "journal", known())
+        with (tmp_path / "journal").open("rb") as file:
+            (tmp_path / "journal").unlink()
+            for _ in range(2):
+                assert read_journal(file.fileno()) == known()
+
+    def test_that_it_cannot_be_written_is_said_once(
+        self, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        path = tmp_path / "guard" / "journal"
+        journal = Journal(path, known())
+        shutil.rmtree(path.parent)
+        path.parent.touch()
+        for number in range(3):
+            journal.write("parameters", "/a", number)
+            journal.look()
+        said = capsys.readouterr().err
+        assert said.count("\n") == 1
+        assert "changes are not written down" in said
+        path.parent.unlink()
+        journal.look()
+        assert "written down again" in capsys.readouterr().err
+        journal.close()
+        found = read_journal(path)
+        assert found is not None
+        assert found.parameters["a"] == 2
+
+    def test_it_is_not_written_through_a_link(self, tmp_path: Path) -> None:
+        (tmp_path / "precious").write_text("mine")
+        (tmp_path / "journal.new").symlink_to(tmp_path / "precious")
+        write_journal(tmp_path / "journal", known())
+        assert (tmp_path / "precious").read_text() == "mine"
+        assert read_journal(tmp_path / "journal") == known()
 
     def test_it_is_written_and_read(self, tmp_path: Path) -> None:
         path = tmp_path / "journal"

@@ -21,7 +21,7 @@ By a service: ready, session_opened, session_taken_over, restored, state_diverge
 evicted, robot_connected, robot_disconnected, link_refused, credentials, credentials_reloaded,
 stopping, process_ended, process_started.
 By ``holdfast ros1-guard``: ready, guarding, master_started, master_lost, master_failed,
-master_hangs, nodes_gone, rosout_ended, note, stopping.
+master_hangs, nodes_gone, journal_failed, journal_written, rosout_ended, note, stopping.
 By ``holdfast chaos``: chaos_trial, left_out, note, interrupted. By a command that ends with an
 error: error. Fields with a place of their own in the text form: ``from`` and ``to`` (of a change),
 ``service``, ``robot``, ``reason``, ``duration_ms``. Of events that may come very often twenty of a

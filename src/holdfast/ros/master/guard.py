@@ -36,6 +36,7 @@ from holdfast.ros.master.process import (
     MasterState,
     parameter_names,
     read_journal,
+    touch,
     write_journal,
 )
 from holdfast.ros.master.settings import (
@@ -76,6 +77,7 @@ _FIRST_DELAY_S, _LAST_DELAY_S = 0.1, 1.0
 _KEPT_S = 5.0
 """Calls are not kept waiting for a master longer than this; then they are refused."""
 
+_LOCKED_EVERY_S = 1.0
 _BACKLOG = 1024
 _ROSOUT = "/rosout"
 _ROSOUT_EVERY_S = 1.0
@@ -102,7 +104,12 @@ class MasterGuard:
         self._other_pid: int | None = None
         self._is_inherited = False
         """Whether the other master is one that an earlier guard has started."""
-        self._written_down: MasterState | None = None
+        self._followed: MasterState | None = None
+        """What a master that keeps no journal knew last."""
+        self._unwritten: str | None = None
+        """Why that is not written down."""
+        self._held = -1
+        """The journal of a master that keeps one; it can be read even if it was removed."""
         self._doubtful = MasterState()
         """Who did not answer when the master began."""
         self._rosout: ChildProcess | None = None
@@ -124,8 +131,8 @@ class MasterGuard:
         directory = self._settings.directory or own_directory()
         port = self._settings.address.port
         self._journal = directory / f"master-{port}.journal"
-        with GuardLock(directory / f"master-{port}.lock", port):
-            helpers: list[asyncio.Task[None]] = []
+        with GuardLock(directory / f"master-{port}.lock", port) as lock:
+            helpers = [asyncio.create_task(_keep_lock(lock))]
             try:
                 self._new_socket(0.0)
                 # Whatever is missing is said now, not when the master dies.
@@ -167,10 +174,12 @@ class MasterGuard:
         except CallError as error:
             raise GuardError(f"what is there is no ROS 1 master: {error}") from error
         else:
+            if self._unwritten is not None:
+                raise GuardError(f"{self._unwritten}; name another --directory")
             return "found"
         finally:
             connection.close()
-        known = read_journal(self._journal) or MasterState()
+        known = self._known()
         nodes, services = await ask_everyone(known)
         others = {uri for node, uri in known.nodes().items() if node != _ROSOUT}
         resumes = any(isinstance(nodes[uri], NodeReport) for uri in others)
@@ -298,6 +307,7 @@ class MasterGuard:
         try:
             # What counts is what was waited, not the clock: the guard may have been stopped itself.
             while failed < self._settings.silent_s:
+                self._hold_journal()
                 asked_at = monotonic()
                 try:
                     await connection.call("getPid", within_s=probe_s)
@@ -335,10 +345,10 @@ class MasterGuard:
         # A stock master answers at once that it has no such call.
         (journal,) = await connection.calls([("getJournal", (CALLER,))], within_s=_PROBE_S)
         inherited = journal == str(self._journal)
+        self._followed = None
         if not inherited:
             # That of another master is not its.
-            self._journal.unlink(missing_ok=True)
-            self._written_down = None
+            self._forget_journal()
             await self._write_down(connection)
         self._other_pid, self._is_inherited = pid, inherited
         self._events.event(
@@ -352,11 +362,84 @@ class MasterGuard:
         """Write down what a stock master knows, if that has changed."""
         try:
             state = await snapshot(connection)
-            if state != self._written_down:
+        except (TypeError, ValueError) as error:
+            raise CallError(f"{self._uri}: cannot be understood: {error}") from error
+        changed, self._followed = state != self._followed, state
+        try:
+            if changed or self._unwritten is not None or not self._has_journal():
                 write_journal(self._journal, state)
-                self._written_down = state
         except (OSError, TypeError, ValueError) as error:
-            raise CallError(f"{self._uri}: cannot be written down: {error}") from error
+            before, self._unwritten = (
+                self._unwritten,
+                f"{self._journal}: what the master knows cannot be written down: "
+                f"{_words_of(error)}",
+            )
+            if before is None:
+                self._events.event("journal_failed", reason=self._unwritten)
+        else:
+            if self._unwritten is not None:
+                self._events.event("journal_written", reason=f"{self._journal}: is whole again")
+            self._unwritten = None
+
+    def _has_journal(self) -> bool:
+        try:
+            touch(self._journal, self._journal.stat())
+        except OSError:
+            return False
+        return True
+
+    # -- the journal -------------------------------------------------------------------------------
+
+    def _hold_journal(self) -> None:
+        """Keep the journal that a master writes now open, so that it can be removed by nobody."""
+        if self._followed is not None:
+            return
+        with contextlib.suppress(OSError):
+            if self._held < 0 or not os.path.samestat(self._journal.stat(), os.fstat(self._held)):
+                held = os.open(self._journal, os.O_RDONLY | os.O_CLOEXEC)
+                self._let_go()
+                self._held = held
+
+    def _let_go(self) -> None:
+        if self._held >= 0:
+            os.close(self._held)
+            self._held = -1
+
+    def _forget_journal(self) -> None:
+        self._let_go()
+        # It is written anew in a moment; whatever is wrong is said then.
+        with contextlib.suppress(OSError):
+            self._journal.unlink(missing_ok=True)
+
+    def _known(self) -> MasterState:
+        """Return what the last master knew."""
+        if self._followed is not None:
+            return self._followed
+        known, wrong = None, None
+        try:
+            known = read_journal(self._journal)
+        except (OSError, ValueError) as error:
+            wrong = error
+        if known is None and self._held >= 0:
+            with contextlib.suppress(OSError, ValueError):
+                known = read_journal(self._held)
+            if known is not None and wrong is None:
+                wrong = FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT))
+        if wrong is not None:
+            reason = f"{self._journal}: {_words_of(wrong)}"
+            if known is not None:
+                reason += "; it was still open here, and nothing is lost"
+            else:
+                # The next master would write its own there. Where this is not possible, it cannot.
+                aside = self._journal.with_name(f"{self._journal.name}.unread")
+                try:
+                    self._journal.replace(aside)
+                    reason += f"; it is kept as {aside}"
+                except OSError as error:
+                    reason += f"; it cannot be put aside: {_words_of(error)}"
+                reason += ", and the new master knows nothing of the last one"
+            self._events.event("journal_failed", reason=reason)
+        return known or MasterState()
 
     # -- replacing ---------------------------------------------------------------------------------
 
@@ -365,7 +448,7 @@ class MasterGuard:
         failures = 0
         while True:
             try:
-                known = read_journal(self._journal) or MasterState()
+                known = self._known()
                 reconciled = reconcile(known, *await ask_everyone(known))
                 await self._start(reconciled, noticed_at)
             except _TakenError as error:
@@ -385,18 +468,22 @@ class MasterGuard:
         begun_at = monotonic() if noticed_at is None else noticed_at
         self._bind()
         state = reconciled.state
-        try:
-            write_journal(self._journal, state)
-        except OSError as error:
-            # The one before is still there; it lists the dead, too, but is better than no master.
-            self._events.event("note", reason=f"{self._journal}: {error.strerror}")
         master = self._next_master()
         self._spare = None
         try:
+            await master.warm()
+            try:
+                master.hand_over(state)
+            except (OSError, TypeError, ValueError) as error:
+                # What the journal holds lists the dead, too, but is better than no master.
+                self._events.event("note", reason=f"the new master's state: {_words_of(error)}")
             await master.serve()
         except BaseException:
             await master.end(at_once=True)
             raise
+        self._followed = self._unwritten = None
+        self._let_go()
+        self._hold_journal()
         self._own = master
         self._doubtful = reconciled.doubtful
         # Where nobody is left a master begins anew, and nothing is missed.
@@ -546,8 +633,19 @@ class MasterGuard:
         if self._own is not None:
             await self._own.end()
         await self._drop_spare()
+        self._let_go()
         if self._listening is not None:
             self._listening.close()
+
+
+async def _keep_lock(lock: GuardLock) -> None:
+    while True:
+        lock.keep()
+        await asyncio.sleep(_LOCKED_EVERY_S)
+
+
+def _words_of(error: Exception) -> str:
+    return (isinstance(error, OSError) and error.strerror) or str(error)
 
 
 class _TakenError(GuardError):

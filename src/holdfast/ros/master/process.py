@@ -13,10 +13,12 @@ ROS's Python runs this file, which may be older than holdfast's and lacks holdfa
 standard library alone and, once it runs, ``rosmaster``. The guard imports :class:`MasterState` and
 the journal from here.
 
-Started as ``process.py SOCKET CONTROL JOURNAL`` (two descriptors and a path) it loads all
-that it needs, says ``warm`` on CONTROL, and waits. On ``go`` it reads the journal, takes the
-connections that come to SOCKET, and says ``serving``. If CONTROL ends before, it ends; afterwards
-it needs nobody.
+It looks after the file, too: one that was removed or changed by others is written anew.
+
+Started as ``process.py SOCKET CONTROL STATE JOURNAL`` (three descriptors and a path) it loads all
+that it needs, says ``warm`` on CONTROL, and waits. On ``go`` it reads what the guard has left in
+STATE, or the journal if nothing is there, takes the connections that come to SOCKET, and says
+``serving``. If CONTROL ends before, it ends; afterwards it needs nobody.
 """
 
 from __future__ import annotations
@@ -29,6 +31,7 @@ import socket
 import struct
 import sys
 import threading
+import time
 from pathlib import Path
 from typing import Any, Dict, List, NamedTuple, NoReturn, Optional, Tuple  # noqa: UP035 (older Python)
 from zlib import crc32
@@ -36,8 +39,10 @@ from zlib import crc32
 __all__ = [
     "Journal",
     "MasterState",
+    "journal_of",
     "parameter_names",
     "read_journal",
+    "touch",
     "write_journal",
 ]
 
@@ -47,6 +52,8 @@ Registrations = Dict[str, List[Tuple[str, str]]]  # noqa: UP006
 _MAGIC = b"holdfast ROS 1 master 1\n"
 _HEAD = struct.Struct("<II")
 _COMPACTED_AFTER_BYTES = 4 * 1024 * 1024
+_LOOK_EVERY_S = 1.0
+_TOUCHED_AFTER_S = 60.0
 _WORKERS = 8
 """Threads that tell nodes of changes. One that a stopped node blocks is lost to the others; stock
 masters have three."""
@@ -178,17 +185,40 @@ def _records_of(state: MasterState) -> bytes:
     return b"".join(map(_encoded, changes))
 
 
-def read_journal(path: Path) -> MasterState | None:
+def journal_of(state: MasterState) -> bytes:
+    """Return the content of a journal that holds a state."""
+    return _MAGIC + _records_of(state)
+
+
+def read_journal(journal: Path | int) -> MasterState | None:
     """Return what a journal holds; None if there is none.
 
     A last record that is not whole is left out: nobody was told that it is there.
+
+    Parameters
+    ----------
+    journal : Path or int
+        A descriptor, which stays open, needs no other one to be read.
+
+    Raises
+    ------
+    OSError
+        If there is one, and it cannot be read.
+    ValueError
+        If what is there is no journal.
     """
     try:
-        content = path.read_bytes()
-    except OSError:
+        with open(journal, "rb", closefd=not isinstance(journal, int)) as file:
+            file.seek(0)
+            content = file.read()
+    except FileNotFoundError:
         return None
+    return _state_in(content)
+
+
+def _state_in(content: bytes) -> MasterState:
     if not content.startswith(_MAGIC):
-        return None
+        raise ValueError("is no journal of a ROS 1 master")
     state = MasterState()
     place = len(_MAGIC)
     while place + _HEAD.size <= len(content):
@@ -208,18 +238,37 @@ def read_journal(path: Path) -> MasterState | None:
 def write_journal(path: Path, state: MasterState) -> int:
     """Write a journal anew, in one piece, and return its size in bytes.
 
+    Its directory is made if it is gone.
+
     Raises
     ------
     OSError
         If it cannot be written; the one before is still there then.
     """
-    content = _MAGIC + _records_of(state)
+    content = journal_of(state)
     new = path.with_name(f"{path.name}.new")
-    descriptor = os.open(new, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
-    with open(descriptor, "wb") as file:  # noqa: PTH123 (a descriptor)
-        file.write(content)
-    new.replace(path)
+    with contextlib.suppress(FileExistsError):
+        path.parent.mkdir(mode=0o700)
+    with contextlib.suppress(FileNotFoundError):
+        new.unlink()
+    # Never through a link that somebody else has put there.
+    descriptor = os.open(new, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+    try:
+        with open(descriptor, "wb") as file:  # noqa: PTH123 (a descriptor)
+            file.write(content)
+        new.replace(path)
+    except OSError:
+        with contextlib.suppress(OSError):
+            new.unlink()
+        raise
     return len(content)
+
+
+def touch(path: Path, found: os.stat_result) -> None:
+    """Keep a file from those who remove what is old, as cleaners of ``/tmp`` do."""
+    if time.time() - found.st_mtime > _TOUCHED_AFTER_S:
+        with contextlib.suppress(OSError):
+            os.utime(path)
 
 
 class Journal:
@@ -227,7 +276,8 @@ class Journal:
 
     It has a copy of its own of all that it has written, so that it can be written anew, shorter,
     whoever changes what meanwhile. If the disk is full, the master goes on, and with every change
-    it is tried again to write the journal anew.
+    it is tried again to write the journal anew. So it is if the file is no longer the one that was
+    written here.
 
     Parameters
     ----------
@@ -242,10 +292,22 @@ class Journal:
         self._lock = threading.Lock()
         self._descriptor = -1
         self._size = self._limit = 0
+        self._failed = False
         try:
             self._write_anew()
         except OSError as error:
             self._give_up(error)
+
+    def look(self) -> None:
+        """Write it anew if it is not there as it was left; never raises."""
+        with self._lock:
+            try:
+                if self._is_there():
+                    touch(self._path, os.fstat(self._descriptor))
+                else:
+                    self._write_anew()
+            except OSError as error:
+                self._give_up(error)
 
     def write(self, table: str, key: str | None, value: Any) -> None:
         """Write down one change; never raises."""
@@ -259,15 +321,27 @@ class Journal:
         with self._lock:
             self._state.apply(*change)
             try:
-                if self._descriptor < 0 or self._size > self._limit:
+                if self._size > self._limit or not self._is_there():
                     self._write_anew()
                     return
                 self._append(record)
             except OSError as error:
                 self._give_up(error)
 
+    def _is_there(self) -> bool:
+        """Tell whether the file at the path is the one that is open, and as long as it was."""
+        if self._descriptor < 0:
+            return False
+        try:
+            found = self._path.lstat()
+        except OSError:
+            return False
+        return os.path.samestat(found, os.fstat(self._descriptor)) and found.st_size == self._size
+
     def _give_up(self, error: OSError) -> None:
-        sys.stderr.write(f"{self._path}: {error}\n")
+        if not self._failed:
+            sys.stderr.write(f"{self._path}: changes are not written down: {error}\n")
+        self._failed = True
         self.close()
 
     def _append(self, record: bytes) -> None:
@@ -280,6 +354,9 @@ class Journal:
         self._size = write_journal(self._path, self._state)
         self._limit = 2 * self._size + _COMPACTED_AFTER_BYTES
         self._descriptor = os.open(self._path, os.O_WRONLY | os.O_APPEND | os.O_CLOEXEC)
+        if self._failed:
+            sys.stderr.write(f"{self._path}: all is written down again\n")
+        self._failed = False
 
     def close(self) -> None:
         """Give the file up; a change that is written down opens it anew."""
@@ -380,9 +457,13 @@ def _load() -> Any:
     class JournalledMaster(rosmaster.master_api.ROSMasterHandler):  # type: ignore[misc, name-defined, unused-ignore]
         """The stock master's calls, and one more."""
 
-        def __init__(self, path: Path) -> None:
+        def __init__(self, path: Path, content: bytes = b"") -> None:
             super().__init__(_WORKERS)
-            state = read_journal(path) or MasterState()
+            # Twice, since what is written down shares nothing with what the master changes.
+            state, written = (
+                (_state_in(content) if content else read_journal(path)) or MasterState()
+                for _ in range(2)
+            )
             manager = self.reg_manager = JournalledRegistrations(self.thread_pool)
             self.publishers = manager.publishers
             self.subscribers = manager.subscribers
@@ -391,9 +472,10 @@ def _load() -> Any:
             self.param_server = JournalledParameters(manager)
             self.topics_types = JournalledTypes(state.types)
             self.restore(manager, state)
-            # A file of its own from here on, and a state that shares nothing with the master's.
-            journal = Journal(path, read_journal(path) or MasterState())
-            self.topics_types.journal = manager.journal = self.param_server.journal = journal
+            # A file of its own from here on.
+            self.journal = Journal(path, written)
+            self.topics_types.journal = manager.journal = self.journal
+            self.param_server.journal = self.journal
             self.path = str(path)
 
         def restore(self, manager: Any, state: MasterState) -> None:
@@ -460,21 +542,25 @@ def _serve(listening: socket.socket, master: Any, serving: Any) -> None:
     threading.Thread(target=server.serve_forever, daemon=True).start()
     serving()
     master.tell_subscribers()
-    ended = threading.Event()
+    looked_at = time.monotonic()
     while master._ok():
-        ended.wait(0.1)
+        time.sleep(0.1)
+        if time.monotonic() - looked_at > _LOOK_EVERY_S:
+            master.journal.look()
+            looked_at = time.monotonic()
 
 
 def main() -> NoReturn:
     """Be a master; see the top of this file."""
-    descriptor, control_descriptor, journal = sys.argv[1:4]
+    descriptor, control_descriptor, state_descriptor, journal = sys.argv[1:5]
     control = socket.socket(fileno=int(control_descriptor))
     # The guard binds it, which may be later.
     listening = socket.socket(fileno=int(descriptor))
     try:
         make = _load()
     except ImportError as error:
-        control.sendall(f"missing {error}".encode())
+        with contextlib.suppress(OSError):
+            control.sendall(f"missing {error}".encode())
         sys.exit(1)
     with contextlib.suppress(Exception):
         # Without a log, there is still a master.
@@ -483,9 +569,17 @@ def main() -> NoReturn:
         from rosgraph.roslogging import configure_logging
 
         configure_logging("rosmaster", logging.INFO, filename="master.log")
-    control.sendall(b"warm")
-    if control.recv(16) != b"go":
+    try:
+        control.sendall(b"warm")
+        told = control.recv(16)
+    except OSError:
+        # The guard is no more.
+        told = b""
+    if told != b"go":
         sys.exit(0)
+    with open(int(state_descriptor), "rb") as file:  # noqa: PTH123 (a descriptor)
+        file.seek(0)
+        content = file.read()
     # What a stock master prints, it prints for nobody here.
     with open(os.devnull, "wb") as nowhere:  # noqa: PTH123
         os.dup2(nowhere.fileno(), 1)
@@ -495,7 +589,7 @@ def main() -> NoReturn:
             control.sendall(b"serving")
         control.close()
 
-    _serve(listening, make(Path(journal)), serving)
+    _serve(listening, make(Path(journal), content), serving)
     # Threads of calls that hang must not keep it.
     os._exit(0)
 

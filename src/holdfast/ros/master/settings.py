@@ -13,6 +13,7 @@ from typing import NamedTuple, Self
 from urllib.parse import urlsplit
 
 from holdfast.errors import HoldfastError
+from holdfast.ros.master.process import touch
 
 __all__ = [
     "DEFAULT_PORT",
@@ -77,10 +78,10 @@ class MasterAddress(NamedTuple):
         text = environment.get("ROS_MASTER_URI") or f"http://localhost:{DEFAULT_PORT}"
         try:
             parts = urlsplit(text)
-            host, named = parts.hostname, parts.port
+            scheme, host, named = parts.scheme, parts.hostname, parts.port
         except ValueError:
-            host = named = None
-        if parts.scheme != "http" or not host:
+            scheme, host, named = "", None, None
+        if scheme != "http" or not host:
             raise GuardError(f"ROS_MASTER_URI is {text!r:.200}; expected http://HOST:PORT")
         # As rosgraph.network has it.
         own = environment.get("ROS_HOSTNAME") or environment.get("ROS_IP") or ""
@@ -167,23 +168,49 @@ class GuardLock:
     """
 
     def __init__(self, path: Path, port: int) -> None:
+        self._path = path
         try:
-            self._descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+            self._descriptor = self._open()
         except OSError as error:
             raise GuardError(f"{path}: cannot be written: {error.strerror}") from error
-        try:
-            fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
+        if not self._take(self._descriptor):
             who = os.pread(self._descriptor, 20, 0).decode(errors="replace").strip()
             os.close(self._descriptor)
             raise GuardError(
                 f"the master at port {port} has a guard already: process {who or 'unknown'}"
-            ) from error
-        os.ftruncate(self._descriptor, 0)
-        os.pwrite(self._descriptor, f"{os.getpid()}\n".encode(), 0)
+            )
 
-    def __enter__(self) -> None:
-        pass
+    def _open(self) -> int:
+        return os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
+
+    def _take(self, descriptor: int) -> bool:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            return False
+        # What locks is the file, not what is in it, for which the disk may have no room.
+        with contextlib.suppress(OSError):
+            os.ftruncate(descriptor, 0)
+            os.pwrite(descriptor, f"{os.getpid()}\n".encode(), 0)
+        return True
+
+    def keep(self) -> None:
+        """Keep the file from those who remove what is old, and lock it anew if it is gone."""
+        try:
+            found = self._path.lstat()
+            if os.path.samestat(found, os.fstat(self._descriptor)):
+                touch(self._path, found)
+                return
+        except OSError:
+            pass
+        with contextlib.suppress(OSError):
+            descriptor = self._open()
+            if self._take(descriptor):
+                descriptor, self._descriptor = self._descriptor, descriptor
+            os.close(descriptor)
+
+    def __enter__(self) -> Self:
+        return self
 
     def __exit__(self, *_: object) -> None:
         os.close(self._descriptor)

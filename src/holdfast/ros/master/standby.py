@@ -13,6 +13,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from holdfast.ros.master import process as master_process
+from holdfast.ros.master.process import MasterState
 from holdfast.ros.master.settings import GuardError, GuardSettings
 
 __all__ = ["ChildProcess", "MasterProcess"]
@@ -116,7 +117,9 @@ class MasterProcess:
         self._control, its = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._control.setblocking(False)
         script = str(Path(master_process.__file__).resolve())
-        descriptors = (listening.fileno(), its.fileno())
+        # In memory, where there is room when the disk is full.
+        self._state = open(os.memfd_create("master-state"), "wb", buffering=0)  # noqa: PTH123, SIM115
+        descriptors = (listening.fileno(), its.fileno(), self._state.fileno())
         try:
             self.process = ChildProcess(
                 (settings.python, script, *map(str, descriptors), str(journal)),
@@ -125,6 +128,7 @@ class MasterProcess:
             )
         except OSError as error:
             self._control.close()
+            self._state.close()
             raise GuardError(
                 f"--python {settings.python}: cannot be run: {error.strerror}"
             ) from error
@@ -150,8 +154,24 @@ class MasterProcess:
             )
         self._warm = True
 
+    def hand_over(self, state: MasterState) -> None:
+        """Give it what it is to know; without that, it knows what the journal holds.
+
+        Raises
+        ------
+        OSError
+            If there is no room; it knows what the journal holds then.
+        """
+        content = memoryview(master_process.journal_of(state))
+        try:
+            while content:
+                content = content[self._state.write(content) :]
+        except OSError:
+            self._state.truncate(0)
+            raise
+
     async def serve(self) -> None:
-        """Have it be the master from now on, with what the journal holds.
+        """Have it be the master from now on, with what it was handed.
 
         Raises
         ------
@@ -164,6 +184,7 @@ class MasterProcess:
         if (said := await self._hear()) != "serving":
             raise GuardError(f"the new master has not begun ({said or 'it ended'})")
         self._control.close()
+        self._state.close()
 
     async def _hear(self) -> str:
         loop = asyncio.get_running_loop()
@@ -178,4 +199,5 @@ class MasterProcess:
     async def end(self, *, at_once: bool = False) -> None:
         """End it; may be repeated."""
         self._control.close()
+        self._state.close()
         await self.process.end(signal.SIGKILL if at_once else signal.SIGTERM)
