@@ -65,9 +65,9 @@ test-ros: $(INSTALLED_DEV) ## a real ROS 1 and ROS 2, which tests/ros/set_up_ros
 	tests/ros/set_up_ros2 $(ROS2) $(PYTHON)
 	tests/ros/set_up_peers $(ROS2) $(PYTHON)
 	if [ -e /usr/bin/rosmaster ]; then tests/ros/set_up_ros1 $(ROS1); fi
-	ROS1=$(ROS1) ROS2=$(ROS2) $(BIN)/pytest -q -m "ros and not slow" -n 2 --dist loadfile tests/ros
+	ROS1=$(ROS1) ROS2=$(ROS2) $(BIN)/pytest -q -m ros -n 2 --dist loadfile tests/ros
 
-test-ros1: $(INSTALLED_DEV) ## those of them that need Debian's ROS 1 alone
+test-ros1: $(INSTALLED_DEV) ## those of them that need Debian's ROS 1 alone, but for the slow ones
 	tests/ros/set_up_ros1 $(ROS1)
 	ROS1=$(ROS1) $(BIN)/pytest -q -m "ros and not slow" -n 2 --dist worksteal \
 	    tests/ros/test_ros1_*.py tests/ros/test_master_guard.py

@@ -37,6 +37,8 @@ def alive(pid: int) -> bool:
 
 
 class TestItsOwnMaster:
+    # (test_ros1_runs.py does so in the midst of runs.)
+    @pytest.mark.slow
     def test_killed_ten_times(self, graph: Graph) -> None:
         guard = graph.guard()
         caller, listener = start_everything(graph)
@@ -156,6 +158,7 @@ class TestItsOwnMaster:
         os.kill(stopped[1].process.pid, signal.SIGCONT)
         graph.run("rosservice", "call", "/work_b")
 
+    @pytest.mark.slow
     def test_while_nodes_start(self, graph: Graph) -> None:
         graph.guard("--no-rosout")
         names = [f"/work_{number}" for number in range(100)]
@@ -338,6 +341,7 @@ class TestItsOwnMaster:
         assert registered["nodes"].keys() == {"/rosout"}
         assert graph.rosout_pid() == rosout
 
+    @pytest.mark.slow
     def test_roslaunch(self, graph: Graph) -> None:
         graph.guard()
         (graph.directory / "one.launch").write_text(
@@ -525,7 +529,7 @@ os._exit(0)
 """
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in (1, 2))])
 def test_it_is_the_stock_master(seed: int, graph: Graph, tmp_path: Path) -> None:
     from holdfast.ros.master import process as master_process
 
