@@ -162,7 +162,17 @@ class TestCalls:
             saying(b"HTTP/1.1 200 OK\r\nContent-Length: 4\r\n\r\n<a/>"),
             saying(b"\xff" * 1_000_000),
         ],
-        ids=str,
+        ids=[
+            "hangs up",
+            "another protocol",
+            "not found",
+            "too long",
+            "negative length",
+            "no length",
+            "broken",
+            "no answer",
+            "no head",
+        ],
     )
     async def test_nonsense(self, handler: Handler) -> None:
         async with listening(handler) as (port, _):
