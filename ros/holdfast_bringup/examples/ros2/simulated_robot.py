@@ -1,0 +1,1 @@
+../../../../examples/ros2/simulated_robot.py
