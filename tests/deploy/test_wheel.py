@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
-import holdfast
 import platform
 import posixpath
-import pytest
 import subprocess
 import sys
 import tarfile
 import zipfile
+from email import message_from_bytes
+from pathlib import Path
+
+import pytest
+from tests.deploy.docker import BASE, ROOT, Engine, missing
+from tests.golden.table import pinned
+
+import holdfast
 
 _BUILD_S = 1200.0
 _NOT_IN_SOURCES = (".ci/", "docs/images/")
