@@ -111,6 +111,8 @@ def master() -> Iterator[Master]:
     yield master
     loop.call_soon_threadsafe(ended.set)
     thread.join(PATIENCE_S)
+    # What was just accepted first gets its handler, which closes it when it is cancelled.
+    loop.run_until_complete(asyncio.sleep(0.02))
     for task in asyncio.all_tasks(loop):
         task.cancel()
     loop.run_until_complete(asyncio.sleep(0.02))  # until the connections are closed
