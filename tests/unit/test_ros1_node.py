@@ -121,7 +121,7 @@ def master() -> Iterator[Master]:
         task.cancel()
     loop.run_until_complete(asyncio.sleep(0.02))  # until the connections are closed
     loop.close()
-    # A connection that nobody had taken yet ends with its loop, unclosed: this master's, not a node's.
+    # A connection that nobody had taken yet ends with its loop, unclosed: this master's alone.
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ResourceWarning)
         gc.collect()
