@@ -32,7 +32,7 @@ from holdfast.cli.options import (
 )
 from holdfast.cli.overrides import Override, combined, parse_assignment
 from holdfast.cli.terminal import counted, duration, print_files, print_summary, run_display
-from holdfast.errors import HoldfastError, InvalidValueError, TransportError
+from holdfast.errors import HoldfastError, InvalidValueError
 from holdfast.printable import printable
 from holdfast.runtime.command_line import MAX_JOBS
 
@@ -551,7 +551,13 @@ def _require_effect(options: _Options, configuration: Configuration, *, as_robot
             "(or offload.services or environment.object), without which the trials are a batch"
         )
     if configuration.offload.services:
-        _check_services(options, configuration)
+        from holdfast.runtime.links import check_services
+
+        # Before a directory is claimed: a mistyped one claims none.
+        on_command_line = any(given.key == "offload.services" for given in options.overrides())
+        check_services(
+            configuration, None if on_command_line else f"{options.configuration_path}: "
+        )
     for given in options.overrides():
         if given.key in _OF_SERVICES and given.value and not configuration.offload.services:
             raise InvalidValueError(
@@ -568,33 +574,6 @@ def _require_effect(options: _Options, configuration: Configuration, *, as_robot
             "--log json needs --service, --environment or --rate (or offload.services or "
             f"environment.object in {options.configuration_path}): without them there are no events"
         )
-
-
-def _check_services(options: _Options, configuration: Configuration) -> None:
-    """Check where the services are, before a directory is claimed: a mistyped one claims none."""
-    from holdfast.transport.endpoints import check_credentials, parse_endpoint
-
-    offload = configuration.offload
-    tls = None
-    if offload.tls is not None:
-        from holdfast.transport.credentials import load_credentials
-
-        # What is only to be warned of is told when the run begins.
-        tls = load_credentials(Path(offload.tls), "robot", warn=lambda _: None)
-    on_command_line = any(given.key == "offload.services" for given in options.overrides())
-    for index, service in enumerate(offload.services):
-        try:
-            endpoint = parse_endpoint(service)
-            check_credentials(endpoint, tls)
-            if endpoint.protocol == "udp":
-                from holdfast.transport.sealing import require_cryptography
-
-                require_cryptography()
-        except TransportError as error:
-            if on_command_line:
-                raise
-            key = f"{options.configuration_path}: offload.services[{index}]"
-            raise TransportError(f"{key}: {error}") from error
 
 
 class _Notes:

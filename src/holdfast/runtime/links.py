@@ -61,8 +61,15 @@ class Links(NamedTuple):
     make_planner: Callable[[Problem, PlanningSettings], Planner] = Planner
 
 
-def check_services(configuration: Configuration) -> None:
+def check_services(configuration: Configuration, source: str | None = "") -> None:
     """Check what can be checked of the services before a run: endpoints and credentials.
+
+    Parameters
+    ----------
+    configuration : Configuration
+    source : str or None
+        What stands before the key in a message; None leaves the key out, too, of services that
+        were not given by it.
 
     Raises
     ------
@@ -72,11 +79,12 @@ def check_services(configuration: Configuration) -> None:
     offload = configuration.offload
     if not offload.services:
         return
-    from holdfast.transport.credentials import load_credentials
     from holdfast.transport.endpoints import check_credentials, parse_endpoint
 
     tls = None
     if offload.tls is not None:
+        from holdfast.transport.credentials import load_credentials
+
         # What is only to be warned of is told when the run begins.
         tls = load_credentials(Path(offload.tls), "robot", warn=lambda _: None)
     for index, service in enumerate(offload.services):
@@ -88,7 +96,9 @@ def check_services(configuration: Configuration) -> None:
 
                 require_cryptography()
         except TransportError as error:
-            raise TransportError(f"offload.services[{index}]: {error}") from error
+            if source is None:
+                raise
+            raise TransportError(f"{source}offload.services[{index}]: {error}") from error
 
 
 def make_links(configuration: Configuration, log_path: Path | None, events: EventSink) -> Links:
