@@ -29,8 +29,13 @@ from typing import Any, TypeVar
 import msgspec
 import msgspec.inspect
 
-from holdfast.contract import GAUSSIAN_OBSERVATIONS, has_general_observations
-from holdfast.errors import ConfigurationError, HoldfastError, UnknownProblemError
+from holdfast.contract import GAUSSIAN_OBSERVATIONS, has_general_observations, resolution_of
+from holdfast.errors import (
+    ConfigurationError,
+    HoldfastError,
+    InvalidValueError,
+    UnknownProblemError,
+)
 from holdfast.files import read_bounded
 from holdfast.problems import registry
 from holdfast.problems.problem import Problem, ProblemBase
@@ -426,6 +431,13 @@ def _build(
             f"is {num_neighbors}; the nearest_neighbor estimator needs it below"
             f" particle_filter.num_particles, which is {num_particles}",
         )
+    if selector.method not in ("random", "fixed"):
+        of_states = selector.method == "state_entropy"
+        try:
+            resolution_of(problem, selector.resolution, of_states=of_states)
+        except InvalidValueError as error:
+            place = source.place(("selector", "resolution"))
+            raise ConfigurationError(f"{place}: {error}") from None
     num_actions = len(problem.sensing_actions)
     if selector.method == "fixed" and selector.sensing_action >= num_actions:
         raise source.error(

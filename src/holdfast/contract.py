@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from holdfast import _kernel
-from holdfast.errors import ProblemError
+from holdfast.errors import InvalidValueError, ProblemError
 
 __all__ = [
     "check_problem",
@@ -31,6 +31,7 @@ __all__ = [
     "observation_mean",
     "observation_variance",
     "policy",
+    "resolution_of",
     "sample_observation",
     "scalar",
     "states_of",
@@ -92,9 +93,9 @@ def check_problem(problem: Any) -> None:
             f"state_labels of {name} has {len(labels)} labels: must have {problem.state_size} or "
             "none"
         )
-    resolution = getattr(problem, "resolution", None)
-    if not isinstance(resolution, (int, float)) or not 0.0 < resolution < np.inf:
-        raise ProblemError(f"resolution of {name} is {resolution!r}: must be positive and finite")
+    _check_resolution(problem, "resolution", "an action", problem.action_size)
+    if getattr(problem, "state_resolution", None) is not None:
+        _check_resolution(problem, "state_resolution", "a state", problem.state_size)
     variance = np.asarray(getattr(problem, "motion_variance", ()))
     numbers = variance.dtype.kind in "fiu" and variance.shape == (problem.action_size,)
     if not numbers or not (variance >= 0.0).all():
@@ -132,6 +133,74 @@ def check_sizes(problem: Any) -> None:
         size = getattr(problem, attribute, None)
         if not isinstance(size, int) or size < 1:
             raise ProblemError(f"{attribute} of {name} is {size!r}: must be a whole number >= 1")
+
+
+def _check_resolution(problem: Any, attribute: str, of_what: str, size: int) -> None:
+    value = getattr(problem, attribute, None)
+    if isinstance(value, (int, float)):
+        if not 0.0 < value < np.inf:
+            raise ProblemError(
+                f"{attribute} of {problem.name} is {value!r}: must be positive and finite"
+            )
+        return
+    numbers = np.asarray(value)
+    fits = numbers.dtype.kind in "fiu" and numbers.shape == (size,)
+    # A comparison with NaN is false.
+    if not fits or not ((numbers > 0.0) & (numbers < np.inf)).all():
+        raise ProblemError(
+            f"{attribute} of {problem.name} is {in_brief(numbers)}: must be one number or {size}, "
+            f"one for each coordinate of {of_what}, positive and finite"
+        )
+
+
+def resolution_of(
+    problem: Any, given: float | Sequence[float] | None, *, of_states: bool
+) -> float | FloatArray:
+    """Return the resolution of the points whose entropy counts.
+
+    Parameters
+    ----------
+    problem : Problem
+    given : float or sequence of float, optional
+        ``selector.resolution``; None for the problem's own.
+    of_states : bool
+        Whether the points are states instead of actions.
+
+    Returns
+    -------
+    float or array
+        One number for all coordinates, or one for each.
+
+    Raises
+    ------
+    InvalidValueError
+        If the numbers are not as many as the coordinates.
+    """
+    of_what, size = ("a state", "state_size") if of_states else ("an action", "action_size")
+    if given is not None:
+        if isinstance(given, (int, float)):
+            return given
+        count = getattr(problem, size)
+        if len(given) != count:
+            raise InvalidValueError(
+                f"selector.resolution {list(given)}: has {len(given)} numbers; need one number, or "
+                f"{count} for {_name(problem)}, one for each coordinate of {of_what}"
+            )
+        return np.array(given, dtype=np.float64)
+    own = problem.resolution
+    if of_states:
+        if getattr(problem, "state_resolution", None) is not None:
+            own = problem.state_resolution
+        elif np.ndim(own) > 0 and problem.state_size != problem.action_size:
+            raise InvalidValueError(
+                f"selector.method state_entropy: resolution of {_name(problem)} has "
+                f"{np.size(own)} numbers, for the coordinates of an action, and a state has "
+                f"{problem.state_size}; give the problem a state_resolution, one number or "
+                f"{problem.state_size}, or write selector.resolution"
+            )
+    if isinstance(own, (int, float)):
+        return own
+    return np.asarray(own, dtype=np.float64)
 
 
 def _check_parameters(name: str, function: str, own: Any, parameters: tuple[str, ...]) -> None:

@@ -51,12 +51,13 @@ class NearestNeighbor(NamedTuple):
     ----------
     neighbors : int
         The k, at least 1.
-    resolution : float
-        Positive, in the unit of the points.
+    resolution : float or array of shape (d,)
+        Positive, in the unit of the points. With an array distances are measured in resolutions,
+        coordinate by coordinate, so they do not depend on units.
     """
 
     neighbors: int = 5
-    resolution: float = 1e-3
+    resolution: float | FloatArray = 1e-3
 
 
 class GaussianMixture(NamedTuple):
@@ -93,7 +94,13 @@ class EstimatorKind(IntEnum):
 
 
 class KernelEstimator(NamedTuple):
-    """An estimator in the kernel's terms; the points are to be multiplied by ``scale``."""
+    """An estimator in the kernel's terms.
+
+    The points are to be multiplied by ``scale``, coordinate by coordinate. What the kernel then
+    returns lacks ``log_volume``, the logarithm of the volume of a cell of the resolution. It is the
+    same for all sensing actions and depends on units: add it after the choice, so that its rounding
+    has no part in that.
+    """
 
     kind: EstimatorKind
     neighbors: int
@@ -101,6 +108,7 @@ class KernelEstimator(NamedTuple):
     exponent: float
     offset: float
     scale: FloatArray | None
+    log_volume: float = 0.0
 
     @property
     def drops_negligible(self) -> bool:
@@ -112,6 +120,32 @@ TOTAL_VARIANCE = KernelEstimator(EstimatorKind.TOTAL_VARIANCE, 1, 1.0, 0.0, 0.0,
 """Not an entropy: the trace of the covariance of weighted points, to compare with."""
 
 
+_UNITS = {
+    EstimatorKind.NEAREST_NEIGHBOR: "resolutions",
+    EstimatorKind.GAUSSIAN_MIXTURE: "standard deviations",
+    EstimatorKind.TOTAL_VARIANCE: "resolutions",
+}
+"""What scaled points are measured in."""
+
+
+def scaled(points: FloatArray, estimator: KernelEstimator) -> FloatArray:
+    """Return the points as the kernel takes them.
+
+    Raises
+    ------
+    InvalidValueError
+        If one is too far from zero in the units of the estimator.
+    """
+    if estimator.scale is None:
+        return points
+    array: FloatArray = points * estimator.scale
+    if (bad := first_unbounded(array)) is not None:
+        raise InvalidValueError(
+            f"point {bad} is {array[bad]} {_UNITS[estimator.kind]} from zero: at most {LARGEST:g}"
+        )
+    return array
+
+
 def first_unbounded(points: FloatArray) -> int | None:
     """Return the index of the first point with a coordinate that is NaN or too large, or None."""
     # A comparison with NaN is false.
@@ -119,10 +153,41 @@ def first_unbounded(points: FloatArray) -> int | None:
     return None if bounded.all() else int(np.argmin(bounded.all(axis=1)))
 
 
+def scale_of(resolution: FloatArray, dimension: int) -> tuple[FloatArray, float]:
+    """Return what makes a resolution 1 in every coordinate, and the log of its cell's volume.
+
+    Raises
+    ------
+    InvalidValueError
+        If there are not as many numbers as coordinates, or one is out of bounds.
+    """
+    sizes = np.ascontiguousarray(resolution, dtype=np.float64)
+    if sizes.shape != (dimension,):
+        raise InvalidValueError(
+            f"resolution of shape {sizes.shape}: need one number, or ({dimension},)"
+        )
+    # A comparison with NaN is false.
+    if not ((sizes >= 1.0 / LARGEST) & (sizes <= LARGEST)).all():
+        raise InvalidValueError(
+            f"resolution {contract.in_brief(sizes)}: allowed are {1.0 / LARGEST:g} to {LARGEST:g} "
+            "in every coordinate"
+        )
+    return 1.0 / sizes, numerics.sum(numerics.log(sizes))
+
+
 def kernel_estimator(
-    estimator: NearestNeighbor | GaussianMixture, dimension: int
+    estimator: NearestNeighbor | GaussianMixture, dimension: int, *, split_volume: bool = False
 ) -> KernelEstimator:
     """Check an estimator and translate it.
+
+    Parameters
+    ----------
+    estimator : NearestNeighbor or GaussianMixture
+    dimension : int
+        Number of coordinates of a point.
+    split_volume : bool
+        Keep the part of a mixture's entropy that depends on units apart, in ``log_volume``. That of
+        a nearest-neighbour estimate with an array is always there.
 
     Raises
     ------
@@ -136,18 +201,15 @@ def kernel_estimator(
     if isinstance(estimator, NearestNeighbor):
         if estimator.neighbors < 1:
             raise InvalidValueError(f"neighbors {estimator.neighbors}: must be at least 1")
+        nearest = EstimatorKind.NEAREST_NEIGHBOR
+        if not isinstance(estimator.resolution, (int, float)):
+            scale, log_volume = scale_of(estimator.resolution, dimension)
+            return KernelEstimator(nearest, estimator.neighbors, 1.0, 0.0, 0.0, scale, log_volume)
         if not 1.0 / LARGEST <= estimator.resolution <= LARGEST:
             raise InvalidValueError(
                 f"resolution {estimator.resolution}: allowed are {1.0 / LARGEST:g} to {LARGEST:g}"
             )
-        return KernelEstimator(
-            EstimatorKind.NEAREST_NEIGHBOR,
-            estimator.neighbors,
-            estimator.resolution,
-            0.0,
-            0.0,
-            None,
-        )
+        return KernelEstimator(nearest, estimator.neighbors, estimator.resolution, 0.0, 0.0, None)
     variance = np.ascontiguousarray(estimator.variance, dtype=np.float64).reshape(-1)
     if variance.shape != (dimension,):
         raise InvalidValueError(f"variance of shape {variance.shape}: need ({dimension},)")
@@ -157,10 +219,14 @@ def kernel_estimator(
         )
     two_pi_e = 17.079468445347132
     offset = 0.5 * dimension * float(numerics.log(two_pi_e))
-    offset += 0.5 * numerics.sum(numerics.log(variance))
+    log_volume = 0.5 * numerics.sum(numerics.log(variance))
+    if not split_volume:
+        offset, log_volume = offset + log_volume, 0.0
     scale = 1.0 / np.sqrt(variance)
     exponent = 0.5 if estimator.upper else 0.125
-    return KernelEstimator(EstimatorKind.GAUSSIAN_MIXTURE, 1, 1.0, exponent, offset, scale)
+    return KernelEstimator(
+        EstimatorKind.GAUSSIAN_MIXTURE, 1, 1.0, exponent, offset, scale, log_volume
+    )
 
 
 def entropy(
@@ -221,12 +287,7 @@ def entropy(
     if not (rows > 0.0).any(axis=1).all():
         bad = int(np.argmin((rows > 0.0).any(axis=1)))
         raise InvalidValueError(f"weights[{bad}] are all zero: one must be positive")
-    if kernel.scale is not None:
-        array = array * kernel.scale
-        if (bad := first_unbounded(array)) is not None:
-            raise InvalidValueError(
-                f"point {bad} is {array[bad]} standard deviations from zero: at most {LARGEST:g}"
-            )
+    array = scaled(array, kernel)
     result, _, _, _ = _kernel.entropies(
         array,
         rows,
@@ -238,4 +299,6 @@ def entropy(
         kernel.offset,
         threads,
     )
+    if kernel.log_volume != 0.0:
+        result = result + kernel.log_volume
     return float(result[0]) if single else result

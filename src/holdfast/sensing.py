@@ -30,6 +30,8 @@ from holdfast.entropy import (
     NearestNeighbor,
     first_unbounded,
     kernel_estimator,
+    scale_of,
+    scaled,
 )
 from holdfast.errors import InvalidValueError, ProblemError
 from holdfast.problems.problem import Problem
@@ -52,8 +54,9 @@ class SensingInfo(NamedTuple):
     ----------
     entropies : array of shape (J,) or None
         Expected (discounted, summed) entropy after each sensing action, in nats; for
-        ``action_covariance`` the trace of the covariance, in the actions' units squared; None for
-        ``random`` and ``fixed``.
+        ``action_covariance`` the trace of the covariance, in the actions' units squared, or in
+        resolutions squared where there is one for each coordinate; None for ``random`` and
+        ``fixed``.
     samples : array of shape (J, M) or None
         The entropies of the single hypothetical observations, whose means ``entropies`` are.
     likelihoods, visits : int
@@ -133,7 +136,7 @@ def choose_sensing_action(
             variance,
             settings.active_sensing.num_observation_samples,
             hypotheses.words,
-            points if estimator.scale is None else points * estimator.scale,
+            scaled(points, estimator),
             estimator.kind,
             estimator.neighbors,
             estimator.resolution,
@@ -172,7 +175,20 @@ def choose_sensing_action(
             f"the entropy after sensing action {index} of {problem.name} is not a number: a "
             "hypothetical observation had no likelihood under any particle"
         )
+    if estimator.log_volume != 0.0:
+        # After the choice: what is the same for all must not decide it by its rounding.
+        volume = estimator.log_volume * _total_factor(settings)
+        entropies, samples = entropies + volume, samples + volume
     return index, SensingInfo(entropies, samples, likelihoods, visits)
+
+
+def _total_factor(settings: PlanningSettings) -> float:
+    """Return how often an entropy counts over the horizon, discounted."""
+    total = factor = 1.0
+    for _ in range(1, settings.active_sensing.horizon):
+        factor *= settings.active_sensing.discount
+        total += factor
+    return total
 
 
 def _points_of(
@@ -194,8 +210,13 @@ def _estimator(
     _require_bounded(problem, points, belief.states, "state")
     dimension = points.shape[1]
     selector = settings.selector
+    of_states = selector.method == "state_entropy"
+    resolution = contract.resolution_of(problem, selector.resolution, of_states=of_states)
+    each_its_own = not isinstance(resolution, (int, float))
     if selector.method == "action_covariance":
-        return TOTAL_VARIANCE
+        if not each_its_own:
+            return TOTAL_VARIANCE
+        return TOTAL_VARIANCE._replace(scale=scale_of(np.asarray(resolution), dimension)[0])
     if selector.estimator == "nearest_neighbor":
         neighbors = settings.active_sensing.num_nearest_neighbors
         if neighbors >= points.shape[0]:
@@ -203,25 +224,24 @@ def _estimator(
                 f"active_sensing.num_nearest_neighbors {neighbors}: must be below the number of "
                 f"particles, {points.shape[0]}"
             )
-        resolution = problem.resolution if selector.resolution is None else selector.resolution
         return kernel_estimator(NearestNeighbor(neighbors, resolution), dimension)
     upper = selector.estimator == "gaussian_mixture_upper"
-    variance = _noise_variance(problem, selector.resolution, dimension)
-    return kernel_estimator(GaussianMixture(variance, upper), dimension)
+    own = np.full(dimension, resolution * resolution)
+    states_have_their_own = of_states and getattr(problem, "state_resolution", None) is not None
+    if selector.resolution is None and not states_have_their_own:
+        own = _noise_variance(problem, own)
+    return kernel_estimator(GaussianMixture(own, upper), dimension, split_volume=each_its_own)
 
 
-def _noise_variance(problem: Problem, resolution: float | None, dimension: int) -> FloatArray:
-    """Return the variances of the noise that blurs the points of a mixture.
+def _noise_variance(problem: Problem, own: FloatArray) -> FloatArray:
+    """Return the variances of the motion noise, by which a mixture's points are blurred.
 
-    Where the motion noise has none for a coordinate (it moves without noise, or the points are
-    states, of which there may be more than actions), the resolution stands in.
+    Where it has none for a coordinate (it moves without noise, or the points are states, of which
+    there may be more than actions), the resolution stands in, whose square is ``own``.
     """
-    if resolution is not None:
-        return np.full(dimension, resolution * resolution)
-    own = problem.resolution * problem.resolution
     variance = np.asarray(problem.motion_variance, dtype=np.float64)
-    if variance.shape != (dimension,):
-        return np.full(dimension, own)
+    if variance.shape != own.shape:
+        return own
     return np.where(variance == 0.0, own, variance)
 
 
@@ -315,7 +335,7 @@ def _entropies(
     threads: int,
 ) -> tuple[FloatArray, int, int]:
     result, likelihoods, visits, _ = _kernel.entropies(
-        np.ascontiguousarray(points if estimator.scale is None else points * estimator.scale),
+        np.ascontiguousarray(scaled(points, estimator)),
         weights,
         logarithms,
         estimator.kind,

@@ -36,6 +36,7 @@ MAX_SERVICES = 16
 Count = Annotated[int, msgspec.Meta(ge=1)]
 NonNegativeCount = Annotated[int, msgspec.Meta(ge=0)]
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
+Resolutions = Annotated[tuple[Positive, ...], msgspec.Meta(min_length=1, max_length=64)]
 Milliseconds = Annotated[float, msgspec.Meta(gt=0.0, le=3_600_000.0)]
 Seed = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
 Text = Annotated[str, msgspec.Meta(min_length=1, max_length=4096)]
@@ -103,16 +104,20 @@ class SelectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
     estimator : {"nearest_neighbor", "gaussian_mixture_upper", "gaussian_mixture_lower"}
         How the two entropies are estimated. A mixture takes few particles, as a sharp look leaves
         them, for certainty: use it with so many that they lie closer than its noise
-        (docs/results.md). Distances between neighbours depend on the units of the coordinates;
-        with the motion noise as its own, the mixture does not.
+        (docs/results.md). Distances between neighbours depend on the units of the coordinates,
+        unless ``resolution`` has a number for each; with the motion noise as its own, the mixture
+        does not.
     actions : {"commanded", "executed"}
         Whether ``action_entropy`` and ``action_covariance`` look at what the policy says or at what
         the limits leave of it.
-    resolution : float or None
-        Distance below which two actions (or states) do not differ in practice, in their unit; for
-        a mixture, the standard deviation of the noise that blurs them. None takes the problem's
-        resolution, and for a mixture its motion noise, unless that has none for a coordinate or
-        there are more coordinates of a state than of an action.
+    resolution : float, tuple of float or None
+        Distance below which two actions (or, for ``state_entropy``, states) do not differ in
+        practice, in their unit; for a mixture, the standard deviation of the noise that blurs them.
+        With as many numbers as coordinates each has its own, in its own unit; then the choice does
+        not depend on units, that of ``action_covariance`` included. None takes the problem's
+        resolution, and for a mixture its motion noise, unless that has none for a coordinate,
+        there are more coordinates of a state than of an action, or the problem has a resolution of
+        states.
     """
 
     method: Literal["action_entropy", "state_entropy", "action_covariance", "random", "fixed"] = (
@@ -123,7 +128,7 @@ class SelectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
         "nearest_neighbor"
     )
     actions: Literal["commanded", "executed"] = "commanded"
-    resolution: Positive | None = None
+    resolution: Positive | Resolutions | None = None
 
 
 class SimulatorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

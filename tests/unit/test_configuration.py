@@ -485,7 +485,9 @@ class TestKeysAndValues:
             ("particle_filter: {num_particles: }", "is null; expected a whole number"),
             ("particle_filter: {num_particles: [1]}", "is [1] (a list of 1); expected a whole"),
             ("active_sensing: {discount: 1.5}", "discount is 1.5; expected a number >= 0 and <= 1"),
-            ("selector: {resolution: 0}", "is 0; expected a number > 0 or null"),
+            ("selector: {resolution: 0}", "is 0; expected a number > 0 or a list of at least 1"),
+            ("selector: {resolution: [1, 1, 0]}", "selector.resolution[2] is 0; expected a number"),
+            ("selector: {resolution: []}", "resolution is [] (a list of 0); expected a number > 0"),
             (
                 "selector: {method: action-entropy}",
                 'selector.method is "action-entropy"; expected one of action_covariance, '

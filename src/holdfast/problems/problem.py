@@ -107,13 +107,22 @@ class Problem(Protocol):
         A label for each sensing action; a sensing action is an index into it.
     num_stages : int
         Stages of the task (holes to pass, via points to reach); 1 where there are none.
-    resolution : float
+    resolution : float or array of shape (action_size,)
         Distance below which two task actions do not differ in practice (of the order of the motion
-        noise's standard deviation), in the actions' unit.
+        noise's standard deviation), in the actions' unit. An array gives each coordinate its own,
+        in its own unit (0.1 m and 0.05 rad), so distances count in resolutions and the choice of
+        what to sense does not depend on units. One number fits where all coordinates have the same.
     motion_variance : array of shape (action_size,)
         Variance of the noise on an executed action, for the Gaussian-mixture entropy.
     state_labels : sequence of str
         Names of the state's coordinates with units, for figures; empty for none.
+
+    Notes
+    -----
+    A problem may also have ``state_resolution``, a float or an array of shape ``(state_size,)``:
+    the resolution of states, for ``state_entropy`` and for nothing else. Without it (or with None)
+    states have the actions' resolution, which must then be one number, or an action must have as
+    many coordinates as a state.
     """
 
     name: str
@@ -121,9 +130,13 @@ class Problem(Protocol):
     action_size: int
     sensing_actions: Sequence[str]
     num_stages: int
-    resolution: float
     motion_variance: FloatArray
     state_labels: Sequence[str]
+
+    @property
+    def resolution(self) -> float | FloatArray:
+        """Distance below which two task actions do not differ, or one for each coordinate."""
+        ...
 
     def initial_states(self, stream: Stream, count: int) -> FloatArray:
         """Draw ``count`` states of the initial belief, shape ``(count, state_size)``."""
@@ -212,7 +225,8 @@ class ProblemBase:
     action_size: int = 0
     sensing_actions: Sequence[str] = ()
     num_stages: int = 1
-    resolution: float = 0.1
+    resolution: float | FloatArray = 0.1
+    state_resolution: float | FloatArray | None = None
     motion_variance: FloatArray = np.array([0.01])
     state_labels: Sequence[str] = ()
     pose: Sequence[str | None] = ()
