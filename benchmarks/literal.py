@@ -76,6 +76,10 @@ def choose_sensing_action(
     sensing = settings.active_sensing
     samples = sensing.num_observation_samples
     resolution = settings.selector.resolution or problem.resolution
+    units, log_volume = 1.0, 0.0
+    if not isinstance(resolution, (int, float)):
+        units, resolution = np.asarray(resolution), 1.0
+        log_volume = float(np.log(units).sum())
     states, weights = state.belief
 
     draws = stream(state.seed, state.trial, state.step, Purpose.HYPOTHESES)
@@ -90,9 +94,9 @@ def choose_sensing_action(
             variance = problem.observation_variance(states[drawn], j)
             observation = problem.observation_mean(states[drawn], j) + np.sqrt(variance) * noise[i]
             posterior = _reweighted(problem, state.belief, j, observation)
-            actions = problem.policy(states, state.stage)
+            actions = problem.policy(states, state.stage) / units
             entropies[j] += entropy(actions, posterior, sensing.num_nearest_neighbors, resolution)
-    entropies /= samples
+    entropies = entropies / samples + log_volume
     return int(np.argmin(entropies)), entropies
 
 

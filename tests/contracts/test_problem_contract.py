@@ -54,7 +54,9 @@ def test_attributes(problem: Problem) -> None:
     assert all(isinstance(label, str) and label for label in problem.sensing_actions)
     assert len(set(problem.sensing_actions)) == len(problem.sensing_actions)
     assert len(problem.state_labels) == problem.state_size
-    assert 0.0 < problem.resolution < np.inf
+    assert np.shape(problem.resolution) in {(), (problem.action_size,)}
+    assert np.all(np.asarray(problem.resolution) > 0.0)
+    assert np.isfinite(problem.resolution).all()
     assert problem.motion_variance.shape == (problem.action_size,)
     assert (problem.motion_variance >= 0.0).all()
 

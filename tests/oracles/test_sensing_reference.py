@@ -146,14 +146,20 @@ def reference_entropy(
 ) -> float:
     selector = settings.selector
     if selector.method == "action_covariance":
+        if isinstance(selector.resolution, tuple):
+            points = points / np.array(selector.resolution)
         return float(np.trace(np.atleast_2d(np.cov(points.T, aweights=weights, ddof=0))))
     if selector.estimator == "nearest_neighbor":
         neighbors = settings.active_sensing.num_nearest_neighbors
         resolution = selector.resolution or problem.resolution
+        if not isinstance(resolution, float):
+            scaled = points / np.array(resolution)
+            volume = float(np.log(resolution).sum())
+            return nearest_neighbor_entropy(scaled, weights, neighbors, 1.0) + volume
         return nearest_neighbor_entropy(points, weights, neighbors, resolution)
     variance = problem.motion_variance
     if selector.resolution is not None:
-        variance = np.full(points.shape[1], selector.resolution**2)
+        variance = np.full(points.shape[1], np.square(selector.resolution))
     upper = selector.estimator == "gaussian_mixture_upper"
     return gaussian_mixture_entropy(points, weights, variance, upper)
 
@@ -287,6 +293,28 @@ def test_selectors(method: str, actions: str, estimator: str, resolution: float 
     )
     problem = LightDark()
     compare(problem, settings_of(selector=selector), some_belief(problem, 60, "weighted"))
+
+
+@pytest.mark.parametrize("horizon", [1, 3])
+@pytest.mark.parametrize(
+    ("method", "estimator"),
+    [
+        ("action_covariance", "nearest_neighbor"),
+        ("action_entropy", "nearest_neighbor"),
+        ("action_entropy", "gaussian_mixture_upper"),
+        ("state_entropy", "nearest_neighbor"),
+        ("state_entropy", "gaussian_mixture_lower"),
+    ],
+)
+def test_a_resolution_for_each_coordinate(method: str, estimator: str, horizon: int) -> None:
+    """The reference divides the points by it; the entropies stay those in the points' units."""
+    selector = SelectorSettings(
+        method=method,  # type: ignore[arg-type]
+        estimator=estimator,  # type: ignore[arg-type]
+        resolution=(0.05, 0.4, 3.0),
+    )
+    settings = settings_of(samples=4, horizon=horizon, selector=selector)
+    compare(Plane(), settings, some_belief(Plane(), 50, "weighted"))
 
 
 @pytest.mark.parametrize("actions", ["commanded", "executed"])

@@ -283,6 +283,25 @@ class TestProblemDirectory:
         assert f"line 2: problem_directory {expected}" in complaint(path)
 
 
+class TestResolution:
+    """One for each coordinate, in a file."""
+
+    def test_as_many_as_an_action_has_coordinates(self, write: Write) -> None:
+        text = "problem: peg_in_hole_2d\nselector: {resolution: [0.1, 1, 5e-2]}"
+        assert load(write(text)).planning.selector.resolution == (0.1, 1.0, 0.05)
+
+    @pytest.mark.parametrize("method", ["action_entropy", "state_entropy", "action_covariance"])
+    def test_another_number_is_refused_with_its_line(self, method: str, write: Write) -> None:
+        text = f"problem: peg_in_hole_2d\nselector:\n  method: {method}\n  resolution: [1, 2]"
+        message = complaint(write(text))
+        assert "line 4: selector.resolution [1.0, 2.0]: has 2 numbers; need one number" in message
+        assert "3 for peg_in_hole_2d, one for each coordinate of " in message
+
+    @pytest.mark.parametrize("method", ["random", "fixed"])
+    def test_where_nothing_is_measured_it_has_no_effect(self, method: str, write: Write) -> None:
+        load(write(f"problem: capsule_robot\nselector: {{method: {method}, resolution: [1]}}"))
+
+
 class TestResolved:
     @pytest.mark.parametrize(
         "text",
@@ -290,11 +309,12 @@ class TestResolved:
             THESIS,
             "problem: capsule_robot\nselector: {method: fixed, sensing_action: 1, resolution: 1e-7}"
             "\nsimulator: {sensing_intervals: 0}",
+            "problem: capsule_robot\nselector: {resolution: [0.1, 2]}",
             "problem: multitier_peg_in_hole_2d\nsimulator: {seed: 9223372036854775807}",
             "problem: lamps:Keywords\nmodel: {colour: '1e-3', lamps: [1, null, {a: 'yes'}]}",
             "problem: lamps:Structs\nmodel: {lamps: [{center: [0.1, 1e22]}], weights: {'1': 2}}",
         ],
-        ids=["thesis", "capsule", "multitier", "keywords", "structs"],
+        ids=["thesis", "capsule", "resolutions", "multitier", "keywords", "structs"],
     )
     def test_it_loads_to_the_same(self, text: str, write: Write) -> None:
         configuration = load(write(text))

@@ -147,6 +147,19 @@ def test_a_misfit_is_named(case: str) -> None:
         ("sensing_actions", (), "sensing_actions of line"),
         ("state_labels", ("x",), "state_labels of line has 1 labels: must have 2"),
         ("resolution", 0.0, "resolution of line is 0.0"),
+        ("resolution", np.inf, "resolution of line is inf"),
+        ("resolution", None, "resolution of line is None: must be one number or 1, one for each"),
+        ("resolution", np.array([0.1, 0.1]), r"line is \[0.1 0.1\]: must be one number or 1, one"),
+        ("resolution", np.array([np.nan]), r"line is \[nan\].* coordinate of an action, positive"),
+        ("resolution", np.array(["x"]), r"resolution of line is \['x'\]: must be one number"),
+        ("state_resolution", -1.0, "state_resolution of line is -1.0: must be positive and finite"),
+        (
+            "state_resolution",
+            (0.1, 0.0),
+            r"state_resolution of line is \[0.1 0. \]: must be one number or 2, one for each "
+            "coordinate of a state",
+        ),
+        ("state_resolution", np.array([0.1]), "state_resolution of line"),
         ("motion_variance", np.array([0.1, 0.1]), "motion_variance of line"),
         ("log_likelihood", lambda *_: 0.0, "log_likelihood alone"),
         ("sample_observation", lambda *_: 0.0, "sample_observation alone"),
@@ -156,6 +169,56 @@ def test_an_attribute_is_named(attribute: str, value: object, message: str) -> N
     broken: Any = type("Broken", (Line,), {attribute: value})()
     with pytest.raises(ProblemError, match=message):
         planning.initial_state(broken, SETTINGS, 0, 0)
+
+
+class TestResolution:
+    """Which resolution the points have whose entropy counts."""
+
+    @staticmethod
+    def of(
+        given: float | tuple[float, ...] | None, *, of_states: bool, **attributes: object
+    ) -> object:
+        problem = type("Resolved", (Line,), attributes)()
+        found = contract.resolution_of(problem, given, of_states=of_states)
+        return found if isinstance(found, float) else found.tolist()
+
+    def test_one_number_is_for_actions_and_states(self) -> None:
+        for of_states in (False, True):
+            assert self.of(None, of_states=of_states, resolution=0.3) == 0.3
+            assert self.of(0.2, of_states=of_states, resolution=np.array([0.3])) == 0.2
+
+    def test_what_is_given_comes_first(self) -> None:
+        own = {"resolution": np.array([0.3]), "state_resolution": np.array([0.1, 0.2])}
+        assert self.of((0.5,), of_states=False, **own) == [0.5]
+        assert self.of((0.5, 0.6), of_states=True, **own) == [0.5, 0.6]
+
+    def test_states_have_their_own(self) -> None:
+        own = {"resolution": np.array([0.3]), "state_resolution": np.array([0.1, 0.2])}
+        assert self.of(None, of_states=False, **own) == [0.3]
+        assert self.of(None, of_states=True, **own) == [0.1, 0.2]
+        assert self.of(None, of_states=True, resolution=(0.3,), state_resolution=0.4) == 0.4
+
+    def test_states_of_as_many_coordinates_have_the_actions(self) -> None:
+        found = self.of(None, of_states=True, resolution=np.array([0.3, 0.4]), action_size=2)
+        assert found == [0.3, 0.4]
+
+    def test_states_of_another_number_of_coordinates_need_one(self) -> None:
+        with pytest.raises(
+            InvalidValueError,
+            match=r"selector.method state_entropy: resolution of line has 1 numbers.*and a state "
+            "has 2; give the problem a state_resolution, one number or 2, or write",
+        ):
+            self.of(None, of_states=True, resolution=np.array([0.3]))
+
+    def test_another_number_of_numbers(self) -> None:
+        with pytest.raises(
+            InvalidValueError,
+            match=r"selector.resolution \[0.5, 0.6\]: has 2 numbers; need one number, or 1 for "
+            "line, one for each coordinate of an action",
+        ):
+            self.of((0.5, 0.6), of_states=False)
+        with pytest.raises(InvalidValueError, match="2 for line, one for each coordinate of a sta"):
+            self.of((0.5,), of_states=True)
 
 
 @pytest.mark.parametrize("function", ["policy", "move", "observation_mean"])

@@ -139,6 +139,43 @@ class TestScaling:
         assert abs(found - expected) < TOLERANCE
 
 
+class TestResolutionOfEachCoordinate:
+    SIZES = np.array([0.3, 5.0, 0.01])
+
+    @pytest.mark.parametrize("count", COUNTS)
+    def test_points_are_measured_in_it(self, count: int) -> None:
+        points, weights = draw(count)
+        expected = entropy(points, weights, NearestNeighbor(5, 1.0)) + np.log(self.SIZES).sum()
+        found = entropy(points * self.SIZES, weights, NearestNeighbor(5, self.SIZES))
+        assert abs(found - expected) < TOLERANCE
+
+    def test_equal_sizes_are_one_size(self) -> None:
+        points, weights = draw(50)
+        expected = entropy(points, weights, NearestNeighbor(5, 0.2))
+        found = entropy(points, weights, NearestNeighbor(5, np.full(3, 0.2)))
+        assert abs(found - expected) < TOLERANCE
+
+    def test_a_single_point_is_known_to_within_an_ellipsoid(self) -> None:
+        expected = np.log(4.0 / 3.0 * np.pi * self.SIZES.prod())
+        assert abs(entropy(np.ones((1, 3)), None, NearestNeighbor(1, self.SIZES)) - expected) < 1e-9
+
+    def test_another_number_of_sizes(self) -> None:
+        with pytest.raises(InvalidValueError, match=r"resolution of shape \(2,\): need .* \(3,\)"):
+            entropy(draw(20)[0], None, NearestNeighbor(5, np.ones(2)))
+
+    @pytest.mark.parametrize("bad", [0.0, -1.0, np.nan, np.inf, 1e-151])
+    def test_a_size_out_of_bounds(self, bad: float) -> None:
+        with pytest.raises(InvalidValueError, match=r"resolution \[.*\]: allowed are .* in every"):
+            entropy(draw(20)[0], None, NearestNeighbor(5, np.array([0.1, bad, 0.1])))
+
+    def test_a_point_that_is_too_many_resolutions_away(self) -> None:
+        points = draw(20)[0] + 1e9
+        with pytest.raises(
+            InvalidValueError, match=r"point 0 is .* resolutions from zero: at most"
+        ):
+            entropy(points, None, NearestNeighbor(5, np.full(3, 1e-145)))
+
+
 class TestDegeneratePoints:
     """Policies map half of the particles to the same action: entropies stay finite."""
 

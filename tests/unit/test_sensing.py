@@ -293,6 +293,39 @@ class TestBadInput:
         same = msgspec.structs.replace(selector, resolution=Exact.resolution)
         self.assert_same_entropies(Exact(), selector, same)
 
+    def test_a_resolution_of_states_blurs_the_states_of_a_mixture(self) -> None:
+        class OfStates(Coordinates):
+            state_resolution = np.array([0.1, 0.5])
+
+        for estimator in ("nearest_neighbor", "gaussian_mixture_upper"):
+            selector = SelectorSettings(
+                method="state_entropy",
+                estimator=estimator,  # type: ignore[arg-type]
+            )
+            same = msgspec.structs.replace(selector, resolution=(0.1, 0.5))
+            self.assert_same_entropies(OfStates(), selector, same)
+
+    def test_an_array_stands_in_for_noise_that_is_not_there(self) -> None:
+        class Exact(Coordinates):
+            motion_variance = np.array([0.0, 0.0625])
+            resolution = np.array([0.5, 1.0])
+
+        selector = SelectorSettings(estimator="gaussian_mixture_lower")
+        same = msgspec.structs.replace(selector, resolution=(0.5, 0.25))
+        self.assert_same_entropies(Exact(), selector, same)
+
+    @pytest.mark.parametrize("method", ["action_entropy", "state_entropy", "action_covariance"])
+    def test_another_number_of_resolutions_is_named(self, method: str) -> None:
+        selector = SelectorSettings(method=method, resolution=(0.1, 0.1, 0.1))  # type: ignore[arg-type]
+        with pytest.raises(InvalidValueError, match=r"selector.resolution .*: has 3 numbers; need"):
+            choose(Coordinates(), settings_of(selector), belief_of(1.0, 1.0))
+
+    @pytest.mark.parametrize("method", ["action_entropy", "state_entropy", "action_covariance"])
+    def test_a_resolution_out_of_bounds_is_named(self, method: str) -> None:
+        selector = SelectorSettings(method=method, resolution=(0.1, 1e-200))  # type: ignore[arg-type]
+        with pytest.raises(InvalidValueError, match=r"resolution \[1.e-001 1.e-200\]: allowed are"):
+            choose(Coordinates(), settings_of(selector), belief_of(1.0, 1.0))
+
     @staticmethod
     def assert_same_entropies(
         problem: Problem, first: SelectorSettings, second: SelectorSettings

@@ -192,7 +192,10 @@ def _tasks(name: str, variant: Variant, scale: Scale) -> list[Task]:
     selector = SelectorSettings(estimator=variant.estimator)
     if variant.resolution is not None:
         own = problem_of(case.problem, case.model, {}).resolution
-        selector = msgspec.structs.replace(selector, resolution=variant.resolution * own)
+        resolution = np.multiply(variant.resolution, own).tolist()
+        if isinstance(resolution, list):
+            resolution = tuple(resolution)
+        selector = msgspec.structs.replace(selector, resolution=resolution)
     series = case.series(
         selector,
         _INTERVALS[name],

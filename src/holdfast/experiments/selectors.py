@@ -173,12 +173,19 @@ def _cases_table(tables: Mapping[_Cell, Table]) -> Table:
                 "M": sensing.num_observation_samples,
                 "k": sensing.num_nearest_neighbors,
                 "horizon": sensing.horizon,
-                "resolution": float(f"{problem_of(case.problem, case.model, {}).resolution:.4g}"),
+                "resolution": _resolution(case),
                 "max_steps": case.max_steps,
                 "trials": tables[name, INTERVALS[0], _DEFAULT].num_rows,
             }
         )
     return Table.of_records(rows)
+
+
+def _resolution(case: Case) -> Cell:
+    """Return a problem's resolution, or in a text those of all coordinates."""
+    own = problem_of(case.problem, case.model, {}).resolution
+    rounded = [f"{each:.4g}" for each in np.atleast_1d(own)]
+    return float(rounded[0]) if isinstance(own, (int, float)) else ", ".join(rounded)
 
 
 def _summary(tables: Mapping[_Cell, Table]) -> Table:
