@@ -75,11 +75,10 @@ def choose_sensing_action(
     entropy = entropy or nearest_neighbor_entropy
     sensing = settings.active_sensing
     samples = sensing.num_observation_samples
-    resolution = settings.selector.resolution or problem.resolution
-    units, log_volume = 1.0, 0.0
-    if not isinstance(resolution, (int, float)):
-        units, resolution = np.asarray(resolution), 1.0
-        log_volume = float(np.log(units).sum())
+    own = settings.selector.resolution or problem.resolution
+    # With one for each coordinate actions are measured in it.
+    units = None if isinstance(own, (int, float)) else np.array(own)
+    resolution = float(own) if isinstance(own, (int, float)) else 1.0
     states, weights = state.belief
 
     draws = stream(state.seed, state.trial, state.step, Purpose.HYPOTHESES)
@@ -94,9 +93,13 @@ def choose_sensing_action(
             variance = problem.observation_variance(states[drawn], j)
             observation = problem.observation_mean(states[drawn], j) + np.sqrt(variance) * noise[i]
             posterior = _reweighted(problem, state.belief, j, observation)
-            actions = problem.policy(states, state.stage) / units
+            actions = problem.policy(states, state.stage)
+            if units is not None:
+                actions = actions / units
             entropies[j] += entropy(actions, posterior, sensing.num_nearest_neighbors, resolution)
-    entropies = entropies / samples + log_volume
+    entropies /= samples
+    if units is not None:
+        entropies += np.log(units).sum()
     return int(np.argmin(entropies)), entropies
 
 

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import csv
 import platform
+import shlex
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -47,7 +48,7 @@ class Run(NamedTuple):
     def command(self) -> str:
         """Return the command that makes this run, from the root of the repository."""
         problem = [] if self.problem is None else ["--problem", self.problem]
-        changes = [f"--set {key}={value}" for key, value in self.changes.items()]
+        changes = [f"--set {shlex.quote(f'{key}={value}')}" for key, value in self.changes.items()]
         words = ["holdfast run", self.file, *problem, "--trials", str(self.trials), *changes]
         return " ".join(words)
 
@@ -74,7 +75,7 @@ class Run(NamedTuple):
 
 def runs() -> list[Run]:
     """Return every run that is pinned; what is new in the product appears here by itself."""
-    return [*_examples(), *_problems(), *_selectors(), *_estimates()]
+    return [*_examples(), *_problems(), *_selectors(), *_resolutions(), *_estimates()]
 
 
 def _examples() -> Iterator[Run]:
@@ -104,6 +105,24 @@ def _selectors() -> Iterator[Run]:
                 yield Run(name, PLAIN, 4, {**selector, **short})
                 if method not in {"random", "fixed"}:
                     yield Run(f"{name}, horizon 2", PLAIN, 4, {**selector, **ahead, **short})
+
+
+def _resolutions() -> Iterator[Run]:
+    """One for each coordinate, of actions and of states."""
+    given = {"selector.resolution": [0.1, 0.1, 0.02]}
+    short = {"particle_filter.num_particles": 100, "simulator.max_steps": 100}
+    for method in ("action_entropy", "action_covariance"):
+        yield Run(f"{method}, resolutions", PLAIN, 4, {"selector.method": method, **given, **short})
+    mixture = {"selector.estimator": "gaussian_mixture_upper", **given, **short}
+    yield Run("mixture, resolutions", PLAIN, 4, mixture)
+    states = {"selector.method": "state_entropy", **short}
+    yield Run(
+        "state_entropy, resolutions of states",
+        PLAIN,
+        4,
+        states,
+        "holdfast.experiments.passer_by:PasserBy",
+    )
 
 
 def _estimates() -> Iterator[Run]:

@@ -133,3 +133,11 @@ def test_number_of_samples_and_neighbors() -> None:
         ),
     )
     assert_same_decision(problem, settings, initial_state(problem, settings, seed=1, trial=0))
+
+
+def test_a_resolution_for_each_coordinate() -> None:
+    problem = PegInHole2D()
+    settings = msgspec.structs.replace(
+        settings_of(80), selector=SelectorSettings(resolution=(0.1, 0.02, 0.5))
+    )
+    assert_same_decision(problem, settings, initial_state(problem, settings, seed=1, trial=0))
