@@ -31,7 +31,10 @@ _GOAL_SIZE = 0.15
 
 
 class LightDark(ProblemBase):
-    """A point robot in the plane; states are (x, y) in metres, the goal is the origin."""
+    """A point robot in the plane; states are (x, y) in metres, the goal is the origin.
+
+    The resolution is what the noise of a step blurs, the same in both coordinates.
+    """
 
     name = "light_dark"
     state_size = 2

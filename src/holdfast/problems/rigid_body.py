@@ -56,6 +56,11 @@ class RigidBodyProblem(ProblemBase):
     ----------
     Model, StateSpacePlanner : type
         Of the problem's settings: it is built of one of each.
+    resolution : float
+        What the motion noise blurs in a step: the geometric mean of its standard deviations. The
+        pegs in the plane and the capsule robot have the same deviation in every coordinate unless
+        their settings say otherwise, and then one number is right for all. Where deviations differ,
+        ``selector.resolution`` takes one for each.
     """
 
     Model: ClassVar[type[Any]]
