@@ -431,8 +431,9 @@ def _build(
             f"is {num_neighbors}; the nearest_neighbor estimator needs it below"
             f" particle_filter.num_particles, which is {num_particles}",
         )
-    if selector.method not in ("random", "fixed"):
-        of_states = selector.method == "state_entropy"
+    of_states = selector.method == "state_entropy"
+    has_a_list = isinstance(selector.resolution, tuple)
+    if of_states or (has_a_list and selector.method not in ("random", "fixed")):
         try:
             resolution_of(problem, selector.resolution, of_states=of_states)
         except InvalidValueError as error:

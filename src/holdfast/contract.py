@@ -200,6 +200,9 @@ def resolution_of(
             )
     if isinstance(own, (int, float)):
         return own
+    # A configuration asks before check_problem has.
+    if np.asarray(own).dtype.kind not in "fiu":
+        raise ProblemError(f"resolution of {_name(problem)} is {own!r:.80}: must be numbers")
     return np.asarray(own, dtype=np.float64)
 
 

@@ -202,14 +202,15 @@ def kernel_estimator(
         if estimator.neighbors < 1:
             raise InvalidValueError(f"neighbors {estimator.neighbors}: must be at least 1")
         nearest = EstimatorKind.NEAREST_NEIGHBOR
-        if not isinstance(estimator.resolution, (int, float)):
-            scale, log_volume = scale_of(estimator.resolution, dimension)
+        if np.ndim(estimator.resolution) > 0:
+            scale, log_volume = scale_of(np.asarray(estimator.resolution), dimension)
             return KernelEstimator(nearest, estimator.neighbors, 1.0, 0.0, 0.0, scale, log_volume)
-        if not 1.0 / LARGEST <= estimator.resolution <= LARGEST:
+        resolution = float(estimator.resolution)
+        if not 1.0 / LARGEST <= resolution <= LARGEST:
             raise InvalidValueError(
-                f"resolution {estimator.resolution}: allowed are {1.0 / LARGEST:g} to {LARGEST:g}"
+                f"resolution {resolution}: allowed are {1.0 / LARGEST:g} to {LARGEST:g}"
             )
-        return KernelEstimator(nearest, estimator.neighbors, estimator.resolution, 0.0, 0.0, None)
+        return KernelEstimator(nearest, estimator.neighbors, resolution, 0.0, 0.0, None)
     variance = np.ascontiguousarray(estimator.variance, dtype=np.float64).reshape(-1)
     if variance.shape != (dimension,):
         raise InvalidValueError(f"variance of shape {variance.shape}: need ({dimension},)")

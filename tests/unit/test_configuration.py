@@ -297,6 +297,23 @@ class TestResolution:
         assert "line 4: selector.resolution [1.0, 2.0]: has 2 numbers; need one number" in message
         assert "3 for peg_in_hole_2d, one for each coordinate of " in message
 
+    def test_states_of_another_number_of_coordinates_need_their_own(
+        self, write: Write, tmp_path: Path
+    ) -> None:
+        (tmp_path / "without_state_resolution.py").write_text(
+            "import numpy as np\n"
+            "from holdfast.experiments.passer_by import PasserBy\n"
+            "class Without(PasserBy):\n"
+            "    resolution = np.array([0.1, 0.2])\n"
+            "    state_resolution = None\n"
+        )
+        text = "problem: without_state_resolution:Without\nselector: {method: "
+        load(write(f"{text}action_entropy}}"))
+        load(write(f"{text}state_entropy, resolution: [1, 1, 2]}}"))
+        message = complaint(write(f"{text}state_entropy}}"))
+        assert "resolution of passer_by has 2 numbers, for the coordinates of an action" in message
+        assert "give the problem a state_resolution, one number or 3, or write selector" in message
+
     @pytest.mark.parametrize("method", ["random", "fixed"])
     def test_where_nothing_is_measured_it_has_no_effect(self, method: str, write: Write) -> None:
         load(write(f"problem: capsule_robot\nselector: {{method: {method}, resolution: [1]}}"))

@@ -159,6 +159,13 @@ class TestResolutionOfEachCoordinate:
         expected = np.log(4.0 / 3.0 * np.pi * self.SIZES.prod())
         assert abs(entropy(np.ones((1, 3)), None, NearestNeighbor(1, self.SIZES)) - expected) < 1e-9
 
+    def test_a_number_of_numpy_is_a_number(self) -> None:
+        points, weights = draw(50)
+        expected = entropy(points, weights, NearestNeighbor(5, 0.25))
+        for number in (np.float32(0.25), np.array(0.25)):
+            estimator = NearestNeighbor(5, number)  # type: ignore[arg-type]
+            assert entropy(points, weights, estimator) == expected
+
     def test_another_number_of_sizes(self) -> None:
         with pytest.raises(InvalidValueError, match=r"resolution of shape \(2,\): need .* \(3,\)"):
             entropy(draw(20)[0], None, NearestNeighbor(5, np.ones(2)))
