@@ -45,6 +45,14 @@ HypothesisInput make_input(const Input<1>& weights, const std::vector<std::uint3
             to_stream(stream), drop_negligible};
 }
 
+/// The sets stand one below the other; each has a point for every particle.
+PointSets make_sets(const Input<2>& points, std::size_t count, const std::vector<double>& factors) {
+    if (factors.empty() || points.shape(0) != factors.size() * count) {
+        throw nb::value_error("points and factors do not fit");
+    }
+    return {points.data(), count, points.shape(1), factors.size(), factors.data()};
+}
+
 double seconds_since(std::chrono::steady_clock::time_point start) {
     return std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count();
 }
@@ -59,8 +67,9 @@ void holdfast::bind_entropy(nb::module_& module) {
     define(module, "entropies",
            [](const Input<2>& points, const Input<2>& rows_in, bool logarithms, int number,
               std::uint32_t neighbors, double resolution, double exponent, double offset,
-              int threads) {
-               const std::size_t posteriors = rows_in.shape(0), count = points.shape(0);
+              int threads, const std::vector<double>& factors) {
+               const std::size_t posteriors = rows_in.shape(0), count = rows_in.shape(1);
+               const PointSets sets = make_sets(points, count, factors);
                double* out;
                auto result = make_array<double>({posteriors}, out);
                EntropyCounts counts;
@@ -77,7 +86,7 @@ void holdfast::bind_entropy(nb::module_& module) {
                        return kernels.normalize(weights, count, drop, weights);
                    };
                    entropies(
-                       points.data(), count, points.shape(1), posteriors, source,
+                       sets, posteriors, source,
                        make_settings(estimator, neighbors, resolution, exponent, offset, threads),
                        out, counts);
                }
@@ -86,34 +95,35 @@ void holdfast::bind_entropy(nb::module_& module) {
                    nb::make_tuple(counts.pair_by_pair, counts.own_tree, counts.grouped));
            });
 
-    define(
-        module, "hypothetical_entropies",
-        [](const Input<1>& weights, const std::vector<std::uint32_t>& sizes,
-           const Input<2>& predicted, const Input<2>& variance, std::size_t samples,
-           const StreamWords& stream, const Input<2>& points, int number, std::uint32_t neighbors,
-           double resolution, double exponent, double offset, int threads) {
-            double* out;
-            auto result = make_array<double>({sizes.size(), samples}, out);
-            double* mean;
-            auto means = make_array<double>({sizes.size()}, mean);
-            EntropyCounts counts;
-            const Estimator estimator = to_estimator(number);
-            {
-                WithoutInterpreter released;
-                hypothetical_entropies(
-                    make_input(weights, sizes, predicted, variance, samples, stream,
-                               drops_negligible(estimator)),
-                    points.data(), points.shape(1),
-                    make_settings(estimator, neighbors, resolution, exponent, offset, threads), out,
-                    counts);
-                for (std::size_t j = 0; j < sizes.size(); ++j) {
-                    double total = 0.0;
-                    for (std::size_t i = 0; i < samples; ++i) total += out[j * samples + i];
-                    mean[j] = total / static_cast<double>(samples);
-                }
-            }
-            return nb::make_tuple(means, result, counts.likelihoods, counts.visits);
-        });
+    define(module, "hypothetical_entropies",
+           [](const Input<1>& weights, const std::vector<std::uint32_t>& sizes,
+              const Input<2>& predicted, const Input<2>& variance, std::size_t samples,
+              const StreamWords& stream, const Input<2>& points, int number,
+              std::uint32_t neighbors, double resolution, double exponent, double offset,
+              int threads, const std::vector<double>& factors) {
+               const PointSets sets = make_sets(points, weights.shape(0), factors);
+               double* out;
+               auto result = make_array<double>({sizes.size(), samples}, out);
+               double* mean;
+               auto means = make_array<double>({sizes.size()}, mean);
+               EntropyCounts counts;
+               const Estimator estimator = to_estimator(number);
+               {
+                   WithoutInterpreter released;
+                   hypothetical_entropies(
+                       make_input(weights, sizes, predicted, variance, samples, stream,
+                                  drops_negligible(estimator)),
+                       sets,
+                       make_settings(estimator, neighbors, resolution, exponent, offset, threads),
+                       out, counts);
+                   for (std::size_t j = 0; j < sizes.size(); ++j) {
+                       double total = 0.0;
+                       for (std::size_t i = 0; i < samples; ++i) total += out[j * samples + i];
+                       mean[j] = total / static_cast<double>(samples);
+                   }
+               }
+               return nb::make_tuple(means, result, counts.likelihoods, counts.visits);
+           });
 
     define(module, "hypothetical_weights",
            [](const Input<1>& weights, const std::vector<std::uint32_t>& sizes,

@@ -192,33 +192,37 @@ class Group {
                  node_weights_.data(),
                  node_counts_.data(),
                  neighbors_.data()};
+        partial_.resize(tree.leaves * columns);
+        visited_.resize(tree.leaves);
     }
 
-    /// One task per leaf; partial sums are added in the order of the leaves.
-    void run(int threads, double* out, std::uint64_t& visits) const {
-        const std::size_t columns = view_.vectors * lane_count;
-        std::vector<double> partial(tree_.leaves * columns);
-        std::vector<std::uint64_t> visited(tree_.leaves);
-        parallel_for(tree_.leaves, threads, [&](std::size_t leaf) {
-            double* terms = &partial[leaf * columns];
-            if (task_.settings->estimator == Estimator::gaussian_mixture) {
-                task_.kernels->group_mixture(view_, leaf, task_.settings->exponent, terms,
-                                             &visited[leaf]);
-                return;
-            }
-            thread_local std::vector<double> scratch;
-            scratch.resize(task_.settings->neighbors);
-            task_.kernels->group_nearest(view_, leaf, task_.constants, scratch.data(), terms,
-                                         &visited[leaf]);
-        });
-        for (const std::uint64_t v : visited) visits += v;
-        for (std::size_t member = 0; member < members_; ++member) {
-            double sum = 0.0;
-            for (std::size_t leaf = 0; leaf < tree_.leaves; ++leaf) {
-                sum += partial[leaf * columns + member];
-            }
-            out[member] = sum;
+    /// The terms of the points of one leaf. For different leaves from several threads at once.
+    void add_leaf(std::size_t leaf) {
+        double* terms = &partial_[leaf * view_.vectors * lane_count];
+        if (task_.settings->estimator == Estimator::gaussian_mixture) {
+            task_.kernels->group_mixture(view_, leaf, task_.settings->exponent, terms,
+                                         &visited_[leaf]);
+            return;
         }
+        thread_local std::vector<double> scratch;
+        scratch.resize(task_.settings->neighbors);
+        task_.kernels->group_nearest(view_, leaf, task_.constants, scratch.data(), terms,
+                                     &visited_[leaf]);
+    }
+
+    /// Partial sums are added in the order of the leaves.
+    double entropy(std::size_t member) const {
+        double sum = 0.0;
+        for (std::size_t leaf = 0; leaf < tree_.leaves; ++leaf) {
+            sum += partial_[leaf * view_.vectors * lane_count + member];
+        }
+        return sum;
+    }
+
+    std::uint64_t visits() const {
+        std::uint64_t total = 0;
+        for (const std::uint64_t v : visited_) total += v;
+        return total;
     }
 
   private:
@@ -227,6 +231,8 @@ class Group {
     std::size_t members_;
     std::vector<double> weights_, block_weights_, node_weights_;
     std::vector<std::uint32_t> significant_, block_counts_, node_counts_, neighbors_;
+    std::vector<double> partial_;
+    std::vector<std::uint64_t> visited_;
     PosteriorGroup view_{};
 };
 
@@ -246,32 +252,36 @@ double own_tree_entropy(const Task& task, const double* weights, std::size_t sur
     own.points = points.data();
     own.count = survivors;
     const PointTree tree(own.points, own.count, own.dimension);
-    const Group group(own, tree, {kept.data()}, {survivors});
-    double entropy;
-    group.run(1, &entropy, visits);
-    return entropy;
+    Group group(own, tree, {kept.data()}, {survivors});
+    for (std::size_t leaf = 0; leaf < tree.leaves; ++leaf) group.add_leaf(leaf);
+    visits += group.visits();
+    return group.entropy(0);
 }
 
 }  // namespace
 
-void entropies(const double* points, std::size_t count, std::size_t dimension,
-               std::size_t posteriors, const PosteriorSource& source,
+void entropies(const PointSets& sets, std::size_t posteriors, const PosteriorSource& source,
                const EntropySettings& settings, double* out, EntropyCounts& counts) {
     const bool nearest = settings.estimator == Estimator::nearest_neighbor;
-    const Task task{points,
-                    count,
-                    dimension,
-                    &settings,
-                    {settings.resolution, nearest ? log_unit_ball(dimension) : 0.0,
-                     nearest ? bias_corrections(count) : nullptr},
-                    &vector_kernels()};
+    const std::size_t count = sets.count;
+    const NearestNeighborConstants constants{settings.resolution,
+                                             nearest ? log_unit_ball(sets.dimension) : 0.0,
+                                             nearest ? bias_corrections(count) : nullptr};
+    std::vector<Task> tasks;
+    for (std::size_t set = 0; set < sets.number; ++set) {
+        tasks.push_back({sets.points + set * count * sets.dimension, count, sets.dimension,
+                         &settings, constants, &vector_kernels()});
+    }
     // Posteriors are taken in batches: their weights fill 64 MB, or those of one group if that is
     // more.
     const std::size_t batch =
         std::max<std::size_t>(max_group_lanes, (std::size_t{8} << 20) / count);
     std::vector<double> weights(std::min(batch, posteriors) * count);
     std::vector<std::size_t> survivors(std::min(batch, posteriors));
-    std::unique_ptr<PointTree> tree;
+    std::vector<std::unique_ptr<PointTree>> trees(sets.number);
+    // Sets whose groups are worked on at once: a group takes 400 bytes for each particle.
+    const std::size_t together =
+        std::max<std::size_t>(1, std::min(sets.number, (std::size_t{1} << 20) / count));
 
     for (std::size_t first = 0; first < posteriors; first += batch) {
         const std::size_t number = std::min(batch, posteriors - first);
@@ -279,22 +289,14 @@ void entropies(const double* points, std::size_t count, std::size_t dimension,
         // that are woken for the likelihoods (from 400 particles and 30 posteriors on) are there
         // when the entropies begin.
         const double likelihoods = static_cast<double>(number) * static_cast<double>(count);
-        std::vector<std::uint64_t> visits(number);
+        std::vector<double> values(sets.number * number);  // [set][posterior]
+        std::vector<std::uint64_t> visits(sets.number * number);
         parallel_for(number, threads_for(work_that_follows * likelihoods, number, settings.threads),
                      [&](std::size_t i) { survivors[i] = source(first + i, &weights[i * count]); });
         counts.likelihoods += number * count;
 
-        if (settings.estimator == Estimator::total_variance) {
-            parallel_for(
-                number, threads_for(work_that_follows * likelihoods, number, settings.threads),
-                [&](std::size_t i) {
-                    out[first + i] = survivors[i] == 0 ? std::numeric_limits<double>::quiet_NaN()
-                                                       : total_variance(task, &weights[i * count]);
-                });
-            counts.visits += number * count;
-            continue;
-        }
-
+        // What becomes of a posterior depends on the number of its points alone, so it is the same
+        // for all sets.
         const double shared_from = grouped_share * static_cast<double>(count);
         double candidates_alone = 0.0;
         std::size_t candidates = 0;
@@ -308,35 +310,52 @@ void entropies(const double* points, std::size_t count, std::size_t dimension,
         const bool group_them =
             candidates_alone >
             static_cast<double>(groups) * static_cast<double>(count) * grouped_cost_of_a_point;
+        const bool variance = settings.estimator == Estimator::total_variance;
         std::vector<std::size_t> alone, grouped;
         double work_alone = 0.0;
         for (std::size_t i = 0; i < number; ++i) {
             const std::size_t s = survivors[i];
-            if (s <= 1) {
-                out[first + i] = s == 0 ? std::numeric_limits<double>::quiet_NaN()
-                                        : entropy_of_one(task) + settings.offset;
+            if (s == 0 || (s == 1 && !variance)) {
+                const double value = s == 0 ? std::numeric_limits<double>::quiet_NaN()
+                                            : entropy_of_one(tasks[0]) + settings.offset;
+                for (std::size_t set = 0; set < sets.number; ++set) {
+                    values[set * number + i] = value;
+                }
+            } else if (variance) {
+                alone.push_back(i);
+                work_alone += work_that_follows * static_cast<double>(count);
             } else if (group_them && s > compact_limit && static_cast<double>(s) >= shared_from) {
                 grouped.push_back(i);
-                ++counts.grouped;
+                counts.grouped += sets.number;
             } else {
                 alone.push_back(i);
-                ++(s <= compact_limit ? counts.pair_by_pair : counts.own_tree);
+                (s <= compact_limit ? counts.pair_by_pair : counts.own_tree) += sets.number;
                 work_alone += cost_alone(s);
             }
         }
-        parallel_for(alone.size(), threads_for(work_alone, alone.size(), settings.threads),
-                     [&](std::size_t task_index) {
-                         const std::size_t i = alone[task_index];
-                         const double* w = &weights[i * count];
-                         out[first + i] =
-                             settings.offset +
-                             (survivors[i] <= compact_limit
-                                  ? compact_entropy(task, w, survivors[i], visits[i])
-                                  : own_tree_entropy(task, w, survivors[i], visits[i]));
-                     });
+        const std::size_t pieces = sets.number * alone.size();
+        parallel_for(
+            pieces,
+            threads_for(static_cast<double>(sets.number) * work_alone, pieces, settings.threads),
+            [&](std::size_t piece) {
+                const std::size_t set = piece / alone.size();
+                const std::size_t i = alone[piece % alone.size()];
+                const std::size_t at = set * number + i;
+                const Task& task = tasks[set];
+                const double* w = &weights[i * count];
+                if (variance) {
+                    values[at] = total_variance(task, w);
+                    visits[at] = count;
+                } else if (survivors[i] <= compact_limit) {
+                    values[at] =
+                        settings.offset + compact_entropy(task, w, survivors[i], visits[at]);
+                } else {
+                    values[at] =
+                        settings.offset + own_tree_entropy(task, w, survivors[i], visits[at]);
+                }
+            });
         for (const std::uint64_t v : visits) counts.visits += v;
 
-        if (!grouped.empty() && !tree) tree = std::make_unique<PointTree>(points, count, dimension);
         for (std::size_t begin = 0; begin < grouped.size(); begin += max_group_lanes) {
             const std::size_t end = std::min(begin + max_group_lanes, grouped.size());
             std::vector<const double*> members;
@@ -345,13 +364,38 @@ void entropies(const double* points, std::size_t count, std::size_t dimension,
                 members.push_back(&weights[grouped[g] * count]);
                 sizes.push_back(survivors[grouped[g]]);
             }
-            const Group group(task, *tree, members, sizes);
-            double results[max_group_lanes];
-            const double work = grouped_cost_of_a_point * static_cast<double>(count);
-            group.run(threads_for(work, tree->leaves, settings.threads), results, counts.visits);
-            for (std::size_t g = begin; g < end; ++g) {
-                out[first + grouped[g]] = settings.offset + results[g - begin];
+            for (std::size_t from = 0; from < sets.number; from += together) {
+                const std::size_t here = std::min(together, sets.number - from);
+                const double work = grouped_cost_of_a_point * static_cast<double>(here) *
+                                    static_cast<double>(count);
+                std::vector<std::unique_ptr<Group>> shared(here);
+                parallel_for(here, threads_for(work, here, settings.threads), [&](std::size_t h) {
+                    std::unique_ptr<PointTree>& tree = trees[from + h];
+                    const Task& task = tasks[from + h];
+                    if (!tree) {
+                        tree = std::make_unique<PointTree>(task.points, count, task.dimension);
+                    }
+                    shared[h] = std::make_unique<Group>(task, *tree, members, sizes);
+                });
+                const std::size_t leaves = trees[from]->leaves;
+                parallel_for(
+                    here * leaves, threads_for(work, here * leaves, settings.threads),
+                    [&](std::size_t piece) { shared[piece / leaves]->add_leaf(piece % leaves); });
+                for (std::size_t h = 0; h < here; ++h) {
+                    counts.visits += shared[h]->visits();
+                    for (std::size_t g = begin; g < end; ++g) {
+                        values[(from + h) * number + grouped[g]] =
+                            settings.offset + shared[h]->entropy(g - begin);
+                    }
+                }
             }
+        }
+        for (std::size_t i = 0; i < number; ++i) {
+            double sum = sets.factors[0] * values[i];
+            for (std::size_t set = 1; set < sets.number; ++set) {
+                sum += sets.factors[set] * values[set * number + i];
+            }
+            out[first + i] = sum;
         }
     }
 }

@@ -55,11 +55,20 @@ inline bool drops_negligible(Estimator estimator) {
 /// Called from several threads at once.
 using PosteriorSource = std::function<std::size_t(std::size_t index, double* weights)>;
 
-/// Entropies of `posteriors` weightings of the points (`count` rows of `dimension`).
+/// Sets of points that are weighted alike: point n of every set has the weight of particle n.
+struct PointSets {
+    const double* points;  // [number][count][dimension]
+    std::size_t count;
+    std::size_t dimension;
+    std::size_t number;     // sets, at least 1
+    const double* factors;  // [number]
+};
+
+/// Entropies of `posteriors` weightings: the sum over the sets, in their order, of factor times
+/// entropy.
 ///
 /// An entry is NaN where the source returned 0.
-void entropies(const double* points, std::size_t count, std::size_t dimension,
-               std::size_t posteriors, const PosteriorSource& source,
+void entropies(const PointSets& sets, std::size_t posteriors, const PosteriorSource& source,
                const EntropySettings& settings, double* out, EntropyCounts& counts);
 
 }  // namespace holdfast

@@ -98,12 +98,11 @@ class Hypotheses {
 
 }  // namespace
 
-void hypothetical_entropies(const HypothesisInput& input, const double* points,
-                            std::size_t dimension, const EntropySettings& settings, double* out,
-                            EntropyCounts& counts) {
+void hypothetical_entropies(const HypothesisInput& input, const PointSets& sets,
+                            const EntropySettings& settings, double* out, EntropyCounts& counts) {
     const Hypotheses hypotheses(input);
     entropies(
-        points, input.count, dimension, input.sensing_actions * input.samples,
+        sets, input.sensing_actions * input.samples,
         [&](std::size_t index, double* weights) { return hypotheses(index, weights); }, settings,
         out, counts);
 }

@@ -34,10 +34,9 @@ struct HypothesisInput {
 };
 
 /// Entropies of the J x M hypothetical posteriors, row by row; NaN where an observation explains
-/// nothing.
-void hypothetical_entropies(const HypothesisInput& input, const double* points,
-                            std::size_t dimension, const EntropySettings& settings, double* out,
-                            EntropyCounts& counts);
+/// nothing. All sets of points share the posteriors.
+void hypothetical_entropies(const HypothesisInput& input, const PointSets& sets,
+                            const EntropySettings& settings, double* out, EntropyCounts& counts);
 
 /// The posterior weights themselves: out[J][M][count]; for horizons above 1.
 void hypothetical_weights(const HypothesisInput& input, double* out);

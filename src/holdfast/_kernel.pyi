@@ -34,6 +34,7 @@ def entropies(
     exponent: float,
     offset: float,
     threads: int,
+    factors: Sequence[float],
 ) -> tuple[_Floats, int, int, tuple[int, int, int]]: ...
 def use_threads_from(nanoseconds: float) -> float: ...
 def threads_started() -> int: ...
@@ -51,6 +52,7 @@ def hypothetical_entropies(
     exponent: float,
     offset: float,
     threads: int,
+    factors: Sequence[float],
 ) -> tuple[_Floats, _Floats, int, int]: ...
 def hypothetical_weights(
     weights: _Floats,

@@ -48,6 +48,7 @@ from holdfast.settings import (
     RecoverySettings,
     SelectorSettings,
     SimulatorSettings,
+    unfit_for_path_entropy,
 )
 from holdfast.user_code import account_of_user_error, in_words
 from holdfast.yaml_document import MAX_BYTES, Document, KeyPath, dotted, read, write
@@ -422,7 +423,7 @@ def _build(
     num_particles = particle_filter.num_particles
     num_neighbors = active_sensing.num_nearest_neighbors
     if (
-        selector.method in ("action_entropy", "state_entropy")
+        selector.method in ("action_entropy", "path_entropy", "state_entropy")
         and selector.estimator == "nearest_neighbor"
         and num_neighbors >= num_particles
     ):
@@ -439,6 +440,14 @@ def _build(
         except InvalidValueError as error:
             place = source.place(("selector", "resolution"))
             raise ConfigurationError(f"{place}: {error}") from None
+    planning = PlanningSettings(
+        particle_filter=particle_filter,
+        active_sensing=active_sensing,
+        selector=selector,
+        sensing_interval=simulator.sensing_intervals,
+    )
+    if (unfit := unfit_for_path_entropy(planning)) is not None:
+        raise source.error(*unfit)
     num_actions = len(problem.sensing_actions)
     if selector.method == "fixed" and selector.sensing_action >= num_actions:
         raise source.error(
@@ -449,12 +458,7 @@ def _build(
     return Configuration(
         problem=problem,
         problem_name=name,
-        planning=PlanningSettings(
-            particle_filter=particle_filter,
-            active_sensing=active_sensing,
-            selector=selector,
-            sensing_interval=simulator.sensing_intervals,
-        ),
+        planning=planning,
         simulator=simulator,
         model=model,
         state_space_planner=planner,

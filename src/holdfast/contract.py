@@ -24,10 +24,12 @@ __all__ = [
     "check_problem",
     "check_sizes",
     "executed_action",
+    "expected_move",
     "has_general_observations",
     "in_brief",
     "log_likelihood",
     "next_stage",
+    "next_stages",
     "observation_mean",
     "observation_variance",
     "policy",
@@ -51,6 +53,7 @@ _EDGE = 4
 PARAMETERS: Mapping[str, tuple[str, ...]] = {
     "initial_states": ("stream", "count"),
     "move": ("states", "actions", "stream"),
+    "expected_move": ("states", "actions"),
     "observation_mean": ("states", "sensing_action"),
     "observation_variance": ("states", "sensing_action"),
     "policy": ("states", "stage"),
@@ -330,7 +333,7 @@ def log_likelihood(
     return checked
 
 
-def policy(problem: Any, states: FloatArray, stage: int) -> FloatArray:
+def policy(problem: Any, states: FloatArray, stage: int | npt.NDArray[np.int64]) -> FloatArray:
     """Return the checked commanded actions, shape ``(..., action_size)``."""
     actions = problem.policy(states, stage)
     shape = (*states.shape[:-1], problem.action_size)
@@ -359,6 +362,48 @@ def next_stage(problem: Any, estimate: FloatArray, stage: int) -> int:
             f"{problem.num_stages - 1}"
         )
     return int(value)
+
+
+def next_stages(
+    problem: Any, states: FloatArray, stages: npt.NDArray[np.int64]
+) -> npt.NDArray[np.int64]:
+    """Return the checked stages that follow, one for each state."""
+    following = problem.next_stage(states, stages)
+    if (
+        not isinstance(following, np.ndarray)
+        or following.dtype.kind not in "iu"
+        or following.shape != stages.shape
+    ):
+        raise _misfit(problem, "next_stage", following, stages.shape)
+    if following.min() < 0 or following.max() >= problem.num_stages:
+        bad = int(np.argmax((following < 0) | (following >= problem.num_stages)))
+        raise ProblemError(
+            f"next_stage of {_name(problem)} is {following[bad]} for state {in_brief(states[bad])}:"
+            f" allowed are 0 to {problem.num_stages - 1}"
+        )
+    checked: npt.NDArray[np.int64] = following
+    return checked
+
+
+def expected_move(
+    problem: Any, states: FloatArray, actions: FloatArray, noise_free: object
+) -> FloatArray:
+    """Return where executed actions lead without noise, of the shape of ``states``, read-only.
+
+    A problem without ``expected_move`` is asked for its ``move`` with the stream ``noise_free``.
+    """
+    function = "expected_move"
+    if hasattr(problem, function):
+        moved = problem.expected_move(states, actions)
+    else:
+        function = "move"
+        moved = problem.move(states, actions, noise_free)
+    # Whether they are finite is asked of the actions there, once for many steps.
+    if not _is_array(moved, states.ndim) or moved.shape != states.shape:
+        raise _misfit(problem, function, moved, states.shape)
+    checked: FloatArray = moved
+    checked.setflags(write=False)
+    return checked
 
 
 def states_of(

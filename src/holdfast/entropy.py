@@ -299,6 +299,7 @@ def entropy(
         kernel.exponent,
         kernel.offset,
         threads,
+        (1.0,),
     )
     if kernel.log_volume != 0.0:
         result = result + kernel.log_volume

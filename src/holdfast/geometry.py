@@ -18,6 +18,7 @@ import numpy.typing as npt
 
 from holdfast import _kernel
 from holdfast.errors import InvalidValueError
+from holdfast.randomness import NOISE_FREE
 
 if TYPE_CHECKING:
     from holdfast.randomness import Stream
@@ -113,7 +114,7 @@ class _World:
         tolerance : float
             Fraction of the action, above 0 and below 1.
         stream : Stream
-            Source of the noise.
+            Source of the noise; with :data:`~holdfast.randomness.NOISE_FREE` there is none.
 
         Returns
         -------
@@ -136,6 +137,8 @@ class _World:
             states, actions = _broadcast(states, actions)
         one_action = actions.shape == (dimension,)
         shape = states.shape if one_action else np.broadcast_shapes(states.shape, actions.shape)
+        if stream is NOISE_FREE:
+            standard_deviation = np.zeros(dimension)
         next_states = np.empty(shape)
         moved = self._kernel.move(
             states.reshape(-1, dimension),

@@ -20,7 +20,7 @@ import numpy.typing as npt
 from holdfast import _kernel
 from holdfast.errors import InvalidValueError
 
-__all__ = ["Purpose", "Stream", "stream"]
+__all__ = ["NOISE_FREE", "NoiseFreeStream", "Purpose", "Stream", "stream"]
 
 Words: TypeAlias = tuple[int, int, int, int, int]
 
@@ -103,6 +103,41 @@ class Stream:
 
     def __repr__(self) -> str:
         return f"Stream({self.words})"
+
+
+class NoiseFreeStream(Stream):
+    """A stream whose numbers are all at the middle: normal deviates 0, uniform ones 0.5.
+
+    What a problem draws from it is what happens without noise, if its noise is made of these
+    deviates. Every substream is the stream itself. There is one, :data:`NOISE_FREE`.
+    """
+
+    __slots__ = ()
+
+    def normal(self, shape: int | tuple[int, ...] = ()) -> npt.NDArray[np.float64]:
+        """Return zeros of the given shape."""
+        return np.zeros(shape)
+
+    def uniform(self, shape: int | tuple[int, ...] = ()) -> npt.NDArray[np.float64]:
+        """Return halves of the given shape."""
+        return np.full(shape, 0.5)
+
+    def substream(self, index: int) -> Stream:
+        """Return the stream itself."""
+        del index
+        return self
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, NoiseFreeStream)
+
+    def __hash__(self) -> int:
+        return hash(NoiseFreeStream)
+
+    def __repr__(self) -> str:
+        return "NOISE_FREE"
+
+
+NOISE_FREE = NoiseFreeStream((0, 0, 0, 0, 0))
 
 
 def stream(seed: int, trial: int, step: int, purpose: Purpose) -> Stream:

@@ -34,6 +34,7 @@ from holdfast.entropy import (
     scaled,
 )
 from holdfast.errors import InvalidValueError, ProblemError
+from holdfast.policy_path import path_points
 from holdfast.problems.problem import Problem
 from holdfast.randomness import Stream
 from holdfast.settings import PlanningSettings
@@ -117,13 +118,19 @@ def choose_sensing_action(
         return int(float(selection.uniform()) * count), SensingInfo(None, None, 0, 0)
 
     points_of = _points_of(problem, settings)
-    points = points_of(belief.states, stage)
-    estimator = _estimator(problem, settings, belief, points)
+    if selector.method == "path_entropy":
+        sets, factors = path_points(problem, settings, belief.states, stage)
+    else:
+        sets, factors = points_of(belief.states, stage)[np.newaxis], (1.0,)
+    estimator = _estimator(problem, settings, belief, sets[0])
+    points = sets.reshape(-1, sets.shape[-1])
     threads = settings.active_sensing.num_cores
     several_steps = settings.active_sensing.horizon > 1
     if contract.has_general_observations(problem):
         log_weights = _general_log_weights(problem, settings, belief, hypotheses)
-        samples, likelihoods, visits = _entropies(points, log_weights, True, estimator, threads)
+        samples, likelihoods, visits = _entropies(
+            points, log_weights, True, estimator, threads, factors
+        )
         samples = samples.reshape(count, -1)
         entropies = _row_means(samples)
         weights = _normalized(log_weights, estimator) if several_steps else None
@@ -143,6 +150,7 @@ def choose_sensing_action(
             estimator.exponent,
             estimator.offset,
             threads,
+            factors,
         )
         weights = None
         if several_steps:
@@ -333,6 +341,7 @@ def _entropies(
     logarithms: bool,
     estimator: KernelEstimator,
     threads: int,
+    factors: tuple[float, ...] = (1.0,),
 ) -> tuple[FloatArray, int, int]:
     result, likelihoods, visits, _ = _kernel.entropies(
         np.ascontiguousarray(scaled(points, estimator)),
@@ -344,6 +353,7 @@ def _entropies(
         estimator.exponent,
         estimator.offset,
         threads,
+        factors,
     )
     return result, likelihoods, visits
 

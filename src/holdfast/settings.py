@@ -9,6 +9,7 @@ does, without the file, at the start of every trial.
 
 from __future__ import annotations
 
+import itertools
 from typing import Annotated, Any, Literal
 
 import msgspec
@@ -25,6 +26,8 @@ __all__ = [
     "SelectorSettings",
     "SimulatorSettings",
     "check_settings",
+    "path_steps",
+    "unfit_for_path_entropy",
 ]
 
 MAX_PARTICLES = 10_000_000
@@ -32,6 +35,12 @@ MAX_PARTICLES = 10_000_000
 
 MAX_SERVICES = 16
 """Bound on ``offload.services``: each has links of its own."""
+
+MAX_PATH_STEPS = 10_000
+"""Bound on the entries of ``selector.path_offsets``, and on the steps that they come to."""
+
+MAX_PATH_OFFSETS = 64
+"""Bound on the number of entries of ``selector.path_offsets``."""
 
 Count = Annotated[int, msgspec.Meta(ge=1)]
 NonNegativeCount = Annotated[int, msgspec.Meta(ge=0)]
@@ -96,9 +105,11 @@ class SelectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
 
     Attributes
     ----------
-    method : {"action_entropy", "state_entropy", "action_covariance", "random", "fixed"}
+    method : {"action_entropy", "path_entropy", "state_entropy", "action_covariance", "random", \
+"fixed"}
         What is minimised: an entropy, or the trace of the covariance of the actions; ``random`` and
-        ``fixed`` look at no belief.
+        ``fixed`` look at no belief. ``path_entropy`` adds up the entropies of the actions at
+        several steps of the way that the policy leads each particle without noise.
     sensing_action : int
         Index of the sensing action that ``fixed`` chooses.
     estimator : {"nearest_neighbor", "gaussian_mixture_upper", "gaussian_mixture_lower"}
@@ -108,8 +119,8 @@ class SelectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
         unless ``resolution`` has a number for each; with the motion noise as its own, the mixture
         does not.
     actions : {"commanded", "executed"}
-        Whether ``action_entropy`` and ``action_covariance`` look at what the policy says or at what
-        the limits leave of it.
+        Whether ``action_entropy``, ``path_entropy`` and ``action_covariance`` look at what the
+        policy says or at what the limits leave of it.
     resolution : float, tuple of float or None
         Distance below which two actions (or, for ``state_entropy``, states) do not differ in
         practice, in their unit; for a mixture, the standard deviation of the noise that blurs them.
@@ -118,17 +129,31 @@ class SelectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
         resolution, and for a mixture its motion noise, unless that has none for a coordinate,
         there are more coordinates of a state than of an action, or the problem has a resolution of
         states.
+    path_offsets : tuple of int
+        How far along the way ``path_entropy`` looks at the actions: strictly increasing, from 0
+        (the next action) to 10,000, 1 to 64 of them.
+    path_unit : {"steps", "sensing_intervals"}
+        What the offsets count. An interval is ``simulator.sensing_intervals + 1`` steps; the
+        offsets in steps are at most 10,000 as well.
+    path_discount : float
+        The entropy h steps on counts ``path_discount**h`` times; above 0, at most 1.
     """
 
-    method: Literal["action_entropy", "state_entropy", "action_covariance", "random", "fixed"] = (
-        "action_entropy"
-    )
+    method: Literal[
+        "action_entropy", "path_entropy", "state_entropy", "action_covariance", "random", "fixed"
+    ] = "action_entropy"
     sensing_action: NonNegativeCount = 0
     estimator: Literal["nearest_neighbor", "gaussian_mixture_upper", "gaussian_mixture_lower"] = (
         "nearest_neighbor"
     )
     actions: Literal["commanded", "executed"] = "commanded"
     resolution: Positive | Resolutions | None = None
+    path_offsets: Annotated[
+        tuple[Annotated[int, msgspec.Meta(ge=0, le=MAX_PATH_STEPS)], ...],
+        msgspec.Meta(min_length=1, max_length=MAX_PATH_OFFSETS),
+    ] = (0, 9, 18, 36)
+    path_unit: Literal["steps", "sensing_intervals"] = "steps"
+    path_discount: Annotated[float, msgspec.Meta(gt=0.0, le=1.0)] = 1.0
 
 
 class SimulatorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -277,6 +302,42 @@ class PlanningSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
     sensing_interval: NonNegativeCount = 8
 
 
+def path_steps(settings: PlanningSettings) -> tuple[int, ...]:
+    """Return ``selector.path_offsets`` in steps."""
+    selector = settings.selector
+    if selector.path_unit == "steps":
+        return selector.path_offsets
+    interval = settings.sensing_interval + 1
+    return tuple(offset * interval for offset in selector.path_offsets)
+
+
+def unfit_for_path_entropy(settings: PlanningSettings) -> tuple[tuple[str, str], str] | None:
+    """Return which key the method ``path_entropy`` cannot use as it is, and why; None if all fit.
+
+    For what the bounds of a single key do not say.
+    """
+    if settings.selector.method != "path_entropy":
+        return None
+    offsets = settings.selector.path_offsets
+    key = ("selector", "path_offsets")
+    if any(after <= before for before, after in itertools.pairwise(offsets)):
+        return key, f"is {list(offsets)}; the offsets must increase strictly"
+    steps = path_steps(settings)
+    if not steps or len(steps) > MAX_PATH_OFFSETS or steps[0] < 0 or steps[-1] > MAX_PATH_STEPS:
+        return key, (
+            f"is {list(offsets)}, {list(steps)} steps with selector.path_unit "
+            f"{settings.selector.path_unit}; allowed are 1 to {MAX_PATH_OFFSETS} offsets from 0 to "
+            f"{MAX_PATH_STEPS} steps"
+        )
+    horizon = settings.active_sensing.horizon
+    if horizon > 1:
+        return ("active_sensing", "horizon"), (
+            f"is {horizon}; with selector.method path_entropy it must be 1: the offsets of "
+            "selector.path_offsets are how far that looks ahead"
+        )
+    return None
+
+
 def check_settings(settings: PlanningSettings) -> None:
     """Check the bounds of settings that were made in Python.
 
@@ -289,3 +350,6 @@ def check_settings(settings: PlanningSettings) -> None:
         msgspec.convert(msgspec.to_builtins(settings), PlanningSettings)
     except (msgspec.ValidationError, TypeError) as error:
         raise InvalidValueError(f"settings: {error}") from error
+    if (unfit := unfit_for_path_entropy(settings)) is not None:
+        (section, key), reason = unfit
+        raise InvalidValueError(f"settings: {section}.{key} {reason}")

@@ -69,7 +69,14 @@ plannings = st.builds(
     selector=st.builds(
         SelectorSettings,
         method=st.sampled_from(
-            ("action_entropy", "state_entropy", "action_covariance", "random", "fixed")
+            (
+                "action_entropy",
+                "path_entropy",
+                "state_entropy",
+                "action_covariance",
+                "random",
+                "fixed",
+            )
         ),
         sensing_action=st.integers(0, 100),
     ),

@@ -98,12 +98,13 @@ def _selectors() -> Iterator[Run]:
     ahead = {"active_sensing.horizon": 2, "active_sensing.discount": 0.5}
     for method in _choices("method"):
         for estimator in _choices("estimator") if method.endswith("_entropy") else (None,):
-            for actions in _choices("actions") if method.startswith("action_") else (None,):
+            acts = method.startswith(("action_", "path_"))
+            for actions in _choices("actions") if acts else (None,):
                 chosen = {"method": method, "estimator": estimator, "actions": actions}
                 selector = {f"selector.{key}": value for key, value in chosen.items() if value}
                 name = ", ".join(selector.values())
                 yield Run(name, PLAIN, 4, {**selector, **short})
-                if method not in {"random", "fixed"}:
+                if method not in {"random", "fixed", "path_entropy"}:
                     yield Run(f"{name}, horizon 2", PLAIN, 4, {**selector, **ahead, **short})
 
 
@@ -133,9 +134,16 @@ def _estimates() -> Iterator[Run]:
     yield Run("few resamplings", PLAIN, 2, weighted)
     yield Run("most likely particle", PLAIN, 2, {**most_likely, **weighted})
     yield Run("stages ahead", PLAIN, 2, ahead, "capsule_robot")
+    on_the_way = {"selector.method": "path_entropy", "simulator.max_steps": 100}
+    yield Run("stages on the way", PLAIN, 2, on_the_way, "capsule_robot")
+    counted = {"selector.path_unit": "sensing_intervals", "selector.path_discount": 0.9}
+    few = {"particle_filter.num_particles": 100}
+    yield Run("offsets in sensing intervals", PLAIN, 4, {**on_the_way, **counted, **few})
     sonar = "tests/golden/sonar_room.yaml"
     short = {"particle_filter.num_particles": 100, "simulator.max_steps": 100}
     yield Run("general likelihood", sonar, 6, short)
+    path = {"selector.method": "path_entropy"}
+    yield Run("general likelihood, path entropy", sonar, 6, {**path, **short})
     yield Run("general likelihood, horizon 2", sonar, 6, {"active_sensing.horizon": 2, **short})
     yield Run("general likelihood, few resamplings", sonar, 6, {**short, **weighted})
 

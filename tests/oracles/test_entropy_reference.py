@@ -105,6 +105,7 @@ def find(
         kernel.exponent,
         kernel.offset,
         1,
+        (1.0,),
     )
     return Found(result, visits, Ways(*ways))
 

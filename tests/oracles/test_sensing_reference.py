@@ -64,7 +64,7 @@ class Plane(ProblemBase):
         return self.variances[sensing_action] * np.arange(1.0, size + 1.0)
 
     def policy(self, states: FloatArray, stage: int | IntArray) -> FloatArray:
-        actions = -np.asarray(states) + stage
+        actions = -np.asarray(states) + np.asarray(stage)[..., np.newaxis]
         far = np.abs(states[..., :1]) > 0.5
         actions[..., 1:] = np.where(far, 0.0, actions[..., 1:])
         return actions
@@ -141,6 +141,33 @@ def reference_points(
     return np.array(points)
 
 
+def reference_sets(
+    problem: Problem, settings: PlanningSettings, states: FloatArray, stage: int
+) -> list[tuple[float, FloatArray]]:
+    """Return factors and points of the entropies that are added up.
+
+    Along the path, one particle and one step at a time; without noise, these problems move a state
+    by the action itself.
+    """
+    selector = settings.selector
+    if selector.method != "path_entropy":
+        return [(1.0, reference_points(problem, settings, states, stage))]
+    unit = settings.sensing_interval + 1 if selector.path_unit == "sensing_intervals" else 1
+    sets = []
+    for offset in selector.path_offsets:
+        points = []
+        for start in states:
+            state, own_stage = start, stage
+            for _ in range(unit * offset):
+                state = state + problem.execute(problem.policy(state, own_stage))
+                own_stage = int(problem.next_stage(state, own_stage))
+            points.append(problem.policy(state, own_stage))
+            if selector.actions == "executed":
+                points[-1] = problem.execute(points[-1])
+        sets.append((selector.path_discount ** (unit * offset), np.array(points)))
+    return sets
+
+
 def reference_entropy(
     problem: Problem, settings: PlanningSettings, points: FloatArray, weights: FloatArray
 ) -> float:
@@ -177,6 +204,7 @@ def algorithm_2(
     largest = max(mean.shape[1] for mean in means)
     noise = hypotheses.substream(1).normal(samples * largest)
     found = np.zeros((count, samples))
+    sets = reference_sets(problem, settings, states, stage)
     for j in range(count):
         mean = means[j]
         size = mean.shape[1]
@@ -195,8 +223,10 @@ def algorithm_2(
                 )
             posterior = np.exp(log_posterior - log_posterior.max())
             posterior /= posterior.sum()
-            points = reference_points(problem, settings, states, stage)
-            found[j, i] = reference_entropy(problem, settings, points, posterior)
+            found[j, i] = sum(
+                factor * reference_entropy(problem, settings, points, posterior)
+                for factor, points in sets
+            )
 
             # The belief moved on by its own action; negligible particles are gone by then, except
             # where they count.

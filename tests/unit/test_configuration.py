@@ -528,7 +528,8 @@ class TestKeysAndValues:
             (
                 "selector: {method: action-entropy}",
                 'selector.method is "action-entropy"; expected one of action_covariance, '
-                "action_entropy, fixed, random, state_entropy; did you mean action_entropy?",
+                "action_entropy, fixed, path_entropy, random, state_entropy; did you mean "
+                "action_entropy?",
             ),
             ("model: {init_mean: [1, 2]}", "is [1, 2] (a list of 2); expected a list of 3"),
             ("model: {init_mean: [1, 2, x]}", 'model.init_mean[2] is "x"; expected a number'),

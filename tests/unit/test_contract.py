@@ -11,6 +11,7 @@ import pytest
 from holdfast import contract, planning
 from holdfast.errors import InvalidValueError, ProblemError
 from holdfast.problems.problem import (
+    ExpectedMotionProblem,
     FloatArray,
     GeneralObservationProblem,
     IntArray,
@@ -275,7 +276,8 @@ def test_a_function_that_takes_something_else_is_named(
 
 
 def test_the_parameters_are_those_of_the_contract() -> None:
-    members = {**vars(Problem), **vars(GeneralObservationProblem)}
+    protocols = (Problem, GeneralObservationProblem, ExpectedMotionProblem)
+    members = {name: own for protocol in protocols for name, own in vars(protocol).items()}
     functions = {
         name: tuple(inspect.signature(member).parameters)[1:]
         for name, member in members.items()

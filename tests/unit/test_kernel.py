@@ -85,20 +85,20 @@ for count, dimension, kept, posteriors, way in (
         for neighbors in (1, 5, 8, 9, 30):
             for resolution in (1e-9, 0.2, 20.0):
                 result, _, visits, ways = kernel.entropies(
-                    points, log_weights, True, 0, neighbors, resolution, 0.0, 0.0, 2)
+                    points, log_weights, True, 0, neighbors, resolution, 0.0, 0.0, 2, (1.0,))
                 name = f"nearest {count} {dimension} {kept} {deviation} {neighbors} {resolution}"
                 note(name, result, np.array(visits))
                 if deviation < 1.0 and ways[way] != posteriors:
                     wrong_ways.append(name)
     for exponent in (0.5, 0.125):
         result, _, visits, ways = kernel.entropies(
-            points * 3.0, normals * 0.4, True, 1, 1, 1.0, exponent, 0.3, 2)
+            points * 3.0, normals * 0.4, True, 1, 1, 1.0, exponent, 0.3, 2, (1.0,))
         name = f"mixture {count} {dimension} {kept} {exponent}"
         note(name, result, np.array(visits))
         if ways[way] != posteriors:
             wrong_ways.append(name)
 
-    result, *_ = kernel.entropies(points, normals, True, 2, 1, 1.0, 0.0, 0.0, 2)
+    result, *_ = kernel.entropies(points, normals, True, 2, 1, 1.0, 0.0, 0.0, 2, (1.0,))
     note(f"variance {count} {dimension} {kept}", result)
 
 for count in (5, 100, 1001):
@@ -109,7 +109,7 @@ for count in (5, 100, 1001):
     for variance in (np.full((5, 1), 0.1), np.ascontiguousarray(0.1 + predicted**2)):
         arguments = (weights, [1, 1, 1, 2], predicted, variance, 9, words)
         found = kernel.hypothetical_entropies(
-            *arguments, np.ascontiguousarray(-states), 0, 3, 0.05, 0.0, 0.0, 2)
+            *arguments, np.ascontiguousarray(-states), 0, 3, 0.05, 0.0, 0.0, 2, (1.0,))
         note(f"hypotheses {count} {variance.shape}", *found[:2],
              kernel.hypothetical_weights(*arguments, True),
              kernel.hypothetical_weights(*arguments, False))
@@ -382,7 +382,7 @@ class TestThreads:
         results = set()
         for threads in (1, 2, 3, 64, 0):
             result, _, visits, ways = _kernel.entropies(
-                points, log_weights, True, estimator, 5, 0.1, 0.5, 0.0, threads
+                points, log_weights, True, estimator, 5, 0.1, 0.5, 0.0, threads, (1.0,)
             )
             results.add((result.tobytes(), visits, ways))
             # A variance has but one way.

@@ -16,7 +16,8 @@ cache) must not show in what it returns.
 
 Observations are Gaussian, by :meth:`Problem.observation_mean` and
 :meth:`Problem.observation_variance`, unless the problem has the two methods of
-:class:`GeneralObservationProblem`.
+:class:`GeneralObservationProblem`. What an action does without noise follows from
+:meth:`Problem.move`, unless the problem has the method of :class:`ExpectedMotionProblem`.
 
 Random numbers come from the :class:`~holdfast.randomness.Stream` that a function is given:
 ``stream.normal(shape)`` and ``stream.uniform(shape)``. A stream gives the same numbers each time
@@ -40,6 +41,7 @@ from holdfast.errors import ProblemError
 from holdfast.randomness import Stream
 
 __all__ = [
+    "ExpectedMotionProblem",
     "FloatArray",
     "GeneralObservationProblem",
     "IntArray",
@@ -208,6 +210,20 @@ class GeneralObservationProblem(Protocol):
         self, state: FloatArray, sensing_action: int, stream: Stream
     ) -> FloatArray:
         """Draw an observation in one state, shape ``(observation_size,)``."""
+        ...
+
+
+class ExpectedMotionProblem(Protocol):
+    """One more method, for problems whose motion without noise is not ``move`` with zero deviates.
+
+    The selector ``path_entropy`` follows particles without noise. It asks a problem that does not
+    have this for its ``move``, with :data:`~holdfast.randomness.NOISE_FREE`: there normal deviates
+    are 0 and uniform ones 0.5. A problem needs the method if it draws otherwise (from
+    ``stream.words``, or again and again until something fits). It may have it to be faster.
+    """
+
+    def expected_move(self, states: FloatArray, actions: FloatArray) -> FloatArray:
+        """Return the states after executed ``actions`` if nothing is random, as ``states``."""
         ...
 
 

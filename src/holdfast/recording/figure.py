@@ -546,6 +546,7 @@ def _draw_choices(panel: Axes, problem: Problem, record: TrialRecord) -> None:
 
 _SCORES = {
     "action_entropy": "expected entropy of\nthe actions (nats)",
+    "path_entropy": "expected entropies of\nthe actions, sum (nats)",
     "state_entropy": "expected entropy of\nthe state (nats)",
     "action_covariance": "expected covariance\nof the actions (trace)",
 }

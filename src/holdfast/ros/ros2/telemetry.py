@@ -44,7 +44,7 @@ _MAX_NOTES = 1000
 
 _NICENESS = 10
 
-_ENTROPIES = ("action_entropy", "state_entropy", "action_covariance")
+_ENTROPIES = ("action_entropy", "path_entropy", "state_entropy", "action_covariance")
 """Methods that compute something for each sensing action; the others only choose."""
 
 
