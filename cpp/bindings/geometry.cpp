@@ -5,8 +5,12 @@
 // what is wrong and raises the error that says so.
 
 #include <nanobind/stl/array.h>
+#include <nanobind/stl/vector.h>
 
+#include <algorithm>
+#include <array>
 #include <cmath>
+#include <cstdint>
 #include <optional>
 #include <stdexcept>
 #include <vector>
@@ -15,6 +19,7 @@
 #include "geometry_2d.hpp"
 #include "geometry_3d.hpp"
 #include "motion.hpp"
+#include "policies.hpp"
 
 namespace nb = nanobind;
 using namespace holdfast;
@@ -120,6 +125,34 @@ std::size_t draw_free_batch(const World& world, const Input<1>& mean,
                      states.data());
 }
 
+template <class World, class Policy>
+bool follow_batch(const World& world, const Policy& policy, const Input<2>& states,
+                  std::size_t stage, const std::vector<std::uint32_t>& offsets, double tolerance,
+                  int threads, InPlace<double, 2> states_at, InPlace<std::int64_t, 1> stages_at) {
+    constexpr std::size_t d = World::dimension;
+    const std::size_t count = states.shape(0);
+    require(states.shape(1) == d && states_at.shape(1) == d &&
+                states_at.shape(0) == count * offsets.size() &&
+                stages_at.shape(0) == count * offsets.size(),
+            "shapes differ");
+    require(!offsets.empty() && std::is_sorted(offsets.begin(), offsets.end()),
+            "the offsets are not in order");
+    require(stage < policy.num_stages(), "there is no such stage");
+    if (!all_finite(states.data(), count * d)) return false;
+    WithoutInterpreter released;
+    follow(world, policy, count, states.data(), stage, offsets, tolerance, threads,
+           states_at.data(), stages_at.data());
+    return true;
+}
+
+template <class World, class Policy>
+void bind_way(nb::class_<World>& world) {
+    world.def("follow", &follow_batch<World, Policy>, nb::arg("policy"),
+              nb::arg("states").noconvert(), nb::arg("stage"), nb::arg("offsets"),
+              nb::arg("tolerance"), nb::arg("threads"), nb::arg("states_at").noconvert(),
+              nb::arg("stages_at").noconvert(), nb::call_guard<StandardRounding>());
+}
+
 template <class World>
 nb::class_<World> bind_world(nb::module_& module, const char* name) {
     return nb::class_<World>(module, name)
@@ -137,27 +170,52 @@ nb::class_<World> bind_world(nb::module_& module, const char* name) {
 }  // namespace
 
 void holdfast::bind_geometry(nb::module_& module) {
-    bind_world<DiscWorld>(module, "DiscWorld")
-        .def(
-            "__init__",
-            [](DiscWorld* self, double radius, const Input<2>& obstacles) {
-                new (self) DiscWorld(radius, rectangles(obstacles));
-            },
-            nb::arg("radius"), nb::arg("obstacles").noconvert());
-    bind_world<RectangleWorld>(module, "RectangleWorld")
-        .def(
-            "__init__",
-            [](RectangleWorld* self, double width, double height, const Input<2>& obstacles) {
-                new (self) RectangleWorld(width, height, rectangles(obstacles));
-            },
-            nb::arg("width"), nb::arg("height"), nb::arg("obstacles").noconvert());
-    bind_world<BoxWorld>(module, "BoxWorld")
-        .def(
-            "__init__",
-            [](BoxWorld* self, double size_x, double size_y, double size_z,
-               const Input<2>& obstacles) {
-                new (self) BoxWorld({size_x, size_y, size_z}, boxes(obstacles));
-            },
-            nb::arg("size_x"), nb::arg("size_y"), nb::arg("size_z"),
-            nb::arg("obstacles").noconvert());
+    auto disc = bind_world<DiscWorld>(module, "DiscWorld");
+    disc.def(
+        "__init__",
+        [](DiscWorld* self, double radius, const Input<2>& obstacles) {
+            new (self) DiscWorld(radius, rectangles(obstacles));
+        },
+        nb::arg("radius"), nb::arg("obstacles").noconvert());
+    auto rectangle = bind_world<RectangleWorld>(module, "RectangleWorld");
+    rectangle.def(
+        "__init__",
+        [](RectangleWorld* self, double width, double height, const Input<2>& obstacles) {
+            new (self) RectangleWorld(width, height, rectangles(obstacles));
+        },
+        nb::arg("width"), nb::arg("height"), nb::arg("obstacles").noconvert());
+    auto box = bind_world<BoxWorld>(module, "BoxWorld");
+    box.def(
+        "__init__",
+        [](BoxWorld* self, double size_x, double size_y, double size_z, const Input<2>& obstacles) {
+            new (self) BoxWorld({size_x, size_y, size_z}, boxes(obstacles));
+        },
+        nb::arg("size_x"), nb::arg("size_y"), nb::arg("size_z"), nb::arg("obstacles").noconvert());
+
+    nb::class_<PegPolicy2D>(module, "PegPolicy2D")
+        .def("__init__", [](PegPolicy2D* self, const std::vector<std::array<double, 3>>& stages,
+                            double half_width, double height, const std::array<double, 3>& limits) {
+            require(!stages.empty(), "a policy has a stage");
+            new (self) PegPolicy2D{{}, half_width, height, limits};
+            for (const auto& [axis, upright_limit, passed_below] : stages) {
+                self->stages.push_back({axis, upright_limit, passed_below});
+            }
+        });
+    nb::class_<PegPolicy3D>(module, "PegPolicy3D")
+        .def("__init__", [](PegPolicy3D* self, double half_width, double upright_limit,
+                            const std::array<double, 6>& limits) {
+            new (self) PegPolicy3D{half_width, upright_limit, limits};
+        });
+    nb::class_<ViaPointPolicy>(module, "ViaPointPolicy")
+        .def("__init__", [](ViaPointPolicy* self, const std::vector<std::array<double, 5>>& stages,
+                            double step_size) {
+            require(!stages.empty(), "a policy has a stage");
+            new (self) ViaPointPolicy{{}, step_size};
+            for (const auto& [x, y, gain_x, gain_y, squared_radius] : stages) {
+                self->stages.push_back({{x, y}, {gain_x, gain_y}, squared_radius});
+            }
+        });
+    bind_way<DiscWorld, ViaPointPolicy>(disc);
+    bind_way<RectangleWorld, PegPolicy2D>(rectangle);
+    bind_way<BoxWorld, PegPolicy3D>(box);
 }

@@ -6,6 +6,7 @@
 
 #include "geometry_2d.hpp"
 #include "geometry_3d.hpp"
+#include "policies.hpp"
 #include "thread_pool.hpp"
 
 namespace holdfast {
@@ -14,6 +15,7 @@ namespace {
 // Particles are worked on in blocks: large enough that the first draw of noise is one call, small
 // enough that its numbers stay on the stack and in the cache.
 constexpr std::size_t block_size = 128;
+constexpr std::size_t way_block_size = 16;
 
 template <class World>
 void stop_at_contact(const World& world, const double* state, const double* action,
@@ -115,15 +117,65 @@ std::size_t draw_free(const World& world, std::size_t count, const double* mean,
     return unplaced;
 }
 
+template <class World, class Policy>
+void follow(const World& world, const Policy& policy, std::size_t count, const double* states,
+            std::size_t stage, const std::vector<std::uint32_t>& offsets, double tolerance,
+            int threads, double* states_at, std::int64_t* stages_at) {
+    constexpr std::size_t d = World::dimension;
+    static_assert(Policy::dimension == d);
+    constexpr double cost_of_a_step = 20.0;
+    const std::size_t num_blocks = (count + way_block_size - 1) / way_block_size;
+    const double work =
+        cost_of_a_step * static_cast<double>(count) * static_cast<double>(offsets.back());
+
+    parallel_for(num_blocks, threads_for(work, num_blocks, threads), [&](std::size_t block) {
+        const std::size_t first = block * way_block_size;
+        const std::size_t end = std::min(first + way_block_size, count);
+        for (std::size_t n = first; n < end; ++n) {
+            std::array<double, d> state, next, action;
+            std::copy(states + n * d, states + (n + 1) * d, state.begin());
+            std::size_t own_stage = stage;
+            std::uint32_t step = 0;
+            bool arrived = false;
+            for (std::size_t k = 0; k < offsets.size(); ++k) {
+                for (; step < offsets[k] && !arrived; ++step) {
+                    policy.executed(state.data(), own_stage, action.data());
+                    if (tolerance > 0.0) {
+                        stop_at_contact(world, state.data(), action.data(), tolerance, next.data());
+                    } else {
+                        for (std::size_t c = 0; c < d; ++c) next[c] = state[c] + action[c];
+                    }
+                    const std::size_t next_stage = policy.next_stage(next.data(), own_stage);
+                    // Without noise, what stands still once does so for ever.
+                    arrived = next == state && next_stage == own_stage;
+                    state = next;
+                    own_stage = next_stage;
+                }
+                std::copy(state.begin(), state.end(), states_at + (k * count + n) * d);
+                stages_at[k * count + n] = static_cast<std::int64_t>(own_stage);
+            }
+        }
+    });
+}
+
 #define HOLDFAST_INSTANTIATE(World)                                                                \
     template void move<World>(const World&, std::size_t, const double*, const double*,             \
                               std::size_t, const double*, double, const Stream&, double*);         \
     template std::size_t draw_free<World>(const World&, std::size_t, const double*, const double*, \
                                           const Stream&, double*);
 
+#define HOLDFAST_INSTANTIATE_WAY(World, Policy)                                                  \
+    template void follow<World, Policy>(const World&, const Policy&, std::size_t, const double*, \
+                                        std::size_t, const std::vector<std::uint32_t>&, double,  \
+                                        int, double*, std::int64_t*);
+
 HOLDFAST_INSTANTIATE(DiscWorld)
 HOLDFAST_INSTANTIATE(RectangleWorld)
 HOLDFAST_INSTANTIATE(BoxWorld)
+HOLDFAST_INSTANTIATE_WAY(DiscWorld, ViaPointPolicy)
+HOLDFAST_INSTANTIATE_WAY(RectangleWorld, PegPolicy2D)
+HOLDFAST_INSTANTIATE_WAY(BoxWorld, PegPolicy3D)
 #undef HOLDFAST_INSTANTIATE
+#undef HOLDFAST_INSTANTIATE_WAY
 
 }  // namespace holdfast

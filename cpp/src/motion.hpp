@@ -11,6 +11,8 @@
 #pragma once
 
 #include <cstddef>
+#include <cstdint>
+#include <vector>
 
 #include "philox.hpp"
 
@@ -36,5 +38,15 @@ void move(const World& world, std::size_t count, const double* states, const dou
 template <class World>
 std::size_t draw_free(const World& world, std::size_t count, const double* mean,
                       const double* standard_deviation, const Stream& stream, double* states);
+
+// Follows a policy of policies.hpp without noise: in each step its action, stopped at contact, and
+// the stage that follows. A tolerance of 0: obstacles do not stop it.
+//
+// `offsets` are numbers of steps, in ascending order. For each of them `states_at[number][count]`
+// and `stages_at[number][count]` are where the particle is after so many.
+template <class World, class Policy>
+void follow(const World& world, const Policy& policy, std::size_t count, const double* states,
+            std::size_t stage, const std::vector<std::uint32_t>& offsets, double tolerance,
+            int threads, double* states_at, std::int64_t* stages_at);
 
 }  // namespace holdfast

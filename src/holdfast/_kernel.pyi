@@ -66,6 +66,25 @@ def hypothetical_weights(
 def measure_exp(count: int, repetitions: int) -> float: ...
 def measure_visit(count: int, dimension: int, repetitions: int) -> float: ...
 
+class PegPolicy2D:
+    def __init__(
+        self,
+        stages: Sequence[tuple[float, float, float]],
+        half_width: float,
+        height: float,
+        limits: Sequence[float],
+    ) -> None: ...
+
+class PegPolicy3D:
+    def __init__(
+        self, half_width: float, upright_limit: float, limits: Sequence[float]
+    ) -> None: ...
+
+class ViaPointPolicy:
+    def __init__(
+        self, stages: Sequence[tuple[float, float, float, float, float]], step_size: float
+    ) -> None: ...
+
 class _World:
     def collides(self, states: _Floats, result: npt.NDArray[np.bool_]) -> bool: ...
     def move(
@@ -76,6 +95,17 @@ class _World:
         tolerance: float,
         stream: _Words,
         next_states: _Floats,
+    ) -> bool: ...
+    def follow(
+        self,
+        policy: PegPolicy2D | PegPolicy3D | ViaPointPolicy,
+        states: _Floats,
+        stage: int,
+        offsets: Sequence[int],
+        tolerance: float,
+        threads: int,
+        states_at: _Floats,
+        stages_at: npt.NDArray[np.int64],
     ) -> bool: ...
     def draw_free(
         self, mean: _Floats, standard_deviation: _Floats, stream: _Words, states: _Floats

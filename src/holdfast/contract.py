@@ -25,7 +25,9 @@ __all__ = [
     "check_sizes",
     "executed_action",
     "expected_move",
+    "expected_path",
     "has_general_observations",
+    "has_own",
     "in_brief",
     "log_likelihood",
     "next_stage",
@@ -54,6 +56,7 @@ PARAMETERS: Mapping[str, tuple[str, ...]] = {
     "initial_states": ("stream", "count"),
     "move": ("states", "actions", "stream"),
     "expected_move": ("states", "actions"),
+    "expected_path": ("states", "stage", "offsets"),
     "observation_mean": ("states", "sensing_action"),
     "observation_variance": ("states", "sensing_action"),
     "policy": ("states", "stage"),
@@ -369,20 +372,22 @@ def next_stages(
 ) -> npt.NDArray[np.int64]:
     """Return the checked stages that follow, one for each state."""
     following = problem.next_stage(states, stages)
-    if (
-        not isinstance(following, np.ndarray)
-        or following.dtype.kind not in "iu"
-        or following.shape != stages.shape
-    ):
-        raise _misfit(problem, "next_stage", following, stages.shape)
-    if following.min() < 0 or following.max() >= problem.num_stages:
-        bad = int(np.argmax((following < 0) | (following >= problem.num_stages)))
-        raise ProblemError(
-            f"next_stage of {_name(problem)} is {following[bad]} for state {in_brief(states[bad])}:"
-            f" allowed are 0 to {problem.num_stages - 1}"
-        )
+    _check_stages(problem, "next_stage", following, states)
     checked: npt.NDArray[np.int64] = following
     return checked
+
+
+def _check_stages(problem: Any, function: str, stages: Any, states: FloatArray) -> None:
+    shape = states.shape[:-1]
+    if not isinstance(stages, np.ndarray) or stages.dtype.kind not in "iu" or stages.shape != shape:
+        raise _misfit(problem, function, stages, shape)
+    if stages.size and (stages.min() < 0 or stages.max() >= problem.num_stages):
+        outside = (stages < 0) | (stages >= problem.num_stages)
+        bad = np.unravel_index(int(np.argmax(outside)), shape)
+        raise ProblemError(
+            f"{function} of {_name(problem)} has the stage {stages[bad]} for state "
+            f"{in_brief(states[bad])}: allowed are 0 to {problem.num_stages - 1}"
+        )
 
 
 def expected_move(
@@ -393,7 +398,7 @@ def expected_move(
     A problem without ``expected_move`` is asked for its ``move`` with the stream ``noise_free``.
     """
     function = "expected_move"
-    if hasattr(problem, function):
+    if has_own(problem, function, ("move",)):
         moved = problem.expected_move(states, actions)
     else:
         function = "move"
@@ -404,6 +409,45 @@ def expected_move(
     checked: FloatArray = moved
     checked.setflags(write=False)
     return checked
+
+
+def expected_path(
+    problem: Any, states: FloatArray, stage: int, offsets: Sequence[int]
+) -> tuple[FloatArray, npt.NDArray[np.int64]]:
+    """Return the checked states and stages after each number of steps, the states read-only."""
+    found = problem.expected_path(states, stage, offsets)
+    shape = (len(offsets), *states.shape)
+    if not isinstance(found, tuple) or len(found) != 2:
+        raise _misfit(problem, "expected_path", found, "two arrays")
+    states_at, stages_at = found
+    if not _is_array(states_at, 3) or states_at.shape != shape:
+        raise _misfit(problem, "expected_path", states_at, shape)
+    _check_stages(problem, "expected_path", stages_at, states_at)
+    states_at.setflags(write=False)
+    return states_at, stages_at
+
+
+def has_own(problem: Any, function: str, spoken_for: tuple[str, ...]) -> bool:
+    """Tell whether a problem has a function that speaks for others, and has not replaced those.
+
+    A subclass with a policy of its own inherits a path that is none of that policy.
+    """
+    if not hasattr(problem, function):
+        return False
+    own = getattr(problem, "__dict__", {})
+    if any(name in own for name in (function, *spoken_for)):
+        return function in own
+    return _speaks_for(type(problem), function, spoken_for)
+
+
+@functools.lru_cache(maxsize=1000)
+def _speaks_for(kind: type, function: str, spoken_for: tuple[str, ...]) -> bool:
+    for base in kind.__mro__:
+        if function in vars(base):
+            return True
+        if any(name in vars(base) for name in spoken_for):
+            return False
+    return True
 
 
 def states_of(

@@ -11,6 +11,7 @@ has no end, like the ground, large (:data:`FAR`).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
@@ -33,6 +34,7 @@ MAX_NOISE_ATTEMPTS = 1000
 
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
+IntArray = npt.NDArray[np.int64]
 
 
 class _World:
@@ -151,6 +153,62 @@ class _World:
         if not moved:
             _explain_move(states, actions, standard_deviation, tolerance)
         return next_states
+
+    def follow(
+        self,
+        policy: Any,
+        states: FloatArray,
+        stage: int,
+        offsets: Sequence[int],
+        tolerance: float,
+    ) -> tuple[FloatArray, IntArray]:
+        """Follow a policy of the kernel without noise, each state for itself.
+
+        The same as asking the problem for its policy, its limits, its motion without noise and its
+        next stage again and again, to the bit, and much faster.
+
+        Parameters
+        ----------
+        policy : PegPolicy2D, PegPolicy3D or ViaPointPolicy
+            Of the kernel, for this kind of world.
+        states : array of shape (n, d)
+        stage : int
+            Of all states, to begin with.
+        offsets : sequence of int
+            Numbers of steps, in ascending order.
+        tolerance : float
+            Fraction of an action to which contact is located; 0 for motion that nothing stops.
+
+        Returns
+        -------
+        states_at : array of shape (len(offsets), n, d)
+        stages_at : array of int of shape (len(offsets), n)
+
+        Raises
+        ------
+        InvalidValueError
+            If the last axis is not d long, or a state is not finite.
+        """
+        dimension = self._DIMENSION
+        states = np.ascontiguousarray(states, dtype=np.float64)
+        if states.ndim != 2 or states.shape[1] != dimension:
+            raise InvalidValueError(f"states: shape {states.shape}, must be (n, {dimension})")
+        shape = (len(offsets), states.shape[0])
+        states_at = np.empty((*shape, dimension))
+        stages_at = np.empty(shape, dtype=np.int64)
+        followed = self._kernel.follow(
+            policy,
+            states,
+            stage,
+            offsets,
+            tolerance,
+            0,
+            states_at.reshape(-1, dimension),
+            stages_at.reshape(-1),
+        )
+        if not followed:
+            _raise_not_finite("states", states)
+        return states_at, stages_at
 
     def draw_free(
         self, mean: FloatArray, standard_deviation: FloatArray, count: int, stream: Stream

@@ -24,6 +24,10 @@ from holdfast.settings import PlanningSettings, path_steps, unfit_for_path_entro
 __all__ = ["PathPoints", "path_points"]
 
 FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+
+_STEP = ("policy", "execute", "move", "expected_move", "next_stage")
+"""What a step of the way is made of."""
 
 
 class PathPoints(NamedTuple):
@@ -69,29 +73,42 @@ def path_points(
         (section, key), reason = unfit
         raise InvalidValueError(f"{section}.{key} {reason}")
     offsets = path_steps(settings)
-    executed = settings.selector.actions == "executed"
-    points = np.empty((len(offsets), states.shape[0], problem.action_size))
+    states_at, stages_at = _followed(problem, states, stage, offsets)
+    points = contract.policy(problem, states_at, stages_at)
+    if settings.selector.actions == "executed":
+        points = contract.executed_action(problem, points)
+    if (bad := first_unbounded(points.reshape(-1, points.shape[-1]))) is not None:
+        row, particle = divmod(bad, states.shape[0])
+        raise ProblemError(
+            f"policy of {problem.name} returned {contract.in_brief(points[row, particle])} in "
+            f"state {contract.in_brief(states_at[row, particle])}, {offsets[row]} steps on: every "
+            f"coordinate must be finite and at most {LARGEST:g}"
+        )
+    return PathPoints(points, _factors(offsets, settings.selector.path_discount))
+
+
+def _followed(
+    problem: Problem, states: FloatArray, stage: int, offsets: tuple[int, ...]
+) -> tuple[FloatArray, int | IntArray]:
+    """Return the states at each offset, shape (K, N, state_size), and the stages there, (K, N)."""
+    if contract.has_own(problem, "expected_path", _STEP):
+        return contract.expected_path(problem, states, stage, offsets)
+    states_at = np.empty((len(offsets), *states.shape))
     several_stages = problem.num_stages > 1
-    stages: int | npt.NDArray[np.int64] = stage
-    if several_stages:
-        stages = np.full(states.shape[0], stage, dtype=np.int64)
+    stages_at = np.full(states_at.shape[:2], stage, dtype=np.int64)
+    stages: int | IntArray = stages_at[0].copy() if several_stages else stage
     step = 0
-    for row, offset in zip(points, offsets, strict=True):
+    for number, offset in enumerate(offsets):
         while step < offset:
             actions = problem.execute(problem.policy(states, stages))
             states = contract.expected_move(problem, states, actions, NOISE_FREE)
             if several_stages:
                 stages = contract.next_stages(problem, states, stages)
             step += 1
-        actions = contract.policy(problem, states, stages)
-        row[...] = contract.executed_action(problem, actions) if executed else actions
-        if (bad := first_unbounded(row)) is not None:
-            raise ProblemError(
-                f"policy of {problem.name} returned {contract.in_brief(row[bad])} in state "
-                f"{contract.in_brief(states[bad])}, {offset} steps on: every coordinate must be "
-                f"finite and at most {LARGEST:g}"
-            )
-    return PathPoints(points, _factors(offsets, settings.selector.path_discount))
+        states_at[number] = states
+        stages_at[number] = stages
+    states_at.setflags(write=False)
+    return states_at, stages_at if several_stages else stage
 
 
 def _factors(offsets: tuple[int, ...], discount: float) -> tuple[float, ...]:

@@ -22,8 +22,9 @@ from tests.oracles.test_sensing_reference import (
 from holdfast import contract
 from holdfast.belief import Belief
 from holdfast.errors import InvalidValueError, ProblemError
-from holdfast.policy_path import path_points
+from holdfast.policy_path import _followed, path_points
 from holdfast.problems import registry
+from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.problems.problem import FloatArray, IntArray, Problem
 from holdfast.randomness import NOISE_FREE, Purpose, Stream, stream
 from holdfast.sensing import SensingInfo, choose_sensing_action
@@ -171,6 +172,48 @@ def test_every_registered_problem_has_a_way(name: str) -> None:
         np.testing.assert_array_equal(alone[:, 0], points[:, n])
 
 
+@pytest.mark.parametrize("name", registry.names())
+def test_the_kernel_follows_as_numpy_does(name: str) -> None:
+    """Bit for bit, through contacts and stages, for one way of several hundred steps."""
+    problem = registry.problem_class(name).from_settings({}, {})
+    plain = _Plain(problem)
+    offsets = (0, 1, 9, 36, 300, 301)
+    for stage in range(problem.num_stages):
+        states = some_belief(problem, 150, "uniform").states
+        states_at, stages_at = problem.expected_path(states, stage, offsets)
+        assert contract.has_own(problem, "expected_path", ("policy", "execute", "next_stage"))
+        expected_states, expected_stages = _followed(plain, states, stage, offsets)
+        np.testing.assert_array_equal(states_at, expected_states)
+        np.testing.assert_array_equal(stages_at, np.broadcast_to(expected_stages, (6, 150)))
+    assert problem.num_stages == 1 or (stages_at[-1] == problem.num_stages - 1).any()
+
+
+class _Plain:
+    """A problem without a path of its own."""
+
+    def __init__(self, problem: Problem) -> None:
+        self._problem = problem
+
+    def __getattr__(self, name: str) -> object:
+        if name == "expected_path":
+            raise AttributeError(name)
+        return getattr(self._problem, name)
+
+
+def test_an_inherited_path_is_none_of_a_new_policy() -> None:
+    class Reversed(PegInHole2D):
+        def policy(self, states: FloatArray, stage: int | IntArray) -> FloatArray:
+            return -super().policy(states, stage)
+
+    problem = Reversed()
+    states = some_belief(problem, 40, "uniform").states
+    points, _ = path_points(problem, path((0, 3)), states, 0)
+    moved = states
+    for _ in range(3):
+        moved = problem.move(moved, problem.execute(problem.policy(moved, 0)), NOISE_FREE)
+    np.testing.assert_array_equal(points[1], problem.policy(moved, 0))
+
+
 class Drifting(Plane):
     """Has a way of its own to move without noise."""
 
@@ -256,8 +299,8 @@ class TestErrors:
     @pytest.mark.parametrize(
         ("stages", "message"),
         [
-            (np.full(40, 3), "next_stage of plane is 3 for state"),
-            (np.full(40, -1), "next_stage of plane is -1 for state"),
+            (np.full(40, 3), "next_stage of plane has the stage 3 for state"),
+            (np.full(40, -1), "next_stage of plane has the stage -1 for state"),
             (np.zeros(40), "next_stage of plane"),
             (1, "next_stage of plane"),
         ],

@@ -13,6 +13,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
+from holdfast import _kernel
 from holdfast.errors import InvalidValueError
 from holdfast.geometry import DiscWorld
 from holdfast.problems._fields import (
@@ -213,6 +214,10 @@ class CapsuleRobot(RigidBodyProblem):
         gains = (planner.gain_0, planner.gain_1)
         self._gains = constant([gains if target.axis == 0 else gains[::-1] for target in targets])
         self._step_size = planner.step_size
+        self._path_policy = _kernel.ViaPointPolicy(
+            np.column_stack([self._centers, self._gains, self._squared_radii]).tolist(),
+            self._step_size,
+        )
         self._observation_variances = [constant(variances) for variances in model.sensing_covs]
 
     def observation_mean(self, states: FloatArray, sensing_action: int) -> FloatArray:
@@ -245,6 +250,14 @@ class CapsuleRobot(RigidBodyProblem):
     def reward(self, states: FloatArray, actions: FloatArray) -> FloatArray:
         """Return -1 where the action, done again from where it led, would end in a wall, else 0."""
         return np.where(self.world.collides(states + actions), -1.0, 0.0)
+
+    def expected_path(
+        self, states: FloatArray, stage: int, offsets: Sequence[int]
+    ) -> tuple[FloatArray, IntArray]:
+        """Follow the policy without noise; the kernel has it as well."""
+        return self.world.follow(
+            self._path_policy, states, stage, offsets, self._collision_tolerance
+        )
 
     def is_goal(self, states: FloatArray) -> npt.NDArray[np.bool_]:
         """Tell where the centre is within the goal's radius."""

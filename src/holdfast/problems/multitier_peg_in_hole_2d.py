@@ -13,6 +13,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
+from holdfast import _kernel
 from holdfast.errors import InvalidValueError
 from holdfast.geometry import FAR, RectangleWorld
 from holdfast.problems._fields import (
@@ -182,6 +183,10 @@ class MultitierPegInHole2D(PegProblem):
         self._upright_limits = constant(
             [upright_limit(hole.tol, 0.5 * height) for hole in model.holes]
         )
+        stages = np.column_stack([self._hole_x, self._upright_limits, self._passed_below])
+        self._path_policy = _kernel.PegPolicy2D(
+            stages.tolist(), self._half_width, self._peg_height, self._upper_limits.tolist()
+        )
 
     def policy(self, states: FloatArray, stage: int | IntArray) -> FloatArray:
         """Go to the hole's axis; near it also turn upright; once upright also go down through."""
@@ -200,6 +205,14 @@ class MultitierPegInHole2D(PegProblem):
         passed = estimates[..., 1] + self._peg_height < self._passed_below[stage]
         following = np.minimum(stage + passed, self.num_stages - 1)
         return int(following) if np.ndim(following) == 0 else following
+
+    def expected_path(
+        self, states: FloatArray, stage: int, offsets: Sequence[int]
+    ) -> tuple[FloatArray, IntArray]:
+        """Follow the policy without noise; the kernel has it as well."""
+        return self.world.follow(
+            self._path_policy, states, stage, offsets, self._collision_tolerance
+        )
 
     def is_goal(self, states: FloatArray) -> npt.NDArray[np.bool_]:
         """Tell where the peg's centre is below that of the last hole, near its axis."""

@@ -14,6 +14,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
+from holdfast import _kernel
 from holdfast.geometry import FAR, RectangleWorld
 from holdfast.problems._fields import (
     Coordinate,
@@ -142,6 +143,9 @@ class PegInHole2D(PegProblem):
         self._half_width = 0.5 * model.peg_width
         self._tolerance = model.hole_tolerance
         self._upright_limit = upright_limit(model.hole_tolerance, 0.5 * model.peg_height)
+        self._path_policy = _kernel.PegPolicy2D(
+            [(0.0, self._upright_limit, 0.0)], self._half_width, 0.0, self._upper_limits.tolist()
+        )
 
     def policy(self, states: FloatArray, stage: int | IntArray) -> FloatArray:
         """Go to x = 0; near it also turn upright; once upright also go down to y = 0."""
@@ -154,6 +158,14 @@ class PegInHole2D(PegProblem):
         actions[..., 1] = np.where(upright, -y, 0.0)
         actions[..., 2] = np.where(near, -angle, 0.0)
         return actions
+
+    def expected_path(
+        self, states: FloatArray, stage: int, offsets: Sequence[int]
+    ) -> tuple[FloatArray, IntArray]:
+        """Follow the policy without noise; the kernel has it as well."""
+        return self.world.follow(
+            self._path_policy, states, stage, offsets, self._collision_tolerance
+        )
 
     def is_goal(self, states: FloatArray) -> npt.NDArray[np.bool_]:
         """Tell where the peg is half-way in the hole."""

@@ -13,6 +13,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
+from holdfast import _kernel
 from holdfast.errors import InvalidValueError
 from holdfast.geometry import FAR, BoxWorld
 from holdfast.problems._fields import (
@@ -157,6 +158,9 @@ class PegInHole3D(PegProblem):
         self._tolerance = model.hole_tolerance
         self._half_width = 0.5 * min(model.peg_dim[0], model.peg_dim[1])
         self._upright_limit = upright_limit(model.hole_tolerance, 0.5 * model.peg_dim[2])
+        self._path_policy = _kernel.PegPolicy3D(
+            self._half_width, self._upright_limit, self._upper_limits.tolist()
+        )
 
     def policy(self, states: FloatArray, stage: int | IntArray) -> FloatArray:
         """Go to the axis; near it also turn upright; once upright also go down to z = 0."""
@@ -170,6 +174,14 @@ class PegInHole3D(PegProblem):
         actions[..., 2] = np.where(lower, actions[..., 2], 0.0)
         actions[..., 3:6] = np.where(near[..., np.newaxis], actions[..., 3:6], 0.0)
         return actions
+
+    def expected_path(
+        self, states: FloatArray, stage: int, offsets: Sequence[int]
+    ) -> tuple[FloatArray, IntArray]:
+        """Follow the policy without noise; the kernel has it as well."""
+        return self.world.follow(
+            self._path_policy, states, stage, offsets, self._collision_tolerance
+        )
 
     def is_goal(self, states: FloatArray) -> npt.NDArray[np.bool_]:
         """Tell where the peg is half-way in the hole."""

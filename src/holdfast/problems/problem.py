@@ -17,7 +17,7 @@ cache) must not show in what it returns.
 Observations are Gaussian, by :meth:`Problem.observation_mean` and
 :meth:`Problem.observation_variance`, unless the problem has the two methods of
 :class:`GeneralObservationProblem`. What an action does without noise follows from
-:meth:`Problem.move`, unless the problem has the method of :class:`ExpectedMotionProblem`.
+:meth:`Problem.move`, unless the problem has a method of :class:`ExpectedMotionProblem`.
 
 Random numbers come from the :class:`~holdfast.randomness.Stream` that a function is given:
 ``stream.normal(shape)`` and ``stream.uniform(shape)``. A stream gives the same numbers each time
@@ -214,16 +214,33 @@ class GeneralObservationProblem(Protocol):
 
 
 class ExpectedMotionProblem(Protocol):
-    """One more method, for problems whose motion without noise is not ``move`` with zero deviates.
+    """Two more methods, for the selector ``path_entropy``, which follows particles without noise.
 
-    The selector ``path_entropy`` follows particles without noise. It asks a problem that does not
-    have this for its ``move``, with :data:`~holdfast.randomness.NOISE_FREE`: there normal deviates
-    are 0 and uniform ones 0.5. A problem needs the method if it draws otherwise (from
-    ``stream.words``, or again and again until something fits). It may have it to be faster.
+    Either, both or none. One that a class inherits is not used if the class itself replaces what it
+    speaks for: ``move``, and for the path ``policy``, ``execute`` and ``next_stage`` as well.
     """
 
     def expected_move(self, states: FloatArray, actions: FloatArray) -> FloatArray:
-        """Return the states after executed ``actions`` if nothing is random, as ``states``."""
+        """Return the states after executed ``actions`` if nothing is random, as ``states``.
+
+        A problem that does not have this is asked for its ``move`` with the stream
+        :data:`~holdfast.randomness.NOISE_FREE`: there normal deviates are 0 and uniform ones 0.5. A
+        problem needs the method if it draws otherwise (from ``stream.words``, or again and again
+        until something fits). It may have it to be faster.
+        """
+        ...
+
+    def expected_path(
+        self, states: FloatArray, stage: int, offsets: Sequence[int]
+    ) -> tuple[FloatArray, IntArray]:
+        """Follow the policy from each state, in one stage, without noise.
+
+        Return the states after each number of steps of ``offsets`` (ascending), shape
+        ``(len(offsets), n, state_size)``, and the stages there, shape ``(len(offsets), n)``. A step
+        is the policy's action for the state and its stage, limited by ``execute``, the motion
+        without noise, and ``next_stage`` of where that leads. What the path is without this method
+        it must be with it: it is there to be faster.
+        """
         ...
 
 

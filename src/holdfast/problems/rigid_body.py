@@ -18,7 +18,7 @@ from holdfast import numerics
 from holdfast.errors import InvalidValueError
 from holdfast.geometry import MAX_NOISE_ATTEMPTS, BoxWorld, DiscWorld, RectangleWorld
 from holdfast.problems.problem import FloatArray, ProblemBase
-from holdfast.randomness import Stream
+from holdfast.randomness import NOISE_FREE, Stream
 
 __all__ = ["PegProblem", "RigidBodyProblem", "constant", "upright_limit"]
 
@@ -118,6 +118,10 @@ class RigidBodyProblem(ProblemBase):
         return self.world.move(
             states, actions, self._motion_deviation, self._collision_tolerance, stream
         )
+
+    def expected_move(self, states: FloatArray, actions: FloatArray) -> FloatArray:
+        """Return the states after executed actions, stopped at contact, without noise."""
+        return self.move(states, actions, NOISE_FREE)
 
 
 class PegProblem(RigidBodyProblem):
