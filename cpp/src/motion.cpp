@@ -15,7 +15,7 @@ namespace {
 // Particles are worked on in blocks: large enough that the first draw of noise is one call, small
 // enough that its numbers stay on the stack and in the cache.
 constexpr std::size_t block_size = 128;
-constexpr std::size_t way_block_size = 16;
+constexpr std::size_t way_block_size = 32;
 
 template <class World>
 void stop_at_contact(const World& world, const double* state, const double* action,
@@ -131,28 +131,43 @@ void follow(const World& world, const Policy& policy, std::size_t count, const d
     parallel_for(num_blocks, threads_for(work, num_blocks, threads), [&](std::size_t block) {
         const std::size_t first = block * way_block_size;
         const std::size_t end = std::min(first + way_block_size, count);
-        for (std::size_t n = first; n < end; ++n) {
-            std::array<double, d> state, next, action;
-            std::copy(states + n * d, states + (n + 1) * d, state.begin());
-            std::size_t own_stage = stage;
-            std::uint32_t step = 0;
-            bool arrived = false;
-            for (std::size_t k = 0; k < offsets.size(); ++k) {
-                for (; step < offsets[k] && !arrived; ++step) {
-                    policy.executed(state.data(), own_stage, action.data());
+        // Step by step through the block: a step of one particle waits for its last one, but not
+        // for the other particles'.
+        std::array<std::array<double, d>, way_block_size> state;
+        std::array<std::size_t, way_block_size> own_stage, moving;
+        std::size_t num_moving = end - first;
+        for (std::size_t i = 0; i < end - first; ++i) {
+            std::copy(states + (first + i) * d, states + (first + i + 1) * d, state[i].begin());
+            own_stage[i] = stage;
+            moving[i] = i;
+        }
+        std::uint32_t step = 0;
+        for (std::size_t k = 0; k < offsets.size(); ++k) {
+            for (; step < offsets[k] && num_moving > 0; ++step) {
+                std::size_t still_moving = 0;
+                for (std::size_t m = 0; m < num_moving; ++m) {
+                    const std::size_t i = moving[m];
+                    std::array<double, d> next, action;
+                    policy.executed(state[i].data(), own_stage[i], action.data());
                     if (tolerance > 0.0) {
-                        stop_at_contact(world, state.data(), action.data(), tolerance, next.data());
+                        stop_at_contact(world, state[i].data(), action.data(), tolerance,
+                                        next.data());
                     } else {
-                        for (std::size_t c = 0; c < d; ++c) next[c] = state[c] + action[c];
+                        for (std::size_t c = 0; c < d; ++c) next[c] = state[i][c] + action[c];
                     }
-                    const std::size_t next_stage = policy.next_stage(next.data(), own_stage);
+                    const std::size_t next_stage = policy.next_stage(next.data(), own_stage[i]);
                     // Without noise, what stands still once does so for ever.
-                    arrived = next == state && next_stage == own_stage;
-                    state = next;
-                    own_stage = next_stage;
+                    moving[still_moving] = i;
+                    still_moving += next != state[i] || next_stage != own_stage[i] ? 1 : 0;
+                    state[i] = next;
+                    own_stage[i] = next_stage;
                 }
-                std::copy(state.begin(), state.end(), states_at + (k * count + n) * d);
-                stages_at[k * count + n] = static_cast<std::int64_t>(own_stage);
+                num_moving = still_moving;
+            }
+            for (std::size_t i = 0; i < end - first; ++i) {
+                const std::size_t at = k * count + first + i;
+                std::copy(state[i].begin(), state[i].end(), states_at + at * d);
+                stages_at[at] = static_cast<std::int64_t>(own_stage[i]);
             }
         }
     });

@@ -56,7 +56,7 @@ PARAMETERS: Mapping[str, tuple[str, ...]] = {
     "initial_states": ("stream", "count"),
     "move": ("states", "actions", "stream"),
     "expected_move": ("states", "actions"),
-    "expected_path": ("states", "stage", "offsets"),
+    "expected_path": ("states", "stage", "offsets", "threads"),
     "observation_mean": ("states", "sensing_action"),
     "observation_variance": ("states", "sensing_action"),
     "policy": ("states", "stage"),
@@ -412,10 +412,10 @@ def expected_move(
 
 
 def expected_path(
-    problem: Any, states: FloatArray, stage: int, offsets: Sequence[int]
+    problem: Any, states: FloatArray, stage: int, offsets: Sequence[int], threads: int
 ) -> tuple[FloatArray, npt.NDArray[np.int64]]:
     """Return the checked states and stages after each number of steps, the states read-only."""
-    found = problem.expected_path(states, stage, offsets)
+    found = problem.expected_path(states, stage, offsets, threads)
     shape = (len(offsets), *states.shape)
     if not isinstance(found, tuple) or len(found) != 2:
         raise _misfit(problem, "expected_path", found, "two arrays")

@@ -161,6 +161,7 @@ class _World:
         stage: int,
         offsets: Sequence[int],
         tolerance: float,
+        threads: int,
     ) -> tuple[FloatArray, IntArray]:
         """Follow a policy of the kernel without noise, each state for itself.
 
@@ -178,6 +179,8 @@ class _World:
             Numbers of steps, in ascending order.
         tolerance : float
             Fraction of an action to which contact is located; 0 for motion that nothing stops.
+        threads : int
+            At most so many; 0 means all cores. The result does not depend on it.
 
         Returns
         -------
@@ -202,7 +205,7 @@ class _World:
             stage,
             offsets,
             tolerance,
-            0,
+            threads,
             states_at.reshape(-1, dimension),
             stages_at.reshape(-1),
         )

@@ -73,7 +73,7 @@ def path_points(
         (section, key), reason = unfit
         raise InvalidValueError(f"{section}.{key} {reason}")
     offsets = path_steps(settings)
-    states_at, stages_at = _followed(problem, states, stage, offsets)
+    states_at, stages_at = _followed(problem, states, stage, offsets, settings.active_sensing.num_cores)
     points = contract.policy(problem, states_at, stages_at)
     if settings.selector.actions == "executed":
         points = contract.executed_action(problem, points)
@@ -88,11 +88,11 @@ def path_points(
 
 
 def _followed(
-    problem: Problem, states: FloatArray, stage: int, offsets: tuple[int, ...]
+    problem: Problem, states: FloatArray, stage: int, offsets: tuple[int, ...], threads: int
 ) -> tuple[FloatArray, int | IntArray]:
     """Return the states at each offset, shape (K, N, state_size), and the stages there, (K, N)."""
     if contract.has_own(problem, "expected_path", _STEP):
-        return contract.expected_path(problem, states, stage, offsets)
+        return contract.expected_path(problem, states, stage, offsets, threads)
     states_at = np.empty((len(offsets), *states.shape))
     several_stages = problem.num_stages > 1
     stages_at = np.full(states_at.shape[:2], stage, dtype=np.int64)

@@ -180,9 +180,9 @@ def test_the_kernel_follows_as_numpy_does(name: str) -> None:
     offsets = (0, 1, 9, 36, 300, 301)
     for stage in range(problem.num_stages):
         states = some_belief(problem, 150, "uniform").states
-        states_at, stages_at = problem.expected_path(states, stage, offsets)
+        states_at, stages_at = problem.expected_path(states, stage, offsets, 1)
         assert contract.has_own(problem, "expected_path", ("policy", "execute", "next_stage"))
-        expected_states, expected_stages = _followed(plain, states, stage, offsets)
+        expected_states, expected_stages = _followed(plain, states, stage, offsets, 1)
         np.testing.assert_array_equal(states_at, expected_states)
         np.testing.assert_array_equal(stages_at, np.broadcast_to(expected_stages, (6, 150)))
     assert problem.num_stages == 1 or (stages_at[-1] == problem.num_stages - 1).any()

@@ -176,11 +176,11 @@ class PegInHole3D(PegProblem):
         return actions
 
     def expected_path(
-        self, states: FloatArray, stage: int, offsets: Sequence[int]
+        self, states: FloatArray, stage: int, offsets: Sequence[int], threads: int
     ) -> tuple[FloatArray, IntArray]:
         """Follow the policy without noise; the kernel has it as well."""
         return self.world.follow(
-            self._path_policy, states, stage, offsets, self._collision_tolerance
+            self._path_policy, states, stage, offsets, self._collision_tolerance, threads
         )
 
     def is_goal(self, states: FloatArray) -> npt.NDArray[np.bool_]:

@@ -231,14 +231,15 @@ class ExpectedMotionProblem(Protocol):
         ...
 
     def expected_path(
-        self, states: FloatArray, stage: int, offsets: Sequence[int]
+        self, states: FloatArray, stage: int, offsets: Sequence[int], threads: int
     ) -> tuple[FloatArray, IntArray]:
         """Follow the policy from each state, in one stage, without noise.
 
         Return the states after each number of steps of ``offsets`` (ascending), shape
         ``(len(offsets), n, state_size)``, and the stages there, shape ``(len(offsets), n)``. A step
         is the policy's action for the state and its stage, limited by ``execute``, the motion
-        without noise, and ``next_stage`` of where that leads. What the path is without this method
+        without noise, and ``next_stage`` of where that leads. ``threads`` may be used, or all cores
+        if it is 0. What the path is without this method
         it must be with it: it is there to be faster.
         """
         ...
