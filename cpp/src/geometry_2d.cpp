@@ -2,14 +2,32 @@
 
 #include <algorithm>
 #include <cmath>
+#include <limits>
 #include <utility>
 
 #include "deterministic_math.hpp"
 
 namespace holdfast {
 
+namespace {
+
+// Less than the gap between a circle and the nearest rectangle by more than rounding can make.
+double gap_around(const double* state, double radius,
+                  const std::vector<AxisAlignedRectangle>& obstacles) {
+    const double x = state[0], y = state[1];
+    double gap = std::numeric_limits<double>::infinity();
+    for (const AxisAlignedRectangle& obstacle : obstacles) {
+        const double beside = std::max(obstacle.x_min - x, x - obstacle.x_max);
+        const double above = std::max(obstacle.y_min - y, y - obstacle.y_max);
+        gap = std::min(gap, std::max(beside, above));
+    }
+    return gap - radius - 1e-9 * (1.0 + radius + std::abs(x) + std::abs(y));
+}
+
+}  // namespace
+
 DiscWorld::DiscWorld(double radius, std::vector<AxisAlignedRectangle> obstacles)
-    : radius_squared_(radius * radius), obstacles_(std::move(obstacles)) {}
+    : radius_(radius), radius_squared_(radius * radius), obstacles_(std::move(obstacles)) {}
 
 bool DiscWorld::collides(const double* state) const {
     const double x = state[0];
@@ -20,6 +38,10 @@ bool DiscWorld::collides(const double* state) const {
         if (dx * dx + dy * dy < radius_squared_) return true;
     }
     return false;
+}
+
+double DiscWorld::clearance(const double* state) const {
+    return gap_around(state, radius_, obstacles_);
 }
 
 RectangleWorld::RectangleWorld(double width, double height,
@@ -72,6 +94,10 @@ bool RectangleWorld::collides(const double* state) const {
         return true;
     }
     return false;
+}
+
+double RectangleWorld::clearance(const double* state) const {
+    return gap_around(state, bounding_radius_, obstacles_);
 }
 
 }  // namespace holdfast

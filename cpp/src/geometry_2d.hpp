@@ -22,25 +22,33 @@ struct AxisAlignedRectangle {
 // A disc among rectangles; its state is (x, y).
 class DiscWorld {
   public:
-    static constexpr std::size_t dimension = 2;
+    static constexpr std::size_t dimension = 2, space_dimension = 2;
 
     DiscWorld(double radius, std::vector<AxisAlignedRectangle> obstacles);
 
     bool collides(const double* state) const;
 
+    // How far the state may move along each axis, and turn as it likes, without a collision. Zero
+    // or less tells nothing.
+    double clearance(const double* state) const;
+
   private:
-    double radius_squared_;
+    double radius_, radius_squared_;
     std::vector<AxisAlignedRectangle> obstacles_;
 };
 
 // A rectangle among rectangles; its state is (x, y, theta) of its centre.
 class RectangleWorld {
   public:
-    static constexpr std::size_t dimension = 3;
+    static constexpr std::size_t dimension = 3, space_dimension = 2;
 
     RectangleWorld(double width, double height, std::vector<AxisAlignedRectangle> obstacles);
 
     bool collides(const double* state) const;
+
+    // How far the state may move along each axis, and turn as it likes, without a collision. Zero
+    // or less tells nothing.
+    double clearance(const double* state) const;
 
   private:
     double half_width_, half_height_;

@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <limits>
 #include <utility>
 
 #include "deterministic_math.hpp"
@@ -108,6 +109,19 @@ bool BoxWorld::collides(const double* state) const {
         if (!apart && !edges_separate(turn, half_size_, obstacle)) return true;
     }
     return false;
+}
+
+double BoxWorld::clearance(const double* state) const {
+    double gap = std::numeric_limits<double>::infinity();
+    for (const AxisAlignedBox& box : obstacles_) {
+        double widest = -std::numeric_limits<double>::infinity();
+        for (std::size_t i = 0; i < 3; ++i) {
+            widest = std::max(widest, std::max(box.low[i] - state[i], state[i] - box.high[i]));
+        }
+        gap = std::min(gap, widest);
+    }
+    const double size = std::abs(state[0]) + std::abs(state[1]) + std::abs(state[2]);
+    return gap - bounding_radius_ - 1e-9 * (1.0 + bounding_radius_ + size);
 }
 
 }  // namespace holdfast

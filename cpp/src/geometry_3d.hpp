@@ -23,11 +23,15 @@ struct AxisAlignedBox {
 // A box among boxes; its state is (x, y, z, yaw, pitch, roll) of its centre.
 class BoxWorld {
   public:
-    static constexpr std::size_t dimension = 6;
+    static constexpr std::size_t dimension = 6, space_dimension = 3;
 
     BoxWorld(const std::array<double, 3>& size, std::vector<AxisAlignedBox> obstacles);
 
     bool collides(const double* state) const;
+
+    // How far the state may move along each axis, and turn as it likes, without a collision. Zero
+    // or less tells nothing.
+    double clearance(const double* state) const;
 
   private:
     std::array<double, 3> half_size_;

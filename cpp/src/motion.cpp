@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <array>
 #include <atomic>
+#include <cmath>
 
 #include "geometry_2d.hpp"
 #include "geometry_3d.hpp"
@@ -71,6 +72,46 @@ std::size_t add_noise(const World& world, std::size_t first, std::size_t count,
     return num_pending;
 }
 
+// Tells which steps of a way can end in collision: none while the particle has moved less than it
+// was away from the nearest obstacle.
+template <class World>
+class Contact {
+  public:
+    explicit Contact(double tolerance) : steps_near_{}, none_(tolerance == 0.0) {
+        room_.fill(unknown);
+    }
+
+    bool stops(const World& world, std::size_t i, const double* state, const double* action) {
+        if (none_) return false;
+        double farthest = 0.0;
+        for (std::size_t c = 0; c < World::space_dimension; ++c) {
+            farthest = std::max(farthest, std::abs(action[c]));
+        }
+        if (room_[i] < farthest) {
+            // Who is near stays near for a while: not asked again at once.
+            if (steps_near_[i] > 0) {
+                --steps_near_[i];
+                return true;
+            }
+            room_[i] = world.clearance(state);
+            if (room_[i] <= farthest) {
+                room_[i] = unknown;
+                steps_near_[i] = 3;
+                return true;
+            }
+        }
+        room_[i] -= farthest;
+        return false;
+    }
+
+  private:
+    static constexpr double unknown = -1.0;  // less than any step, also than one that only turns
+
+    std::array<double, way_block_size> room_;
+    std::array<int, way_block_size> steps_near_;
+    bool none_;
+};
+
 int threads_for_particles(std::size_t count) {
     return count >= parallel_threshold ? thread_limit(0) : 1;
 }
@@ -136,6 +177,7 @@ void follow(const World& world, const Policy& policy, std::size_t count, const d
         std::array<std::array<double, d>, way_block_size> state;
         std::array<std::size_t, way_block_size> own_stage, moving;
         std::size_t num_moving = end - first;
+        Contact<World> contact(tolerance);
         for (std::size_t i = 0; i < end - first; ++i) {
             std::copy(states + (first + i) * d, states + (first + i + 1) * d, state[i].begin());
             own_stage[i] = stage;
@@ -149,7 +191,7 @@ void follow(const World& world, const Policy& policy, std::size_t count, const d
                     const std::size_t i = moving[m];
                     std::array<double, d> next, action;
                     policy.executed(state[i].data(), own_stage[i], action.data());
-                    if (tolerance > 0.0) {
+                    if (contact.stops(world, i, state[i].data(), action.data())) {
                         stop_at_contact(world, state[i].data(), action.data(), tolerance,
                                         next.data());
                     } else {

@@ -73,7 +73,8 @@ def path_points(
         (section, key), reason = unfit
         raise InvalidValueError(f"{section}.{key} {reason}")
     offsets = path_steps(settings)
-    states_at, stages_at = _followed(problem, states, stage, offsets, settings.active_sensing.num_cores)
+    threads = settings.active_sensing.num_cores
+    states_at, stages_at = _followed(problem, states, stage, offsets, threads)
     points = contract.policy(problem, states_at, stages_at)
     if settings.selector.actions == "executed":
         points = contract.executed_action(problem, points)
@@ -92,7 +93,10 @@ def _followed(
 ) -> tuple[FloatArray, int | IntArray]:
     """Return the states at each offset, shape (K, N, state_size), and the stages there, (K, N)."""
     if contract.has_own(problem, "expected_path", _STEP):
-        return contract.expected_path(problem, states, stage, offsets, threads)
+        states_at, stages_at = contract.expected_path(problem, states, stage, offsets, threads)
+        # One stage for all is the same, and most policies look it up once then.
+        first = stages_at.flat[0]
+        return states_at, int(first) if (stages_at == first).all() else stages_at
     states_at = np.empty((len(offsets), *states.shape))
     several_stages = problem.num_stages > 1
     stages_at = np.full(states_at.shape[:2], stage, dtype=np.int64)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import msgspec
 import numpy as np
@@ -22,6 +22,7 @@ from tests.oracles.test_sensing_reference import (
 from holdfast import contract
 from holdfast.belief import Belief
 from holdfast.errors import InvalidValueError, ProblemError
+from holdfast.experiments.busy_room import BusyRoom
 from holdfast.policy_path import _followed, path_points
 from holdfast.problems import registry
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
@@ -172,11 +173,14 @@ def test_every_registered_problem_has_a_way(name: str) -> None:
         np.testing.assert_array_equal(alone[:, 0], points[:, n])
 
 
-@pytest.mark.parametrize("name", registry.names())
+@pytest.mark.parametrize("name", [*registry.names(), "busy_room"])
 def test_the_kernel_follows_as_numpy_does(name: str) -> None:
     """Bit for bit, through contacts and stages, for one way of several hundred steps."""
-    problem = registry.problem_class(name).from_settings({}, {})
-    plain = _Plain(problem)
+    if name == "busy_room":
+        problem: Any = BusyRoom()
+    else:
+        problem = registry.problem_class(name).from_settings({}, {})
+    plain: Any = _Plain(problem)
     offsets = (0, 1, 9, 36, 300, 301)
     for stage in range(problem.num_stages):
         states = some_belief(problem, 150, "uniform").states

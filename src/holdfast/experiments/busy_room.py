@@ -8,6 +8,8 @@ and it is here for that reason.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import numpy.typing as npt
 
@@ -60,6 +62,15 @@ class BusyRoom(ProblemBase):
         peg = self._peg.move(np.ascontiguousarray(states[..., :_PEG]), actions, stream)
         noise = stream.substream(_STEPS).normal((*states.shape[:-1], _THINGS))
         return np.concatenate([peg, states[..., _PEG:] + _STEP_DEVIATION * noise], axis=-1)
+
+    def expected_path(
+        self, states: FloatArray, stage: int, offsets: Sequence[int], threads: int
+    ) -> tuple[FloatArray, IntArray]:
+        """Follow the peg; without noise the things stay where they are."""
+        own = np.ascontiguousarray(states[:, :_PEG])
+        peg, stages = self._peg.expected_path(own, stage, offsets, threads)
+        things = np.broadcast_to(states[:, _PEG:], (*stages.shape, _THINGS))
+        return np.concatenate([peg, things], axis=-1), stages
 
     def observation_mean(self, states: FloatArray, sensing_action: int) -> FloatArray:
         """Return the coordinate that is looked at."""
