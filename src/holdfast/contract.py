@@ -437,7 +437,8 @@ def has_own(problem: Any, function: str, spoken_for: tuple[str, ...]) -> bool:
     own = getattr(problem, "__dict__", {})
     if any(name in own for name in (function, *spoken_for)):
         return function in own
-    return _speaks_for(type(problem), function, spoken_for)
+    kind: type = type(problem)
+    return _speaks_for(kind, function, spoken_for)
 
 
 @functools.lru_cache(maxsize=1000)

@@ -98,13 +98,13 @@ def _followed(
         first = stages_at.flat[0]
         return states_at, int(first) if (stages_at == first).all() else stages_at
     states_at = np.empty((len(offsets), *states.shape))
-    several_stages = problem.num_stages > 1
     stages_at = np.full(states_at.shape[:2], stage, dtype=np.int64)
-    stages: int | IntArray = stages_at[0].copy() if several_stages else stage
+    several_stages = problem.num_stages > 1
+    stages = stages_at[0].copy()
     step = 0
     for number, offset in enumerate(offsets):
         while step < offset:
-            actions = problem.execute(problem.policy(states, stages))
+            actions = problem.execute(problem.policy(states, stages if several_stages else stage))
             states = contract.expected_move(problem, states, actions, NOISE_FREE)
             if several_stages:
                 stages = contract.next_stages(problem, states, stages)

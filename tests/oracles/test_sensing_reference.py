@@ -64,7 +64,7 @@ class Plane(ProblemBase):
         return self.variances[sensing_action] * np.arange(1.0, size + 1.0)
 
     def policy(self, states: FloatArray, stage: int | IntArray) -> FloatArray:
-        actions = -np.asarray(states) + np.asarray(stage)[..., np.newaxis]
+        actions: FloatArray = -np.asarray(states) + np.asarray(stage)[..., np.newaxis]
         far = np.abs(states[..., :1]) > 0.5
         actions[..., 1:] = np.where(far, 0.0, actions[..., 1:])
         return actions
