@@ -36,6 +36,7 @@ CHOSEN = {
     "environment.directory": "robots",
     "environment.arguments": {"port": 7},
     "selector.resolution": 0.25,
+    "selector.path_offsets": [1, 3],
     "model.init_mean": [1, 2, 3],
     "model.init_cov": [1, 2, 3],
     "model.motion_cov": [1, 2, 3],

@@ -706,6 +706,7 @@ class TestFigure:
         [
             ("action_entropy", "expected entropy of\nthe actions (nats)"),
             ("state_entropy", "expected entropy of\nthe state (nats)"),
+            ("path_entropy", "expected entropies of\nthe actions, sum (nats)"),
             ("action_covariance", "expected covariance\nof the actions (trace)"),
         ],
     )
