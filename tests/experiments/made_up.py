@@ -23,7 +23,8 @@ def results_of(
         rows = []
         for number in range(first, first + task.parameters["num_trials"]):
             success, steps, reward = trial(task, number)
-            rows.append((number, success, steps, reward, steps // 2, 0.5, 0, "digest"))
+            to_goal = steps if success else None
+            rows.append((number, success, steps, reward, steps // 2, 0.5, 0, "digest", to_goal))
         tables[task_key(task)] = Table.of_rows(COLUMNS, rows)
     return Results(tables, task_key)
 

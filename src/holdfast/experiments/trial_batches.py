@@ -11,6 +11,7 @@ from holdfast.configuration import build_problem
 from holdfast.errors import HoldfastError
 from holdfast.experiments.tables import Table
 from holdfast.experiments.tasks import Task, TaskError
+from holdfast.outcome import TrialResult
 from holdfast.problems.problem import Problem
 from holdfast.problems.registry import problem_class
 from holdfast.runtime.trial import run_trial
@@ -27,8 +28,13 @@ COLUMNS = (
     "mean_sensing_ms",
     "unexplained_observations",
     "digest",
+    "steps_to_goal",
 )
-"""Of the table of a batch: a row for each trial."""
+"""Of the table of a batch: a row for each trial.
+
+``steps_to_goal`` is ``steps`` of a trial that reached the goal, and of one that was continued and
+reached it then, the steps it took in all; None of one that never did.
+"""
 
 _DIGEST_CHARACTERS = 16
 """Enough to tell that two runs decided the same, at a quarter of the size."""
@@ -47,6 +53,9 @@ class TrialSeries(msgspec.Struct, frozen=True, kw_only=True):
     max_steps : int
     seed : int
     num_trials : int
+    continued_to : int, optional
+        Steps up to which a trial that is cut off at ``max_steps`` is continued, to see whether it
+        is slow or stuck; only ``steps_to_goal`` depends on it. None: not at all.
     """
 
     problem: str
@@ -56,6 +65,7 @@ class TrialSeries(msgspec.Struct, frozen=True, kw_only=True):
     max_steps: int = 500
     seed: int = 0
     num_trials: int = 1000
+    continued_to: int | None = None
 
 
 def trial_tasks(series: TrialSeries, trials_in_each: int, kind: str = "trials") -> Iterator[Task]:
@@ -100,10 +110,18 @@ def run_trials_of(first_trial: int, **series: Any) -> Table:
         sensing_intervals=wanted.planning.sensing_interval,
         seed=wanted.seed,
     )
+    longer = None
+    if wanted.continued_to is not None:
+        longer = msgspec.structs.replace(simulator, max_steps=wanted.continued_to)
     rows = []
     for trial in range(first_trial, first_trial + wanted.num_trials):
         try:
             result = run_trial(problem, wanted.planning, simulator, trial)
+            whole = result
+            if longer is not None and _is_cut_off(result):
+                # From its beginning: every random draw is named by its step, so the trial goes
+                # through the same states as before.
+                whole = run_trial(problem, wanted.planning, longer, trial)
         except HoldfastError as error:
             raise TaskError(
                 f"trial {trial} (seed {wanted.seed}) of {wanted.problem}: {error}"
@@ -118,9 +136,14 @@ def run_trials_of(first_trial: int, **series: Any) -> Table:
                 result.mean_sensing_ms,
                 result.unexplained_observations,
                 result.digest[:_DIGEST_CHARACTERS],
+                whole.steps if whole.success else None,
             )
         )
     return Table.of_rows(COLUMNS, rows)
+
+
+def _is_cut_off(result: TrialResult) -> bool:
+    return not result.success and not result.failed
 
 
 def problem_of(
