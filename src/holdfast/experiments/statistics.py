@@ -10,7 +10,7 @@ SciPy takes a second to import, so that is done where it is needed.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -19,7 +19,7 @@ import numpy.typing as npt
 from holdfast.errors import InvalidValueError
 
 if TYPE_CHECKING:
-    from holdfast.experiments.tables import Table
+    from holdfast.experiments.tables import Cell, Table
 
 __all__ = [
     "Interval",
@@ -28,6 +28,8 @@ __all__ = [
     "add_adjusted",
     "agreement_of_means",
     "agreement_of_rates",
+    "as_it_is",
+    "cells_across_problems",
     "cells_of",
     "logarithms_of_steps",
     "mean_interval",
@@ -321,6 +323,51 @@ def across_problems(
         effects.append(float(difference.mean()))
         errors.append(max(least, scatter / math.sqrt(difference.size)))
     return random_effects(np.array(effects), np.array(errors))
+
+
+def as_it_is(difference: Interval) -> Interval:
+    """Return a difference that is shown as such."""
+    return difference
+
+
+def cells_across_problems(
+    pairs: Sequence[tuple[FloatArray, FloatArray]],
+    least_difference: float,
+    shown: Callable[[Interval], Interval],
+) -> dict[str, Cell]:
+    """Return the cells of how two ways differ over these problems, and over all such problems.
+
+    Parameters
+    ----------
+    pairs : sequence of (array, array)
+        Of each problem: a number of each trial, of one way and of the other.
+    least_difference : float
+        See :func:`across_problems`.
+    shown : callable
+        What is shown of a difference.
+
+    Returns
+    -------
+    dict
+        ``mean``: over these problems, of the trials that all have; ``expected``: over all such
+        problems; ``new_problem``: in one more; ``deviation_between_problems`` as a difference.
+    """
+    fewest = min(own.size for own, _ in pairs)
+    own, other = (np.mean([pair[which][:fewest] for pair in pairs], axis=0) for which in (0, 1))
+    mean, p_value = paired_difference(own, other)
+    found = across_problems(pairs, least_difference)
+    new_low, new_high = shown(found.new_problem)[1:]
+    return {
+        "trials": fewest,
+        **cells_of("mean", shown(mean)),
+        "mean_p_value": p_value,
+        "problems": len(pairs),
+        **cells_of("expected", shown(found.mean)),
+        "expected_p_value": found.p_value,
+        "deviation_between_problems": found.deviation,
+        "new_problem_low": new_low,
+        "new_problem_high": new_high,
+    }
 
 
 def cells_of(name: str, interval: Interval) -> dict[str, float | None]:

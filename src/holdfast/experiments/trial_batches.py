@@ -28,12 +28,13 @@ COLUMNS = (
     "mean_sensing_ms",
     "unexplained_observations",
     "digest",
+    "step_limit",
     "steps_to_goal",
 )
 """Of the table of a batch: a row for each trial.
 
-``steps_to_goal`` is ``steps`` of a trial that reached the goal, and of one that was continued and
-reached it then, the steps it took in all; None of one that never did.
+``step_limit`` is the limit of a trial with which it is continued, if it is, and ``steps_to_goal``
+the steps that it took within that limit; None if it did not reach the goal.
 """
 
 _DIGEST_CHARACTERS = 16
@@ -53,9 +54,11 @@ class TrialSeries(msgspec.Struct, frozen=True, kw_only=True):
     max_steps : int
     seed : int
     num_trials : int
-    continued_to : int, optional
-        Steps up to which a trial that is cut off at ``max_steps`` is continued, to see whether it
-        is slow or stuck; only ``steps_to_goal`` depends on it. None: not at all.
+    continued_trials : int
+        The first ones, which are continued where they are cut off at ``max_steps``, to see whether
+        they are slow or stuck. Nothing but ``steps_to_goal`` depends on it.
+    continued_to : int
+        Up to how many steps.
     """
 
     problem: str
@@ -65,7 +68,8 @@ class TrialSeries(msgspec.Struct, frozen=True, kw_only=True):
     max_steps: int = 500
     seed: int = 0
     num_trials: int = 1000
-    continued_to: int | None = None
+    continued_trials: int = 0
+    continued_to: int = 10_000
 
 
 def trial_tasks(series: TrialSeries, trials_in_each: int, kind: str = "trials") -> Iterator[Task]:
@@ -110,15 +114,16 @@ def run_trials_of(first_trial: int, **series: Any) -> Table:
         sensing_intervals=wanted.planning.sensing_interval,
         seed=wanted.seed,
     )
-    longer = None
-    if wanted.continued_to is not None:
-        longer = msgspec.structs.replace(simulator, max_steps=wanted.continued_to)
+    longer = msgspec.structs.replace(
+        simulator, max_steps=max(wanted.continued_to, wanted.max_steps)
+    )
     rows = []
     for trial in range(first_trial, first_trial + wanted.num_trials):
         try:
             result = run_trial(problem, wanted.planning, simulator, trial)
             whole = result
-            if longer is not None and _is_cut_off(result):
+            continued = trial < wanted.continued_trials
+            if continued and _is_cut_off(result):
                 # From its beginning: every random draw is named by its step, so the trial goes
                 # through the same states as before.
                 whole = run_trial(problem, wanted.planning, longer, trial)
@@ -136,6 +141,7 @@ def run_trials_of(first_trial: int, **series: Any) -> Table:
                 result.mean_sensing_ms,
                 result.unexplained_observations,
                 result.digest[:_DIGEST_CHARACTERS],
+                longer.max_steps if continued else wanted.max_steps,
                 whole.steps if whole.success else None,
             )
         )

@@ -1,25 +1,33 @@
 """Trials in a file: small enough to be committed, so that every number can be computed anew.
 
 Parquet keeps each column by itself, and a name that ten thousand rows repeat once. Numbers with a
-fraction have seven digits there; so a study rounds them (:func:`rounded`) before it computes
-anything from them, and what it computes from the file is the same.
+fraction have seven digits there; so a study rounds them before it computes anything from them, and
+what it computes from the file is the same.
 """
 
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
 
-from holdfast.errors import HoldfastError
+from holdfast.errors import HoldfastError, InvalidValueError
 from holdfast.experiments.study import Scale
 from holdfast.experiments.tables import Cell, Table
 
-__all__ = ["TRIALS_NAME", "TrialFile", "TrialFileError", "read_trials", "rounded"]
+__all__ = [
+    "TRIALS_NAME",
+    "TrialFile",
+    "TrialFileError",
+    "cells_of_trials",
+    "kept_trials",
+    "read_trials",
+    "require_cells",
+]
 
 TRIALS_NAME = "trials.parquet"
 
@@ -100,8 +108,77 @@ def read_trials(path: Path) -> TrialFile:
     )
 
 
-def rounded(cells: Sequence[Cell]) -> list[Cell]:
-    """Return numbers as a file keeps them: with seven digits."""
+_KEPT = (
+    "trial",
+    "success",
+    "steps",
+    "reward",
+    "sensing_decisions",
+    "step_limit",
+    "steps_to_goal",
+)
+
+
+def kept_trials(table: Table) -> Table:
+    """Return what a file keeps of the trials of one cell.
+
+    Times differ from run to run: their median over the trials stands for all of them.
+    """
+    columns = {name: list(table.columns[name]) for name in _KEPT}
+    columns["reward"] = _rounded(columns["reward"])
+    times = table.numbers("mean_sensing_ms")[table.numbers("sensing_decisions") > 0.0]
+    median = float(np.median(times)) if times.size else None
+    return Table({**columns, "median_sensing_ms": _rounded([median]) * table.num_rows})
+
+
+def cells_of_trials(trials: Table, names: Sequence[str]) -> dict[tuple[Any, ...], Table]:
+    """Return the trials by what they are trials of.
+
+    Parameters
+    ----------
+    trials : Table
+    names : sequence of str
+        Columns whose cells tell it.
+
+    Raises
+    ------
+    InvalidValueError
+        If a column is missing.
+    """
+    missing = [name for name in (*names, *_KEPT) if name not in trials.columns]
+    if missing:
+        raise InvalidValueError(f"trials without the columns {', '.join(missing)}")
+    rows: dict[tuple[Any, ...], list[int]] = {}
+    keys = zip(*(trials.columns[name] for name in names), strict=True)
+    for number, key in enumerate(keys):
+        rows.setdefault(key, []).append(number)
+    own = {name: cells for name, cells in trials.columns.items() if name not in names}
+    return {
+        key: Table({name: [cells[number] for number in numbers] for name, cells in own.items()})
+        for key, numbers in rows.items()
+    }
+
+
+def require_cells(
+    study: str, cells: Mapping[tuple[Any, ...], Table], expected: Collection[tuple[Any, ...]]
+) -> None:
+    """Make sure that there are trials of what a study compares, and of nothing else.
+
+    Raises
+    ------
+    InvalidValueError
+        If a cell is missing or unknown.
+    """
+    for each in expected:
+        if each not in cells:
+            raise InvalidValueError(f"{study}: there are no trials of {', '.join(map(str, each))}")
+    for each in cells:
+        if each not in expected:
+            raise InvalidValueError(f"{study}: knows nothing of {', '.join(map(str, each))}")
+
+
+def _rounded(cells: Sequence[Cell]) -> list[Cell]:
+    """Return numbers as a file keeps them."""
     return [None if cell is None else float(np.float32(cell)) for cell in cells]
 
 
