@@ -94,7 +94,8 @@ def read_trials(path: Path) -> TrialFile:
     """
     pyarrow = _pyarrow()
     try:
-        table = pyarrow.parquet.ParquetFile(path).read()
+        with path.open("rb") as file:
+            table = pyarrow.parquet.ParquetFile(file).read()
         about = msgspec.json.decode(dict(table.schema.metadata or {})[_ABOUT], type=_About)
     except OSError as error:
         raise TrialFileError(f"{path}: cannot be read: {error.strerror or error}") from error
