@@ -113,8 +113,8 @@ _CONTINUED_TRIALS = 50
 """Of these, as many at each interval: a trial that is stuck takes twenty times as long as one that
 is cut off."""
 
-_TRIALS = {CHOICE: 40, CLAIM: 200}
-_QUICK_TRIALS = {CHOICE: 4, CLAIM: 8}
+_TRIALS = {CHOICE: 30, CLAIM: 200}
+_QUICK_TRIALS = {CHOICE: 2, CLAIM: 4}
 _TRIALS_IN_EACH = 20
 
 
