@@ -403,7 +403,9 @@ def test_what_decides_about_the_default(decided: Report) -> None:
         assert row["beaten_in"] == ("steps" if slow else ""), row
         better = row["problem"] == "tight hole"
         assert row["success_gain"] == (0.5 if better else 0.0)
-        assert row["candidate"] != PATH or (row["success_gain_adjusted_p_value"] < 0.05) == better
+        assert row["candidate"] != PATH or better == (
+            number_of(row["success_gain_adjusted_p_value"]) < 0.05
+        )
     (said,) = (each for each in decided.findings if each.startswith(f"{PATH} as the default"))
     assert "(chosen on the other seed): beaten beyond noise in 2 of 80 comparisons" in said
     assert "(busy room at 14 by random in steps; busy room at 14 by action" in said

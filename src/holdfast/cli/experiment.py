@@ -120,6 +120,8 @@ def experiment(
         raise InvalidValueError("which experiment? Say all, or names that --list shows")
     studies = studies_of(names)
     if source is not None:
+        if quick:
+            raise InvalidValueError("--quick: has no effect with --from, which runs nothing")
         _make_anew(studies, source, out)
         return
     words = ["holdfast", "experiment", *names]

@@ -123,7 +123,7 @@ def compute(workload: Workload, executor: Executor, on_progress: Callable[[int],
     LocalExecutor(1).run([task for task in workload.pending if task.exclusive], keep)
 
 
-class _Origin(msgspec.Struct, kw_only=True):
+class _Origin(msgspec.Struct, kw_only=True, omit_defaults=True):
     """Where numbers come from; the content of ``origin.json``."""
 
     study: str
@@ -132,6 +132,7 @@ class _Origin(msgspec.Struct, kw_only=True):
     holdfast_version: str
     machine: dict[str, str]
     findings: list[str]
+    claim_seed: int | None = None
 
 
 def write_report(
@@ -200,6 +201,7 @@ def write_report(
         holdfast_version=__version__,
         machine=machine,
         findings=report.findings,
+        claim_seed=None if report.trials is None else scale.claim_seed,
     )
     text = msgspec.json.format(msgspec.json.encode(origin), indent=2)
     write_atomically(origin_path, text + b"\n")

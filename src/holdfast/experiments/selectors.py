@@ -87,6 +87,9 @@ _DEFAULT = "action entropy, neighbours"
 _CANDIDATES = ("path entropy, neighbours", "path entropy, mixture")
 """Ways of which one may become the default: the better one on the trials for choosing."""
 
+_BEFORE = "action entropy, neighbours"
+"""What the default was when they were compared with it."""
+
 _DISTRACTING = ("busy room", "passer-by")
 """Made so that asking for the state and asking for the action differ."""
 
@@ -462,7 +465,8 @@ def _default_candidates(choosing: _Trials, tables: Mapping[_Cell, Table]) -> Tab
     """Return what decides whether another way becomes the default.
 
     It does not if it is beaten beyond noise, in steps or success, by the baseline or by the default
-    in any cell. The p-values of a candidate are adjusted for all its comparisons, of both measures.
+    before, in any cell. The p-values of a candidate are adjusted for all its comparisons, of both
+    measures.
     """
     place = next(iter(_GROUPS))
     chosen = min(_CANDIDATES, key=lambda way: float(np.nanmean(choosing[place, way])))
@@ -479,7 +483,7 @@ def _default_candidates(choosing: _Trials, tables: Mapping[_Cell, Table]) -> Tab
             }
             for case in _CASES
             for interval in (*INTERVALS, _MEAN)
-            for rival in (BASELINE, _DEFAULT)
+            for rival in (BASELINE, _BEFORE)
         ]
         table = Table.of_records(rows)
         p_values = np.concatenate([table.numbers(f"{name}_p_value") for name in _MEASURES])
@@ -547,16 +551,8 @@ def _stuck(tables: Mapping[_Cell, Table]) -> Table:
                     "continued_to": found[0].columns["step_limit"][0],
                     "stuck": int(stuck.sum()),
                 }
-                for measure, trials in (("cut_off", cut), ("stuck", stuck)):
-                    # Trials of one world at four intervals are not independent.
-                    share = (
-                        statistics.Interval(
-                            float(trials.mean()), *wilson_interval(int(trials.sum()), trials.size)
-                        )
-                        if len(intervals) == 1
-                        else statistics.mean_interval(trials.mean(axis=0))
-                    )
-                    row |= statistics.cells_of(f"{measure}_share", share)
+                row |= statistics.cells_of("cut_off_share", _share(cut))
+                row |= statistics.cells_of("stuck_share", _share(stuck))
                 if len(intervals) == 1:
                     difference, p_value = statistics.paired_rates(stuck[0], others[0])
                 else:
@@ -570,6 +566,22 @@ def _stuck(tables: Mapping[_Cell, Table]) -> Table:
     compared = np.array([way != BASELINE for way in table.columns["way"]])
     statistics.add_adjusted(table, "p_value", compared=compared)
     return table
+
+
+def _share(trials: npt.NDArray[np.bool_]) -> statistics.Interval:
+    """Return the share of trials, shape (intervals, worlds), in which something is so.
+
+    Trials of one world are not independent: over several intervals the interval is Student's, of
+    the worlds' shares, and Wilson's where these are all 0 or all 1, which have no scatter.
+    """
+    whole = trials.all() or not trials.any()
+    if trials.shape[0] > 1 and not whole:
+        value, low, high = statistics.mean_interval(trials.mean(axis=0))
+        return statistics.Interval(value, max(low, 0.0), min(high, 1.0))
+    successes = int(trials[0].sum())
+    return statistics.Interval(
+        successes / trials.shape[1], *wilson_interval(successes, trials.shape[1])
+    )
 
 
 def _continued(table: Table) -> Table:
@@ -699,7 +711,7 @@ def _findings_of_choices(best: Table, candidates: Table) -> list[str]:
         )
         findings.append(
             f"{candidate} as the default ({chosen}): beaten beyond noise in {len(beaten)} of "
-            f"{len(rows)} comparisons with random and {_DEFAULT}"
+            f"{len(rows)} comparisons with random and {_BEFORE}"
             f"{f' ({places})' if places else ''}, better beyond noise in {better} (each problem, "
             "each interval and the mean over them; paired t-tests and McNemar's, Holm-adjusted "
             f"level {LEVEL_OF_VERDICT:g} over all)"
