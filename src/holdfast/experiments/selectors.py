@@ -236,7 +236,6 @@ def _cases_table(tables: Mapping[_Cell, Table], choosing: Mapping[_Cell, Table])
     for name, case in _CASES.items():
         series = case.series(WAYS[_DEFAULT], INTERVALS[0], seed=0, num_trials=2)
         sensing = series.planning.active_sensing
-        problem = problem_of(case.problem, case.model, {})
         rows.append(
             {
                 "problem": name,
