@@ -112,7 +112,7 @@ estimate, the default."""
 _CONTINUED = tuple(way for way in _SHOWN if way != "fixed")
 """Ways whose trials are continued where they are cut off."""
 
-_CONTINUED_TRIALS = 50
+_CONTINUED_TRIALS = 100
 """Of these, as many at each interval: a trial that is stuck takes twenty times as long as one that
 is cut off."""
 
