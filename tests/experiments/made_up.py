@@ -23,7 +23,10 @@ def results_of(
         rows = []
         for number in range(first, first + task.parameters["num_trials"]):
             success, steps, reward = trial(task, number)
-            rows.append((number, success, steps, reward, steps // 2, 0.5, 0, "digest"))
+            to_goal = steps if success else None
+            limit = 10**6 if number < task.parameters["continued_trials"] else 10**5
+            row = (number, success, steps, reward, steps // 2, 0.5, 0, "digest", limit, to_goal)
+            rows.append(row)
         tables[task_key(task)] = Table.of_rows(COLUMNS, rows)
     return Results(tables, task_key)
 

@@ -15,6 +15,7 @@ from holdfast.experiments.published_2017 import published_rows, series_of
 from holdfast.experiments.registry import studies_of, study_names
 from holdfast.experiments.study import Scale
 from holdfast.experiments.trial_batches import problem_of
+from holdfast.experiments.trial_files import TrialFileError
 
 
 def test_list(capsys: pytest.CaptureFixture[str]) -> None:
@@ -30,11 +31,13 @@ def test_list(capsys: pytest.CaptureFixture[str]) -> None:
         ({"names": ["all"], "jobs": -1}, "--jobs -1: must be from 1 to "),
         ({"names": ["all"], "place": "slurm"}, "--executor slurm: must be local, ray "),
         ({"names": ["all"], "place": "ray://"}, "--executor ray://: must be local, ray "),
+        ({"names": ["selectors"], "source": Path("a.parquet")}, "a.parquet: cannot be read: No"),
+        ({"names": ["selectors"], "source": Path("a"), "quick": True}, "--quick: has no effect"),
         ({"names": ["all"], "place": "ray", "jobs": 3}, "--jobs 3: has no effect with .* ray"),
     ],
 )
 def test_what_is_wrong_is_said(arguments: dict[str, Any], message: str, tmp_path: Path) -> None:
-    with pytest.raises(InvalidValueError, match=message):
+    with pytest.raises((InvalidValueError, TrialFileError), match=message):
         experiment(**arguments, out=tmp_path / "out")
     assert not (tmp_path / "out").exists()
 

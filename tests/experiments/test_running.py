@@ -384,7 +384,7 @@ class TestWorkload:
 def test_missing_packages_are_told_of_first(monkeypatch: pytest.MonkeyPatch) -> None:
     check_packages()
     monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
-    with pytest.raises(HoldfastError, match=r"need scipy and .*: pip install scipy matplotlib"):
+    with pytest.raises(HoldfastError, match=r"need scipy, .*: pip install scipy matplotlib p"):
         check_packages()
 
 

@@ -9,6 +9,7 @@ from scipy import stats
 from holdfast.errors import InvalidValueError
 from holdfast.experiments.statistics import (
     Interval,
+    across_problems,
     agreement_of_means,
     agreement_of_rates,
     cells_of,
@@ -17,6 +18,7 @@ from holdfast.experiments.statistics import (
     mean_interval,
     paired_difference,
     paired_rates,
+    random_effects,
     ratio_of,
     smallest_levels,
 )
@@ -130,3 +132,58 @@ def test_ratios_of_differences_of_logarithms() -> None:
     assert cells_of("mean", Interval(math.nan, -math.inf, math.inf)) == dict.fromkeys(
         ("mean", "mean_low", "mean_high")
     )
+
+
+EFFECTS = np.array([0.61, 0.10, -0.23, 0.18, 0.05, 0.72, 0.30, 0.44])
+ERRORS = np.array([0.11, 0.09, 0.14, 0.20, 0.06, 0.08, 0.10, 0.31])
+
+
+@pytest.mark.parametrize("spread", [1.0, 0.1])
+def test_random_effects_are_those_of_statsmodels(spread: float) -> None:
+    """Where problems differ, and where they differ no more than their errors."""
+    meta_analysis = pytest.importorskip("statsmodels.stats.meta_analysis")
+    effects = spread * EFFECTS
+    found = random_effects(effects, ERRORS)
+    theirs = meta_analysis.combine_effects(
+        effects, ERRORS**2, method_re="iterated", use_t=True, atol=1e-14, maxiter=1000
+    )
+    assert found.deviation == pytest.approx(math.sqrt(max(theirs.tau2, 0.0)), abs=1e-6)
+    assert (found.deviation > 0.0) == (spread == 1.0)
+    assert found.mean.value == pytest.approx(theirs.mean_effect_re, rel=1e-6)
+    error = max(theirs.sd_eff_w_re, theirs.sd_eff_w_re_hksj)
+    half = stats.t.ppf(0.975, EFFECTS.size - 1) * error
+    assert found.mean.high - found.mean.value == pytest.approx(half, rel=1e-5)
+    assert found.p_value == pytest.approx(
+        2.0 * stats.t.sf(abs(theirs.mean_effect_re) / error, EFFECTS.size - 1), rel=1e-4
+    )
+    wide = stats.t.ppf(0.975, EFFECTS.size - 2) * math.sqrt(max(theirs.tau2, 0.0) + error**2)
+    assert found.new_problem.high - found.mean.value == pytest.approx(wide, rel=1e-5)
+
+
+def test_intervals_over_problems_hold_what_they_promise() -> None:
+    """Of 2,000 drawn samples of eight problems, and of one more problem each."""
+    generator = np.random.default_rng(17)
+    runs, covered, predicted = 2000, 0, 0
+    for _ in range(runs):
+        errors = generator.uniform(0.05, 0.3, size=8)
+        effects = 0.5 + 0.3 * generator.normal(size=8) + errors * generator.normal(size=8)
+        found = random_effects(effects, errors)
+        covered += found.mean.low < 0.5 < found.mean.high
+        predicted += found.new_problem.low < 0.5 + 0.3 * generator.normal() < found.new_problem.high
+    # The promise is 95 % and an approximation; with 2,000 runs, 2.5 points are five deviations.
+    assert covered / runs == pytest.approx(0.95, abs=0.025)
+    assert predicted / runs == pytest.approx(0.95, abs=0.035)
+
+
+def test_problems_in_which_nothing_differs_have_an_error_too() -> None:
+    same = np.ones(98)
+    half = np.repeat([0.0, 1.0], 49)
+    found = across_problems([(same, same), (same, same), (same, half)], 1.0)
+    assert found.deviation > 0.1
+    assert found.new_problem.low < found.mean.low < found.mean.value < found.mean.high
+    found = across_problems([(same, same)] * 3, 1.0)
+    # Three errors of 1 / 100.
+    assert found.mean.high == pytest.approx(stats.t.ppf(0.975, 2) * 0.01 / math.sqrt(3.0))
+    assert found.p_value == 1.0
+    with pytest.raises(InvalidValueError, match="2 effects"):
+        across_problems([(same, same)] * 2, 1.0)

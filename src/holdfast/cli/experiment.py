@@ -19,7 +19,7 @@ from holdfast.runtime.command_line import MAX_JOBS
 if TYPE_CHECKING:
     from holdfast.experiments.executors import Executor
     from holdfast.experiments.running import Workload
-    from holdfast.experiments.study import Scale, Study
+    from holdfast.experiments.study import Report, Scale, Study
 
 __all__ = ["experiment"]
 
@@ -59,7 +59,8 @@ def experiment(
             "--seed",
             metavar="S",
             parser=whole_number("--seed", 0, MAX_SEED),
-            help="Seed of all trials.",
+            help="Seed of all trials. Where something is chosen (selectors, parameters), by these; "
+            "those by which it is judged have the next seed.",
         ),
     ] = 2017,
     jobs: Annotated[
@@ -83,6 +84,17 @@ def experiment(
             "Changes time only.",
         ),
     ] = "local",
+    source: Annotated[
+        Path | None,
+        typer.Option(
+            "--from",
+            metavar="FILE",
+            parser=location("--from"),
+            show_default=False,
+            help="Run nothing: make the tables and figures of selectors or parameters anew from "
+            "their trials in FILE (trials.parquet).",
+        ),
+    ] = None,
     list_names: Annotated[
         bool, typer.Option("--list", help="List the experiments and end.")
     ] = False,
@@ -91,8 +103,8 @@ def experiment(
 
     What was computed is kept in DIR/cache under the digest of everything that it depends on, code
     included. So the same command goes on after Ctrl-C, and draws at once what is complete. Each
-    experiment has a directory in DIR with its tables (CSV), figures (PNG and SVG), every trial, and
-    where it all comes from.
+    experiment has a directory in DIR with its tables (CSV), figures (PNG and SVG), every trial (CSV
+    or Parquet), and where it all comes from.
     """
     from holdfast.experiments.registry import studies_of
     from holdfast.experiments.study import Scale
@@ -107,6 +119,11 @@ def experiment(
     if not names:
         raise InvalidValueError("which experiment? Say all, or names that --list shows")
     studies = studies_of(names)
+    if source is not None:
+        if quick:
+            raise InvalidValueError("--quick: has no effect with --from, which runs nothing")
+        _make_anew(studies, source, out)
+        return
     words = ["holdfast", "experiment", *names]
     words += ["--quick"] if quick else []
     words += ["--seed", str(seed)]
@@ -116,6 +133,26 @@ def experiment(
     # One signal is enough: another would cut short what ends the processes.
     with ended_by_signals(once=True):
         _run(studies, Scale(quick=quick, seed=seed), out, _executor_of(place, jobs), again)
+
+
+def _make_anew(studies: list[Study], source: Path, directory: Path) -> None:
+    from holdfast.experiments.running import check_packages, write_report
+    from holdfast.experiments.study import TrialStudy
+    from holdfast.experiments.trial_files import read_trials
+
+    check_packages()
+    kept = read_trials(source)
+    if [study.name for study in studies] != [kept.study]:
+        raise InvalidValueError(
+            f"--from {source}: has the trials of {kept.study}, not of "
+            f"{', '.join(study.name for study in studies)}"
+        )
+    study = studies[0]
+    if not isinstance(study, TrialStudy):
+        raise InvalidValueError(f"--from {source}: {study.name} makes nothing of trials in a file")
+    report = study.report_of(kept.trials)
+    place = directory / study.name
+    _show(study, report, write_report(study, kept.scale, report, place, kept.machine), place)
 
 
 def _executor_of(place: str, jobs: int) -> Executor:
@@ -181,7 +218,10 @@ def _report(study: Study, scale: Scale, workload: Workload, directory: Path) -> 
     from holdfast.experiments.running import write_report
 
     report = study.report(scale, workload.results)
-    names = write_report(study, scale, report, directory)
+    _show(study, report, write_report(study, scale, report, directory), directory)
+
+
+def _show(study: Study, report: Report, names: list[str], directory: Path) -> None:
     sys.stdout.write(f"\n{study.title}\n\n")
     for finding in report.findings[:_MOST_FINDINGS]:
         sys.stdout.write(f"- {finding}\n")

@@ -53,6 +53,7 @@ class Case(msgspec.Struct, frozen=True, kw_only=True):
         num_trials: int,
         active_sensing: ActiveSensingSettings | None = None,
         particle_filter: ParticleFilterSettings | None = None,
+        continued_trials: int = 0,
     ) -> TrialSeries:
         """Return the trials of one way of sensing.
 
@@ -65,6 +66,8 @@ class Case(msgspec.Struct, frozen=True, kw_only=True):
             Of a problem whose share is 1.
         active_sensing, particle_filter : optional
             Default: the project's, on one core, with this case's number of particles.
+        continued_trials : int
+            The first ones, which are continued if they are cut off.
         """
         if (
             self.state_resolution is not None
@@ -88,6 +91,7 @@ class Case(msgspec.Struct, frozen=True, kw_only=True):
             max_steps=self.max_steps,
             seed=seed,
             num_trials=max(2, round(self.share * num_trials)),
+            continued_trials=continued_trials,
         )
 
 
@@ -107,6 +111,7 @@ CASES = (
         name="light and dark",
         problem="holdfast.experiments.light_dark:LightDark",
         num_particles=500,
+        share=0.5,
     ),
     Case(
         name="busy room",

@@ -16,12 +16,15 @@ from holdfast.experiments.result_cache import ResultCache
 from holdfast.experiments.study import Report, Results, Scale, Study
 from holdfast.experiments.tables import Table
 from holdfast.experiments.tasks import Task, TaskError, task_key
+from holdfast.experiments.trial_files import TRIALS_NAME, TrialFile
 from holdfast.files import OutputError, remove_unfinished, write_atomically
 from holdfast.recording.machine import describe
 
 __all__ = ["Workload", "check_packages", "compute", "write_report"]
 
 _CACHE = "cache"
+
+_PACKAGES = ("scipy", "matplotlib", "pyarrow")
 
 
 class Workload:
@@ -120,7 +123,7 @@ def compute(workload: Workload, executor: Executor, on_progress: Callable[[int],
     LocalExecutor(1).run([task for task in workload.pending if task.exclusive], keep)
 
 
-class _Origin(msgspec.Struct, kw_only=True):
+class _Origin(msgspec.Struct, kw_only=True, omit_defaults=True):
     """Where numbers come from; the content of ``origin.json``."""
 
     study: str
@@ -129,9 +132,16 @@ class _Origin(msgspec.Struct, kw_only=True):
     holdfast_version: str
     machine: dict[str, str]
     findings: list[str]
+    claim_seed: int | None = None
 
 
-def write_report(study: Study, scale: Scale, report: Report, directory: Path) -> list[str]:
+def write_report(
+    study: Study,
+    scale: Scale,
+    report: Report,
+    directory: Path,
+    machine: dict[str, str] | None = None,
+) -> list[str]:
     """Write a study's tables, figures and findings.
 
     ``origin.json`` comes last: where it is not there, the rest may be of two runs.
@@ -143,6 +153,8 @@ def write_report(study: Study, scale: Scale, report: Report, directory: Path) ->
     report : Report
     directory : Path
         Of this study; made if it is not there.
+    machine : dict, optional
+        On which its trials were run; this one by default.
 
     Returns
     -------
@@ -163,6 +175,7 @@ def write_report(study: Study, scale: Scale, report: Report, directory: Path) ->
         origin_path.unlink(missing_ok=True)
     except OSError as error:
         raise OutputError(f"{origin_path}: cannot be replaced: {error.strerror}") from error
+    machine = describe() if machine is None else machine
     names = []
     for name, table in report.summary.items():
         write_atomically(directory / f"{name}.csv", table.to_csv().encode())
@@ -170,6 +183,10 @@ def write_report(study: Study, scale: Scale, report: Report, directory: Path) ->
     for name, table in report.raw.items():
         write_atomically(directory / f"{name}_trials.csv", table.to_csv().encode())
         names.append(f"{name}_trials.csv")
+    if report.trials is not None:
+        kept = TrialFile(study=study.name, scale=scale, machine=machine, trials=report.trials)
+        write_atomically(directory / TRIALS_NAME, kept.encoded())
+        names.append(TRIALS_NAME)
     if report.figures:
         from holdfast.experiments import plots
     for name, draw in report.figures.items():
@@ -182,8 +199,9 @@ def write_report(study: Study, scale: Scale, report: Report, directory: Path) ->
         quick=scale.quick,
         seed=scale.seed,
         holdfast_version=__version__,
-        machine=describe(),
+        machine=machine,
         findings=report.findings,
+        claim_seed=None if report.trials is None else scale.claim_seed,
     )
     text = msgspec.json.format(msgspec.json.encode(origin), indent=2)
     write_atomically(origin_path, text + b"\n")
@@ -199,10 +217,10 @@ def check_packages() -> None:
     HoldfastError
         If a package is missing.
     """
-    missing = [name for name in ("scipy", "matplotlib") if importlib.util.find_spec(name) is None]
+    missing = [name for name in _PACKAGES if importlib.util.find_spec(name) is None]
     if missing:
         raise HoldfastError(
-            f"experiments need {' and '.join(missing)}, not installed here: pip install "
+            f"experiments need {', '.join(missing)}, not installed here: pip install "
             f"{' '.join(missing)}"
         )
 

@@ -10,6 +10,7 @@ SciPy takes a second to import, so that is done where it is needed.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -18,18 +19,23 @@ import numpy.typing as npt
 from holdfast.errors import InvalidValueError
 
 if TYPE_CHECKING:
-    from holdfast.experiments.tables import Table
+    from holdfast.experiments.tables import Cell, Table
 
 __all__ = [
     "Interval",
+    "RandomEffects",
+    "across_problems",
     "add_adjusted",
     "agreement_of_means",
     "agreement_of_rates",
+    "as_it_is",
+    "cells_across_problems",
     "cells_of",
     "logarithms_of_steps",
     "mean_interval",
     "paired_difference",
     "paired_rates",
+    "random_effects",
     "ratio_of",
     "smallest_levels",
 ]
@@ -209,6 +215,159 @@ def agreement_of_means(values: FloatArray, other_mean: float, other_count: int) 
 def ratio_of(difference: Interval) -> Interval:
     """Return the ratio that a difference of logarithms stands for."""
     return Interval(*(math.exp(min(end, _LARGEST_EXPONENT)) for end in difference))
+
+
+class RandomEffects(NamedTuple):
+    """What an effect is over problems of which those that were tried are a sample.
+
+    Attributes
+    ----------
+    mean : Interval
+        Mean of the effects over all such problems.
+    p_value : float
+        That this mean is zero.
+    deviation : float
+        Standard deviation of the effects between problems.
+    new_problem : Interval
+        The mean with the interval in which the effect of one more problem lies.
+    """
+
+    mean: Interval
+    p_value: float
+    deviation: float
+    new_problem: Interval
+
+
+def random_effects(effects: FloatArray, errors: FloatArray) -> RandomEffects:
+    """Return the mean of effects that differ from problem to problem.
+
+    The mean over given problems says nothing of other problems: its interval shrinks with the
+    trials, however much problems differ. Here each effect is one that is drawn for its problem,
+    seen with an error.
+
+    The variance between problems is the one by which the effects scatter as much as they should
+    (Paule and Mandel; preferred by Veroniki et al., "Methods to estimate the between-study variance
+    and its uncertainty in meta-analysis", 2016). The interval of the mean is that of Hartung and
+    Knapp (Knapp and Hartung, "Improved tests for a random effects meta-regression with a single
+    covariate", 2003), never narrower than without their factor. This factor is 1 where the variance
+    between problems is not zero: so Paule and Mandel chose the variance. The interval of a new
+    problem: Higgins, Thompson and Spiegelhalter, "A re-evaluation of random-effects meta-analysis",
+    2009, equation 12.
+
+    Parameters
+    ----------
+    effects : array of shape (problems,)
+    errors : array of shape (problems,)
+        Their standard errors, above zero.
+
+    Raises
+    ------
+    InvalidValueError
+        For fewer than three problems, or an error that is not above zero.
+    """
+    from scipy import stats
+
+    count = effects.size
+    if count < 3 or errors.shape != effects.shape or not np.all(errors > 0.0):
+        raise InvalidValueError(
+            f"{count} effects with errors {errors}: at least 3, each with an error above zero"
+        )
+    own = errors * errors
+
+    def scatter(variance: float) -> float:
+        weights = 1.0 / (own + variance)
+        mean = float(weights @ effects / weights.sum())
+        return float(weights @ (effects - mean) ** 2)
+
+    between = 0.0
+    if scatter(0.0) > count - 1:
+        low, high = 0.0, float(np.var(effects, ddof=1)) + float(own.max())
+        while scatter(high) > count - 1:
+            low, high = high, 2.0 * high
+        for _ in range(200):
+            between = 0.5 * (low + high)
+            low, high = (between, high) if scatter(between) > count - 1 else (low, between)
+    weights = 1.0 / (own + between)
+    mean = float(weights @ effects / weights.sum())
+    error = 1.0 / math.sqrt(float(weights.sum()))
+    half = float(stats.t.ppf(0.5 + 0.5 * _LEVEL, count - 1)) * error
+    wide = float(stats.t.ppf(0.5 + 0.5 * _LEVEL, count - 2)) * math.hypot(math.sqrt(between), error)
+    return RandomEffects(
+        Interval(mean, mean - half, mean + half),
+        float(2.0 * stats.t.sf(abs(mean) / error, count - 1)),
+        math.sqrt(between),
+        Interval(mean, mean - wide, mean + wide),
+    )
+
+
+def across_problems(
+    pairs: Sequence[tuple[FloatArray, FloatArray]], least_difference: float
+) -> RandomEffects:
+    """Return how two ways differ over problems, from their trials in some of them.
+
+    Parameters
+    ----------
+    pairs : sequence of (array, array)
+        Of each problem: a number of each trial, of one way and of the other; NaN in both for a
+        trial that is left out.
+    least_difference : float
+        By which two trials can differ. Where no trial differs, the error is that of Agresti and
+        Min's estimate ("Simple improved confidence intervals for comparing matched proportions",
+        2005), which adds half a pair that differs in either direction; no error is below that.
+    """
+    effects, errors = [], []
+    for first, second in pairs:
+        difference = (first - second)[~np.isnan(first)]
+        least = least_difference / (difference.size + 2)
+        scatter = float(difference.std(ddof=1)) if difference.size > 1 else 0.0
+        effects.append(float(difference.mean()))
+        errors.append(max(least, scatter / math.sqrt(difference.size)))
+    return random_effects(np.array(effects), np.array(errors))
+
+
+def as_it_is(difference: Interval) -> Interval:
+    """Return a difference that is shown as such."""
+    return difference
+
+
+def cells_across_problems(
+    pairs: Sequence[tuple[FloatArray, FloatArray]],
+    least_difference: float,
+    shown: Callable[[Interval], Interval],
+) -> dict[str, Cell]:
+    """Return the cells of how two ways differ over these problems, and over all such problems.
+
+    Parameters
+    ----------
+    pairs : sequence of (array, array)
+        Of each problem: a number of each trial, of one way and of the other.
+    least_difference : float
+        See :func:`across_problems`.
+    shown : callable
+        What is shown of a difference.
+
+    Returns
+    -------
+    dict
+        ``mean``: over these problems, of the trials that all have; ``expected``: over all such
+        problems; ``new_problem``: in one more; ``deviation_between_problems`` as a difference.
+    """
+    fewest = min(own.size for own, _ in pairs)
+    own, other = (np.mean([pair[which][:fewest] for pair in pairs], axis=0) for which in (0, 1))
+    mean, p_value = paired_difference(own, other)
+    found = across_problems(pairs, least_difference)
+    new_low, new_high = shown(found.new_problem)[1:]
+    return {
+        "trials": fewest,
+        **cells_of("mean", shown(mean)),
+        "mean_p_value": p_value,
+        "problems": len(pairs),
+        **cells_of("expected", shown(found.mean)),
+        "expected_p_value": found.p_value,
+        "deviation_between_problems": found.deviation,
+        "new_problem_low": new_low,
+        "new_problem_high": new_high,
+    }
 
 
 def cells_of(name: str, interval: Interval) -> dict[str, float | None]:

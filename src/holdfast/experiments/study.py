@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import msgspec
 
@@ -13,7 +13,12 @@ from holdfast.experiments.tasks import Task
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["Report", "Results", "Scale", "Study"]
+__all__ = ["CHOICE", "CLAIM", "Report", "Results", "Scale", "Study", "TrialStudy"]
+
+CHOICE = "choice"
+CLAIM = "claim"
+"""What trials are for: something is chosen by those of one seed and judged by those of another.
+What seems best among many seems better than it is, on the trials that made it seem so."""
 
 
 class Scale(msgspec.Struct, frozen=True, kw_only=True):
@@ -24,11 +29,16 @@ class Scale(msgspec.Struct, frozen=True, kw_only=True):
     quick : bool
         Few trials, to see that everything works; what comes of it is no evidence.
     seed : int
-        Of all its trials.
+        Of all its trials; a study that chooses something chooses by these.
     """
 
     quick: bool = False
     seed: int = 0
+
+    @property
+    def claim_seed(self) -> int:
+        """Of the trials by which a study judges what it chose by those of ``seed``."""
+        return (self.seed + 1) % 2**63
 
 
 class Results:
@@ -60,7 +70,9 @@ class Report(msgspec.Struct, kw_only=True):
     summary : dict of str to Table
         Small tables by name, to be committed and shown.
     raw : dict of str to Table
-        Every trial, by name.
+        Every trial, by name; not to be committed.
+    trials : Table, optional
+        Every trial, by which all else can be made anew; kept small, to be committed.
     figures : dict of str to callable
         By name; each draws one. Called only where matplotlib is there.
     findings : list of str
@@ -69,6 +81,7 @@ class Report(msgspec.Struct, kw_only=True):
 
     summary: dict[str, Table] = msgspec.field(default_factory=dict)
     raw: dict[str, Table] = msgspec.field(default_factory=dict)
+    trials: Table | None = None
     figures: dict[str, Callable[[], Figure]] = msgspec.field(default_factory=dict)
     findings: list[str] = msgspec.field(default_factory=list)
 
@@ -92,4 +105,19 @@ class Study(Protocol):
 
     def report(self, scale: Scale, results: Results) -> Report:
         """Return what it comes to, from the results of all its tasks."""
+        ...
+
+
+@runtime_checkable
+class TrialStudy(Study, Protocol):
+    """A study whose report follows from a table of its trials, which is kept."""
+
+    def report_of(self, trials: Table) -> Report:
+        """Return what it comes to, from all its trials.
+
+        Raises
+        ------
+        InvalidValueError
+            If they are not those of this study.
+        """
         ...

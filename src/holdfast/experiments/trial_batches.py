@@ -11,6 +11,7 @@ from holdfast.configuration import build_problem
 from holdfast.errors import HoldfastError
 from holdfast.experiments.tables import Table
 from holdfast.experiments.tasks import Task, TaskError
+from holdfast.outcome import TrialResult
 from holdfast.problems.problem import Problem
 from holdfast.problems.registry import problem_class
 from holdfast.runtime.trial import run_trial
@@ -27,8 +28,14 @@ COLUMNS = (
     "mean_sensing_ms",
     "unexplained_observations",
     "digest",
+    "step_limit",
+    "steps_to_goal",
 )
-"""Of the table of a batch: a row for each trial."""
+"""Of the table of a batch: a row for each trial.
+
+``step_limit`` is the limit of a trial with which it is continued, if it is, and ``steps_to_goal``
+the steps that it took within that limit; None if it did not reach the goal.
+"""
 
 _DIGEST_CHARACTERS = 16
 """Enough to tell that two runs decided the same, at a quarter of the size."""
@@ -47,6 +54,11 @@ class TrialSeries(msgspec.Struct, frozen=True, kw_only=True):
     max_steps : int
     seed : int
     num_trials : int
+    continued_trials : int
+        The first ones, which are continued where they are cut off at ``max_steps``, to see whether
+        they are slow or stuck. Nothing but ``steps_to_goal`` depends on it.
+    continued_to : int
+        Up to how many steps.
     """
 
     problem: str
@@ -56,6 +68,8 @@ class TrialSeries(msgspec.Struct, frozen=True, kw_only=True):
     max_steps: int = 500
     seed: int = 0
     num_trials: int = 1000
+    continued_trials: int = 0
+    continued_to: int = 10_000
 
 
 def trial_tasks(series: TrialSeries, trials_in_each: int, kind: str = "trials") -> Iterator[Task]:
@@ -100,10 +114,19 @@ def run_trials_of(first_trial: int, **series: Any) -> Table:
         sensing_intervals=wanted.planning.sensing_interval,
         seed=wanted.seed,
     )
+    longer = msgspec.structs.replace(
+        simulator, max_steps=max(wanted.continued_to, wanted.max_steps)
+    )
     rows = []
     for trial in range(first_trial, first_trial + wanted.num_trials):
         try:
             result = run_trial(problem, wanted.planning, simulator, trial)
+            whole = result
+            continued = trial < wanted.continued_trials
+            if continued and _is_cut_off(result):
+                # From its beginning: every random draw is named by its step, so the trial goes
+                # through the same states as before.
+                whole = run_trial(problem, wanted.planning, longer, trial)
         except HoldfastError as error:
             raise TaskError(
                 f"trial {trial} (seed {wanted.seed}) of {wanted.problem}: {error}"
@@ -118,9 +141,15 @@ def run_trials_of(first_trial: int, **series: Any) -> Table:
                 result.mean_sensing_ms,
                 result.unexplained_observations,
                 result.digest[:_DIGEST_CHARACTERS],
+                longer.max_steps if continued else wanted.max_steps,
+                whole.steps if whole.success else None,
             )
         )
     return Table.of_rows(COLUMNS, rows)
+
+
+def _is_cut_off(result: TrialResult) -> bool:
+    return not result.success and not result.failed
 
 
 def problem_of(
