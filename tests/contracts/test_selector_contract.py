@@ -36,7 +36,7 @@ LOOKING = [
     )
     for method, estimator, actions in itertools.product(
         ("action_entropy", "path_entropy", "state_entropy"),
-        ("nearest_neighbor", "gaussian_mixture_upper", "gaussian_mixture_lower"),
+        ("nearest_neighbor", "prior_neighbors", "gaussian_mixture_upper", "gaussian_mixture_lower"),
         ("commanded", "executed"),
     )
 ]
