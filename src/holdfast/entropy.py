@@ -3,9 +3,9 @@
 Three estimates. *Nearest neighbour*: where the k-th neighbour is far, the density is low. Below a
 resolution distances are not looked at, so that equal points (a policy that says "do not move" to
 half of the particles) give a finite answer. *Prior neighbours*: the same for the points before they
-were weighted, less the information that the weights carry. *Gaussian mixture*: every point stands for a Gaussian
-of the motion noise, because that is what a robot that is told to do it will do; pairwise distances
-then bound the entropy of the mixture.
+were weighted, less the information that the weights carry. *Gaussian mixture*: every point stands
+for a Gaussian of the motion noise, because that is what a robot that is told to do it will do;
+pairwise distances then bound the entropy of the mixture.
 
 Entropies are in nats. Those of continuous quantities may be negative.
 """
@@ -88,8 +88,8 @@ class PriorNeighbors(NamedTuple):
         Weights of the points before the observation: non-negative, of sum 1.
     neighbors : int
         The k, at least 1.
-    resolution : float
-        Positive, in the unit of the points.
+    resolution : float or array of shape (d,)
+        As that of :class:`NearestNeighbor`.
 
     Notes
     -----

@@ -56,9 +56,7 @@ def test_reference(
     prior /= prior.sum()
     rows = posteriors_of(rng, prior, number)
     found = entropy(places, rows, PriorNeighbors(prior, neighbors, resolution))
-    expected = [
-        prior_neighbors_entropy(places, row, prior, neighbors, resolution) for row in rows
-    ]
+    expected = [prior_neighbors_entropy(places, row, prior, neighbors, resolution) for row in rows]
     np.testing.assert_allclose(found, expected, rtol=0.0, atol=TOLERANCE)
 
 
