@@ -95,7 +95,7 @@ def relative_entropies(
         squares = (observed[:, np.newaxis] - states[:, coordinate]) ** 2 / 0.001
         weights = np.exp(-0.5 * (squares - squares.min(axis=1, keepdims=True)))
         found.append(np.mean(entropy(points, weights, estimator)))
-    return np.array(found) - np.mean(found)
+    return np.asarray(np.array(found) - np.mean(found))
 
 
 def test_errors_of_few_points_are_more_even_than_those_of_nearest_neighbours() -> None:
