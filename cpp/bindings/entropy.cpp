@@ -19,8 +19,12 @@ using namespace holdfast::bindings;
 namespace {
 
 EntropySettings make_settings(Estimator estimator, std::uint32_t neighbors, double resolution,
-                              double exponent, double offset, int threads) {
-    return {estimator, neighbors, resolution, exponent, offset, threads};
+                              double exponent, double offset, int threads, const Input<1>& prior,
+                              std::size_t count) {
+    if (estimator == Estimator::prior_neighbors && prior.shape(0) != count) {
+        throw nb::value_error("prior and weights do not fit");
+    }
+    return {estimator, neighbors, resolution, exponent, offset, threads, prior.data()};
 }
 
 /// `number` as in `EstimatorKind` of entropy.py.
@@ -32,6 +36,8 @@ Estimator to_estimator(int number) {
             return Estimator::gaussian_mixture;
         case 2:
             return Estimator::total_variance;
+        case 3:
+            return Estimator::prior_neighbors;
         default:
             throw nb::value_error("there is no such estimator");
     }
@@ -67,13 +73,15 @@ void holdfast::bind_entropy(nb::module_& module) {
     define(module, "entropies",
            [](const Input<2>& points, const Input<2>& rows_in, bool logarithms, int number,
               std::uint32_t neighbors, double resolution, double exponent, double offset,
-              int threads, const std::vector<double>& factors) {
+              int threads, const std::vector<double>& factors, const Input<1>& prior) {
                const std::size_t posteriors = rows_in.shape(0), count = rows_in.shape(1);
                const PointSets sets = make_sets(points, count, factors);
                double* out;
                auto result = make_array<double>({posteriors}, out);
                EntropyCounts counts;
                const Estimator estimator = to_estimator(number);
+               const EntropySettings settings = make_settings(
+                   estimator, neighbors, resolution, exponent, offset, threads, prior, count);
                const bool drop = drops_negligible(estimator);
                {
                    WithoutInterpreter released;
@@ -85,10 +93,7 @@ void holdfast::bind_entropy(nb::module_& module) {
                        kernels.log(row, weights, count);
                        return kernels.normalize(weights, count, drop, weights);
                    };
-                   entropies(
-                       sets, posteriors, source,
-                       make_settings(estimator, neighbors, resolution, exponent, offset, threads),
-                       out, counts);
+                   entropies(sets, posteriors, source, settings, out, counts);
                }
                return nb::make_tuple(
                    result, counts.likelihoods, counts.visits,
@@ -100,7 +105,7 @@ void holdfast::bind_entropy(nb::module_& module) {
               const Input<2>& predicted, const Input<2>& variance, std::size_t samples,
               const StreamWords& stream, const Input<2>& points, int number,
               std::uint32_t neighbors, double resolution, double exponent, double offset,
-              int threads, const std::vector<double>& factors) {
+              int threads, const std::vector<double>& factors, const Input<1>& prior) {
                const PointSets sets = make_sets(points, weights.shape(0), factors);
                double* out;
                auto result = make_array<double>({sizes.size(), samples}, out);
@@ -108,14 +113,14 @@ void holdfast::bind_entropy(nb::module_& module) {
                auto means = make_array<double>({sizes.size()}, mean);
                EntropyCounts counts;
                const Estimator estimator = to_estimator(number);
+               const EntropySettings settings =
+                   make_settings(estimator, neighbors, resolution, exponent, offset, threads, prior,
+                                 weights.shape(0));
                {
                    WithoutInterpreter released;
-                   hypothetical_entropies(
-                       make_input(weights, sizes, predicted, variance, samples, stream,
-                                  drops_negligible(estimator)),
-                       sets,
-                       make_settings(estimator, neighbors, resolution, exponent, offset, threads),
-                       out, counts);
+                   hypothetical_entropies(make_input(weights, sizes, predicted, variance, samples,
+                                                     stream, drops_negligible(estimator)),
+                                          sets, settings, out, counts);
                    for (std::size_t j = 0; j < sizes.size(); ++j) {
                        double total = 0.0;
                        for (std::size_t i = 0; i < samples; ++i) total += out[j * samples + i];

@@ -7,6 +7,7 @@
 
 #include "deterministic_math.hpp"
 #include "point_tree.hpp"
+#include "prior_neighbors.hpp"
 #include "thread_pool.hpp"
 #include "vector_kernels.hpp"
 
@@ -258,11 +259,39 @@ double own_tree_entropy(const Task& task, const double* weights, std::size_t sur
     return group.entropy(0);
 }
 
+/// Set by set, because neighbourhoods may be large: values[set][posterior].
+void prior_entropies(const std::vector<Task>& tasks, const std::vector<double>& weights,
+                     const std::vector<std::size_t>& survivors, std::size_t number,
+                     std::vector<double>& values, EntropyCounts& counts) {
+    for (std::size_t set = 0; set < tasks.size(); ++set) {
+        const Task& task = tasks[set];
+        const EntropySettings& settings = *task.settings;
+        const PriorNeighbors neighbors(task.points, task.count, task.dimension, settings.prior,
+                                       settings.neighbors, task.constants, settings.threads);
+        counts.visits += task.count * task.count;
+        const std::size_t pieces = (number + prior_lanes - 1) / prior_lanes;
+        const double work = static_cast<double>(pieces) *
+                            (4.0 * static_cast<double>(neighbors.members()) +
+                             prior_lanes * work_that_follows * static_cast<double>(task.count));
+        parallel_for(pieces, threads_for(work, pieces, settings.threads), [&](std::size_t piece) {
+            const std::size_t first = piece * prior_lanes;
+            const std::size_t here = std::min(prior_lanes, number - first);
+            double* out = &values[set * number + first];
+            neighbors.entropies(&weights[first * task.count], here, out);
+            for (std::size_t i = 0; i < here; ++i) {
+                out[i] = survivors[first + i] == 0 ? std::numeric_limits<double>::quiet_NaN()
+                                                   : out[i] + settings.offset;
+            }
+        });
+    }
+}
+
 }  // namespace
 
 void entropies(const PointSets& sets, std::size_t posteriors, const PosteriorSource& source,
                const EntropySettings& settings, double* out, EntropyCounts& counts) {
-    const bool nearest = settings.estimator == Estimator::nearest_neighbor;
+    const bool shared = settings.estimator == Estimator::prior_neighbors;
+    const bool nearest = shared || settings.estimator == Estimator::nearest_neighbor;
     const std::size_t count = sets.count;
     const NearestNeighborConstants constants{settings.resolution,
                                              nearest ? log_unit_ball(sets.dimension) : 0.0,
@@ -315,6 +344,7 @@ void entropies(const PointSets& sets, std::size_t posteriors, const PosteriorSou
         double work_alone = 0.0;
         for (std::size_t i = 0; i < number; ++i) {
             const std::size_t s = survivors[i];
+            if (shared) continue;
             if (s == 0 || (s == 1 && !variance)) {
                 const double value = s == 0 ? std::numeric_limits<double>::quiet_NaN()
                                             : entropy_of_one(tasks[0]) + settings.offset;
@@ -333,6 +363,7 @@ void entropies(const PointSets& sets, std::size_t posteriors, const PosteriorSou
                 work_alone += cost_alone(s);
             }
         }
+        if (shared) prior_entropies(tasks, weights, survivors, number, values, counts);
         const std::size_t pieces = sets.number * alone.size();
         parallel_for(
             pieces,

@@ -14,6 +14,8 @@
 //     u_j)),
 // c = 1/2 from above, 1/8 from below. The caller scales the points by S^-1/2.
 //
+// Prior neighbours: see prior_neighbors.hpp.
+//
 // Total variance: no entropy, but the trace of the weighted points' covariance, to compare with.
 
 #pragma once
@@ -24,7 +26,7 @@
 
 namespace holdfast {
 
-enum class Estimator { nearest_neighbor, gaussian_mixture, total_variance };
+enum class Estimator { nearest_neighbor, gaussian_mixture, total_variance, prior_neighbors };
 
 struct EntropySettings {
     Estimator estimator;
@@ -33,6 +35,7 @@ struct EntropySettings {
     double exponent;          // mixture: c > 0
     double offset;            // added to every entropy (the mixture's constant terms)
     int threads;              // 0: all
+    const double* prior;      // prior neighbours: [count], sum 1; else unused
 };
 
 /// What was counted on the way, for benchmarks.

@@ -35,6 +35,7 @@ def entropies(
     offset: float,
     threads: int,
     factors: Sequence[float],
+    prior: _Floats,
 ) -> tuple[_Floats, int, int, tuple[int, int, int]]: ...
 def use_threads_from(nanoseconds: float) -> float: ...
 def threads_started() -> int: ...
@@ -53,6 +54,7 @@ def hypothetical_entropies(
     offset: float,
     threads: int,
     factors: Sequence[float],
+    prior: _Floats,
 ) -> tuple[_Floats, _Floats, int, int]: ...
 def hypothetical_weights(
     weights: _Floats,

@@ -30,6 +30,7 @@ import msgspec
 import msgspec.inspect
 
 from holdfast.contract import GAUSSIAN_OBSERVATIONS, has_general_observations, resolution_of
+from holdfast.entropy import MAX_PRIOR_NEIGHBORS_POINTS
 from holdfast.errors import (
     ConfigurationError,
     HoldfastError,
@@ -424,12 +425,12 @@ def _build(
     num_neighbors = active_sensing.num_nearest_neighbors
     if (
         selector.method in ("action_entropy", "path_entropy", "state_entropy")
-        and selector.estimator == "nearest_neighbor"
+        and selector.estimator in {"nearest_neighbor", "prior_neighbors"}
         and num_neighbors >= num_particles
     ):
         raise source.error(
             ("active_sensing", "num_nearest_neighbors"),
-            f"is {num_neighbors}; the nearest_neighbor estimator needs it below"
+            f"is {num_neighbors}; the {selector.estimator} estimator needs it below"
             f" particle_filter.num_particles, which is {num_particles}",
         )
     of_states = selector.method == "state_entropy"
@@ -440,6 +441,16 @@ def _build(
         except InvalidValueError as error:
             place = source.place(("selector", "resolution"))
             raise ConfigurationError(f"{place}: {error}") from None
+    if (
+        selector.method in ("action_entropy", "path_entropy", "state_entropy")
+        and selector.estimator == "prior_neighbors"
+        and num_particles > MAX_PRIOR_NEIGHBORS_POINTS
+    ):
+        raise source.error(
+            ("particle_filter", "num_particles"),
+            f"is {num_particles}; the prior_neighbors estimator allows"
+            f" {MAX_PRIOR_NEIGHBORS_POINTS}",
+        )
     planning = PlanningSettings(
         particle_filter=particle_filter,
         active_sensing=active_sensing,

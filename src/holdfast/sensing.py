@@ -24,10 +24,12 @@ from holdfast import _kernel, contract, numerics
 from holdfast.belief import Belief, estimate
 from holdfast.entropy import (
     LARGEST,
+    MAX_PRIOR_NEIGHBORS_POINTS,
     TOTAL_VARIANCE,
     GaussianMixture,
     KernelEstimator,
     NearestNeighbor,
+    PriorNeighbors,
     first_unbounded,
     kernel_estimator,
     scale_of,
@@ -151,6 +153,7 @@ def choose_sensing_action(
             estimator.offset,
             threads,
             factors,
+            estimator.prior,
         )
         weights = None
         if several_steps:
@@ -225,14 +228,21 @@ def _estimator(
         if not each_its_own:
             return TOTAL_VARIANCE
         return TOTAL_VARIANCE._replace(scale=scale_of(np.asarray(resolution), dimension)[0])
-    if selector.estimator == "nearest_neighbor":
+    if selector.estimator in {"nearest_neighbor", "prior_neighbors"}:
         neighbors = settings.active_sensing.num_nearest_neighbors
         if neighbors >= points.shape[0]:
             raise InvalidValueError(
                 f"active_sensing.num_nearest_neighbors {neighbors}: must be below the number of "
                 f"particles, {points.shape[0]}"
             )
-        return kernel_estimator(NearestNeighbor(neighbors, resolution), dimension)
+        if selector.estimator == "nearest_neighbor":
+            return kernel_estimator(NearestNeighbor(neighbors, resolution), dimension)
+        if points.shape[0] > MAX_PRIOR_NEIGHBORS_POINTS:
+            raise InvalidValueError(
+                f"particle_filter.num_particles {points.shape[0]}: selector.estimator "
+                f"prior_neighbors allows {MAX_PRIOR_NEIGHBORS_POINTS}"
+            )
+        return kernel_estimator(PriorNeighbors(belief.weights, neighbors, resolution), dimension)
     upper = selector.estimator == "gaussian_mixture_upper"
     own = np.full(dimension, resolution * resolution)
     states_have_their_own = of_states and getattr(problem, "state_resolution", None) is not None
@@ -354,6 +364,7 @@ def _entropies(
         estimator.offset,
         threads,
         factors,
+        estimator.prior,
     )
     return result, likelihoods, visits
 

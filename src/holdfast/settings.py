@@ -86,8 +86,8 @@ class ActiveSensingSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=T
     num_observation_samples : int
         Number M of hypothetical observations of each sensing action.
     num_nearest_neighbors : int
-        The k of the nearest-neighbour estimate, below ``num_particles``; without effect for the
-        others.
+        The k of ``nearest_neighbor`` and ``prior_neighbors``, below ``num_particles``; without
+        effect for the other estimators.
     num_cores : int
         Threads of a decision; 0 means all cores (or what ``OMP_NUM_THREADS`` says). Changes time
         only, never a result. Moving 4,096 particles or more always uses all cores.
@@ -112,12 +112,14 @@ class SelectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
         several steps of the way that the policy leads each particle without noise.
     sensing_action : int
         Index of the sensing action that ``fixed`` chooses.
-    estimator : {"nearest_neighbor", "gaussian_mixture_upper", "gaussian_mixture_lower"}
-        How the two entropies are estimated. A mixture takes few particles, as a sharp look leaves
-        them, for certainty: use it with so many that they lie closer than its noise
-        (docs/results.md). Distances between neighbours depend on the units of the coordinates,
-        unless ``resolution`` has a number for each; with the motion noise as its own, the mixture
-        does not.
+    estimator : {"nearest_neighbor", "prior_neighbors", "gaussian_mixture_upper", \
+"gaussian_mixture_lower"}
+        How the entropies are estimated. ``prior_neighbors`` has less bias where a sharp look leaves
+        few particles: with some hundred it chooses as ``nearest_neighbor`` does with ten times as
+        many; at most 4,096. A mixture takes few particles for certainty: use it with so many that
+        they lie closer than its noise (docs/results.md). Distances between neighbours depend on the
+        units of the coordinates, unless ``resolution`` has a number for each; with the motion noise
+        as its own, the mixture does not.
     actions : {"commanded", "executed"}
         Whether ``action_entropy``, ``path_entropy`` and ``action_covariance`` look at what the
         policy says or at what the limits leave of it.
@@ -143,9 +145,9 @@ class SelectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
         "action_entropy", "path_entropy", "state_entropy", "action_covariance", "random", "fixed"
     ] = "action_entropy"
     sensing_action: NonNegativeCount = 0
-    estimator: Literal["nearest_neighbor", "gaussian_mixture_upper", "gaussian_mixture_lower"] = (
-        "nearest_neighbor"
-    )
+    estimator: Literal[
+        "nearest_neighbor", "prior_neighbors", "gaussian_mixture_upper", "gaussian_mixture_lower"
+    ] = "nearest_neighbor"
     actions: Literal["commanded", "executed"] = "commanded"
     resolution: Positive | Resolutions | None = None
     path_offsets: Annotated[

@@ -36,7 +36,7 @@ LOOKING = [
     )
     for method, estimator, actions in itertools.product(
         ("action_entropy", "path_entropy", "state_entropy"),
-        ("nearest_neighbor", "gaussian_mixture_upper", "gaussian_mixture_lower"),
+        ("nearest_neighbor", "prior_neighbors", "gaussian_mixture_upper", "gaussian_mixture_lower"),
         ("commanded", "executed"),
     )
 ]
@@ -167,7 +167,7 @@ class TestEverySelector:
                 assert index == 0
 
 
-@pytest.mark.parametrize("selector", [LOOKING[0], LOOKING[2], LOOKING[13]], ids=describe)
+@pytest.mark.parametrize("selector", [LOOKING[index] for index in (0, 2, 4, 17)], ids=describe)
 def test_horizon(problem: Problem, selector: SelectorSettings) -> None:
     """A longer horizon adds to what the next step's entropy is."""
     belief = belief_of(problem)

@@ -68,6 +68,50 @@ def nearest_neighbor_entropy(
     return float(total)
 
 
+def prior_neighbors_entropy(
+    points: FloatArray,
+    weights: FloatArray,
+    prior: FloatArray,
+    neighbors: int,
+    resolution: float,
+) -> float:
+    weights = np.where(significant(weights), weights, 0.0)
+    weights = weights / weights.sum()
+    points, weights, prior = points[prior > 0.0], weights[prior > 0.0], prior[prior > 0.0]
+    count, dimension = points.shape
+    log_ball = log_unit_ball(dimension)
+    if count == 1:
+        return float(log_ball + dimension * math.log(resolution))
+    k = min(neighbors, count - 1)
+    total = 0.0
+    for n in range(count):
+        others = np.delete(np.arange(count), n)
+        squared = np.zeros(count - 1)
+        for coordinate in range(dimension):
+            squared += (points[others, coordinate] - points[n, coordinate]) ** 2
+        kth = np.partition(squared, k - 1)[k - 1]
+        tolerance = 1.0 + 2.0**-40
+        resolved = kth > resolution * resolution * tolerance
+        radius_squared = (kth if resolved else resolution * resolution) * tolerance
+        within = others[squared <= radius_squared]
+        q = k if resolved else len(within)
+        share = prior[within].sum() / prior[others].sum()
+        total += prior[n] * (
+            -math.log(share)
+            + log_ball
+            + 0.5 * dimension * math.log(radius_squared)
+            + math.log(q)
+            - digamma(q)
+        )
+        if weights[n] > 0.0:
+            before, after = (
+                (w[within].sum() + 0.05 * w[n]) / (w[others].sum() + 0.05 * w[n])
+                for w in (prior, weights)
+            )
+            total -= weights[n] * math.log(after / before)
+    return float(total)
+
+
 def gaussian_mixture_entropy(
     points: FloatArray, weights: FloatArray, variance: FloatArray, upper: bool
 ) -> float:

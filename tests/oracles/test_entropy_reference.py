@@ -106,6 +106,7 @@ def find(
         kernel.offset,
         1,
         (1.0,),
+        kernel.prior,
     )
     return Found(result, visits, Ways(*ways))
 

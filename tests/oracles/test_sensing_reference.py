@@ -18,6 +18,7 @@ from scipy import stats
 from tests.oracles.reference_entropy import (
     gaussian_mixture_entropy,
     nearest_neighbor_entropy,
+    prior_neighbors_entropy,
     significant,
 )
 
@@ -169,20 +170,28 @@ def reference_sets(
 
 
 def reference_entropy(
-    problem: Problem, settings: PlanningSettings, points: FloatArray, weights: FloatArray
+    problem: Problem,
+    settings: PlanningSettings,
+    points: FloatArray,
+    weights: FloatArray,
+    prior: FloatArray,
 ) -> float:
     selector = settings.selector
     if selector.method == "action_covariance":
         if isinstance(selector.resolution, tuple):
             points = points / np.array(selector.resolution)
         return float(np.trace(np.atleast_2d(np.cov(points.T, aweights=weights, ddof=0))))
-    if selector.estimator == "nearest_neighbor":
+    if selector.estimator in {"nearest_neighbor", "prior_neighbors"}:
         neighbors = settings.active_sensing.num_nearest_neighbors
         resolution = selector.resolution or problem.resolution
         if not isinstance(resolution, float):
             scaled = points / np.array(resolution)
             volume = float(np.log(resolution).sum())
+            if selector.estimator == "prior_neighbors":
+                return prior_neighbors_entropy(scaled, weights, prior, neighbors, 1.0) + volume
             return nearest_neighbor_entropy(scaled, weights, neighbors, 1.0) + volume
+        if selector.estimator == "prior_neighbors":
+            return prior_neighbors_entropy(points, weights, prior, neighbors, resolution)
         return nearest_neighbor_entropy(points, weights, neighbors, resolution)
     variance = problem.motion_variance
     if selector.resolution is not None:
@@ -224,7 +233,7 @@ def algorithm_2(
             posterior = np.exp(log_posterior - log_posterior.max())
             posterior /= posterior.sum()
             found[j, i] = sum(
-                factor * reference_entropy(problem, settings, points, posterior)
+                factor * reference_entropy(problem, settings, points, posterior, weights)
                 for factor, points in sets
             )
 
@@ -244,7 +253,7 @@ def algorithm_2(
                 later_states = problem.move(later_states, action, motion)
                 points = reference_points(problem, settings, later_states, later_stage)
                 found[j, i] += sensing.discount**step * reference_entropy(
-                    problem, settings, points, posterior
+                    problem, settings, points, posterior, weights
                 )
     return found
 
@@ -312,7 +321,9 @@ def test_beliefs(problem: Problem, count: int, kind: str) -> None:
 
 @pytest.mark.parametrize("actions", ["commanded", "executed"])
 @pytest.mark.parametrize("method", ["action_entropy", "state_entropy"])
-@pytest.mark.parametrize("estimator", ["nearest_neighbor", "gaussian_mixture_upper"])
+@pytest.mark.parametrize(
+    "estimator", ["nearest_neighbor", "prior_neighbors", "gaussian_mixture_upper"]
+)
 @pytest.mark.parametrize("resolution", [None, 0.4])
 def test_selectors(method: str, actions: str, estimator: str, resolution: float | None) -> None:
     selector = SelectorSettings(
@@ -331,6 +342,7 @@ def test_selectors(method: str, actions: str, estimator: str, resolution: float 
     [
         ("action_covariance", "nearest_neighbor"),
         ("action_entropy", "nearest_neighbor"),
+        ("action_entropy", "prior_neighbors"),
         ("action_entropy", "gaussian_mixture_upper"),
         ("state_entropy", "nearest_neighbor"),
         ("state_entropy", "gaussian_mixture_lower"),
@@ -345,6 +357,18 @@ def test_a_resolution_for_each_coordinate(method: str, estimator: str, horizon: 
     )
     settings = settings_of(samples=4, horizon=horizon, selector=selector)
     compare(Plane(), settings, some_belief(Plane(), 50, "weighted"))
+
+
+@pytest.mark.parametrize(
+    ("method", "horizon"), [("action_entropy", 1), ("action_entropy", 3), ("path_entropy", 1)]
+)
+@pytest.mark.parametrize("kind", ["uniform", "weighted", "zeros", "copies"])
+def test_prior_neighbors(method: str, horizon: int, kind: str) -> None:
+    """The prior is the belief's own, along a path and in predicted steps as well."""
+    selector = SelectorSettings(method=method, estimator="prior_neighbors")  # type: ignore[arg-type]
+    settings = settings_of(samples=4, horizon=horizon, selector=selector)
+    problem = LightDark()
+    compare(problem, settings, some_belief(problem, 50, kind))
 
 
 @pytest.mark.parametrize("actions", ["commanded", "executed"])

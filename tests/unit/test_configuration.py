@@ -612,6 +612,15 @@ class TestTwoKeys:
         assert "is 5;" in complaint(write(text % 4))  # The default breaks it as well.
         assert load(write(text % 6)).planning.particle_filter.num_particles == 6
 
+    def test_neighbours_of_the_prior_are_counted_among_few_particles(self, write: Write) -> None:
+        text = "problem: peg_in_hole_2d\nselector: {estimator: prior_neighbors}\n"
+        text += "particle_filter: {num_particles: %d}\n"
+        assert "is 5; the prior_neighbors estimator needs it below" in complaint(write(text % 5))
+        message = complaint(write(text % 4097))
+        assert "line 3: particle_filter.num_particles is 4097;" in message
+        assert "allows 4096" in message
+        assert load(write(text % 4096)).planning.selector.estimator == "prior_neighbors"
+
     @pytest.mark.parametrize(
         "selector",
         ["{estimator: gaussian_mixture_upper}", "{method: random}", "{method: fixed}"],

@@ -30,6 +30,7 @@ from holdfast.randomness import Stream
 
 words = (7, 0, 3, 2, 1)
 stream = Stream(words)
+alone = ((1.0,), np.empty(0))  # one set of points, no prior
 hashes = {}
 
 def note(name, *arrays):
@@ -85,21 +86,24 @@ for count, dimension, kept, posteriors, way in (
         for neighbors in (1, 5, 8, 9, 30):
             for resolution in (1e-9, 0.2, 20.0):
                 result, _, visits, ways = kernel.entropies(
-                    points, log_weights, True, 0, neighbors, resolution, 0.0, 0.0, 2, (1.0,))
+                    points, log_weights, True, 0, neighbors, resolution, 0.0, 0.0, 2, *alone)
                 name = f"nearest {count} {dimension} {kept} {deviation} {neighbors} {resolution}"
                 note(name, result, np.array(visits))
                 if deviation < 1.0 and ways[way] != posteriors:
                     wrong_ways.append(name)
     for exponent in (0.5, 0.125):
         result, _, visits, ways = kernel.entropies(
-            points * 3.0, normals * 0.4, True, 1, 1, 1.0, exponent, 0.3, 2, (1.0,))
+            points * 3.0, normals * 0.4, True, 1, 1, 1.0, exponent, 0.3, 2, *alone)
         name = f"mixture {count} {dimension} {kept} {exponent}"
         note(name, result, np.array(visits))
         if ways[way] != posteriors:
             wrong_ways.append(name)
 
-    result, *_ = kernel.entropies(points, normals, True, 2, 1, 1.0, 0.0, 0.0, 2, (1.0,))
+    result, *_ = kernel.entropies(points, normals, True, 2, 1, 1.0, 0.0, 0.0, 2, *alone)
     note(f"variance {count} {dimension} {kept}", result)
+    prior = np.full(count, 1.0 / count)
+    result, *_ = kernel.entropies(points, normals, True, 3, 5, 0.1, 0.0, 0.0, 2, (1.0,), prior)
+    note(f"prior neighbours {count} {dimension} {kept}", result)
 
 for count in (5, 100, 1001):
     draw = stream.substream(count)
@@ -109,7 +113,7 @@ for count in (5, 100, 1001):
     for variance in (np.full((5, 1), 0.1), np.ascontiguousarray(0.1 + predicted**2)):
         arguments = (weights, [1, 1, 1, 2], predicted, variance, 9, words)
         found = kernel.hypothetical_entropies(
-            *arguments, np.ascontiguousarray(-states), 0, 3, 0.05, 0.0, 0.0, 2, (1.0,))
+            *arguments, np.ascontiguousarray(-states), 0, 3, 0.05, 0.0, 0.0, 2, *alone)
         note(f"hypotheses {count} {variance.shape}", *found[:2],
              kernel.hypothetical_weights(*arguments, True),
              kernel.hypothetical_weights(*arguments, False))
@@ -370,7 +374,7 @@ class TestThreads:
         yield
         assert _kernel.use_threads_from(usual) == 0.0
 
-    @pytest.mark.parametrize("estimator", [0, 1, 2])
+    @pytest.mark.parametrize("estimator", [0, 1, 2, 3])
     @pytest.mark.parametrize(("count", "posteriors"), [(100, 30), (1500, 40), (4000, 3)])
     def test_entropies(self, count: int, posteriors: int, estimator: int) -> None:
         points = _kernel.normals(WORDS, count * 3).reshape(count, 3)
@@ -379,13 +383,14 @@ class TestThreads:
         for row in range(posteriors):
             log_weights[row, count // (1 + row % 7) :] = -np.inf
         log_weights[0, 20:] = -np.inf
+        prior = np.full(count, 1.0 / count)
         results = set()
         for threads in (1, 2, 3, 64, 0):
             result, _, visits, ways = _kernel.entropies(
-                points, log_weights, True, estimator, 5, 0.1, 0.5, 0.0, threads, (1.0,)
+                points, log_weights, True, estimator, 5, 0.1, 0.5, 0.0, threads, (1.0,), prior
             )
             results.add((result.tobytes(), visits, ways))
-            # A variance has but one way.
+            # The others have but one way.
             assert (ways[0] > 0) == (estimator < 2)
             assert (ways[1] + ways[2] > 0) == (estimator < 2)
         assert len(results) == 1

@@ -222,6 +222,13 @@ class Broken(Coordinates):
 
 
 class TestBadInput:
+    def test_too_many_particles_for_neighbours_of_the_prior(self) -> None:
+        settings = settings_of(SelectorSettings(estimator="prior_neighbors"))
+        belief = Belief.uniform(np.zeros((4097, 2)))
+        expected = r"particle_filter\.num_particles 4097: .*prior_neighbors allows 4096"
+        with pytest.raises(InvalidValueError, match=expected):
+            choose(Coordinates(), settings, belief)
+
     @pytest.mark.parametrize("neighbors", [60, 61, 1000])
     def test_as_many_neighbours_as_particles(self, neighbors: int) -> None:
         selector = SelectorSettings(estimator="nearest_neighbor")

@@ -1,0 +1,53 @@
+// Entropies of posteriors whose neighbourhoods are those of the prior.
+//
+// A sharp observation leaves few points. What the nearest-neighbour estimate makes of them is
+// mostly bias, which depends on how many are left: on the sensing action. Here each point n has one
+// neighbourhood for all posteriors, B_n: the other points within the distance to the k-th nearest
+// of the prior, or within the resolution if that is larger. With w the prior's weights, W those of
+// a posterior, and
+//     m_n(W) = (sum_{j in B_n} W_j + s W_n) / (1 - (1 - s) W_n),
+//     entropy = (nearest-neighbour entropy of the prior) - sum_n W_n log(m_n(W) / m_n(w)):
+// the prior's entropy less the information gained, the Kullback-Leibler divergence of posterior
+// from prior. Volumes are those of the prior and the same for all sensing actions, so they cannot
+// favour any. The share s counts a little of the point itself, so that m_n is not zero where
+// nothing else is left; a whole one would take few points for certainty, as a kernel density does.
+
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+#include <vector>
+
+#include "vector_kernels.hpp"
+
+namespace holdfast {
+
+/// Posteriors whose entropies are computed side by side.
+inline constexpr std::size_t prior_lanes = 8;
+
+class PriorNeighbors {
+  public:
+    /// `prior` [count]: not negative, one of them positive, sum 1.
+    PriorNeighbors(const double* points, std::size_t count, std::size_t dimension,
+                   const double* prior, std::uint32_t neighbors,
+                   const NearestNeighborConstants& constants, int threads);
+
+    /// `weights` [number][count], number <= prior_lanes. For several of them from several threads.
+    void entropies(const double* weights, std::size_t number, double* out) const;
+
+    /// Members of all neighbourhoods together.
+    std::size_t members() const;
+
+  private:
+    /// The neighbourhoods of points one after another.
+    struct Block {
+        std::vector<std::uint32_t> members, ends;
+    };
+
+    std::size_t count_;
+    double entropy_ = 0.0;              // of the prior
+    std::vector<double> inverse_mass_;  // [count] 1 / m_n(w), 0 where w_n is 0
+    std::vector<Block> blocks_;
+};
+
+}  // namespace holdfast
