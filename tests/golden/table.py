@@ -81,7 +81,7 @@ def runs() -> list[Run]:
 def _examples() -> Iterator[Run]:
     for path in sorted((ROOT / "examples").rglob("*.yaml")):
         file = path.relative_to(ROOT).as_posix()
-        yield Run(file, file, 3, {"simulator.max_steps": 300})
+        yield Run(file, file, 3, {"simulator.max_steps": 300, **_as_before(path.stem)})
 
 
 def _problems() -> Iterator[Run]:
@@ -89,7 +89,15 @@ def _problems() -> Iterator[Run]:
     for problem in dict.fromkeys((*registry.BUILT_IN, *(case.problem for case in CASES))):
         for count in (100, 300):
             changes = {"particle_filter.num_particles": count, "simulator.max_steps": 60}
-            yield Run(f"{problem}, {count} particles", PLAIN, 3, changes, problem)
+            before = _as_before(problem)
+            yield Run(f"{problem}, {count} particles", PLAIN, 3, {**changes, **before}, problem)
+            if before:
+                yield Run(f"{problem}, {count} particles, as now", PLAIN, 3, changes, problem)
+
+
+def _as_before(problem: str) -> dict[str, Any]:
+    """The peg in space had one resolution for metres and radians; so old runs can be had again."""
+    return {"selector.resolution": 0.04728708045015877} if problem == "peg_in_hole_3d" else {}
 
 
 def _selectors() -> Iterator[Run]:

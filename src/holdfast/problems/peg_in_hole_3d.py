@@ -101,10 +101,8 @@ class PegInHole3D(PegProblem):
     defaults here, 200 particles and a sensing interval of 4, about 95 % of the trials end within
     700 steps, with an interval of 8 about 90 %; 100 particles are too few.
 
-    The motion noise moves the peg 0.071 m and 0.032 rad in a step, and ``resolution`` is one number
-    between the two, their geometric mean, which adds metres and radians as if they were the same.
-    To count each in its own unit, give the selector the noise's deviations:
-    ``selector.resolution: [0.071, 0.071, 0.071, 0.032, 0.032, 0.032]``.
+    The resolution of each coordinate is what the motion noise blurs in a step, 0.071 m and
+    0.032 rad: metres and radians are not added as if they were the same.
 
     Parameters
     ----------
@@ -152,6 +150,10 @@ class PegInHole3D(PegProblem):
                 *[planner.translation_step_size] * 3,
                 *[planner.rotation_step_size] * 3,
             ),
+        )
+        # Where a coordinate moves without noise, the mean of the others has to do.
+        self.resolution = np.where(
+            self.motion_variance > 0.0, np.sqrt(self.motion_variance), self.resolution
         )
         self.model = model
         self.state_space_planner = planner
