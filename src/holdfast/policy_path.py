@@ -85,7 +85,8 @@ def path_points(
             f"state {contract.in_brief(states_at[row, particle])}, {offsets[row]} steps on: every "
             f"coordinate must be finite and at most {LARGEST:g}"
         )
-    return PathPoints(points, _factors(offsets, settings.selector.path_discount))
+    selector = settings.selector
+    return PathPoints(points, _factors(selector.path_offsets, selector.path_discount))
 
 
 def _followed(
@@ -119,10 +120,10 @@ def _factors(offsets: tuple[int, ...], discount: float) -> tuple[float, ...]:
     """Return ``discount**offset`` by multiplication, which has the same bits everywhere."""
     factors = []
     factor = 1.0
-    step = 0
+    before = 0
     for offset in offsets:
-        for _ in range(offset - step if discount < 1.0 else 0):
+        for _ in range(offset - before if discount < 1.0 else 0):
             factor *= discount
-        step = offset
+        before = offset
         factors.append(factor)
     return tuple(factors)

@@ -133,12 +133,14 @@ class SelectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
         states.
     path_offsets : tuple of int
         How far along the way ``path_entropy`` looks at the actions: strictly increasing, from 0
-        (the next action) to 10,000, 1 to 64 of them.
-    path_unit : {"steps", "sensing_intervals"}
+        (the next action) to 10,000, 1 to 64 of them. The default looks at the next action and at
+        the one after the next look.
+    path_unit : {"sensing_intervals", "steps"}
         What the offsets count. An interval is ``simulator.sensing_intervals + 1`` steps; the
         offsets in steps are at most 10,000 as well.
     path_discount : float
-        The entropy h steps on counts ``path_discount**h`` times; above 0, at most 1.
+        The entropy at offset h counts ``path_discount**h`` times, h in ``path_unit``; above 0,
+        at most 1. What is h looks away, h more looks can still tell.
     """
 
     method: Literal[
@@ -153,9 +155,9 @@ class SelectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
     path_offsets: Annotated[
         tuple[Annotated[int, msgspec.Meta(ge=0, le=MAX_PATH_STEPS)], ...],
         msgspec.Meta(min_length=1, max_length=MAX_PATH_OFFSETS),
-    ] = (0, 9, 18, 36)
-    path_unit: Literal["steps", "sensing_intervals"] = "steps"
-    path_discount: Annotated[float, msgspec.Meta(gt=0.0, le=1.0)] = 1.0
+    ] = (0, 1)
+    path_unit: Literal["sensing_intervals", "steps"] = "sensing_intervals"
+    path_discount: Annotated[float, msgspec.Meta(gt=0.0, le=1.0)] = 0.5
 
 
 class SimulatorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

@@ -357,7 +357,7 @@ def test_each_variant_differs_in_one_thing() -> None:
     assert references == 3
 
 
-PATH = "path entropy, neighbours"
+PATH = "path entropy, prior neighbours"
 
 
 @pytest.fixture(scope="module")

@@ -144,9 +144,10 @@ def _estimates() -> Iterator[Run]:
     yield Run("stages ahead", PLAIN, 2, ahead, "capsule_robot")
     on_the_way = {"selector.method": "path_entropy", "simulator.max_steps": 100}
     yield Run("stages on the way", PLAIN, 2, on_the_way, "capsule_robot")
-    counted = {"selector.path_unit": "sensing_intervals", "selector.path_discount": 0.9}
+    counted = {"selector.path_unit": "steps", "selector.path_offsets": [0, 9, 18, 36]}
+    counted |= {"selector.path_discount": 1.0}
     few = {"particle_filter.num_particles": 100}
-    yield Run("offsets in sensing intervals", PLAIN, 4, {**on_the_way, **counted, **few})
+    yield Run("offsets in steps", PLAIN, 4, {**on_the_way, **counted, **few})
     sonar = "tests/golden/sonar_room.yaml"
     short = {"particle_filter.num_particles": 100, "simulator.max_steps": 100}
     yield Run("general likelihood", sonar, 6, short)

@@ -111,11 +111,13 @@ def test_settings(estimator: str, actions: Actions, discount: float) -> None:
 def test_offsets_in_sensing_intervals() -> None:
     problem = Plane()
     belief = some_belief(problem, 60, "weighted")
-    settings = path((0, 1, 2), unit="sensing_intervals", interval=2, discount=0.9)
-    compare(problem, settings, belief)
-    assert bits(choose(problem, settings, belief)) == bits(
-        choose(problem, path((0, 3, 6), discount=0.9), belief)
-    )
+    settings = path((0, 1, 2), unit="sensing_intervals", interval=2)
+    assert bits(choose(problem, settings, belief)) == bits(choose(problem, path((0, 3, 6)), belief))
+
+
+def test_the_discount_counts_in_the_unit_of_the_offsets() -> None:
+    settings = path((0, 1, 2), unit="sensing_intervals", interval=2, discount=0.5)
+    compare(Plane(), settings, some_belief(Plane(), 60, "weighted"))
 
 
 @pytest.mark.parametrize("estimator", ["nearest_neighbor", "gaussian_mixture_upper"])

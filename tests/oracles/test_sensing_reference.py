@@ -165,7 +165,7 @@ def reference_sets(
             points.append(problem.policy(state, own_stage))
             if selector.actions == "executed":
                 points[-1] = problem.execute(points[-1])
-        sets.append((selector.path_discount ** (unit * offset), np.array(points)))
+        sets.append((selector.path_discount**offset, np.array(points)))
     return sets
 
 

@@ -37,7 +37,7 @@ LEVEL = 0.01
 """Of the tests of steps, and of those of successes: the probability that any difference is claimed
 where there is none."""
 
-_TRIALS = {CHOICE: 24, CLAIM: 120}
+_TRIALS = {CHOICE: 16, CLAIM: 80}
 _QUICK_TRIALS = {CHOICE: 2, CLAIM: 4}
 _MOST_QUICK_PARTICLES = 3.0
 """In a quick run, as a multiple of a problem's."""
@@ -60,14 +60,15 @@ _CASES = {case.name: case for case in CASES if case.name in _INTERVALS}
 
 _TOGETHER = "all five problems (mean)"
 
-Way = Literal["neighbours", "mixture", "random"]
+Way = Literal["neighbours", "path, prior neighbours", "mixture", "random"]
 
 _WAYS: Mapping[Way, SelectorSettings] = {
     "neighbours": SelectorSettings(method=METHOD, estimator="nearest_neighbor"),
+    "path, prior neighbours": SelectorSettings(method="path_entropy", estimator="prior_neighbors"),
     "mixture": SelectorSettings(method=METHOD, estimator="gaussian_mixture_upper"),
     "random": SelectorSettings(method="random"),
 }
-"""The two estimators of the entropy, and the way that estimates nothing."""
+"""Ways of estimating an entropy (of actions, if not of paths), and one that estimates nothing."""
 
 _DEFAULT: Way = "neighbours"
 _RANDOM: Way = "random"
@@ -80,7 +81,7 @@ class Variant(NamedTuple):
     ----------
     parameter, value : str
         What differs, and how; empty for the reference itself.
-    way : {"neighbours", "mixture", "random"}
+    way : {"neighbours", "path, prior neighbours", "mixture", "random"}
     active_sensing : ActiveSensingSettings
     particle_filter : ParticleFilterSettings
     resolution : float, optional
@@ -130,6 +131,7 @@ def variants() -> list[Variant]:
         sensing = ActiveSensingSettings(num_nearest_neighbors=neighbors)
         found.append(Variant("k", str(neighbors), active_sensing=sensing))
     found += _resolutions("neighbours", (0.1, 0.3, 3.0, 10.0))
+    found += _of_paths("path, prior neighbours")
     found += [Variant(way="mixture"), *_numbers_of_particles("mixture")]
     # The same in all directions, as the motion noise itself need not be: so 1 is another, too.
     found += _resolutions("mixture", (0.1, 0.3, 1.0, 3.0, 10.0))
@@ -141,6 +143,17 @@ def _numbers_of_particles(way: Way) -> list[Variant]:
         Variant("particles", f"x {times:g}", way=way, times_the_particles=times)
         for times in (0.5, 3.0, 10.0)
     ]
+
+
+def _of_paths(way: Way) -> list[Variant]:
+    found = [Variant(way=way), *_numbers_of_particles(way)[:2]]
+    for samples in (3, 30):
+        sensing = ActiveSensingSettings(num_observation_samples=samples)
+        found.append(Variant("M", str(samples), way=way, active_sensing=sensing))
+    for neighbors in (3, 10):
+        sensing = ActiveSensingSettings(num_nearest_neighbors=neighbors)
+        found.append(Variant("k", str(neighbors), way=way, active_sensing=sensing))
+    return found
 
 
 def _resolutions(way: Way, factors: Sequence[float]) -> list[Variant]:
