@@ -154,7 +154,7 @@ def main() -> None:
     for name in WANTED:
         choices = compare(name, seed)
         first = np.array([choice.lost for choice in choices[RIVALS[0]]])
-        print(f"\n{name}, {len(first)} beliefs")
+        print(f"\n{name}, {len(first)} beliefs", flush=True)
         for rival in RIVALS:
             lost = np.array([choice.lost for choice in choices[rival]])
             less = first - lost

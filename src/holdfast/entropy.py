@@ -93,6 +93,9 @@ class PriorNeighbors(NamedTuple):
 
     Notes
     -----
+    Of few points it takes observations that say nothing for somewhat informative, the more the
+    fewer they leave: the divergence of a random handful from the prior is not zero.
+
     Without weights, divergences from distances to nearest neighbours are those of Wang, Kulkarni
     and Verdu (2009), "Divergence estimation for multidimensional densities via k-nearest-neighbor
     distances", IEEE Transactions on Information Theory 55(5). Time and memory grow with the square
