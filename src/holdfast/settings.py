@@ -115,9 +115,8 @@ class SelectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
     estimator : {"nearest_neighbor", "prior_neighbors", "gaussian_mixture_upper", \
 "gaussian_mixture_lower"}
         How the entropies are estimated. ``prior_neighbors`` has less bias where a sharp look leaves
-        few particles: with some hundred it chooses as ``nearest_neighbor`` does with ten times as
-        many; at most 4,096. A mixture takes few particles for certainty: use it with so many that
-        they lie closer than its noise (docs/results.md). Distances between neighbours depend on the
+        few particles: 300 choose about as well as 1,000 with ``nearest_neighbor``; at most 4,096. A
+        mixture takes few particles for certainty: use it with so many that they lie closer than its noise (docs/results.md). Distances between neighbours depend on the
         units of the coordinates, unless ``resolution`` has a number for each; with the motion noise
         as its own, the mixture does not.
     actions : {"commanded", "executed"}
