@@ -82,7 +82,8 @@ class ActiveSensingSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=T
     horizon : int
         Number H of entropies added up: now, and after each of H - 1 predicted steps.
     discount : float
-        Weight of the entropy h steps ahead is ``discount**h``.
+        Weight of the entropy, or for ``expected_return`` of the reward, h steps ahead is
+        ``discount**h``.
     num_observation_samples : int
         Number M of hypothetical observations of each sensing action.
     num_nearest_neighbors : int
@@ -105,11 +106,12 @@ class SelectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
 
     Attributes
     ----------
-    method : {"action_entropy", "path_entropy", "state_entropy", "action_covariance", "random", \
-"fixed"}
-        What is minimised: an entropy, or the trace of the covariance of the actions; ``random`` and
-        ``fixed`` look at no belief. ``path_entropy`` adds up the entropies of the actions at
-        several steps of the way that the policy leads each particle without noise.
+    method : {"action_entropy", "path_entropy", "state_entropy", "action_covariance", \
+"expected_return", "random", "fixed"}
+        What is minimised: an entropy, or the trace of the covariance of the actions; or what is
+        maximised: the expected return less the price of sensing. ``random`` and ``fixed`` look at
+        no belief. ``path_entropy`` adds up the entropies of the actions at several steps of the
+        way that the policy leads each particle without noise.
     sensing_action : int
         Index of the sensing action that ``fixed`` chooses.
     estimator : {"nearest_neighbor", "gaussian_mixture_upper", "gaussian_mixture_lower"}
@@ -137,10 +139,29 @@ class SelectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
         offsets in steps are at most 10,000 as well.
     path_discount : float
         The entropy h steps on counts ``path_discount**h`` times; above 0, at most 1.
+    rollout_reward : {"problem", "steps"}
+        Whose sum is the return of ``expected_return``: the problem's rewards, or -1 for each step
+        up to the goal. A problem without rewards has the steps in any case.
+    rollout_steps : int
+        Steps after which a rollout of ``expected_return`` that has not reached the goal ends.
+    rollout_looks : int
+        How many of the sensing steps to come a look has to last: in a rollout of
+        ``expected_return`` the state gets known at each of so many with equal chances, 1 over this
+        number, and at the last one for sure.
+    max_observation_samples : int
+        Bound on the hypothetical observations of a sensing action with ``expected_return``: it
+        begins with ``num_observation_samples`` and doubles them for those sensing actions whose
+        return differs from the best one's by less than two standard errors.
     """
 
     method: Literal[
-        "action_entropy", "path_entropy", "state_entropy", "action_covariance", "random", "fixed"
+        "action_entropy",
+        "path_entropy",
+        "state_entropy",
+        "action_covariance",
+        "expected_return",
+        "random",
+        "fixed",
     ] = "action_entropy"
     sensing_action: NonNegativeCount = 0
     estimator: Literal["nearest_neighbor", "gaussian_mixture_upper", "gaussian_mixture_lower"] = (
@@ -154,6 +175,10 @@ class SelectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
     ] = (0, 9, 18, 36)
     path_unit: Literal["steps", "sensing_intervals"] = "steps"
     path_discount: Annotated[float, msgspec.Meta(gt=0.0, le=1.0)] = 1.0
+    rollout_reward: Literal["problem", "steps"] = "problem"
+    rollout_steps: Annotated[int, msgspec.Meta(ge=1, le=100_000)] = 200
+    rollout_looks: Annotated[int, msgspec.Meta(ge=1, le=1000)] = 4
+    max_observation_samples: Annotated[int, msgspec.Meta(ge=1, le=1_000_000)] = 40
 
 
 class SimulatorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
