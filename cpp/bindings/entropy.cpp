@@ -18,6 +18,10 @@ using namespace holdfast::bindings;
 
 namespace {
 
+// About what one particle of a posterior takes; from it follows how many threads are worth their
+// waking.
+constexpr double nanoseconds_of_a_point = 100.0;
+
 EntropySettings make_settings(Estimator estimator, std::uint32_t neighbors, double resolution,
                               double exponent, double offset, int threads, const Input<1>& prior,
                               std::size_t count) {
@@ -99,6 +103,41 @@ void holdfast::bind_entropy(nb::module_& module) {
                    result, counts.likelihoods, counts.visits,
                    nb::make_tuple(counts.pair_by_pair, counts.own_tree, counts.grouped));
            });
+
+    // Row r of the weights weighs points of its own, block r.
+    define(
+        module, "entropies_of_each",
+        [](const Input<3>& points, const Input<2>& rows_in, int number, std::uint32_t neighbors,
+           double resolution, double exponent, double offset, int threads, const Input<1>& prior) {
+            const std::size_t rows = rows_in.shape(0), count = rows_in.shape(1);
+            const std::size_t dimension = points.shape(2);
+            if (points.shape(0) != rows || points.shape(1) != count) {
+                throw nb::value_error("points and weights do not fit");
+            }
+            double* out;
+            auto result = make_array<double>({rows}, out);
+            const Estimator estimator = to_estimator(number);
+            const bool drop = drops_negligible(estimator);
+            const EntropySettings settings =
+                make_settings(estimator, neighbors, resolution, exponent, offset, 1, prior, count);
+            {
+                WithoutInterpreter released;
+                const VectorKernels& kernels = vector_kernels();
+                const double work = nanoseconds_of_a_point * static_cast<double>(rows * count);
+                parallel_for(rows, threads_for(work, rows, threads), [&](std::size_t row) {
+                    const auto source = [&](std::size_t, double* weights) {
+                        kernels.log(rows_in.data() + row * count, weights, count);
+                        return kernels.normalize(weights, count, drop, weights);
+                    };
+                    EntropyCounts counts;
+                    const double whole = 1.0;
+                    const PointSets own{points.data() + row * count * dimension, count, dimension,
+                                        1, &whole};
+                    entropies(own, 1, source, settings, out + row, counts);
+                });
+            }
+            return result;
+        });
 
     define(module, "hypothetical_entropies",
            [](const Input<1>& weights, const std::vector<std::uint32_t>& sizes,

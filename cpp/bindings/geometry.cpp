@@ -113,6 +113,30 @@ bool move_batch(const World& world, const Input<2>& states, const Input<2>& acti
 }
 
 template <class World>
+bool move_each_batch(const World& world, const Input<3>& states, const Input<2>& actions,
+                     const Input<1>& standard_deviation, double tolerance,
+                     const std::vector<StreamWords>& words, int threads, InPlace<double, 3> next) {
+    constexpr std::size_t d = World::dimension;
+    const std::size_t beliefs = states.shape(0), count = states.shape(1);
+    require(states.shape(2) == d && actions.shape(1) == d && actions.shape(0) == beliefs &&
+                words.size() == beliefs && next.shape(0) == beliefs && next.shape(1) == count &&
+                next.shape(2) == d,
+            "shapes differ");
+    if (!all_finite(states.data(), beliefs * count * d) ||
+        !all_finite(actions.data(), beliefs * d) || standard_deviation.shape(0) != d ||
+        !all_finite(standard_deviation.data(), d) ||
+        !all_non_negative(standard_deviation.data(), d) || !(tolerance > 0.0 && tolerance < 1.0)) {
+        return false;
+    }
+    std::vector<Stream> streams;
+    for (const StreamWords& own : words) streams.push_back(to_stream(own));
+    WithoutInterpreter released;
+    move_each(world, beliefs, count, states.data(), actions.data(), standard_deviation.data(),
+              tolerance, streams.data(), threads, next.data());
+    return true;
+}
+
+template <class World>
 std::size_t draw_free_batch(const World& world, const Input<1>& mean,
                             const Input<1>& standard_deviation, const StreamWords& stream,
                             InPlace<double, 2> states) {
@@ -162,6 +186,10 @@ nb::class_<World> bind_world(nb::module_& module, const char* name) {
              nb::arg("actions").noconvert(), nb::arg("standard_deviation").noconvert(),
              nb::arg("tolerance"), nb::arg("stream"), nb::arg("next_states").noconvert(),
              nb::call_guard<StandardRounding>())
+        .def("move_each", &move_each_batch<World>, nb::arg("states").noconvert(),
+             nb::arg("actions").noconvert(), nb::arg("standard_deviation").noconvert(),
+             nb::arg("tolerance"), nb::arg("streams"), nb::arg("threads"),
+             nb::arg("next_states").noconvert(), nb::call_guard<StandardRounding>())
         .def("draw_free", &draw_free_batch<World>, nb::arg("mean").noconvert(),
              nb::arg("standard_deviation").noconvert(), nb::arg("stream"),
              nb::arg("states").noconvert(), nb::call_guard<StandardRounding>());

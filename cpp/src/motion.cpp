@@ -18,6 +18,9 @@ namespace {
 constexpr std::size_t block_size = 128;
 constexpr std::size_t way_block_size = 32;
 
+// About what one particle takes; from it follows how many threads are worth their waking.
+constexpr double nanoseconds_of_a_move = 80.0;
+
 template <class World>
 void stop_at_contact(const World& world, const double* state, const double* action,
                      double tolerance, double* next) {
@@ -112,6 +115,19 @@ class Contact {
     bool none_;
 };
 
+// Moves the block of `count` states of which the first is particle `first`.
+template <class World>
+void move_block(const World& world, std::size_t first, std::size_t count, const double* states,
+                const double* actions, std::size_t action_stride, const double* standard_deviation,
+                bool noisy, double tolerance, const Stream& stream, double* next) {
+    constexpr std::size_t d = World::dimension;
+    for (std::size_t n = first; n < first + count; ++n) {
+        stop_at_contact(world, states + n * d, actions + n * action_stride, tolerance,
+                        next + n * d);
+    }
+    if (noisy) add_noise(world, first, count, standard_deviation, stream, next + first * d);
+}
+
 int threads_for_particles(std::size_t count) {
     return count >= parallel_threshold ? thread_limit(0) : 1;
 }
@@ -133,12 +149,29 @@ void move(const World& world, std::size_t count, const double* states, const dou
     parallel_for(num_blocks, threads_for_particles(count), [&](std::size_t block) {
         const std::size_t first = block * block_size;
         const std::size_t size = std::min(block_size, count - first);
-        for (std::size_t n = first; n < first + size; ++n) {
-            stop_at_contact(world, states + n * d, actions + n * action_stride, tolerance,
-                            next + n * d);
-        }
-        if (noisy) add_noise(world, first, size, standard_deviation, stream, next + first * d);
+        move_block(world, first, size, states, actions, action_stride, standard_deviation, noisy,
+                   tolerance, stream, next);
     });
+}
+
+template <class World>
+void move_each(const World& world, std::size_t beliefs, std::size_t count, const double* states,
+               const double* actions, const double* standard_deviation, double tolerance,
+               const Stream* streams, int threads, double* next) {
+    constexpr std::size_t d = World::dimension;
+    const bool noisy = !all_zero(standard_deviation, d);
+    const std::size_t num_blocks = (count + block_size - 1) / block_size;
+    const double work = nanoseconds_of_a_move * static_cast<double>(beliefs * count);
+
+    parallel_for(beliefs * num_blocks, threads_for(work, beliefs * num_blocks, threads),
+                 [&](std::size_t task) {
+                     const std::size_t belief = task / num_blocks;
+                     const std::size_t first = task % num_blocks * block_size;
+                     const std::size_t size = std::min(block_size, count - first);
+                     move_block(world, first, size, states + belief * count * d,
+                                actions + belief * d, 0, standard_deviation, noisy, tolerance,
+                                streams[belief], next + belief * count * d);
+                 });
 }
 
 template <class World>
@@ -218,6 +251,9 @@ void follow(const World& world, const Policy& policy, std::size_t count, const d
 #define HOLDFAST_INSTANTIATE(World)                                                                \
     template void move<World>(const World&, std::size_t, const double*, const double*,             \
                               std::size_t, const double*, double, const Stream&, double*);         \
+    template void move_each<World>(const World&, std::size_t, std::size_t, const double*,          \
+                                   const double*, const double*, double, const Stream*, int,       \
+                                   double*);                                                       \
     template std::size_t draw_free<World>(const World&, std::size_t, const double*, const double*, \
                                           const Stream&, double*);
 

@@ -33,6 +33,13 @@ void move(const World& world, std::size_t count, const double* states, const dou
           std::size_t action_stride, const double* standard_deviation, double tolerance,
           const Stream& stream, double* next);
 
+// The same for each of several beliefs of `count` states with an action and a stream of its own.
+// The bits are those of as many calls of `move`. `threads` as everywhere: 0 is all.
+template <class World>
+void move_each(const World& world, std::size_t beliefs, std::size_t count, const double* states,
+               const double* actions, const double* standard_deviation, double tolerance,
+               const Stream* streams, int threads, double* next);
+
 // Draws `count` states of N(mean, diag(standard_deviation^2)) that are free of collision. Returns
 // how many found no free state; those are set to the mean.
 template <class World>

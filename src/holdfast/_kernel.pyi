@@ -37,6 +37,17 @@ def entropies(
     factors: Sequence[float],
     prior: _Floats,
 ) -> tuple[_Floats, int, int, tuple[int, int, int]]: ...
+def entropies_of_each(
+    points: _Floats,
+    weights: _Floats,
+    estimator: int,
+    neighbors: int,
+    resolution: float,
+    exponent: float,
+    offset: float,
+    threads: int,
+    prior: _Floats,
+) -> _Floats: ...
 def use_threads_from(nanoseconds: float) -> float: ...
 def threads_started() -> int: ...
 def hypothetical_entropies(
@@ -108,6 +119,16 @@ class _World:
         threads: int,
         states_at: _Floats,
         stages_at: npt.NDArray[np.int64],
+    ) -> bool: ...
+    def move_each(
+        self,
+        states: _Floats,
+        actions: _Floats,
+        standard_deviation: _Floats,
+        tolerance: float,
+        streams: Sequence[_Words],
+        threads: int,
+        next_states: _Floats,
     ) -> bool: ...
     def draw_free(
         self, mean: _Floats, standard_deviation: _Floats, stream: _Words, states: _Floats

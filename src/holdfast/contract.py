@@ -26,24 +26,31 @@ __all__ = [
     "executed_action",
     "expected_move",
     "expected_path",
+    "goals",
     "has_general_observations",
     "has_own",
     "in_brief",
+    "known_state_return",
     "log_likelihood",
+    "move_each",
     "next_stage",
     "next_stages",
     "observation_mean",
     "observation_variance",
     "policy",
     "resolution_of",
+    "rewards",
     "sample_observation",
     "scalar",
+    "sensing_costs",
     "states_of",
     "truth",
     "unusable_prediction",
 ]
 
 FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+BoolArray = npt.NDArray[np.bool_]
 
 # The contract itself is holdfast.problems.problem.Problem. Here a problem is anything that may or
 # may not fulfil it.
@@ -67,6 +74,8 @@ PARAMETERS: Mapping[str, tuple[str, ...]] = {
     "scene": (),
     "log_likelihood": ("states", "sensing_action", "observation"),
     "sample_observation": ("state", "sensing_action", "stream"),
+    "known_state_return": ("states", "stages"),
+    "move_each": ("states", "actions", "streams", "threads"),
 }
 """What a problem's functions are called with, by position."""
 
@@ -93,6 +102,7 @@ def check_problem(problem: Any) -> None:
     for label in actions:
         if not isinstance(label, str):
             raise ProblemError(f"sensing_actions of {name} has {label!r:.80}: labels must be text")
+    sensing_costs(problem)
     labels = getattr(problem, "state_labels", ())
     if labels and len(labels) != problem.state_size:
         raise ProblemError(
@@ -239,6 +249,26 @@ def _takes(function: Any, arguments: tuple[str | None, ...]) -> str | None:
     return None
 
 
+def sensing_costs(problem: Any) -> FloatArray:
+    """Return the checked price of each sensing action, shape ``(J,)``; zeros if there is none."""
+    count = len(problem.sensing_actions)
+    given = getattr(problem, "sensing_costs", None)
+    if given is None:
+        return np.zeros(count)
+    costs = np.asarray(given)
+    # A comparison with NaN is false.
+    if (
+        costs.dtype.kind not in "fiu"
+        or costs.shape != (count,)
+        or not ((costs >= 0.0) & (costs < np.inf)).all()
+    ):
+        raise ProblemError(
+            f"sensing_costs of {_name(problem)} is {in_brief(given)}: must be {count} finite "
+            "numbers >= 0, one for each sensing action"
+        )
+    return costs.astype(np.float64)
+
+
 def has_general_observations(problem: object) -> bool:
     """Tell whether a problem gives a likelihood of its own instead of a Gaussian one."""
     return hasattr(problem, "log_likelihood")
@@ -336,7 +366,7 @@ def log_likelihood(
     return checked
 
 
-def policy(problem: Any, states: FloatArray, stage: int | npt.NDArray[np.int64]) -> FloatArray:
+def policy(problem: Any, states: FloatArray, stage: int | IntArray) -> FloatArray:
     """Return the checked commanded actions, shape ``(..., action_size)``."""
     actions = problem.policy(states, stage)
     shape = (*states.shape[:-1], problem.action_size)
@@ -451,6 +481,50 @@ def _speaks_for(kind: type, function: str, spoken_for: tuple[str, ...]) -> bool:
     return True
 
 
+def rewards(problem: Any, states: FloatArray, actions: FloatArray) -> FloatArray:
+    """Return the checked rewards of executed actions that led to many states."""
+    values = problem.reward(states, actions)
+    shape = states.shape[:-1]
+    if not _is_array(values, len(shape)) or values.shape != shape:
+        raise _misfit(problem, "reward", values, shape)
+    if not _kernel.all_finite(np.ascontiguousarray(values)):
+        raise ProblemError(
+            f"reward of {_name(problem)} returned {in_brief(values)}: all must be finite"
+        )
+    checked: FloatArray = values
+    return checked
+
+
+def goals(problem: Any, states: FloatArray) -> BoolArray:
+    """Return, checked, which of many states are goals."""
+    reached = problem.is_goal(states)
+    shape = states.shape[:-1]
+    if not isinstance(reached, np.ndarray) or reached.dtype != np.bool_ or reached.shape != shape:
+        raise ProblemError(
+            f"is_goal of {_name(problem)}, asked of {states.shape[0]} states at once, returned "
+            f"{reached!r:.80}: need as many truth values"
+        )
+    return reached
+
+
+def known_state_return(problem: Any, states: FloatArray, stages: IntArray) -> FloatArray | None:
+    """Return the problem's own returns of acting in known states, checked; None if it has none."""
+    function = getattr(problem, "known_state_return", None)
+    if function is None:
+        return None
+    rows = np.ascontiguousarray(states).reshape(-1, states.shape[-1])
+    values = function(rows, np.ascontiguousarray(stages).reshape(-1))
+    if not _is_array(values, 1) or values.shape != rows.shape[:1]:
+        raise _misfit(problem, "known_state_return", values, rows.shape[:1])
+    if not _kernel.all_finite(np.ascontiguousarray(values)):
+        raise ProblemError(
+            f"known_state_return of {_name(problem)} returned {in_brief(values)}: all must be "
+            "finite"
+        )
+    checked: FloatArray = values.reshape(stages.shape)
+    return checked
+
+
 def states_of(
     problem: Any, function: str, states: FloatArray, shape: tuple[int, ...]
 ) -> FloatArray:
@@ -465,6 +539,35 @@ def states_of(
     contiguous = np.ascontiguousarray(states)
     contiguous.setflags(write=False)
     return contiguous
+
+
+def move_each(
+    problem: Any,
+    states: FloatArray,
+    actions: FloatArray,
+    streams: Sequence[object],
+    threads: int,
+) -> FloatArray:
+    """Return several beliefs moved, each by its own action, checked, and read-only from now on.
+
+    Parameters
+    ----------
+    problem : Problem
+    states : array of shape (b, n, state_size)
+    actions : array of shape (b, action_size)
+    streams : sequence of Stream
+        One for each belief.
+    threads : int
+        At most so many, if the problem has a ``move_each``; 0 is all.
+    """
+    if has_own(problem, "move_each", ("move",)):
+        moved = problem.move_each(states, actions, streams, threads)
+        return states_of(problem, "move_each", moved, states.shape)
+    together = np.empty(states.shape)
+    for row, (own, action, stream) in enumerate(zip(states, actions, streams, strict=True)):
+        together[row] = states_of(problem, "move", problem.move(own, action, stream), own.shape)
+    together.setflags(write=False)
+    return together
 
 
 def scalar(problem: Any, function: str, value: object) -> float:

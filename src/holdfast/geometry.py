@@ -213,6 +213,63 @@ class _World:
             _raise_not_finite("states", states)
         return states_at, stages_at
 
+    def move_each(
+        self,
+        states: FloatArray,
+        actions: FloatArray,
+        standard_deviation: FloatArray,
+        tolerance: float,
+        streams: Sequence[Stream],
+        threads: int,
+    ) -> FloatArray:
+        """Move several beliefs, each by an action and with a stream of its own.
+
+        The result is, bit for bit, that of :meth:`move` for one after the other.
+
+        Parameters
+        ----------
+        states : array of shape (b, n, d)
+        actions : array of shape (b, d)
+        standard_deviation : array of shape (d,)
+        tolerance : float
+        streams : sequence of Stream
+            One for each belief.
+        threads : int
+            At most so many; 0 is all.
+
+        Returns
+        -------
+        array of shape (b, n, d)
+
+        Raises
+        ------
+        InvalidValueError
+            If shapes do not fit, or a value is not finite or out of bounds.
+        """
+        dimension = self._DIMENSION
+        states = np.ascontiguousarray(states, dtype=np.float64)
+        actions = np.ascontiguousarray(actions, dtype=np.float64)
+        beliefs = len(streams)
+        fits = states.ndim == 3 and states.shape[0] == beliefs and states.shape[2] == dimension
+        if not fits or actions.shape != (beliefs, dimension):
+            raise InvalidValueError(
+                f"states: shape {states.shape}, actions: shape {actions.shape}; for {beliefs} "
+                f"streams they must be ({beliefs}, n, {dimension}) and ({beliefs}, {dimension})"
+            )
+        next_states = np.empty(states.shape)
+        moved = self._kernel.move_each(
+            states,
+            actions,
+            np.ascontiguousarray(standard_deviation, dtype=np.float64),
+            tolerance,
+            [stream.words for stream in streams],
+            threads,
+            next_states,
+        )
+        if not moved:
+            _explain_move(states, actions, standard_deviation, tolerance)
+        return next_states
+
     def draw_free(
         self, mean: FloatArray, standard_deviation: FloatArray, count: int, stream: Stream
     ) -> tuple[FloatArray, int]:

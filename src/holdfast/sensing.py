@@ -14,7 +14,7 @@ minimization", IEEE Access, 2019; Algorithm 2 of the thesis that the configurati
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -36,6 +36,7 @@ from holdfast.entropy import (
     scaled,
 )
 from holdfast.errors import InvalidValueError, ProblemError
+from holdfast.expected_return import expected_returns
 from holdfast.policy_path import path_points
 from holdfast.problems.problem import Problem
 from holdfast.randomness import Stream
@@ -49,6 +50,9 @@ FloatArray = npt.NDArray[np.float64]
 _HORIZON_MOTION = 2
 _GENERAL_OBSERVATIONS = 3
 
+_LARGEST_BLOCK = 2**20
+"""Coordinates of the beliefs that are predicted at the same time: 8 MB."""
+
 
 class SensingInfo(NamedTuple):
     """Why a sensing action was chosen.
@@ -58,7 +62,8 @@ class SensingInfo(NamedTuple):
     entropies : array of shape (J,) or None
         Expected (discounted, summed) entropy after each sensing action, in nats; for
         ``action_covariance`` the trace of the covariance, in the actions' units squared, or in
-        resolutions squared where there is one for each coordinate; None for ``random`` and
+        resolutions squared where there is one for each coordinate; for ``expected_return`` the
+        return less the price of sensing, negated and up to a constant; None for ``random`` and
         ``fixed``.
     samples : array of shape (J, M) or None
         The entropies of the single hypothetical observations, whose means ``entropies`` are.
@@ -119,6 +124,9 @@ def choose_sensing_action(
     if selector.method == "random":
         return int(float(selection.uniform()) * count), SensingInfo(None, None, 0, 0)
 
+    if selector.method == "expected_return":
+        return _greatest_return(problem, settings, belief, stage, hypotheses)
+
     points_of = _points_of(problem, settings)
     if selector.method == "path_entropy":
         sets, factors = path_points(problem, settings, belief.states, stage)
@@ -129,7 +137,10 @@ def choose_sensing_action(
     threads = settings.active_sensing.num_cores
     several_steps = settings.active_sensing.horizon > 1
     if contract.has_general_observations(problem):
-        log_weights = _general_log_weights(problem, settings, belief, hypotheses)
+        particles = _stratified(
+            belief.weights, settings.active_sensing.num_observation_samples, hypotheses
+        )
+        log_weights = _general_log_weights(problem, belief, range(count), particles, hypotheses)
         samples, likelihoods, visits = _entropies(
             points, log_weights, True, estimator, threads, factors
         )
@@ -137,7 +148,7 @@ def choose_sensing_action(
         entropies = _row_means(samples)
         weights = _normalized(log_weights, estimator) if several_steps else None
     else:
-        sizes, predicted, variance = _predictions(problem, belief)
+        sizes, predicted, variance = _predictions(problem, belief, range(count))
         entropies, samples, likelihoods, visits = _kernel.hypothetical_entropies(
             belief.weights,
             sizes,
@@ -200,6 +211,33 @@ def _total_factor(settings: PlanningSettings) -> float:
         factor *= settings.active_sensing.discount
         total += factor
     return total
+
+
+def _greatest_return(
+    problem: Problem, settings: PlanningSettings, belief: Belief, stage: int, hypotheses: Stream
+) -> tuple[int, SensingInfo]:
+    likelihoods = 0
+
+    def posteriors(
+        actions: Sequence[int], samples: int, stream: Stream
+    ) -> tuple[list[int], FloatArray]:
+        nonlocal likelihoods
+        likelihoods += len(actions) * samples * belief.weights.shape[0]
+        truths = _stratified(belief.weights, samples, stream)
+        if contract.has_general_observations(problem):
+            log_weights = _general_log_weights(problem, belief, actions, truths, stream)
+            rows = [_kernel.normalize(row, False)[0] for row in log_weights]
+            return truths, np.array(rows).reshape(len(actions), samples, -1)
+        sizes, predicted, variance = _predictions(problem, belief, actions)
+        weights = _kernel.hypothetical_weights(
+            belief.weights, sizes, predicted, variance, samples, stream.words, False
+        )
+        return truths, weights
+
+    returns = expected_returns(problem, settings, belief, stage, hypotheses, posteriors)
+    # What is least: as for the other methods.
+    losses = -returns.means
+    return int(losses.argmin()), SensingInfo(losses, -returns.samples, likelihoods, 0)
 
 
 def _points_of(
@@ -272,7 +310,9 @@ def _require_bounded(problem: Problem, points: FloatArray, states: FloatArray, w
         )
 
 
-def _predictions(problem: Problem, belief: Belief) -> tuple[list[int], FloatArray, FloatArray]:
+def _predictions(
+    problem: Problem, belief: Belief, actions: Sequence[int]
+) -> tuple[list[int], FloatArray, FloatArray]:
     """Return the sizes of the observations, their means and their variances, row by coordinate.
 
     The variances have one column where no sensing action's variance depends on the state.
@@ -281,7 +321,7 @@ def _predictions(problem: Problem, belief: Belief) -> tuple[list[int], FloatArra
     count = states.shape[0]
     means = []
     variances = []
-    for action in range(len(problem.sensing_actions)):
+    for action in actions:
         means.append(contract.observation_mean(problem, states, action))
         variances.append(contract.observation_variance(problem, states, action, means[-1]))
     sizes = [mean.shape[-1] for mean in means]
@@ -298,7 +338,7 @@ def _predictions(problem: Problem, belief: Belief) -> tuple[list[int], FloatArra
     # A comparison with NaN is false.
     usable = ((variance > 0.0) & (variance < np.inf)).all()
     if not usable or not numerics.all_finite(predicted):
-        for action, (mean, own_variance) in enumerate(zip(means, variances, strict=True)):
+        for action, mean, own_variance in zip(actions, means, variances, strict=True):
             right = (own_variance > 0.0).all() and numerics.all_finite(own_variance)
             if not right or not numerics.all_finite(mean):
                 raise contract.unusable_prediction(problem, action, mean, own_variance)
@@ -306,17 +346,19 @@ def _predictions(problem: Problem, belief: Belief) -> tuple[list[int], FloatArra
 
 
 def _general_log_weights(
-    problem: Problem, settings: PlanningSettings, belief: Belief, hypotheses: Stream
+    problem: Problem,
+    belief: Belief,
+    actions: Sequence[int],
+    particles: Sequence[int],
+    hypotheses: Stream,
 ) -> FloatArray:
-    """Return the log weights of all hypothetical posteriors, shape (J * M, N).
+    """Return the log weights of the hypothetical posteriors, a row for each action and particle.
 
     For problems that give ``log_likelihood`` and ``sample_observation`` instead of a Gaussian.
     """
-    samples = settings.active_sensing.num_observation_samples
-    particles = _stratified(belief.weights, samples, hypotheses)
     log_prior = numerics.log(belief.weights)
     rows = []
-    for action in range(len(problem.sensing_actions)):
+    for action in actions:
         for i, particle in enumerate(particles):
             observation = contract.sample_observation(
                 problem,
@@ -385,31 +427,85 @@ def _later_entropies(
     Each hypothetical belief takes the action of its own estimate and is moved by it. The motion
     noise is the same for every sensing action, as the observation noise is.
     """
-    sensing = settings.active_sensing
-    kind = settings.particle_filter.estimate
-    actions, samples, _ = weights.shape
+    actions, samples, count = weights.shape
+    rows = weights.reshape(-1, count)
     motion = hypotheses.substream(_HORIZON_MOTION)
-    later = np.zeros((actions, samples))
-    for j in range(actions):
-        for i in range(samples):
-            states = states_now
-            own_weights = np.ascontiguousarray(weights[j, i])
-            own_stage: int = stage
-            factor = 1.0
-            for step in range(1, sensing.horizon):
-                estimated = estimate(Belief(states, own_weights), kind)
-                own_stage = contract.next_stage(problem, estimated, own_stage)
-                action = contract.executed_action(
-                    problem, contract.policy(problem, estimated, own_stage)
-                )
-                moved = problem.move(states, action, motion.substream(i).substream(step))
-                states = contract.states_of(problem, "move", moved, states.shape)
-                factor *= sensing.discount
-                points = points_of(states, own_stage)
-                _require_bounded(problem, points, states, "the predicted state")
-                row, _, _ = _entropies(points, own_weights.reshape(1, -1), False, estimator, 1)
-                later[j, i] += factor * row[0]
+    motions = [motion.substream(i) for i in range(samples)] * actions
+    size = max(1, _LARGEST_BLOCK // states_now.size)
+    blocks = [slice(first, first + size) for first in range(0, len(motions), size)]
+    later = [
+        _later_of_some(
+            problem, settings, states_now, rows[block], stage, motions[block], estimator, points_of
+        )
+        for block in blocks
+    ]
+    return np.concatenate(later).reshape(actions, samples)
+
+
+def _later_of_some(
+    problem: Problem,
+    settings: PlanningSettings,
+    states_now: FloatArray,
+    weights: FloatArray,
+    stage: int,
+    motions: Sequence[Stream],
+    estimator: KernelEstimator,
+    points_of: Callable[[FloatArray, int], FloatArray],
+) -> FloatArray:
+    """Return the later entropies of some beliefs, which are followed at the same time."""
+    sensing = settings.active_sensing
+    count, threads = len(motions), sensing.num_cores
+    weights = np.ascontiguousarray(weights)
+    states = np.broadcast_to(states_now, (count, *states_now.shape))
+    stages = [stage] * count
+    later = np.zeros(count)
+    factor = 1.0
+    for step in range(1, sensing.horizon):
+        actions = np.empty((count, problem.action_size))
+        for row in range(count):
+            # One by one, as in planning: the policy of a user who does not keep to exact
+            # operations may have other bits for many estimates at once.
+            belief = Belief(states[row], weights[row])
+            estimated = estimate(belief, settings.particle_filter.estimate)
+            stages[row] = contract.next_stage(problem, estimated, stages[row])
+            commanded = contract.policy(problem, estimated, stages[row])
+            actions[row] = contract.executed_action(problem, commanded)
+        streams = [motion.substream(step) for motion in motions]
+        states = contract.move_each(problem, states, actions, streams, threads)
+        factor *= sensing.discount
+        points = _points_by_stage(points_of, states, stages)
+        flat_states = states.reshape(-1, states.shape[-1])
+        _require_bounded(problem, points, flat_states, "the predicted state")
+        later += factor * _kernel.entropies_of_each(
+            scaled(points, estimator).reshape(count, -1, points.shape[1]),
+            weights,
+            estimator.kind,
+            estimator.neighbors,
+            estimator.resolution,
+            estimator.exponent,
+            estimator.offset,
+            threads,
+            estimator.prior,
+        )
     return later
+
+
+def _points_by_stage(
+    points_of: Callable[[FloatArray, int], FloatArray], states: FloatArray, stages: Sequence[int]
+) -> FloatArray:
+    """Return the points of several beliefs one below the other, those of a stage at once."""
+    size = states.shape[-1]
+    if len(set(stages)) == 1:
+        return np.ascontiguousarray(points_of(states.reshape(-1, size), stages[0]))
+    found: dict[int, FloatArray] = {}
+    for stage in sorted(set(stages)):
+        own = [row for row, other in enumerate(stages) if other == stage]
+        chosen = states[own].reshape(-1, size)
+        chosen.setflags(write=False)
+        found |= zip(
+            own, points_of(chosen, stage).reshape(len(own), states.shape[1], -1), strict=True
+        )
+    return np.concatenate([found[row] for row in range(len(stages))])
 
 
 def _row_means(rows: FloatArray) -> FloatArray:

@@ -82,7 +82,8 @@ class ActiveSensingSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=T
     horizon : int
         Number H of entropies added up: now, and after each of H - 1 predicted steps.
     discount : float
-        Weight of the entropy h steps ahead is ``discount**h``.
+        Weight of the entropy, or for ``expected_return`` of the reward, h steps ahead is
+        ``discount**h``.
     num_observation_samples : int
         Number M of hypothetical observations of each sensing action.
     num_nearest_neighbors : int
@@ -105,20 +106,22 @@ class SelectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
 
     Attributes
     ----------
-    method : {"action_entropy", "path_entropy", "state_entropy", "action_covariance", "random", \
-"fixed"}
-        What is minimised: an entropy, or the trace of the covariance of the actions; ``random`` and
-        ``fixed`` look at no belief. ``path_entropy`` adds up the entropies of the actions at
-        several steps of the way that the policy leads each particle without noise.
+    method : {"action_entropy", "path_entropy", "state_entropy", "action_covariance", \
+"expected_return", "random", "fixed"}
+        What is minimised: an entropy, or the trace of the covariance of the actions; or what is
+        maximised: the expected return less the price of sensing. ``random`` and ``fixed`` look at
+        no belief. ``path_entropy`` adds up the entropies of the actions at several steps of the
+        way that the policy leads each particle without noise.
     sensing_action : int
         Index of the sensing action that ``fixed`` chooses.
     estimator : {"nearest_neighbor", "prior_neighbors", "gaussian_mixture_upper", \
 "gaussian_mixture_lower"}
         How the entropies are estimated. ``prior_neighbors`` has less bias where a sharp look leaves
         few particles: 300 choose about as well as 1,000 with ``nearest_neighbor``; at most 4,096. A
-        mixture takes few particles for certainty: use it with so many that they lie closer than its noise (docs/results.md). Distances between neighbours depend on the
-        units of the coordinates, unless ``resolution`` has a number for each; with the motion noise
-        as its own, the mixture does not.
+        mixture takes few particles for certainty: use it with so many that they lie closer than its
+        noise (docs/results.md). Distances between neighbours depend on the units of the
+        coordinates, unless ``resolution`` has a number for each; with the motion noise as its own,
+        the mixture does not.
     actions : {"commanded", "executed"}
         Whether ``action_entropy``, ``path_entropy`` and ``action_covariance`` look at what the
         policy says or at what the limits leave of it.
@@ -140,10 +143,29 @@ class SelectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
     path_discount : float
         The entropy at offset h counts ``path_discount**h`` times, h in ``path_unit``; above 0,
         at most 1. What is h looks away, h more looks can still tell.
+    rollout_reward : {"problem", "steps"}
+        Whose sum is the return of ``expected_return``: the problem's rewards, or -1 for each step
+        up to the goal. A problem without rewards has the steps in any case.
+    rollout_steps : int
+        Steps after which a rollout of ``expected_return`` that has not reached the goal ends.
+    rollout_looks : int
+        How many of the sensing steps to come a look has to last: in a rollout of
+        ``expected_return`` the state gets known at each of so many with equal chances, 1 over this
+        number, and at the last one for sure.
+    max_observation_samples : int
+        Bound on the hypothetical observations of a sensing action with ``expected_return``: it
+        begins with ``num_observation_samples`` and doubles them for those sensing actions whose
+        return differs from the best one's by less than two standard errors.
     """
 
     method: Literal[
-        "action_entropy", "path_entropy", "state_entropy", "action_covariance", "random", "fixed"
+        "action_entropy",
+        "path_entropy",
+        "state_entropy",
+        "action_covariance",
+        "expected_return",
+        "random",
+        "fixed",
     ] = "action_entropy"
     sensing_action: NonNegativeCount = 0
     estimator: Literal[
@@ -157,6 +179,10 @@ class SelectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
     ] = (0, 1)
     path_unit: Literal["sensing_intervals", "steps"] = "sensing_intervals"
     path_discount: Annotated[float, msgspec.Meta(gt=0.0, le=1.0)] = 0.5
+    rollout_reward: Literal["problem", "steps"] = "problem"
+    rollout_steps: Annotated[int, msgspec.Meta(ge=1, le=100_000)] = 200
+    rollout_looks: Annotated[int, msgspec.Meta(ge=1, le=1000)] = 4
+    max_observation_samples: Annotated[int, msgspec.Meta(ge=1, le=1_000_000)] = 40
 
 
 class SimulatorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

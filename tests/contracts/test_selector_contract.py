@@ -44,6 +44,15 @@ LOOKING += [
     SelectorSettings(method="action_covariance", actions=actions)
     for actions in ("commanded", "executed")
 ]
+LOOKING += [
+    # Long enough for the capsule, whose rewards are all zero unless it hits a wall.
+    SelectorSettings(
+        method="expected_return",
+        rollout_reward="steps",
+        rollout_steps=400,
+        max_observation_samples=4,
+    )
+]
 SELECTORS = [
     *LOOKING,
     SelectorSettings(),

@@ -74,6 +74,7 @@ plannings = st.builds(
                 "path_entropy",
                 "state_entropy",
                 "action_covariance",
+                "expected_return",
                 "random",
                 "fixed",
             )

@@ -34,6 +34,7 @@ TABLE = Path(__file__).with_name("digests.csv")
 REWRITE = "python -m tests.golden.table"
 COLUMNS = ("name", "command", "digest")
 PLAIN = "tests/golden/plain.yaml"
+SONAR = "tests/golden/sonar_room.yaml"
 
 
 class Run(NamedTuple):
@@ -111,6 +112,9 @@ def _selectors() -> Iterator[Run]:
                 chosen = {"method": method, "estimator": estimator, "actions": actions}
                 selector = {f"selector.{key}": value for key, value in chosen.items() if value}
                 name = ", ".join(selector.values())
+                if method == "expected_return":
+                    yield from _returns()
+                    continue
                 yield Run(name, PLAIN, 4, {**selector, **short})
                 if method not in {"random", "fixed", "path_entropy"}:
                     yield Run(f"{name}, horizon 2", PLAIN, 4, {**selector, **ahead, **short})
@@ -134,6 +138,19 @@ def _resolutions() -> Iterator[Run]:
     )
 
 
+def _returns() -> Iterator[Run]:
+    """Expected return of the rewards and of the steps, and with a general likelihood."""
+    for file, rewards in ((PLAIN, "problem"), (PLAIN, "steps"), (SONAR, "steps")):
+        changes = {
+            "selector.method": "expected_return",
+            "selector.rollout_reward": rewards,
+            "selector.max_observation_samples": 20,
+            "particle_filter.num_particles": 100,
+            "simulator.max_steps": 200,
+        }
+        yield Run(f"expected_return, {rewards}, {Path(file).stem}", file, 2, changes)
+
+
 def _estimates() -> Iterator[Run]:
     """Weights that last, the other estimate of the state, stages ahead, a general likelihood."""
     weighted = {"particle_filter.resampling_threshold": 0.4, "simulator.max_steps": 100}
@@ -148,13 +165,12 @@ def _estimates() -> Iterator[Run]:
     counted |= {"selector.path_discount": 1.0}
     few = {"particle_filter.num_particles": 100}
     yield Run("offsets in steps", PLAIN, 4, {**on_the_way, **counted, **few})
-    sonar = "tests/golden/sonar_room.yaml"
     short = {"particle_filter.num_particles": 100, "simulator.max_steps": 100}
-    yield Run("general likelihood", sonar, 6, short)
+    yield Run("general likelihood", SONAR, 6, short)
     path = {"selector.method": "path_entropy"}
-    yield Run("general likelihood, path entropy", sonar, 6, {**path, **short})
-    yield Run("general likelihood, horizon 2", sonar, 6, {"active_sensing.horizon": 2, **short})
-    yield Run("general likelihood, few resamplings", sonar, 6, {**short, **weighted})
+    yield Run("general likelihood, path entropy", SONAR, 6, {**path, **short})
+    yield Run("general likelihood, horizon 2", SONAR, 6, {"active_sensing.horizon": 2, **short})
+    yield Run("general likelihood, few resamplings", SONAR, 6, {**short, **weighted})
 
 
 def _choices(key: str) -> tuple[str, ...]:

@@ -129,8 +129,13 @@ SELECTORS: dict[str, SelectorSettings] = {
             estimator=estimator,  # type: ignore[arg-type]
         )
         for method, estimator in product(
-            ("action_entropy", "state_entropy"),
-            ("nearest_neighbor", "gaussian_mixture_upper", "gaussian_mixture_lower"),
+            ("action_entropy", "path_entropy", "state_entropy"),
+            (
+                "nearest_neighbor",
+                "prior_neighbors",
+                "gaussian_mixture_upper",
+                "gaussian_mixture_lower",
+            ),
         )
     },
     "executed actions": SelectorSettings(actions="executed"),

@@ -11,10 +11,12 @@ import pytest
 from holdfast import contract, planning
 from holdfast.errors import InvalidValueError, ProblemError
 from holdfast.problems.problem import (
+    BatchedMotionProblem,
     ExpectedMotionProblem,
     FloatArray,
     GeneralObservationProblem,
     IntArray,
+    KnownStateReturnProblem,
     Problem,
     ProblemBase,
 )
@@ -276,7 +278,13 @@ def test_a_function_that_takes_something_else_is_named(
 
 
 def test_the_parameters_are_those_of_the_contract() -> None:
-    protocols = (Problem, GeneralObservationProblem, ExpectedMotionProblem)
+    protocols = (
+        Problem,
+        GeneralObservationProblem,
+        ExpectedMotionProblem,
+        KnownStateReturnProblem,
+        BatchedMotionProblem,
+    )
     members = {name: own for protocol in protocols for name, own in vars(protocol).items()}
     functions = {
         name: tuple(inspect.signature(member).parameters)[1:]

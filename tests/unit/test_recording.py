@@ -708,6 +708,7 @@ class TestFigure:
             ("state_entropy", "expected entropy of\nthe state (nats)"),
             ("path_entropy", "expected entropies of\nthe actions, sum (nats)"),
             ("action_covariance", "expected covariance\nof the actions (trace)"),
+            ("expected_return", "expected loss\n(minus the return)"),
         ],
     )
     def test_the_scores_say_of_what_they_are_and_which_were_not_chosen(

@@ -52,6 +52,7 @@ def test_each_key_stands_there_with_its_default(section: str, settings: object) 
         ("method", SelectorSettings),
         ("estimator", SelectorSettings),
         ("actions", SelectorSettings),
+        ("rollout_reward", SelectorSettings),
         ("launch", RecoverySettings),
         ("journal_survives", RecoverySettings),
     ],

@@ -72,6 +72,21 @@ class BusyRoom(ProblemBase):
         things = np.broadcast_to(states[:, _PEG:], (*stages.shape, _THINGS))
         return np.concatenate([peg, things], axis=-1), stages
 
+    def move_each(
+        self, states: FloatArray, actions: FloatArray, streams: Sequence[Stream], threads: int
+    ) -> FloatArray:
+        """Move several beliefs as :meth:`move` does one after the other."""
+        pegs = np.ascontiguousarray(states[..., :_PEG])
+        shape = (*states.shape[1:-1], _THINGS)
+        noise = np.stack([stream.substream(_STEPS).normal(shape) for stream in streams])
+        return np.concatenate(
+            [
+                self._peg.move_each(pegs, actions, streams, threads),
+                states[..., _PEG:] + _STEP_DEVIATION * noise,
+            ],
+            axis=-1,
+        )
+
     def observation_mean(self, states: FloatArray, sensing_action: int) -> FloatArray:
         """Return the coordinate that is looked at."""
         return states[..., sensing_action : sensing_action + 1]

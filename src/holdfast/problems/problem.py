@@ -41,10 +41,12 @@ from holdfast.errors import ProblemError
 from holdfast.randomness import Stream
 
 __all__ = [
+    "BatchedMotionProblem",
     "ExpectedMotionProblem",
     "FloatArray",
     "GeneralObservationProblem",
     "IntArray",
+    "KnownStateReturnProblem",
     "Problem",
     "ProblemBase",
     "Scene",
@@ -125,6 +127,11 @@ class Problem(Protocol):
     the resolution of states, for ``state_entropy`` and for nothing else. Without it (or with None)
     states have the actions' resolution, which must then be one number, or an action must have as
     many coordinates as a state.
+
+    It may have ``sensing_costs``, the price of each sensing action in units of reward, numbers of
+    at least 0. A trial's reward is less by it at each sensing, and ``expected_return`` weighs it
+    against what sensing gains. Without this attribute sensing costs nothing. "Not looking" is a
+    sensing action like any other: one of price 0 whose observation says nothing (a huge variance).
     """
 
     name: str
@@ -241,6 +248,34 @@ class ExpectedMotionProblem(Protocol):
         without noise, and ``next_stage`` of where that leads. ``threads`` may be used, or all cores
         if it is 0. What the path is without this method
         it must be with it: it is there to be faster.
+        """
+        ...
+
+
+class BatchedMotionProblem(Protocol):
+    """One more method, for ``active_sensing.horizon`` above 1 on all cores; no problem needs it."""
+
+    def move_each(
+        self, states: FloatArray, actions: FloatArray, streams: Sequence[Stream], threads: int
+    ) -> FloatArray:
+        """Move several beliefs, each by an action and with a stream of its own.
+
+        The shapes are ``(b, n, state_size)``, ``(b, action_size)`` and ``(b,)``. The result has the
+        bits of ``move`` of one belief after the other, for any number of ``threads`` (0: all). One
+        that a class inherits is not used if the class itself replaces ``move``.
+        """
+        ...
+
+
+class KnownStateReturnProblem(Protocol):
+    """One more method, for ``selector.method: expected_return``; no problem needs it."""
+
+    def known_state_return(self, states: FloatArray, stages: IntArray) -> FloatArray:
+        """Return the expected discounted return of acting in known states from now on.
+
+        ``states`` has the shape ``(n, state_size)``, ``stages`` and the result ``(n,)``; the
+        discount is ``active_sensing.discount``, and the unit is that of the reward. It takes the
+        place of simulating the policy up to the goal, and may be better than the policy.
         """
         ...
 

@@ -123,6 +123,14 @@ class RigidBodyProblem(ProblemBase):
         """Return the states after executed actions, stopped at contact, without noise."""
         return self.move(states, actions, NOISE_FREE)
 
+    def move_each(
+        self, states: FloatArray, actions: FloatArray, streams: Sequence[Stream], threads: int
+    ) -> FloatArray:
+        """Move several beliefs as :meth:`move` does one after the other."""
+        return self.world.move_each(
+            states, actions, self._motion_deviation, self._collision_tolerance, streams, threads
+        )
+
 
 class PegProblem(RigidBodyProblem):
     """A peg: one observed coordinate per sensing action, limited actions, reward for short ways.

@@ -549,6 +549,7 @@ _SCORES = {
     "path_entropy": "expected entropies of\nthe actions, sum (nats)",
     "state_entropy": "expected entropy of\nthe state (nats)",
     "action_covariance": "expected covariance\nof the actions (trace)",
+    "expected_return": "expected loss\n(minus the return)",
 }
 """What is drawn of the alternatives, by the method that weighs them."""
 

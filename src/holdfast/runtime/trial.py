@@ -15,6 +15,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from holdfast import contract
 from holdfast.errors import EnvironmentFailedError, ProblemError
 from holdfast.outcome import DecisionLog, Done, TrialResult, with_reward
 from holdfast.planning import (
@@ -153,6 +154,7 @@ def run_trial(
     observer.trial_began(environment, state)
 
     log = DecisionLog(problem.action_size)
+    costs = contract.sensing_costs(problem)
     sensing_ms: list[float] = []
     total_reward: float | None = None
     unexplained = 0
@@ -169,6 +171,8 @@ def run_trial(
             if not observation_info.explained:
                 unexplained += 1
             log.sensed(steps, sensing_action, digest(state))
+            if costs[sensing_action] > 0.0:
+                total_reward = with_reward(total_reward, -float(costs[sensing_action]))
             observer.sensed(
                 SensingStep(
                     before, sensing_action, sensing_info, observation, state, observation_info

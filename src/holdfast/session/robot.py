@@ -20,6 +20,7 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
+from holdfast import contract
 from holdfast.belief import UNEXPLAINED_DEVIATIONS_SQUARED
 from holdfast.errors import HoldfastError, InvalidValueError
 from holdfast.outcome import DecisionLog, Done, TrialResult, with_reward
@@ -132,6 +133,7 @@ class History:
         self.observations: tuple[Observed, ...] = ()
         self.num_observations = 0
         self.log = DecisionLog(planner.problem.action_size)
+        self._costs = contract.sensing_costs(planner.problem)
         self.actions: list[FloatArray] = []
         self.total_reward: float | None = None
         self.pending: FloatArray | None = None
@@ -157,6 +159,9 @@ class History:
         self.num_divergences += self.unexplained_in_a_row == _DIVERGENCE_RUN
         self.sensing_ms.append(record.sensing_ms)
         self.log.sensed(record.step, record.sensing_action, record.digest)
+        cost = float(self._costs[record.sensing_action])
+        if cost > 0.0:
+            self.total_reward = with_reward(self.total_reward, -cost)
         self.state = after
 
     def performed(self, planner: Planner, reward: float | None) -> None:

@@ -1,0 +1,421 @@
+"""What a look is worth: the return of acting after it, less its price.
+
+Imagine the true state and what a sensing action would show of it; update the belief; let the robot
+act by the policy on that belief while the true state moves; and add up the reward. The mean over
+many imagined truths is the expected return after that sensing action. Nothing else says in units
+of reward what sensing gains, so nothing else can be weighed against its price.
+
+Done naively, the differences between sensing actions drown in noise: far from the goal all of them
+lead to the same actions, and a return is the sum of a hundred noisy steps. So:
+
+- All sensing actions share their truths and the noise of observations and motions (common random
+  numbers). What is left in a difference is the observation's work.
+- Within a rollout the belief is its estimate, which moves as a few of its particles do.
+- The robot will sense again, and would then know what it has not looked at now. At each of the next
+  ``rollout_looks`` sensing steps the rollout forks: with a probability of one over their number the
+  state is known from then on, and the known-state policy acts; at the last one it is known for
+  sure. Both branches are followed: no draw decides. With one look this is QMDP (Littman, Cassandra
+  and Kaelbling, "Learning policies for partially observable environments", ICML 1995) over an
+  interval.
+- Where looks cost, the mean price is paid at each later sensing step up to the goal, as by a robot
+  that senses at random from then on: who is at the goal sooner pays less often. If knowledge came
+  for nothing, looks would be put off for ever.
+- Truth i is left out of the posterior that its own observation makes. A robot's true state is not
+  among its particles, and a posterior of few particles that has it would look too good.
+- A rollout ends at the goal, or as soon as the state is known and the same after every sensing
+  action: what is left has no part in a difference. Far from the goal, where all of them lead to the
+  same actions, that is soon.
+- The number of truths is doubled, up to a bound, for those sensing actions alone whose paired
+  difference from the best is less than two standard errors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from holdfast import contract, numerics
+from holdfast.belief import Belief, estimate
+from holdfast.errors import ProblemError
+from holdfast.problems.problem import Problem, ProblemBase
+from holdfast.randomness import Stream
+from holdfast.settings import PlanningSettings
+
+__all__ = ["Posteriors", "Returns", "expected_returns", "rollout_returns"]
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+BoolArray = npt.NDArray[np.bool_]
+
+Posteriors = Callable[[Sequence[int], int, Stream], tuple[Sequence[int], FloatArray]]
+"""Called with sensing actions, a number M of samples and a stream. Returns the M particles that are
+the truths, and the weights of the posteriors, shape ``(len(sensing_actions), M, N)``."""
+
+# Substreams of the stream of hypotheses (1 to 3 are those of holdfast.sensing and the kernel).
+# Further rounds of samples have substreams of the first one.
+_ROUNDS = 4
+_CLOUDS = 5
+_MOTION = 6
+
+_CLOUD = 8
+"""Particles that stand for a posterior where it only has to move."""
+
+_CLOSE = 2.0
+"""Standard errors within which a difference is too close to call."""
+
+_NEGLIGIBLE = 1e-9
+"""Weight of all others below which the truth stays in its posterior: they say nothing, then."""
+
+
+class Returns(NamedTuple):
+    """Expected returns of all sensing actions.
+
+    Attributes
+    ----------
+    means : array of shape (J,)
+        Expected discounted return after each sensing action, less its price, and up to a constant
+        that all of them share. For one that was given up early it is the best one's mean plus their
+        mean difference in the samples that they share.
+    samples : array of shape (J, M)
+        The returns after single hypothetical observations, less the price. NaN for those of later
+        rounds of a sensing action that had been given up.
+    """
+
+    means: FloatArray
+    samples: FloatArray
+
+
+def expected_returns(
+    problem: Problem,
+    settings: PlanningSettings,
+    belief: Belief,
+    stage: int,
+    hypotheses: Stream,
+    posteriors: Posteriors,
+) -> Returns:
+    """Return what each sensing action is expected to lead to.
+
+    Parameters
+    ----------
+    problem : Problem
+    settings : PlanningSettings
+    belief : Belief
+    stage : int
+        Stage of the task.
+    hypotheses : Stream
+        Random numbers of the hypothetical observations.
+    posteriors : callable
+        See :data:`Posteriors`.
+
+    Raises
+    ------
+    ProblemError
+        If a function of the problem returns something out of its contract, or a hypothetical
+        observation has no likelihood under any particle.
+    """
+    costs = contract.sensing_costs(problem)
+    count = costs.shape[0]
+    size = settings.active_sensing.num_observation_samples
+    limit = max(size, settings.selector.max_observation_samples)
+    contenders = list(range(count))
+    rounds: list[FloatArray] = []
+    drawn = 0
+    while True:
+        stream = hypotheses if not rounds else hypotheses.substream(_ROUNDS).substream(len(rounds))
+        truths, weights = posteriors(contenders, size, stream)
+        found = np.full((count, size), np.nan)
+        found[contenders] = (
+            _sampled_returns(problem, settings, belief, stage, truths, weights, stream)
+            - costs[contenders, np.newaxis]
+        )
+        rounds.append(found)
+        drawn += size
+        samples = np.concatenate(rounds, axis=1)
+        contenders = _contenders(samples, contenders)
+        size = min(drawn, limit - drawn)
+        if len(contenders) == 1 or size <= 0:
+            return Returns(_paired_means(samples), samples)
+
+
+def _sampled_returns(
+    problem: Problem,
+    settings: PlanningSettings,
+    belief: Belief,
+    stage: int,
+    truths: Sequence[int],
+    weights: FloatArray,
+    stream: Stream,
+) -> FloatArray:
+    """Return the return after each hypothetical observation, shape ``(actions, samples)``."""
+    actions, samples, _ = weights.shape
+    kind = settings.particle_filter.estimate
+    states = belief.states
+    estimates = np.empty((actions, samples, states.shape[1]))
+    clouds = np.empty((actions, samples, _CLOUD, states.shape[1]))
+    at = (np.arange(_CLOUD) + stream.substream(_CLOUDS).uniform((samples, 1))) / _CLOUD
+    for j in range(actions):
+        for i in range(samples):
+            own = _without(weights[j, i], truths[i])
+            if own is None:
+                raise ProblemError(
+                    f"a hypothetical observation of {problem.name} had no likelihood under any "
+                    "particle"
+                )
+            estimates[j, i] = estimate(Belief(states, own), kind)
+            # np.cumsum adds one by one, in order, unlike np.sum.
+            drawn = np.searchsorted(np.cumsum(own), at[i], side="right")
+            clouds[j, i] = states[np.minimum(drawn, int(np.flatnonzero(own)[-1]))]
+    true_states = states[np.asarray(truths)]
+    return rollout_returns(
+        problem, settings, true_states, estimates, clouds, stage, stream.substream(_MOTION)
+    )
+
+
+def _without(weights: FloatArray, particle: int) -> FloatArray | None:
+    """Return normalised weights without one particle's, unless that is all there is."""
+    if not weights[particle] >= 0.0:
+        return None  # NaN
+    rest = weights.copy()
+    rest[particle] = 0.0
+    total = numerics.sum(rest)
+    return rest / total if total > _NEGLIGIBLE else np.ascontiguousarray(weights)
+
+
+def rollout_returns(
+    problem: Problem,
+    settings: PlanningSettings,
+    true_states: FloatArray,
+    estimates: FloatArray,
+    clouds: FloatArray,
+    stage: int,
+    motion: Stream,
+) -> FloatArray:
+    """Return the discounted returns of robots that act on a belief, up to the goal.
+
+    They lack what is the same for all J: a rollout ends where only that is left.
+
+    Parameters
+    ----------
+    problem : Problem
+    settings : PlanningSettings
+        Of it count the discount, the sensing interval and the length of a rollout.
+    true_states : array of shape (M, state_size)
+        Where the robots are.
+    estimates : array of shape (J, M, state_size)
+        Where they believe to be after each of J observations.
+    clouds : array of shape (J, M, L, state_size)
+        Some particles of these beliefs. By their mean displacement the estimates move.
+    stage : int
+        Stage of the task.
+    motion : Stream
+        The noise of the motion, the same for all J.
+
+    Returns
+    -------
+    array of shape (J, M)
+
+    Raises
+    ------
+    ProblemError
+        If a function of the problem returns something out of its contract.
+    """
+    rollouts = _Rollouts(problem, settings, true_states, estimates, clouds, stage)
+    interval = settings.sensing_interval + 1
+    looks = settings.selector.rollout_looks
+    costs = contract.sensing_costs(problem)
+    price = numerics.sum(costs) / costs.shape[0]
+    for step in range(settings.selector.rollout_steps):
+        later, between = divmod(step, interval)
+        if between == 0 and later > 0:
+            rollouts.pay(price)
+            if later <= looks:
+                rollouts.fork(1.0 if later == looks else 1.0 / looks)
+            rollouts.drop_decided()
+        if not rollouts.advance(motion.substream(step)):
+            break
+    return rollouts.returns
+
+
+class _Rollouts:
+    """Robots on their way, all of them at once.
+
+    All arrays have the J sensing actions first and then a column for each branch of a rollout. The
+    columns whose state is not known come first, and each of them has a cloud of particles. A column
+    is dropped once the goal is reached in it after every one of the J: as noise is drawn by
+    position, all J have the same noise only while they have the same columns.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        settings: PlanningSettings,
+        true_states: FloatArray,
+        estimates: FloatArray,
+        clouds: FloatArray,
+        stage: int,
+    ) -> None:
+        actions, samples, size = estimates.shape
+        own_rewards = getattr(type(problem), "reward", None) is not ProblemBase.reward
+        self._problem = problem
+        self._counts_steps = settings.selector.rollout_reward == "steps" or not own_rewards
+        self._discount = settings.active_sensing.discount
+        self._factor = 1.0
+        self.returns = np.zeros((actions, samples))
+        self._unknown = samples
+        self._states = np.broadcast_to(true_states, (actions, samples, size))
+        self._clouds = clouds
+        self._offsets = estimates - _means(clouds)
+        self._stages: IntArray = np.full((actions, samples), stage, dtype=np.int64)
+        self._origins = np.arange(samples)
+        # The probability of the branch; 0 where the goal is reached.
+        self._shares = np.ones((actions, samples))
+        self._end_at_goals()
+
+    def pay(self, price: float) -> None:
+        """Pay for a later look wherever the goal is not reached."""
+        if price > 0.0:
+            self._add(self._origins, -price * self._shares)
+
+    def fork(self, chance: float) -> None:
+        """Split each column whose state is not known: with this probability it is from now on."""
+        unknown = self._unknown
+        shares = self._shares[:, :unknown] * chance
+        value = contract.known_state_return(
+            self._problem, self._states[:, :unknown], self._stages[:, :unknown]
+        )
+        if value is not None:
+            self._add(self._origins[:unknown], shares * value)
+        else:
+            self._states = np.concatenate([self._states, self._states[:, :unknown]], axis=1)
+            self._stages = np.concatenate([self._stages, self._stages[:, :unknown]], axis=1)
+            self._shares = np.concatenate([self._shares, shares], axis=1)
+            self._origins = np.concatenate([self._origins, self._origins[:unknown]])
+        self._shares[:, :unknown] -= shares
+        if chance == 1.0:
+            self._keep(np.arange(self._origins.shape[0]) >= unknown)
+
+    def advance(self, motion: Stream) -> bool:
+        """Take one step; tell whether there is anybody left to take another."""
+        count, unknown = self._origins.shape[0], self._unknown
+        if count == 0 or self._factor == 0.0 or not self._shares.any():
+            return False
+        problem = self._problem
+        believed = np.concatenate(
+            [_means(self._clouds) + self._offsets, self._states[:, unknown:]], axis=1
+        )
+        shape, size, cloud = believed.shape[:2], believed.shape[2], self._clouds.shape[2]
+        rows = believed.reshape(-1, size)
+        _read_only(rows)
+        stage: int | IntArray = 0
+        if problem.num_stages > 1:
+            stage = contract.next_stages(problem, rows, self._stages.reshape(-1))
+            self._stages = stage.reshape(shape)
+        commanded = contract.policy(problem, rows, stage)
+        executed = contract.executed_action(problem, commanded)
+        actions = executed.reshape(*shape, -1)
+        for_clouds = np.repeat(actions[:, :unknown], cloud, axis=1)
+        before = np.concatenate(
+            [self._states, self._clouds.reshape(actions.shape[0], -1, size)], axis=1
+        )
+        all_actions = np.concatenate([actions, for_clouds], axis=1)
+        _read_only(before, all_actions)
+        moved = np.stack(
+            [problem.move(*each, motion) for each in zip(before, all_actions, strict=True)]
+        )
+        moved = contract.states_of(problem, "move", moved, before.shape)
+        self._states = moved[:, :count]
+        self._clouds = moved[:, count:].reshape(self._clouds.shape)
+        if self._counts_steps:
+            self._add(self._origins, -self._shares)
+        else:
+            rewards = contract.rewards(problem, self._states.reshape(-1, size), executed)
+            self._add(self._origins, self._shares * rewards.reshape(shape))
+        self._factor *= self._discount
+        self._end_at_goals()
+        return True
+
+    def _end_at_goals(self) -> None:
+        rows = self._states.reshape(-1, self._states.shape[2])
+        reached = contract.goals(self._problem, rows).reshape(self._shares.shape)
+        self._shares = np.where(reached, 0.0, self._shares)
+
+    def drop_decided(self) -> None:
+        """Forget the columns in which nothing can differ any more.
+
+        Either the goal is reached in them after every sensing action, or the state is known and the
+        same after each: with the same noise the rest is the same, too.
+        """
+        going_on = self._shares > 0.0
+        differ = (self._states != self._states[:1]).any(axis=2)
+        differ |= (self._stages != self._stages[:1]) | (self._shares != self._shares[:1])
+        differ[:, : self._unknown] = True
+        self._keep(np.asarray(going_on.any(axis=0) & differ.any(axis=0)))
+
+    def _keep(self, columns: BoolArray) -> None:
+        of_unknown = columns[: self._unknown]
+        self._clouds = self._clouds[:, of_unknown]
+        self._offsets = self._offsets[:, of_unknown]
+        self._unknown = self._offsets.shape[1]
+        self._states = self._states[:, columns]
+        self._stages = self._stages[:, columns]
+        self._shares = self._shares[:, columns]
+        self._origins = self._origins[columns]
+
+    def _add(self, origins: IntArray, values: FloatArray) -> None:
+        """Add values to the rollouts that their columns are branches of, column by column."""
+        samples = self.returns.shape[1]
+        discounted = self._factor * values
+        for row, added in zip(self.returns, discounted, strict=True):
+            # bincount adds one by one, in order.
+            row += np.bincount(origins, weights=added, minlength=samples)
+
+
+def _read_only(*arrays: FloatArray) -> None:
+    for array in arrays:
+        array.setflags(write=False)
+
+
+def _means(clouds: FloatArray) -> FloatArray:
+    """Return the mean of each cloud, added one by one, in order."""
+    total = clouds[:, :, 0]
+    for member in range(1, clouds.shape[2]):
+        total = total + clouds[:, :, member]
+    return np.asarray(total / clouds.shape[2])
+
+
+def _contenders(samples: FloatArray, among: Sequence[int]) -> list[int]:
+    """Return the sensing actions whose difference from the best one is too close to call."""
+    rows = {j: samples[j] for j in among}
+    count = samples.shape[1]
+    means = {j: numerics.sum(row) / count for j, row in rows.items()}
+    best = max(among, key=lambda j: means[j])
+    close = []
+    for j in among:
+        differences = rows[best] - rows[j]
+        mean = means[best] - means[j]
+        away = differences - mean
+        squared_error = numerics.sum(away * away) / (count * max(count - 1, 1))
+        # Of equal returns more samples would tell nothing.
+        equal = not differences.any() and j != best
+        if j == best or (not equal and mean * mean < _CLOSE * _CLOSE * squared_error):
+            close.append(j)
+    return close
+
+
+def _paired_means(samples: FloatArray) -> FloatArray:
+    """Return the mean of each row; of a shorter one, by its difference from the best."""
+    lengths = [int((row == row).sum()) for row in samples]
+    longest = max(lengths)
+    full = [j for j, length in enumerate(lengths) if length == longest]
+    means = np.empty(len(lengths))
+    for j in full:
+        means[j] = numerics.sum(samples[j]) / longest
+    best = max(full, key=lambda j: means[j])
+    for j, length in enumerate(lengths):
+        if length < longest:
+            differences = samples[j, :length] - samples[best, :length]
+            means[j] = means[best] + numerics.sum(differences) / length
+    return means

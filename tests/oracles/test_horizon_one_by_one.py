@@ -1,0 +1,164 @@
+"""The steps ahead of all hypothetical beliefs at once, against one belief after the other.
+
+The reference is how they were computed before: the same functions, called for a single belief. The
+results are equal to the last bit, for every problem, estimate and number of threads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from benchmarks.horizon import one_by_one
+from tests.golden.sonar_room import SonarRoom
+
+from holdfast import _kernel, contract, sensing
+from holdfast.belief import Belief
+from holdfast.experiments.busy_room import BusyRoom
+from holdfast.experiments.light_dark import LightDark
+from holdfast.problems import registry
+from holdfast.problems.peg_in_hole_2d import PegInHole2D
+from holdfast.problems.problem import FloatArray
+from holdfast.randomness import Purpose, Stream, stream
+from holdfast.sensing import choose_sensing_action
+from holdfast.settings import (
+    ActiveSensingSettings,
+    ParticleFilterSettings,
+    PlanningSettings,
+    SelectorSettings,
+)
+
+PROBLEMS: dict[str, Callable[[], Any]] = {
+    **{
+        name: lambda name=name: registry.problem_class(name).from_settings({}, {})  # type: ignore[misc]
+        for name in registry.names()
+    },
+    "light_dark": LightDark,
+    "busy_room": BusyRoom,
+    "sonar_room": SonarRoom,
+}
+SELECTORS = [
+    SelectorSettings(),
+    SelectorSettings(estimator="gaussian_mixture_upper", actions="executed"),
+    SelectorSettings(method="state_entropy"),
+    SelectorSettings(method="action_covariance"),
+]
+
+
+def on_the_way(problem: Any, count: int) -> tuple[Belief, int]:
+    """Return a belief of unequal weights, some steps after the start, and its stage."""
+    draws = stream(61, 0, 0, Purpose.INITIAL_BELIEF)
+    states = problem.initial_states(draws, count)
+    stage = 0
+    for step in range(42):
+        mean = states.mean(axis=0)
+        stage = contract.next_stage(problem, mean, stage)
+        action = problem.execute(problem.policy(mean, stage))
+        states = problem.move(states, action, draws.substream(2).substream(step))
+    weights = draws.substream(1).uniform(count)
+    weights[::7] = 0.0
+    return Belief.weighted(states, weights), stage
+
+
+def settings_of(
+    selector: SelectorSettings, threads: int = 1, estimates: str = "mean"
+) -> PlanningSettings:
+    return PlanningSettings(
+        particle_filter=ParticleFilterSettings(num_particles=60, estimate=estimates),  # type: ignore[arg-type]
+        active_sensing=ActiveSensingSettings(
+            horizon=4, discount=0.7, num_observation_samples=3, num_cores=threads
+        ),
+        selector=selector,
+    )
+
+
+def samples_of(problem: Any, settings: PlanningSettings, belief: Belief, stage: int) -> bytes:
+    hypotheses = stream(61, 0, 0, Purpose.HYPOTHESES)
+    selection = stream(61, 0, 0, Purpose.SELECTION)
+    _, info = choose_sensing_action(problem, settings, belief, stage, hypotheses, selection)
+    assert info.samples is not None
+    return info.samples.tobytes()
+
+
+@pytest.mark.parametrize("name", PROBLEMS)
+@pytest.mark.parametrize("selector", SELECTORS, ids=lambda each: f"{each.method} {each.estimator}")
+def test_every_problem(
+    name: str, selector: SelectorSettings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    problem = PROBLEMS[name]()
+    belief, stage = on_the_way(problem, 60)
+    for estimates in ("mean", "most_likely"):
+        together = {
+            samples_of(problem, settings_of(selector, threads, estimates), belief, stage)
+            for threads in (1, 2, 0)
+        }
+        with monkeypatch.context() as patched:
+            patched.setattr(sensing, "_later_entropies", one_by_one)
+            alone = samples_of(problem, settings_of(selector, 1, estimates), belief, stage)
+        assert together == {alone}
+
+
+@pytest.mark.parametrize("largest", [1, 400, 10**9])
+def test_blocks_change_nothing(largest: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    problem = PROBLEMS["peg_in_hole_2d"]()
+    belief, stage = on_the_way(problem, 60)
+    usual = samples_of(problem, settings_of(SELECTORS[0]), belief, stage)
+    monkeypatch.setattr(sensing, "_LARGEST_BLOCK", largest)
+    assert samples_of(problem, settings_of(SELECTORS[0]), belief, stage) == usual
+
+
+def test_threads_that_are_worth_their_waking(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Helpers take part however little there is to do, and change nothing."""
+    problem = PROBLEMS["multitier_peg_in_hole_2d"]()
+    belief, stage = on_the_way(problem, 300)
+    usual = samples_of(problem, settings_of(SELECTORS[0]), belief, stage)
+    before = _kernel.use_threads_from(0.0)
+    try:
+        assert samples_of(problem, settings_of(SELECTORS[0], 4), belief, stage) == usual
+    finally:
+        _kernel.use_threads_from(before)
+
+
+def test_stages_of_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Some hypothetical beliefs have reached the light, and others have not."""
+    asked: list[set[int]] = []
+    draws = stream(62, 0, 0, Purpose.INITIAL_BELIEF)
+    belief = Belief.uniform(np.array([4.8, 0.0]) + 0.3 * draws.normal((60, 2)))
+    by_stage = sensing._points_by_stage
+
+    def noted(points_of: Any, states: FloatArray, stages: Any) -> FloatArray:
+        asked.append(set(stages))
+        return by_stage(points_of, states, stages)
+
+    monkeypatch.setattr(sensing, "_points_by_stage", noted)
+    together = samples_of(LightDark(), settings_of(SELECTORS[0]), belief, 0)
+    assert {0, 1} in asked
+    monkeypatch.setattr(sensing, "_later_entropies", one_by_one)
+    assert samples_of(LightDark(), settings_of(SELECTORS[0]), belief, 0) == together
+
+
+@pytest.mark.parametrize("name", [*registry.names()])
+def test_beliefs_are_moved_as_one_after_the_other(name: str) -> None:
+    problem = PROBLEMS[name]()
+    beliefs = [on_the_way(problem, count)[0].states for count in (150, 150, 150)]
+    states = np.stack(beliefs) + np.array([0.0, 0.01, 0.02])[:, np.newaxis, np.newaxis]
+    actions = problem.execute(problem.policy(states[:, 0], 0))
+    streams = [stream(63, 0, step, Purpose.PREDICTION) for step in range(3)]
+    alone = np.stack([problem.move(*each) for each in zip(states, actions, streams, strict=True)])
+    for threads in (1, 2, 0):
+        together = problem.move_each(states, actions, streams, threads)
+        assert together.tobytes() == alone.tobytes()
+
+
+def test_who_moves_otherwise_does_not_inherit_the_batch(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Slow(PegInHole2D):
+        def move(self, states: FloatArray, actions: FloatArray, stream: Stream) -> FloatArray:
+            return super().move(states, 0.5 * actions, stream)
+
+    belief, stage = on_the_way(PegInHole2D(), 60)
+    together = samples_of(Slow(), settings_of(SELECTORS[0]), belief, stage)
+    assert together != samples_of(PegInHole2D(), settings_of(SELECTORS[0]), belief, stage)
+    monkeypatch.setattr(sensing, "_later_entropies", one_by_one)
+    assert samples_of(Slow(), settings_of(SELECTORS[0]), belief, stage) == together

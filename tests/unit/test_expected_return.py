@@ -1,0 +1,448 @@
+"""Expected return: what a look is worth, and what it costs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from holdfast import contract, expected_return, planning
+from holdfast.belief import Belief
+from holdfast.errors import ProblemError
+from holdfast.expected_return import rollout_returns
+from holdfast.outcome import SensingDecision
+from holdfast.problems.problem import FloatArray, IntArray, ProblemBase
+from holdfast.randomness import Purpose, Stream, stream
+from holdfast.runtime.trial import run_trial
+from holdfast.sensing import SensingInfo, choose_sensing_action
+from holdfast.session.records import ObservedRecord
+from holdfast.session.robot import History
+from holdfast.settings import (
+    ActiveSensingSettings,
+    ParticleFilterSettings,
+    PlanningSettings,
+    SelectorSettings,
+    SimulatorSettings,
+)
+
+HYPOTHESES = stream(43, 0, 0, Purpose.HYPOTHESES)
+SELECTION = stream(43, 0, 0, Purpose.SELECTION)
+
+
+class Dock(ProblemBase):
+    """Go to the origin of the plane, 0.2 a step; the third sensing action shows nothing."""
+
+    name = "dock"
+    state_size = 2
+    action_size = 2
+    sensing_actions: Sequence[str] = ("x", "y", "nothing")
+    resolution = 0.1
+    motion_variance = np.array([0.0025, 0.0025])
+
+    def initial_states(self, stream: Stream, count: int) -> FloatArray:
+        return np.array([1.0, 1.0]) + 0.5 * stream.normal((count, 2))
+
+    def move(self, states: FloatArray, actions: FloatArray, stream: Stream) -> FloatArray:
+        return np.asarray(states + actions + 0.05 * stream.normal(states.shape))
+
+    def observation_mean(self, states: FloatArray, sensing_action: int) -> FloatArray:
+        return states[..., :1] if sensing_action == 2 else states[..., [sensing_action]]
+
+    def observation_variance(self, states: FloatArray, sensing_action: int) -> FloatArray:
+        return np.array([1e12 if sensing_action == 2 else 0.0025])
+
+    def policy(self, states: FloatArray, stage: int | IntArray) -> FloatArray:
+        return -states
+
+    def execute(self, actions: FloatArray) -> FloatArray:
+        return np.clip(actions, -0.2, 0.2)
+
+    def reward(self, states: FloatArray, actions: FloatArray) -> FloatArray:
+        return np.asarray(-1.0 - np.abs(actions[..., 0]))
+
+    def is_goal(self, states: FloatArray) -> npt.NDArray[np.bool_]:
+        return np.asarray((np.abs(states) < 0.15).all(axis=-1))
+
+
+class Free(Dock):
+    """Has no reward."""
+
+    reward = ProblemBase.reward
+
+
+class TwoDocks(Dock):
+    """First to x = 1, then to the origin."""
+
+    num_stages = 2
+
+    def policy(self, states: FloatArray, stage: int | IntArray) -> FloatArray:
+        first = np.expand_dims(np.asarray(stage) == 0, -1)
+        return np.where(first, np.array([1.0, 0.0]) - states, -states)
+
+    def next_stage(self, estimates: FloatArray, stage: int | IntArray) -> int | IntArray:
+        there = np.abs(estimates[..., 0] - 1.0) < 0.15
+        following = np.where(there, 1, stage)
+        return following if following.ndim else int(following)
+
+
+class Sonar(Dock):
+    """The same with a likelihood of its own."""
+
+    def log_likelihood(
+        self, states: FloatArray, sensing_action: int, observation: FloatArray
+    ) -> FloatArray:
+        away = self.observation_mean(states, sensing_action)[..., 0] - observation[0]
+        return np.asarray(-0.5 * away * away / self.observation_variance(states, sensing_action)[0])
+
+    def sample_observation(
+        self, state: FloatArray, sensing_action: int, stream: Stream
+    ) -> FloatArray:
+        return self.observation_mean(state, sensing_action) + 0.05 * stream.normal(1)
+
+
+def settings_of(
+    samples: int = 10,
+    interval: int = 4,
+    discount: float = 1.0,
+    particles: int = 60,
+    **selector: Any,
+) -> PlanningSettings:
+    selector = {"method": "expected_return", "rollout_steps": 60, "rollout_looks": 4, **selector}
+    return PlanningSettings(
+        particle_filter=ParticleFilterSettings(num_particles=particles),
+        active_sensing=ActiveSensingSettings(
+            num_observation_samples=samples, discount=discount, num_cores=1
+        ),
+        selector=SelectorSettings(**selector),
+        sensing_interval=interval,
+    )
+
+
+def belief_of(*spreads: float, count: int = 60) -> Belief:
+    """Return a belief around (0.5, 0.5), spread by so much along x and y."""
+    draws = stream(44, 0, 0, Purpose.INITIAL_BELIEF).normal((count, 2))
+    return Belief.uniform(0.5 + np.array(spreads) * draws)
+
+
+def choose(
+    problem: Any, settings: PlanningSettings, belief: Belief, stage: int = 0
+) -> tuple[int, SensingInfo]:
+    return choose_sensing_action(problem, settings, belief, stage, HYPOTHESES, SELECTION)
+
+
+class TestWhatIsChosen:
+    @pytest.mark.parametrize("problem", [Dock(), Free(), Sonar()])
+    @pytest.mark.parametrize(("spreads", "best"), [((0.5, 0.01), 0), ((0.01, 0.5), 1)])
+    def test_what_the_robot_does_not_know(
+        self, problem: Any, spreads: tuple[float, float], best: int
+    ) -> None:
+        chosen, info = choose(problem, settings_of(), belief_of(*spreads))
+        assert chosen == best
+        assert info.entropies is not None
+        assert int(info.entropies.argmin()) == best
+
+    def test_not_looking_where_looks_cost_more_than_they_gain(self) -> None:
+        for price, looks in ((0.01, True), (100.0, False)):
+            problem = Dock()
+            problem.sensing_costs = (price, price, 0.0)  # type: ignore[attr-defined]
+            chosen, _ = choose(problem, settings_of(), belief_of(0.5, 0.5))
+            assert (chosen != 2) is looks
+
+    def test_a_price_is_subtracted(self) -> None:
+        # So long an interval that no look comes later.
+        settings = settings_of(max_observation_samples=1, interval=100)
+        belief = belief_of(0.5, 0.5)
+        _, free = choose(Dock(), settings, belief)
+        priced = Dock()
+        priced.sensing_costs = [0.25, 0.5, 0.0]  # type: ignore[attr-defined]
+        _, paid = choose(priced, settings, belief)
+        assert free.samples is not None
+        assert paid.samples is not None
+        more = np.broadcast_to([[0.25], [0.5], [0.0]], free.samples.shape)
+        np.testing.assert_allclose(paid.samples - free.samples, more, atol=1e-12)
+
+    def test_equal_ones_cost_no_more_samples_and_the_first_is_taken(self) -> None:
+        belief = Belief.uniform(np.full((60, 2), 0.5))
+        chosen, info = choose(Dock(), settings_of(samples=5), belief)
+        assert chosen == 0
+        assert info.samples is not None
+        assert info.samples.shape == (3, 5)
+
+    def test_close_ones_are_sampled_more_than_others(self) -> None:
+        _, info = choose(Dock(), settings_of(samples=5), belief_of(0.3, 0.3, count=200))
+        assert info.samples is not None
+        drawn = np.isfinite(info.samples).sum(axis=1)
+        assert drawn.max() <= 40
+        assert drawn.min() >= 5
+        assert drawn[2] < drawn[:2].max()
+
+    def test_a_horizon_changes_nothing(self) -> None:
+        near = settings_of(samples=5)
+        far = msgspec.structs.replace(
+            near, active_sensing=msgspec.structs.replace(near.active_sensing, horizon=3)
+        )
+        first, second = (choose(Dock(), each, belief_of(0.5, 0.5))[1] for each in (near, far))
+        assert first.entropies is not None
+        assert second.entropies is not None
+        assert first.entropies.tobytes() == second.entropies.tobytes()
+
+    def test_an_observation_that_no_particle_explains(self) -> None:
+        class Impossible(Sonar):
+            def log_likelihood(
+                self, states: FloatArray, sensing_action: int, observation: FloatArray
+            ) -> FloatArray:
+                return np.full(states.shape[:-1], -np.inf)
+
+        with pytest.raises(ProblemError, match="dock had no likelihood under any particle"):
+            choose(Impossible(), settings_of(), belief_of(0.5, 0.5))
+
+
+class TestRollouts:
+    """Against one robot after another, in plain Python."""
+
+    ESTIMATES = np.array([[[0.7, 0.2], [-0.4, 0.9]], [[0.5, 0.6], [-0.6, 1.2]]])
+    STATES = np.array([[0.5, 0.5], [-0.5, 1.0]])
+
+    @pytest.mark.parametrize("problem", [Dock(), Free(), TwoDocks()])
+    @pytest.mark.parametrize("discount", [1.0, 0.9])
+    def test_against_single_robots(self, problem: Dock, discount: float) -> None:
+        """Without noise: then it does not matter which column has which."""
+        noiseless: Any = type("Noiseless", (type(problem),), {"move": lambda _, s, a, __: s + a})()
+        settings = settings_of(discount=discount)
+        clouds = self.ESTIMATES[:, :, np.newaxis] + np.array([[0.1, 0.0], [-0.1, 0.2]])
+        found = rollout_returns(
+            noiseless, settings, self.STATES, self.ESTIMATES, clouds, 0, HYPOTHESES
+        )
+        gains = []
+        for i in range(2):
+            first, second = (
+                self.alone(noiseless, settings, self.STATES[i], self.ESTIMATES[j, i])
+                for j in range(2)
+            )
+            gains.append(first - second)
+        assert max(map(abs, gains)) > 1e-3
+        # What the two have in common may be missing.
+        np.testing.assert_allclose(found[0] - found[1], gains, atol=1e-10)
+
+    def test_alone_it_is_followed_to_the_end_or_not_at_all(self) -> None:
+        """One sensing action differs from none: nothing is left once the state is known."""
+        asked = []
+
+        class Noted(Dock):
+            def policy(self, states: FloatArray, stage: int | IntArray) -> FloatArray:
+                asked.append(len(states))
+                return super().policy(states, stage)
+
+        estimates = self.ESTIMATES[:1]
+        settings = settings_of(rollout_steps=1000)
+        rollout_returns(
+            Noted(), settings, self.STATES, estimates, estimates[:, :, np.newaxis], 0, HYPOTHESES
+        )
+        assert len(asked) <= settings.selector.rollout_looks * (settings.sensing_interval + 1)
+
+    def alone(
+        self, problem: Any, settings: PlanningSettings, state: FloatArray, estimate: FloatArray
+    ) -> float:
+        """Return the mean over the sensing step at which the state gets known."""
+        total, left = 0.0, 1.0
+        for later in range(1, settings.selector.rollout_looks + 1):
+            last = later == settings.selector.rollout_looks
+            share = left if last else left / 4.0
+            known_from = later * (settings.sensing_interval + 1)
+            total += share * self.one(problem, settings, state, estimate, known_from)
+            left -= share
+        return total
+
+    def one(
+        self,
+        problem: Any,
+        settings: PlanningSettings,
+        state: FloatArray,
+        estimate: FloatArray,
+        known_from: int,
+    ) -> float:
+        stage, total = 0, 0.0
+        for step in range(settings.selector.rollout_steps):
+            if problem.is_goal(state):
+                break
+            if step >= known_from:
+                estimate = state
+            stage = problem.next_stage(estimate, stage)
+            action = problem.execute(problem.policy(estimate, stage))
+            state, estimate = state + action, estimate + action
+            reward = -1.0 if isinstance(problem, Free) else float(problem.reward(state, action))
+            total += settings.active_sensing.discount**step * reward
+        return total
+
+    def test_steps_instead_of_rewards(self) -> None:
+        settings = settings_of(rollout_reward="steps")
+        clouds = self.ESTIMATES[:, :, np.newaxis]
+        by_steps = rollout_returns(
+            Dock(), settings, self.STATES, self.ESTIMATES, clouds, 0, HYPOTHESES
+        )
+        without = rollout_returns(
+            Free(), settings_of(), self.STATES, self.ESTIMATES, clouds, 0, HYPOTHESES
+        )
+        assert by_steps.tobytes() == without.tobytes()
+
+    def test_all_sensing_actions_have_the_same_noise(self) -> None:
+        """Equal beliefs have equal returns, whatever the others are like."""
+        estimates = np.concatenate([self.ESTIMATES, self.ESTIMATES[:1]])
+        clouds = np.repeat(estimates[:, :, np.newaxis], 3, axis=2)
+        found = rollout_returns(
+            Dock(), settings_of(), self.STATES, estimates, clouds, 0, HYPOTHESES
+        )
+        assert found[0].tobytes() == found[2].tobytes()
+        assert found[0].tobytes() != found[1].tobytes()
+
+    def test_later_looks_have_a_price_too(self) -> None:
+        """At each sensing step up to the goal the mean price: who is there sooner has fewer."""
+        estimates = np.stack([self.STATES, self.STATES + np.array([1.0, 0.0])])
+        clouds = estimates[:, :, np.newaxis]
+        found = []
+        for price in (0.0, 3.0):
+            problem: Any = type("Exact", (Free,), {"move": lambda _, s, a, __: s + a})()
+            problem.sensing_costs = (price, 2.0 * price, 0.0)
+            returns = rollout_returns(
+                problem,
+                settings_of(interval=1),
+                self.STATES,
+                estimates,
+                clouds,
+                0,
+                HYPOTHESES,
+            )
+            found.append(returns[0] - returns[1])
+        assert found[0][0] == found[1][0] == 0.0  # the first robot is as soon there as the other
+        assert found[0][1] > 1.0
+        assert found[1][1] > found[0][1] + 1.0
+
+    def test_a_problem_may_know_what_known_states_are_worth(self) -> None:
+        asked = []
+
+        class Told(Free):
+            def known_state_return(self, states: FloatArray, stages: IntArray) -> FloatArray:
+                asked.append((states.shape, stages.shape))
+                return np.full(states.shape[0], 1000.0)
+
+        far = self.STATES + 50.0
+        clouds = self.ESTIMATES[:, :, np.newaxis]
+        found = rollout_returns(Told(), settings_of(), far, self.ESTIMATES, clouds, 0, HYPOTHESES)
+        # Known at steps 5, 10, 15 and 20 with the probabilities 1/4, 3/16, 9/64 and 27/64.
+        steps = 5 / 4 + 10 * 3 / 16 + 15 * 9 / 64 + 20 * 27 / 64
+        np.testing.assert_allclose(found, 1000.0 - steps, rtol=1e-12)
+        assert asked == [((4, 2), (4,))] * 4
+
+    @pytest.mark.parametrize(
+        ("function", "own", "message"),
+        [
+            ("is_goal", lambda _, s: s[..., 0], "is_goal of dock, asked of 4 states at once"),
+            ("reward", lambda *_: 0.0, "reward of dock returned float"),
+            ("reward", lambda _, s, __: np.full(s.shape[:-1], np.nan), "all must be finite"),
+            ("move", lambda _, s, *__: s * np.inf, "move of dock put particle 0 at"),
+            ("known_state_return", lambda *_: 0.0, "known_state_return of dock returned float"),
+            ("next_stage", lambda *_: 0, "next_stage of dock returned int"),
+        ],
+    )
+    def test_what_breaks_the_contract_is_named(self, function: str, own: Any, message: str) -> None:
+        broken: Any = type("Broken", (TwoDocks,), {function: own})()
+        clouds = self.ESTIMATES[:, :, np.newaxis]
+        with pytest.raises(ProblemError, match=message):
+            rollout_returns(
+                broken, settings_of(), self.STATES, self.ESTIMATES, clouds, 0, HYPOTHESES
+            )
+
+    @pytest.mark.parametrize("function", ["policy", "move"])
+    def test_nothing_can_be_changed_in_place(self, function: str) -> None:
+        def in_place(_self: Dock, states: FloatArray, *_: object) -> FloatArray:
+            states += 1.0
+            return states
+
+        broken: Any = type("InPlace", (Dock,), {function: in_place})()
+        with pytest.raises(ValueError, match="read-only"):
+            choose(broken, settings_of(), belief_of(0.5, 0.5))
+
+
+class TestSamples:
+    def test_contenders(self) -> None:
+        draws = stream(45, 0, 0, Purpose.HYPOTHESES).normal((4, 20))
+        best = 5.0 + draws[0]
+        samples = np.stack([best, best - 1.0, best - 0.1 * draws[1] - 0.01, best - draws[2]])
+        # The second is worse by 1 without a doubt; the third by less than its error.
+        assert expected_return._contenders(samples, [0, 1, 2, 3]) == [0, 2, 3]
+        assert expected_return._contenders(samples, [1, 3])[-1] == 3
+
+    def test_equal_rows_are_not_contended(self) -> None:
+        assert expected_return._contenders(np.ones((3, 4)), [0, 1, 2]) == [0]
+
+    def test_a_single_sample_tells_nothing_about_its_error(self) -> None:
+        assert expected_return._contenders(np.array([[1.0], [2.0]]), [0, 1]) == [1]
+
+    def test_paired_means(self) -> None:
+        nan = np.nan
+        samples = np.array([[1.0, 2.0, 9.0, 8.0], [0.0, 1.5, nan, nan], [1.0, 2.5, 7.0, 8.0]])
+        found = expected_return._paired_means(samples)
+        np.testing.assert_allclose(found, [5.0, 5.0 - 0.75, 4.625])
+
+
+class Priced(Dock):
+    sensing_costs: Any = (0.5, 0.25, 0.0)
+
+
+class TestSensingCosts:
+    def test_a_trial_pays_for_each_look(self) -> None:
+        settings = settings_of(method="random", particles=30)
+        simulator = SimulatorSettings(max_steps=60, sensing_intervals=4)
+        free, paid = (run_trial(each, settings, simulator, 1) for each in (Dock(), Priced()))
+        assert free.digest == paid.digest
+        assert free.decisions is not None
+        prices = Priced.sensing_costs
+        looks = [d.sensing_action for d in free.decisions if isinstance(d, SensingDecision)]
+        assert len(looks) > 1
+        assert free.reward is not None
+        assert paid.reward is not None
+        expected = free.reward - sum(prices[look] for look in looks)
+        np.testing.assert_allclose(paid.reward, expected, rtol=1e-12)
+
+    def test_a_robot_pays_for_each_look(self) -> None:
+        planner = planning.Planner(Priced(), settings_of(method="random", particles=30))
+        history = History(planner, 0, 0)
+        observation = np.array([0.5])
+        for sensing_action, total in ((0, -0.5), (1, -0.75), (2, -0.75)):
+            after, info = planner.observe(history.state, sensing_action, observation)
+            record = ObservedRecord(
+                step=0,
+                sensing_action=sensing_action,
+                observation=observation.tobytes(),
+                digest=planner.digest(after),
+                sensing_ms=0.0,
+            )
+            history.observed(record, after, explained=info.explained)
+            assert history.total_reward == total
+
+    def test_a_price_alone_is_a_reward(self) -> None:
+        problem = Free()
+        problem.sensing_costs = (1.0, 1.0, 1.0)  # type: ignore[attr-defined]
+        simulator = SimulatorSettings(max_steps=10, sensing_intervals=4)
+        result = run_trial(problem, settings_of(method="random", particles=30), simulator, 0)
+        assert result.reward == -float(result.sensing_decisions)
+
+    def test_none_is_free(self) -> None:
+        for costs in (None, (0.0, 0.0, 0.0), np.zeros(3), [0, 0, 0]):
+            problem = Dock()
+            problem.sensing_costs = costs  # type: ignore[attr-defined]
+            assert contract.sensing_costs(problem).tolist() == [0.0, 0.0, 0.0]
+        assert contract.sensing_costs(Dock()).tolist() == [0.0, 0.0, 0.0]
+
+    @pytest.mark.parametrize(
+        "costs",
+        [(1.0,), (1.0, -0.5, 0.0), (0.0, np.nan, 0.0), (0.0, np.inf, 0.0), 1.0, ("a", "b", "c")],
+    )
+    def test_a_wrong_price_is_named(self, costs: object) -> None:
+        broken: Any = type("Broken", (Dock,), {"sensing_costs": costs})()
+        with pytest.raises(ProblemError, match=r"sensing_costs of dock is .*: must be 3 finite"):
+            planning.initial_state(broken, settings_of(), 0, 0)
