@@ -38,7 +38,7 @@ def settings_for(num_particles: int, threads: int, **sensing: Any) -> PlanningSe
     """Return the published settings (nearest neighbours, M = 10, k = 5), changed as asked."""
     settings = PlanningSettings(
         particle_filter=ParticleFilterSettings(num_particles=num_particles),
-        selector=SelectorSettings(estimator="nearest_neighbor"),
+        selector=SelectorSettings(method="action_entropy", estimator="nearest_neighbor"),
     )
     return with_sensing(settings, num_cores=threads, **sensing)
 

@@ -449,9 +449,9 @@ def estimators(context: Context) -> Result:
     selectors = {
         f"{selector.method}, {selector.estimator}": selector
         for selector in (
-            SelectorSettings(estimator="nearest_neighbor"),
-            SelectorSettings(estimator="gaussian_mixture_upper"),
-            SelectorSettings(estimator="gaussian_mixture_lower"),
+            SelectorSettings(method="action_entropy", estimator="nearest_neighbor"),
+            SelectorSettings(method="action_entropy", estimator="gaussian_mixture_upper"),
+            SelectorSettings(method="action_entropy", estimator="gaussian_mixture_lower"),
             SelectorSettings(method="state_entropy", estimator="nearest_neighbor"),
             SelectorSettings(method="state_entropy", estimator="gaussian_mixture_upper"),
             SelectorSettings(method="state_entropy", estimator="gaussian_mixture_lower"),

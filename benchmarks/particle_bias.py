@@ -77,7 +77,7 @@ def settings_of(rival: Rival, sensing_interval: int = 8) -> PlanningSettings:
     return PlanningSettings(
         particle_filter=settings.particle_filter,
         active_sensing=settings.active_sensing,
-        selector=SelectorSettings(estimator=rival.estimator),  # type: ignore[arg-type]
+        selector=SelectorSettings(method="action_entropy", estimator=rival.estimator),  # type: ignore[arg-type]
         sensing_interval=sensing_interval,
     )
 

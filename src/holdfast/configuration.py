@@ -49,6 +49,7 @@ from holdfast.settings import (
     RecoverySettings,
     SelectorSettings,
     SimulatorSettings,
+    estimator_of,
     unfit_for_path_entropy,
 )
 from holdfast.user_code import account_of_user_error, in_words
@@ -423,14 +424,15 @@ def _build(
 
     num_particles = particle_filter.num_particles
     num_neighbors = active_sensing.num_nearest_neighbors
+    estimator = estimator_of(selector, num_particles)
     if (
         selector.method in ("action_entropy", "path_entropy", "state_entropy")
-        and selector.estimator in {"nearest_neighbor", "prior_neighbors"}
+        and estimator in {"nearest_neighbor", "prior_neighbors"}
         and num_neighbors >= num_particles
     ):
         raise source.error(
             ("active_sensing", "num_nearest_neighbors"),
-            f"is {num_neighbors}; the {selector.estimator} estimator needs it below"
+            f"is {num_neighbors}; the {estimator} estimator needs it below"
             f" particle_filter.num_particles, which is {num_particles}",
         )
     of_states = selector.method == "state_entropy"
@@ -443,7 +445,7 @@ def _build(
             raise ConfigurationError(f"{place}: {error}") from None
     if (
         selector.method in ("action_entropy", "path_entropy", "state_entropy")
-        and selector.estimator == "prior_neighbors"
+        and estimator == "prior_neighbors"
         and num_particles > MAX_PRIOR_NEIGHBORS_POINTS
     ):
         raise source.error(

@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from holdfast import _kernel
 from holdfast.errors import InvalidValueError
-from holdfast.randomness import NOISE_FREE
+from holdfast.randomness import NoiseFreeStream
 
 if TYPE_CHECKING:
     from holdfast.randomness import Stream
@@ -116,7 +116,7 @@ class _World:
         tolerance : float
             Fraction of the action, above 0 and below 1.
         stream : Stream
-            Source of the noise; with :data:`~holdfast.randomness.NOISE_FREE` there is none.
+            Source of the noise; with a :class:`~holdfast.randomness.NoiseFreeStream` there is none.
 
         Returns
         -------
@@ -139,7 +139,7 @@ class _World:
             states, actions = _broadcast(states, actions)
         one_action = actions.shape == (dimension,)
         shape = states.shape if one_action else np.broadcast_shapes(states.shape, actions.shape)
-        if stream is NOISE_FREE:
+        if isinstance(stream, NoiseFreeStream):
             standard_deviation = np.zeros(dimension)
         next_states = np.empty(shape)
         moved = self._kernel.move(

@@ -18,7 +18,7 @@ from holdfast import contract
 from holdfast.entropy import LARGEST, first_unbounded
 from holdfast.errors import InvalidValueError, ProblemError
 from holdfast.problems.problem import Problem
-from holdfast.randomness import NOISE_FREE
+from holdfast.randomness import NoiseFreeStream
 from holdfast.settings import PlanningSettings, path_steps, unfit_for_path_entropy
 
 __all__ = ["PathPoints", "path_points"]
@@ -28,6 +28,10 @@ IntArray = npt.NDArray[np.int64]
 
 _STEP = ("policy", "execute", "move", "expected_move", "next_stage")
 """What a step of the way is made of."""
+
+
+_MOST_DRAWS = 1000
+"""Of a move without noise: one that draws more often waits for another number."""
 
 
 class PathPoints(NamedTuple):
@@ -105,8 +109,10 @@ def _followed(
     step = 0
     for number, offset in enumerate(offsets):
         while step < offset:
-            actions = problem.execute(problem.policy(states, stages if several_stages else stage))
-            states = contract.expected_move(problem, states, actions, NOISE_FREE)
+            own_stages = stages if several_stages else stage
+            actions = problem.execute(contract.policy(problem, states, own_stages))
+            noise_free = NoiseFreeStream(_MOST_DRAWS)
+            states = contract.expected_move(problem, states, actions, noise_free)
             if several_stages:
                 stages = contract.next_stages(problem, states, stages)
             step += 1

@@ -12,13 +12,14 @@ purpose are words of its counter, so that no two streams of one seed share a blo
 from __future__ import annotations
 
 import enum
+import math
 from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
 from holdfast import _kernel
-from holdfast.errors import InvalidValueError
+from holdfast.errors import InvalidValueError, ProblemError
 
 __all__ = ["NOISE_FREE", "NoiseFreeStream", "Purpose", "Stream", "stream"]
 
@@ -109,17 +110,34 @@ class NoiseFreeStream(Stream):
     """A stream whose numbers are all at the middle: normal deviates 0, uniform ones 0.5.
 
     What a problem draws from it is what happens without noise, if its noise is made of these
-    deviates. Every substream is the stream itself. There is one, :data:`NOISE_FREE`.
+    deviates. Every substream is the stream itself. :data:`NOISE_FREE` is one.
+
+    A problem that draws again until something holds would wait for ever here, where all draws are
+    the same. So a stream made with a limit raises ProblemError when it is asked more often.
     """
 
-    __slots__ = ()
+    __slots__ = ("_left",)
+
+    def __init__(self, limit: float = math.inf) -> None:
+        super().__init__((0, 0, 0, 0, 0))
+        self._left = limit
+
+    def _count(self) -> None:
+        self._left -= 1
+        if self._left < 0:
+            raise ProblemError(
+                "a move without noise draws again and again, as if it waited for another number: "
+                "give the problem an expected_move(states, actions), which path_entropy uses"
+            )
 
     def normal(self, shape: int | tuple[int, ...] = ()) -> npt.NDArray[np.float64]:
         """Return zeros of the given shape."""
+        self._count()
         return np.zeros(shape)
 
     def uniform(self, shape: int | tuple[int, ...] = ()) -> npt.NDArray[np.float64]:
         """Return halves of the given shape."""
+        self._count()
         return np.full(shape, 0.5)
 
     def substream(self, index: int) -> Stream:
@@ -137,7 +155,7 @@ class NoiseFreeStream(Stream):
         return "NOISE_FREE"
 
 
-NOISE_FREE = NoiseFreeStream((0, 0, 0, 0, 0))
+NOISE_FREE = NoiseFreeStream()
 
 
 def stream(seed: int, trial: int, step: int, purpose: Purpose) -> Stream:

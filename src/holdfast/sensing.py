@@ -40,7 +40,7 @@ from holdfast.expected_return import expected_returns
 from holdfast.policy_path import path_points
 from holdfast.problems.problem import Problem
 from holdfast.randomness import Stream
-from holdfast.settings import PlanningSettings
+from holdfast.settings import PlanningSettings, estimator_of
 
 __all__ = ["SensingInfo", "choose_sensing_action"]
 
@@ -199,7 +199,7 @@ def choose_sensing_action(
         )
     if estimator.log_volume != 0.0:
         # After the choice: what is the same for all must not decide it by its rounding.
-        volume = estimator.log_volume * _total_factor(settings)
+        volume = estimator.log_volume * sum(factors) * _total_factor(settings)
         entropies, samples = entropies + volume, samples + volume
     return index, SensingInfo(entropies, samples, likelihoods, visits)
 
@@ -266,14 +266,15 @@ def _estimator(
         if not each_its_own:
             return TOTAL_VARIANCE
         return TOTAL_VARIANCE._replace(scale=scale_of(np.asarray(resolution), dimension)[0])
-    if selector.estimator in {"nearest_neighbor", "prior_neighbors"}:
+    kind = estimator_of(selector, points.shape[0])
+    if kind in {"nearest_neighbor", "prior_neighbors"}:
         neighbors = settings.active_sensing.num_nearest_neighbors
         if neighbors >= points.shape[0]:
             raise InvalidValueError(
                 f"active_sensing.num_nearest_neighbors {neighbors}: must be below the number of "
                 f"particles, {points.shape[0]}"
             )
-        if selector.estimator == "nearest_neighbor":
+        if kind == "nearest_neighbor":
             return kernel_estimator(NearestNeighbor(neighbors, resolution), dimension)
         if points.shape[0] > MAX_PRIOR_NEIGHBORS_POINTS:
             raise InvalidValueError(
@@ -281,7 +282,7 @@ def _estimator(
                 f"prior_neighbors allows {MAX_PRIOR_NEIGHBORS_POINTS}"
             )
         return kernel_estimator(PriorNeighbors(belief.weights, neighbors, resolution), dimension)
-    upper = selector.estimator == "gaussian_mixture_upper"
+    upper = kind == "gaussian_mixture_upper"
     own = np.full(dimension, resolution * resolution)
     states_have_their_own = of_states and getattr(problem, "state_resolution", None) is not None
     if selector.resolution is None and not states_have_their_own:

@@ -26,6 +26,7 @@ __all__ = [
     "SelectorSettings",
     "SimulatorSettings",
     "check_settings",
+    "estimator_of",
     "path_steps",
     "unfit_for_path_entropy",
 ]
@@ -35,6 +36,10 @@ MAX_PARTICLES = 10_000_000
 
 MAX_SERVICES = 16
 """Bound on ``offload.services``: each has links of its own."""
+
+FEW_PARTICLES = 500
+"""Up to so many ``prior_neighbors`` has the less bias and takes little longer; its time grows with
+their square."""
 
 MAX_PATH_STEPS = 10_000
 """Bound on the entries of ``selector.path_offsets``, and on the steps that they come to."""
@@ -115,13 +120,14 @@ class SelectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
     sensing_action : int
         Index of the sensing action that ``fixed`` chooses.
     estimator : {"nearest_neighbor", "prior_neighbors", "gaussian_mixture_upper", \
-"gaussian_mixture_lower"}
+"gaussian_mixture_lower"} or None
         How the entropies are estimated. ``prior_neighbors`` has less bias where a sharp look leaves
         few particles: 300 choose about as well as 1,000 with ``nearest_neighbor``; at most 4,096. A
         mixture takes few particles for certainty: use it with so many that they lie closer than its
         noise (docs/results.md). Distances between neighbours depend on the units of the
         coordinates, unless ``resolution`` has a number for each; with the motion noise as its own,
-        the mixture does not.
+        the mixture does not. None: ``nearest_neighbor``, but ``prior_neighbors`` for
+        ``path_entropy`` with at most 500 particles.
     actions : {"commanded", "executed"}
         Whether ``action_entropy``, ``path_entropy`` and ``action_covariance`` look at what the
         policy says or at what the limits leave of it.
@@ -166,11 +172,17 @@ class SelectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
         "expected_return",
         "random",
         "fixed",
-    ] = "action_entropy"
+    ] = "path_entropy"
     sensing_action: NonNegativeCount = 0
-    estimator: Literal[
-        "nearest_neighbor", "prior_neighbors", "gaussian_mixture_upper", "gaussian_mixture_lower"
-    ] = "nearest_neighbor"
+    estimator: (
+        Literal[
+            "nearest_neighbor",
+            "prior_neighbors",
+            "gaussian_mixture_upper",
+            "gaussian_mixture_lower",
+        ]
+        | None
+    ) = None
     actions: Literal["commanded", "executed"] = "commanded"
     resolution: Positive | Resolutions | None = None
     path_offsets: Annotated[
@@ -329,6 +341,14 @@ class PlanningSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
     active_sensing: ActiveSensingSettings = msgspec.field(default_factory=ActiveSensingSettings)
     selector: SelectorSettings = msgspec.field(default_factory=SelectorSettings)
     sensing_interval: NonNegativeCount = 8
+
+
+def estimator_of(selector: SelectorSettings, num_particles: int) -> str:
+    """Return how the entropies of so many particles are estimated."""
+    if selector.estimator is not None:
+        return selector.estimator
+    few = num_particles <= FEW_PARTICLES
+    return "prior_neighbors" if few and selector.method == "path_entropy" else "nearest_neighbor"
 
 
 def path_steps(settings: PlanningSettings) -> tuple[int, ...]:

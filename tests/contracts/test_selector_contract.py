@@ -55,7 +55,7 @@ LOOKING += [
 ]
 SELECTORS = [
     *LOOKING,
-    SelectorSettings(),
+    SelectorSettings(method="action_entropy", estimator="nearest_neighbor"),
     SelectorSettings(method="random"),
     SelectorSettings(method="fixed", sensing_action=1),
 ]

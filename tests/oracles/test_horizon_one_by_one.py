@@ -40,8 +40,10 @@ PROBLEMS: dict[str, Callable[[], Any]] = {
     "sonar_room": SonarRoom,
 }
 SELECTORS = [
-    SelectorSettings(),
-    SelectorSettings(estimator="gaussian_mixture_upper", actions="executed"),
+    SelectorSettings(method="action_entropy", estimator="nearest_neighbor"),
+    SelectorSettings(
+        method="action_entropy", estimator="gaussian_mixture_upper", actions="executed"
+    ),
     SelectorSettings(method="state_entropy"),
     SelectorSettings(method="action_covariance"),
 ]

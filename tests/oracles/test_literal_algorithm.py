@@ -50,7 +50,7 @@ def settings_of(num_particles: int) -> PlanningSettings:
     return PlanningSettings(
         particle_filter=ParticleFilterSettings(num_particles=num_particles),
         active_sensing=ActiveSensingSettings(num_cores=1),
-        selector=SelectorSettings(estimator="nearest_neighbor"),
+        selector=SelectorSettings(method="action_entropy", estimator="nearest_neighbor"),
     )
 
 
@@ -138,6 +138,9 @@ def test_number_of_samples_and_neighbors() -> None:
 def test_a_resolution_for_each_coordinate() -> None:
     problem = PegInHole2D()
     settings = msgspec.structs.replace(
-        settings_of(80), selector=SelectorSettings(resolution=(0.1, 0.02, 0.5))
+        settings_of(80),
+        selector=SelectorSettings(
+            method="action_entropy", estimator="nearest_neighbor", resolution=(0.1, 0.02, 0.5)
+        ),
     )
     assert_same_decision(problem, settings, initial_state(problem, settings, seed=1, trial=0))

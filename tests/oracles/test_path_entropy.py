@@ -246,6 +246,22 @@ def test_a_stream_without_noise() -> None:
     assert Stream((0, 0, 0, 0, 0)) != NOISE_FREE
 
 
+class Redrawing(Plane):
+    """Draws its noise again until nobody stays where he is, as he does without noise."""
+
+    def move(self, states: FloatArray, actions: FloatArray, stream: Stream) -> FloatArray:
+        noise = stream.normal(states.shape)
+        while not noise.all():
+            noise = stream.substream(1).normal(states.shape)
+        return states + actions + 0.1 * noise
+
+
+def test_a_move_that_waits_for_another_number_is_told_of() -> None:
+    problem = Redrawing()
+    with pytest.raises(ProblemError, match=r"give the problem an expected_move\(states, actions\)"):
+        choose(problem, path(), some_belief(problem, 20, "weighted"))
+
+
 class TestErrors:
     @pytest.mark.parametrize(
         ("settings", "message"),

@@ -276,7 +276,8 @@ def settings_of(
             num_nearest_neighbors=neighbors,
             num_cores=1,
         ),
-        selector=selector or SelectorSettings(),
+        selector=selector
+        or SelectorSettings(method="action_entropy", estimator="nearest_neighbor"),
     )
 
 
@@ -419,7 +420,7 @@ def test_numbers_of_samples_and_neighbours(samples: int, neighbors: int) -> None
 
 
 def test_lower_bound_of_the_mixture() -> None:
-    selector = SelectorSettings(estimator="gaussian_mixture_lower")
+    selector = SelectorSettings(method="action_entropy", estimator="gaussian_mixture_lower")
     problem = Plane()
     compare(problem, settings_of(selector=selector), some_belief(problem, 60, "weighted"))
 

@@ -138,7 +138,9 @@ SELECTORS: dict[str, SelectorSettings] = {
             ),
         )
     },
-    "executed actions": SelectorSettings(actions="executed"),
+    "executed actions": SelectorSettings(
+        method="action_entropy", estimator="nearest_neighbor", actions="executed"
+    ),
     "action_covariance": SelectorSettings(method="action_covariance"),
 }
 

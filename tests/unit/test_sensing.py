@@ -57,7 +57,11 @@ class Coordinates(ProblemBase):
 
 def settings_of(selector: SelectorSettings | None = None, **sensing: int) -> PlanningSettings:
     active_sensing = msgspec.structs.replace(ActiveSensingSettings(num_cores=1), **sensing)
-    return PlanningSettings(active_sensing=active_sensing, selector=selector or SelectorSettings())
+    return PlanningSettings(
+        active_sensing=active_sensing,
+        selector=selector
+        or SelectorSettings(method="action_entropy", estimator="nearest_neighbor"),
+    )
 
 
 def belief_of(*deviations: float, count: int = 60) -> Belief:
@@ -101,7 +105,12 @@ class TestWhatIsChosen:
         belief = Belief.uniform(noise.states + np.array([50.0, 0.0]))
         assert choose(Limited(), settings_of(), belief)[0] == 0
         executed = settings_of(
-            SelectorSettings(estimator="nearest_neighbor", actions="executed", resolution=0.01)
+            SelectorSettings(
+                method="action_entropy",
+                estimator="nearest_neighbor",
+                actions="executed",
+                resolution=0.01,
+            )
         )
         assert choose(Limited(), executed, belief)[0] == 1
 
@@ -223,7 +232,9 @@ class Broken(Coordinates):
 
 class TestBadInput:
     def test_too_many_particles_for_neighbours_of_the_prior(self) -> None:
-        settings = settings_of(SelectorSettings(estimator="prior_neighbors"))
+        settings = settings_of(
+            SelectorSettings(method="action_entropy", estimator="prior_neighbors")
+        )
         belief = Belief.uniform(np.zeros((4097, 2)))
         expected = r"particle_filter\.num_particles 4097: .*prior_neighbors allows 4096"
         with pytest.raises(InvalidValueError, match=expected):
@@ -231,7 +242,7 @@ class TestBadInput:
 
     @pytest.mark.parametrize("neighbors", [60, 61, 1000])
     def test_as_many_neighbours_as_particles(self, neighbors: int) -> None:
-        selector = SelectorSettings(estimator="nearest_neighbor")
+        selector = SelectorSettings(method="action_entropy", estimator="nearest_neighbor")
         settings = settings_of(selector, num_nearest_neighbors=neighbors)
         expected = rf"active_sensing\.num_nearest_neighbors {neighbors}: must be below .*, 60"
         with pytest.raises(InvalidValueError, match=expected):
@@ -243,7 +254,9 @@ class TestBadInput:
         actions = -belief.states
         actions[7, 1] = bad
         for actions_that_count in ("commanded", "executed"):
-            selector = SelectorSettings(actions=actions_that_count)
+            selector = SelectorSettings(
+                method="action_entropy", estimator="nearest_neighbor", actions=actions_that_count
+            )
             with pytest.raises(ProblemError, match=rf"policy of coordinates returned \[.*{bad}\]"):
                 choose(Broken(policy=actions), settings_of(selector), belief)
 
@@ -296,7 +309,7 @@ class TestBadInput:
         class Exact(Coordinates):
             motion_variance = np.array([0.0, 0.0])
 
-        selector = SelectorSettings(estimator="gaussian_mixture_lower")
+        selector = SelectorSettings(method="action_entropy", estimator="gaussian_mixture_lower")
         same = msgspec.structs.replace(selector, resolution=Exact.resolution)
         self.assert_same_entropies(Exact(), selector, same)
 
@@ -318,7 +331,7 @@ class TestBadInput:
 
         problem = Exact()
         vars(problem)["resolution"] = np.array([0.5, 1.0])
-        selector = SelectorSettings(estimator="gaussian_mixture_lower")
+        selector = SelectorSettings(method="action_entropy", estimator="gaussian_mixture_lower")
         same = msgspec.structs.replace(selector, resolution=(0.5, 0.25))
         self.assert_same_entropies(problem, selector, same)
 
@@ -349,7 +362,7 @@ class TestBadInput:
         class Wrong(Coordinates):
             motion_variance = np.array([-1.0, 0.01])
 
-        selector = SelectorSettings(estimator="gaussian_mixture_lower")
+        selector = SelectorSettings(method="action_entropy", estimator="gaussian_mixture_lower")
         with pytest.raises(InvalidValueError, match=r"variance \[.*\]: every entry must be > 0"):
             choose(Wrong(), settings_of(selector), belief_of(1.0, 1.0))
 

@@ -80,7 +80,7 @@ def planning_of(interval: int = 3, particles: int = 20, **sensing: Any) -> Plann
     return PlanningSettings(
         particle_filter=ParticleFilterSettings(num_particles=particles),
         active_sensing=ActiveSensingSettings(**sensing),
-        selector=SelectorSettings(estimator="nearest_neighbor"),
+        selector=SelectorSettings(method="action_entropy", estimator="nearest_neighbor"),
         sensing_interval=interval,
     )
 

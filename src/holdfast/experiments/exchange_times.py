@@ -134,7 +134,7 @@ def measure_exchange(**exchange: Any) -> Table:
         raise TaskError(f"way {wanted.way!r}: there are {', '.join(ways)}")
     settings = PlanningSettings(
         particle_filter=ParticleFilterSettings(num_particles=wanted.particles),
-        selector=SelectorSettings(estimator="nearest_neighbor"),
+        selector=SelectorSettings(method="action_entropy", estimator="nearest_neighbor"),
     )
     code = (
         core_version(),

@@ -60,19 +60,25 @@ WAYS: Mapping[str, SelectorSettings] = {
     "state entropy, mixture": SelectorSettings(
         method="state_entropy", estimator="gaussian_mixture_upper"
     ),
-    "action entropy, neighbours": SelectorSettings(estimator="nearest_neighbor"),
-    "action entropy, neighbours, executed": SelectorSettings(
-        estimator="nearest_neighbor", actions="executed"
+    "action entropy, neighbours": SelectorSettings(
+        method="action_entropy", estimator="nearest_neighbor"
     ),
-    "action entropy, mixture": SelectorSettings(estimator="gaussian_mixture_upper"),
+    "action entropy, neighbours, executed": SelectorSettings(
+        method="action_entropy", estimator="nearest_neighbor", actions="executed"
+    ),
+    "action entropy, mixture": SelectorSettings(
+        method="action_entropy", estimator="gaussian_mixture_upper"
+    ),
     "action entropy, mixture, executed": SelectorSettings(
-        estimator="gaussian_mixture_upper", actions="executed"
+        method="action_entropy", estimator="gaussian_mixture_upper", actions="executed"
     ),
     "action covariance": SelectorSettings(method="action_covariance"),
     "path entropy, neighbours": SelectorSettings(
         method="path_entropy", estimator="nearest_neighbor"
     ),
-    "action entropy, prior neighbours": SelectorSettings(estimator="prior_neighbors"),
+    "action entropy, prior neighbours": SelectorSettings(
+        method="action_entropy", estimator="prior_neighbors"
+    ),
     "path entropy, prior neighbours": SelectorSettings(
         method="path_entropy", estimator="prior_neighbors"
     ),

@@ -97,7 +97,7 @@ def series_of(particles: int, num_trials: int, seed: int) -> TrialSeries:
             active_sensing=ActiveSensingSettings(
                 num_observation_samples=10, num_nearest_neighbors=5, num_cores=1
             ),
-            selector=SelectorSettings(estimator="nearest_neighbor"),
+            selector=SelectorSettings(method="action_entropy", estimator="nearest_neighbor"),
             sensing_interval=8,
         ),
         max_steps=_MAX_STEPS,

@@ -127,7 +127,7 @@ class Simulator:
         problem = PegInHole2D()
         planning = PlanningSettings(
             particle_filter=ParticleFilterSettings(num_particles=_NUM_PARTICLES),
-            selector=SelectorSettings(estimator="nearest_neighbor"),
+            selector=SelectorSettings(method="action_entropy", estimator="nearest_neighbor"),
         )
         self._twins = Twins(problem, planning, _SEED)
         self._planner = RememberingPlanner(Planner(problem, planning))
