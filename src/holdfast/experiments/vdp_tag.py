@@ -29,17 +29,23 @@ from holdfast.randomness import Purpose, Stream, stream
 __all__ = [
     "DISCOUNT",
     "MAX_STEPS",
+    "Intercept",
     "ManageUncertainty",
     "ToNext",
     "VdpTag",
     "VdpTagPolicy",
     "VdpTagTrial",
     "active_beam",
+    "chance_of_tag",
+    "interception",
+    "missing_length",
     "reading_log_likelihood",
     "run_vdp_tag_trials",
     "stop_at_barriers",
     "target_flow",
     "toward",
+    "value_of_plan",
+    "way_length",
 ]
 
 DISCOUNT = 0.95
@@ -63,7 +69,14 @@ _LOOK_DEVIATION = 0.1
 _BEAM_DEVIATION = 5.0
 _EMPTY_BEAM = 1.0
 """Mean reading of a beam that does not hold the target."""
+_LONGEST_PURSUIT = 30
+_INSIDE_TIPS = 0.9 * BARRIER_START * np.array([(1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0)])
+"""Places by which a way leads past the inner ends."""
 _EPSILON = float(np.finfo(np.float64).eps)
+
+_POWERS = [1.0]
+for _ in range(MAX_STEPS):
+    _POWERS.append(_POWERS[-1] * DISCOUNT)
 
 
 def target_flow(targets: FloatArray, steps: int = 1) -> FloatArray:
@@ -149,11 +162,146 @@ def toward(offsets: FloatArray) -> FloatArray:
     return np.where(usable[..., np.newaxis], scale[..., np.newaxis] * offsets, along_x)
 
 
+def way_length(starts: FloatArray, ends: FloatArray) -> FloatArray:
+    """Return lengths of ways that lead past the barriers.
+
+    A straight one, if no barrier is in its way; else past the inner end of the barrier that is, or
+    the longer of two such ways where two barriers are. The outer ends are further off than any
+    target ever is.
+
+    Parameters
+    ----------
+    starts, ends : arrays of shape (..., 2)
+        Broadcast against each other.
+
+    Returns
+    -------
+    array of shape (...)
+    """
+    ax, ay, bx, by = starts[..., 0], starts[..., 1], ends[..., 0], ends[..., 1]
+    dx, dy = bx - ax, by - ay
+    straight = np.sqrt(dx * dx + dy * dy)
+    # Zero only where the way crosses no axis.
+    at_x = ax - ay * dx / np.where(dy == 0.0, 1.0, dy)
+    at_y = ay - ax * dy / np.where(dx == 0.0, 1.0, dx)
+    stops_x = ((ay > 0.0) != (by > 0.0)) & _is_barrier(at_x)
+    stops_y = ((ax > 0.0) != (bx > 0.0)) & _is_barrier(at_y)
+    tip_x, tip_y = np.copysign(BARRIER_START, at_x), np.copysign(BARRIER_START, at_y)
+    past_x = _norm(ax - tip_x, ay) + _norm(bx - tip_x, by)
+    past_y = _norm(ax, ay - tip_y) + _norm(bx, by - tip_y)
+    detour = np.maximum(np.where(stops_x, past_x, 0.0), np.where(stops_y, past_y, 0.0))
+    return np.asarray(np.maximum(straight, detour))
+
+
+def _is_barrier(at: FloatArray) -> npt.NDArray[np.bool_]:
+    size = np.abs(at)
+    return np.asarray((size > BARRIER_START) & (size < BARRIER_END))
+
+
+def _norm(x: FloatArray, y: FloatArray) -> FloatArray:
+    return np.asarray(np.sqrt(x * x + y * y))
+
+
+def missing_length(lengths: FloatArray, steps: npt.ArrayLike) -> FloatArray:
+    """Return how far from the end of a way some steps of the agent must end.
+
+    Two steps or more end anywhere within their reach, as they need not lead straight on; a single
+    one ends on a circle.
+
+    Parameters
+    ----------
+    lengths : array
+        Of the ways.
+    steps : array of int
+        At least 1; broadcast against the lengths.
+    """
+    beyond = lengths - STEP * np.asarray(steps)
+    return np.where(np.equal(steps, 1), np.abs(beyond), np.maximum(beyond, 0.0))
+
+
+def chance_of_tag(steps: int) -> float:
+    """Return how likely a target is tagged where it is expected in some steps.
+
+    Its noise is taken to add up; the flow makes less of that which leads off the limit cycle.
+    """
+    variance = steps * TARGET_DEVIATION * TARGET_DEVIATION
+    return 1.0 - float(numerics.exp(np.array(-0.5 * TAG_RADIUS * TAG_RADIUS / variance)))
+
+
+def value_of_plan(steps: npt.ArrayLike, chance: npt.ArrayLike, after: float = 0.0) -> FloatArray:
+    """Return the discounted return of steps of which the last one may tag.
+
+    Parameters
+    ----------
+    steps : array of int
+        At least 1.
+    chance : array
+        That the last one tags.
+    after : float
+        Value of being there if it does not.
+    """
+    powers = np.array(_POWERS)
+    before = powers[np.asarray(steps) - 1]
+    chance = np.asarray(chance)
+    last = TAG_REWARD * chance + (1.0 - chance) * (DISCOUNT * after - 1.0)
+    return np.asarray(before * last - (1.0 - before) / (1.0 - DISCOUNT))
+
+
+def interception(agents: FloatArray, targets: FloatArray) -> tuple[FloatArray, IntArray]:
+    """Return the steps that lead to where known targets can be met first, and how many it takes.
+
+    Parameters
+    ----------
+    agents, targets : arrays of shape (n, 2)
+
+    Returns
+    -------
+    steps : array of shape (n, 2)
+    numbers : array of shape (n,)
+    """
+    count = agents.shape[0]
+    numbers = np.zeros(count, dtype=np.int64)
+    places = np.zeros((count, 2))
+    place = targets
+    for step in range(1, _LONGEST_PURSUIT + 1):
+        place = target_flow(place)
+        missing = missing_length(way_length(agents, place), step)
+        met = (numbers == 0) & ((missing < 0.5 * TAG_RADIUS) | (step == _LONGEST_PURSUIT))
+        numbers = np.where(met, step, numbers)
+        places = np.where(met[:, np.newaxis], place, places)
+    return _first_steps(agents, places, numbers), numbers
+
+
+def _first_steps(agents: FloatArray, places: FloatArray, numbers: IntArray) -> FloatArray:
+    """Return the first of some steps to places, of which two must not lead straight on."""
+    offsets = places - agents
+    length = _norm(offsets[:, 0], offsets[:, 1])
+    direct = toward(offsets)
+    # Two steps of the same length make an isosceles triangle with the way.
+    half = 0.5 * length / STEP
+    aside = np.sqrt(np.maximum(1.0 - half * half, 0.0))[:, np.newaxis]
+    left = np.stack([-direct[:, 1], direct[:, 0]], axis=-1)
+    bends = [half[:, np.newaxis] * direct + sign * aside * left for sign in (1.0, -1.0)]
+    free = [np.abs(stop_at_barriers(agents, bend) - agents - bend).max(axis=1) for bend in bends]
+    bend = np.where((free[0] <= free[1])[:, np.newaxis], bends[0], bends[1])
+    chosen = np.where(((numbers == 2) & (length < 2.0 * STEP))[:, np.newaxis], bend, direct)
+    # Round a barrier: past the inner end that makes the way short.
+    blocked = way_length(agents, places) > length + 1e-9
+    tips = _INSIDE_TIPS - agents[:, np.newaxis]
+    ways = way_length(agents[:, np.newaxis], _INSIDE_TIPS) + way_length(
+        _INSIDE_TIPS, places[:, np.newaxis]
+    )
+    best = tips[np.arange(agents.shape[0]), ways.argmin(axis=1)]
+    # At the end itself, go on.
+    there = _norm(best[:, 0], best[:, 1]) < 1e-6
+    return np.where((blocked & ~there)[:, np.newaxis], toward(best), chosen)
+
+
 class VdpTag(ProblemBase):
     """Van der Pol tag with barriers; states are agent (x, y) and target (x, y).
 
     Actions are steps of the agent, all of the length 0.5. Its policy heads for where the target
-    will be after the next step.
+    can be met first.
     """
 
     name = "vdp_tag"
@@ -190,9 +338,15 @@ class VdpTag(ProblemBase):
         return np.where(active, _LOOK_DEVIATION**2, _BEAM_DEVIATION**2)
 
     def policy(self, states: FloatArray, stage: int | IntArray) -> FloatArray:
-        """Head for where the target will be after the next step."""
+        """Head for where the target can be met first."""
         del stage
-        return toward(target_flow(states[..., 2:]) - states[..., :2])
+        rows = np.ascontiguousarray(states).reshape(-1, 4)
+        return interception(rows[:, :2], rows[:, 2:])[0].reshape(*states.shape[:-1], 2)
+
+    def known_state_return(self, states: FloatArray, stages: IntArray) -> FloatArray:
+        """Return what meeting the target first is worth, if the last step succeeds as it may."""
+        del stages
+        return value_of_plan(interception(states[:, :2], states[:, 2:])[1], chance_of_tag(1))
 
     def execute(self, actions: FloatArray) -> FloatArray:
         """Make a step of every action: its direction is what counts."""
@@ -258,6 +412,18 @@ class ToNext:
         return steps, np.zeros(len(draws), dtype=np.int64)
 
 
+class Intercept:
+    """Heads for where the target of the first particle can be met first, and never looks.
+
+    With known states: what certainty would be worth.
+    """
+
+    def decide(self, beliefs: FloatArray, draws: Sequence[Stream]) -> tuple[FloatArray, IntArray]:
+        """Return the steps, and 0 for each."""
+        steps, _ = interception(beliefs[:, 0, :2], beliefs[:, 0, 2:])
+        return steps, np.zeros(len(draws), dtype=np.int64)
+
+
 class ManageUncertainty:
     """The published heuristic ``manage_uncertainty``.
 
@@ -312,6 +478,7 @@ def run_vdp_tag_trials(
     num_particles: int = 1000,
     *,
     misses_at_once: bool = True,
+    known_state: bool = False,
 ) -> list[VdpTagTrial]:
     """Run trials, side by side, with the order of events of the published figures.
 
@@ -331,6 +498,8 @@ def run_vdp_tag_trials(
     misses_at_once : bool
         Whether the filter drops a particle whose target would have been tagged before the next
         decision. That of the published figures drops it one step later.
+    known_state : bool
+        Whether the policy is told the true state instead: what no filter can give, for a bound.
 
     Returns
     -------
@@ -338,6 +507,9 @@ def run_vdp_tag_trials(
         In the order of ``trials``.
     """
     runs = [_Run(seed, trial, num_particles) for trial in trials]
+    if known_state:
+        for run in runs:
+            run.states[1:] = run.states[:1]
     for step in range(MAX_STEPS):
         going = [run for run in runs if not run.tagged]
         if not going:
@@ -359,7 +531,9 @@ def run_vdp_tag_trials(
         beams = active_beam(states[..., 2:] - states[..., :2])
         for index, run in enumerate(going):
             run.earn(float(rewards[index]), int(looks[index]), bool(tagged[index, 0]))
-            if not run.tagged:
+            if not run.tagged and known_state:
+                run.states = np.repeat(states[index, :1], num_particles + 1, axis=0)
+            elif not run.tagged:
                 run.observe(step, int(looks[index]), states[index], impossible[index], beams[index])
     return [VdpTagTrial(run.total, run.tagged, run.steps, run.looks) for run in runs]
 
