@@ -72,14 +72,14 @@ class PursuitSettings(NamedTuple):
         What uncertainty costs after the next look but one.
     """
 
-    num_particles: int = 192
-    num_places: int = 48
-    horizon: int = 11
-    num_directions: int = 32
-    num_candidates: int = 4
+    num_particles: int = 128
+    num_places: int = 32
+    horizon: int = 16
+    num_directions: int = 24
+    num_candidates: int = 3
     num_second_directions: int = 16
-    num_observations: int = 24
-    value_of_failure: float = 30.0
+    num_observations: int = 16
+    value_of_failure: float = 10.0
     residual: float = 4.0
 
 
@@ -221,6 +221,7 @@ class _Decision:
         )
         self._hits = np.ascontiguousarray(np.moveaxis(hits, 2, 0).reshape(count, -1))
         self._few = np.arange(0, count, stride)
+        self._hopeless = float(value_of_plan(horizon, 0.0, settings.value_of_failure))
 
     def best(self) -> tuple[FloatArray, int]:
         by, settings = self._by, self._by._settings
@@ -269,23 +270,33 @@ class _Decision:
         if by._rule is None or isinstance(by._rule, Always):
             looks = [self._posteriors(agent, weights)]
         found = []
+        # Most places cannot be reached in time.
+        chosen = np.flatnonzero(reach > _OUT_OF_REACH)
+        in_reach = reach.reshape(-1)[chosen]
+        steps = self._later[chosen // reach.shape[1]]
+        hits = np.ascontiguousarray(self._hits[:, chosen])
         for posteriors in [weights[_NEW], *looks]:
-            values = np.empty(posteriors.shape[0])
-            for row, own in enumerate(posteriors):
-                hits = numerics.weighted_mean(self._hits, own).reshape(reach.shape)
-                plans = value_of_plan(self._later[:, _NEW], reach * hits, settings.value_of_failure)
-                values[row] = plans.max()
-                few = own[self._few]
-                total = numerics.sum(few)
-                if waits is not None and total > 0.0:
-                    waiting = numerics.weighted_mean(waits, few / total).max()
-                    values[row] = max(values[row], waiting)
+            chances = np.stack([numerics.weighted_mean(hits, own) for own in posteriors])
+            plans = value_of_plan(steps, in_reach * chances, settings.value_of_failure)
+            values = plans.max(axis=1, initial=self._hopeless)
+            if waits is not None:
+                values = np.maximum(values, self._waiting(waits, posteriors[:, self._few]))
             found.append(numerics.sum(values) / values.size)
         without = float(_return(first, found[0]))
         if not looks:
             return [without]
         with_look = float(_return(first, found[1])) - LOOK_COST
         return [without, with_look]
+
+    @staticmethod
+    def _waiting(waits: FloatArray, posteriors: FloatArray) -> FloatArray:
+        """Return what the best second step is worth, under each posterior."""
+        found = np.full(posteriors.shape[0], -np.inf)
+        for row, own in enumerate(posteriors):
+            total = numerics.sum(own)
+            if total > 0.0:
+                found[row] = numerics.weighted_mean(waits, own / total).max()
+        return found
 
     def _belief(self, agent: FloatArray) -> Belief:
         """Return what is believed after a step to there, if it does not tag."""
@@ -348,6 +359,8 @@ class _Decision:
 
 
 _NEW = np.newaxis
+_OUT_OF_REACH = 0.05
+"""Share of a chance that is left where a plan is not worth a thought."""
 _DIRECT = 10
 """Particles to which directions lead."""
 _TIPS = 0.9 * BARRIER_START * np.array([(1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0)])
