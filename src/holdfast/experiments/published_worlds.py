@@ -110,7 +110,7 @@ WAYS: Mapping[str, Way] = {
     "known state": Way(Intercept, 1000, 1, known_state=True),
 }
 """By the names that tables give them. All but the published heuristics and the last one make the
-same plans, and differ in when they look. The last one is told what no look would tell, for a bound."""
+same plans, and differ in when they look. The last one is told what no look would tell: a bound."""
 
 
 class PublishedWorlds:

@@ -1,16 +1,16 @@
 """Playing Van der Pol tag: plans for a belief, and looks that are worth their price.
 
-A plan is a place and a time: be there then, and tag what comes by. Where a particle's target will be
-is such a place; how many of the other particles' targets will be there, too, is how likely the plan
-succeeds; and whether the agent can be there in time is known. So the best plan for a belief is found
-among its own particles, and so is the best one for what the belief would be after a look. A look is
-worth its price if the best plans after what it may show are better, in the mean, by more than that.
-What is looked for in vain is not lost: the agent may take one more step and look then, so that is a
-plan as well, priced with that look.
+A plan is a place and a time: be there then, and tag what comes by. Where a particle's target will
+be is such a place; how many of the other particles' targets will be there, too, is how likely the
+plan succeeds; and whether the agent can be there in time is known. So the best plan for a belief is
+found among its own particles, and so is the best one for what the belief would be after a look. A
+look is worth its price if the best plans after what it may show are better, in the mean, by more
+than that. A look that is not taken now may be taken after the next step, so that is a plan as well,
+at the price of that look.
 
-Directions of the next step are compared by the best plan that is left after them. Whether to look is
-decided together with the direction (:data:`RETURN`), or afterwards by one of holdfast's selectors,
-for the belief that the step leads to.
+Directions of the next step are compared by the best plan that is left after them. Whether to look
+is decided together with the direction, or afterwards by a rule of its own: one of holdfast's
+selectors, say, asked about the belief that the step leads to.
 """
 
 from __future__ import annotations
@@ -76,11 +76,11 @@ class PursuitSettings(NamedTuple):
     num_places: int = 32
     horizon: int = 16
     num_directions: int = 24
-    num_candidates: int = 3
+    num_candidates: int = 6
     num_second_directions: int = 16
     num_observations: int = 16
     value_of_failure: float = 10.0
-    residual: float = 4.0
+    residual: float = 6.0
 
 
 class LookRule(Protocol):
