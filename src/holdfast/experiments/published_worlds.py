@@ -25,7 +25,7 @@ from holdfast.experiments import statistics
 from holdfast.experiments.study import Report, Results, Scale
 from holdfast.experiments.tables import Cell, Table, number_of
 from holdfast.experiments.tasks import Task, TaskError
-from holdfast.experiments.vdp_pursuit import Always, Chance, LookRule, Never, Pursuit, Selector
+from holdfast.experiments.vdp_pursuit import Always, Chance, Never, Pursuit, Selector
 from holdfast.experiments.vdp_tag import (
     DISCOUNT,
     Intercept,
