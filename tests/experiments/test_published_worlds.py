@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from holdfast.errors import InvalidValueError
 from holdfast.experiments.published_worlds import (
     BEST,
     COLUMNS,
@@ -55,10 +56,10 @@ def test_the_table_has_ours_and_theirs(made_up: Report) -> None:
     rows = {row["way"]: row for row in made_up.summary["vdp_tag"].rows()}
     assert set(rows) == {*WAYS, *published_planners()}
     ours = rows[BEST]
-    assert ours["mean_discounted_reward"] == pytest.approx(40.0)
+    assert ours["mean_discounted_reward"] == pytest.approx(40.0, rel=1e-6)
     assert ours["standard_error"] == pytest.approx(10.0 / 1000**0.5, rel=1e-3)
     assert ours["published_mean"] is None
-    assert rows["to_next"]["standard_errors_apart"] == pytest.approx(0.0, abs=1e-9)
+    assert rows["to_next"]["standard_errors_apart"] == pytest.approx(0.0, abs=1e-5)
     assert rows["pomcpow"]["trials"] is None
 
 
@@ -74,10 +75,18 @@ def test_findings_tell_how_far_off_the_heuristics_are(made_up: Report) -> None:
     assert "+10.7" in made_up.findings[2]  # 40 less the strongest planner's 29.3
 
 
-def test_each_trial_is_kept(made_up: Report) -> None:
-    raw = made_up.raw["vdp_tag"]
-    assert raw.num_rows == sum(way.trials for way in WAYS.values())
-    assert list(raw.columns) == ["way", *COLUMNS]
+def test_all_is_made_of_the_trials_that_are_kept(made_up: Report) -> None:
+    trials = made_up.trials
+    assert trials is not None
+    assert trials.num_rows == sum(way.trials for way in WAYS.values())
+    again = PublishedWorlds().report_of(trials)
+    assert again.findings == made_up.findings
+    assert again.summary == made_up.summary
+
+
+def test_other_trials_are_refused(made_up: Report) -> None:
+    with pytest.raises(InvalidValueError, match="published_worlds: these are trials of something"):
+        PublishedWorlds().report_of(Table({"way": []}))
 
 
 def test_the_figure_can_be_drawn(made_up: Report) -> None:

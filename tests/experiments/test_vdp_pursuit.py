@@ -116,7 +116,8 @@ def test_the_known_state_return_is_the_value_of_meeting_the_target() -> None:
     near[:, 2:] = [1.2, 1.1]
     following = target_flow(near[:, 2:])
     near[:, :2] = following - toward(following - near[:, :2])
-    assert VdpTag().known_state_return(near, np.zeros(1))[0] == value_of_plan(1, chance_of_tag(1))
+    known = VdpTag().known_state_return(near, np.zeros(1, dtype=np.int64))
+    assert known[0] == value_of_plan(1, chance_of_tag(1))
 
 
 class Seen(LookRule):

@@ -199,7 +199,7 @@ def test_the_published_heuristics(name: str) -> None:
     A false alarm comes in less than 1 of 1,000 seeds, rewards being skewed. 1,000 trials are run by
     the study ``published_worlds``.
     """
-    policy = {"to_next": ToNext(), "manage_uncertainty": ManageUncertainty()}[name]
+    policy: VdpTagPolicy = ToNext() if name == "to_next" else ManageUncertainty()
     results = run_vdp_tag_trials(policy, SEED, range(100), 100, misses_at_once=False)
     rewards = np.array([result.discounted_reward for result in results])
     mean, error = PUBLISHED[name]

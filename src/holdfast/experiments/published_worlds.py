@@ -16,11 +16,13 @@ import csv
 import math
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from importlib import resources
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from holdfast.errors import InvalidValueError
 from holdfast.experiments import statistics
 from holdfast.experiments.study import Report, Results, Scale
 from holdfast.experiments.tables import Cell, Table, number_of
@@ -49,6 +51,8 @@ __all__ = ["COLUMNS", "WAYS", "PublishedWorlds", "Way", "published_planners", "r
 
 COLUMNS = ("trial", "discounted_reward", "tagged", "steps", "looks", "mean_decision_ms")
 """Of the table of a task: a row for each trial."""
+
+_FRACTIONS = ("discounted_reward", "mean_decision_ms")
 
 BEST = "priced looks"
 """The way that is compared with all others."""
@@ -128,18 +132,38 @@ class PublishedWorlds:
 
     def report(self, scale: Scale, results: Results) -> Report:
         """Return what it comes to, from the results of all its tasks."""
-        report = Report()
-        tables = {way: results.of(_tasks(way, scale)) for way in WAYS}
-        raw = Table({})
-        for way, table in tables.items():
-            raw.extend(table, way=way)
+        trials = Table({})
+        for way in WAYS:
+            table = results.of(_tasks(way, scale))
+            for name in _FRACTIONS:
+                # As a file keeps them, so that what is made of it is the same.
+                cells = table.numbers(name)
+                table.columns[name] = [float(np.float32(cell)) for cell in cells]
+            trials.extend(table, way=way)
+        return self.report_of(trials)
+
+    def report_of(self, trials: Table) -> Report:
+        """Return what it comes to, from all its trials.
+
+        Raises
+        ------
+        InvalidValueError
+            If they are not those of this study.
+        """
+        if list(trials.columns) != ["way", *COLUMNS] or set(trials.columns["way"]) != set(WAYS):
+            raise InvalidValueError(f"{self.name}: these are trials of something else")
+        tables = {way: Table({}) for way in WAYS}
+        for row in trials.rows():
+            cells = {name: [row[name]] for name in COLUMNS}
+            tables[str(row["way"])].extend(Table(cells))
         summary = _summary(tables)
         rivals = _rivals(tables)
-        report.raw["vdp_tag"] = raw
-        report.summary |= {"vdp_tag": summary, "looks": rivals}
-        report.figures["vdp_tag"] = lambda: _draw(summary)
-        report.findings = _findings(summary, rivals)
-        return report
+        return Report(
+            trials=trials,
+            summary={"vdp_tag": summary, "looks": rivals},
+            figures={"vdp_tag": partial(_draw, summary)},
+            findings=_findings(summary, rivals),
+        )
 
 
 def run_vdp_tag(way: str, seed: int, first_trial: int, num_trials: int) -> Table:

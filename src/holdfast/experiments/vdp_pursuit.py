@@ -182,7 +182,9 @@ class Pursuit:
         variance = TARGET_DEVIATION * TARGET_DEVIATION * steps
         self._chances = np.array([chance_of_tag(int(step)) for step in steps])
         # A disc is as wide, in each coordinate, as a Gaussian of a quarter of its squared radius.
-        self._doubled_widths = 2.0 * (variance + 0.25 * TAG_RADIUS * TAG_RADIUS)
+        self._doubled_widths: FloatArray = np.asarray(
+            2.0 * (variance + 0.25 * TAG_RADIUS * TAG_RADIUS), dtype=np.float64
+        )
         self._waits = not isinstance(rule, Never)
 
     def decide(self, beliefs: FloatArray, draws: Sequence[Stream]) -> tuple[FloatArray, IntArray]:
@@ -334,13 +336,15 @@ class _Decision:
         reach = _near(missing * missing, by._doubled_widths[: steps.size, _NEW])
         chances = by._chances[: steps.size, _NEW]
         known = value_of_plan(steps, reach * chances, settings.value_of_failure).max(axis=1)
-        return np.ascontiguousarray(_return(tags, known - settings.residual).T) - LOOK_COST
+        values = _return(tags, known - settings.residual) - LOOK_COST
+        return np.ascontiguousarray(values.T)
 
     def _tags(self, agents: FloatArray, targets: FloatArray, step: int) -> FloatArray:
         """Return how likely each agent tags each target, which is expected after ``step`` more."""
         by = self._by
         squares = _squares(agents[:, _NEW] - targets)
-        return by._chances[step] * _near(squares, by._doubled_widths[step])
+        near = _near(squares, by._doubled_widths[step])
+        return np.asarray(by._chances[step] * near)
 
     def _directions(self) -> FloatArray:
         """Return steps all around, to targets, to where targets can be met next, and to the gap."""

@@ -307,9 +307,9 @@ class VdpTag(ProblemBase):
     name = "vdp_tag"
     state_size = 4
     action_size = 2
-    sensing_actions = ("do not look", "look")
+    sensing_actions: Sequence[str] = ("do not look", "look")
     sensing_costs = (0.0, LOOK_COST)
-    state_labels = ("agent x", "agent y", "target x", "target y")
+    state_labels: Sequence[str] = ("agent x", "agent y", "target x", "target y")
     resolution = TAG_RADIUS  # steps that differ by less tag the same targets
     motion_variance = np.zeros(2)  # the agent steps as it is told
 
