@@ -18,6 +18,7 @@ INITIAL = stream(SEED, 0, 0, Purpose.INITIAL_BELIEF)
 OF_EXPERIMENTS = [
     "holdfast.experiments.light_dark:LightDark",
     "holdfast.experiments.busy_room:BusyRoom",
+    "holdfast.experiments.vdp_tag:VdpTag",
 ]
 MOTION = stream(SEED, 0, 0, Purpose.PREDICTION)
 

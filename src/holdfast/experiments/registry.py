@@ -18,6 +18,7 @@ _STUDIES: Mapping[str, str] = {
     "thesis_chapter_6": "holdfast.experiments.thesis_chapter_6:ThesisChapter6",
     "cloud_worth": "holdfast.experiments.cloud_worth:CloudWorth",
     "published_2017": "holdfast.experiments.published_2017:Published2017",
+    "published_worlds": "holdfast.experiments.published_worlds:PublishedWorlds",
     "selectors": "holdfast.experiments.selectors:Selectors",
     "parameters": "holdfast.experiments.parameters:Parameters",
 }

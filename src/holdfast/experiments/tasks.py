@@ -31,6 +31,7 @@ _FUNCTIONS: Mapping[str, str] = {
     "trials": "holdfast.experiments.trial_batches:run_trials_of",
     "cloud_trials": "holdfast.experiments.cloud_trials:run_cloud_trials",
     "emulation_2017": "holdfast.experiments.emulation_2017:run_emulation",
+    "vdp_tag": "holdfast.experiments.published_worlds:run_vdp_tag",
     "exchange_times": "holdfast.experiments.exchange_times:measure_exchange",
     "sensing_times": "holdfast.experiments.sensing_times:measure_sensing",
 }
