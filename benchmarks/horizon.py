@@ -64,6 +64,7 @@ def one_by_one(
                     estimator.offset,
                     1,
                     (1.0,),
+                    estimator.prior,
                 )
                 later[j, i] += factor * found[0]
     return later

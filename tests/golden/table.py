@@ -79,7 +79,7 @@ def runs() -> list[Run]:
     return [*_examples(), *_problems(), *_selectors(), *_resolutions(), *_estimates()]
 
 
-_FIRST_DEFAULTS = {
+_FIRST_DEFAULTS: dict[str, Any] = {
     "selector.method": "action_entropy",
     "selector.estimator": "nearest_neighbor",
 }
@@ -89,7 +89,7 @@ _FIRST_DEFAULTS = {
 def _examples() -> Iterator[Run]:
     for path in sorted((ROOT / "examples").rglob("*.yaml")):
         file = path.relative_to(ROOT).as_posix()
-        short = {"simulator.max_steps": 300}
+        short: dict[str, Any] = {"simulator.max_steps": 300}
         if path.stem == "priced_looks":
             yield Run(file, file, 3, short)
             continue
@@ -173,8 +173,11 @@ def _estimates() -> Iterator[Run]:
     yield Run("stages ahead", PLAIN, 2, ahead, "capsule_robot")
     on_the_way = {"selector.method": "path_entropy", "simulator.max_steps": 100}
     yield Run("stages on the way", PLAIN, 2, on_the_way, "capsule_robot")
-    counted = {"selector.path_unit": "steps", "selector.path_offsets": [0, 9, 18, 36]}
-    counted |= {"selector.path_discount": 1.0}
+    counted: dict[str, Any] = {
+        "selector.path_unit": "steps",
+        "selector.path_offsets": [0, 9, 18, 36],
+        "selector.path_discount": 1.0,
+    }
     few = {"particle_filter.num_particles": 100}
     yield Run("offsets in steps", PLAIN, 4, {**on_the_way, **counted, **few})
     short = {"particle_filter.num_particles": 100, "simulator.max_steps": 100}

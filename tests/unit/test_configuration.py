@@ -175,7 +175,10 @@ class TestWhatLoads:
     def test_the_thesis_example_has_exactly_the_thesis_keys_and_values(self) -> None:
         example = yaml.safe_load((EXAMPLES / "thesis.yaml").read_text(encoding="utf-8"))
         assert example.pop("problem") == "peg_in_hole_2d"
-        assert example.pop("selector") == {"estimator": "nearest_neighbor"}
+        assert example.pop("selector") == {
+            "method": "action_entropy",
+            "estimator": "nearest_neighbor",
+        }
         assert example == yaml.safe_load(THESIS)
 
     @pytest.mark.parametrize("path", sorted(EXAMPLES.rglob("*.yaml")), ids=lambda path: path.stem)
@@ -347,7 +350,7 @@ class TestResolved:
             "translation_step_size": 0.1,
             "rotation_step_size": 0.1,
         }
-        assert resolved["selector"]["method"] == "action_entropy"
+        assert resolved["selector"]["method"] == "path_entropy"
         assert resolved["selector"]["resolution"] is None
         assert resolved["simulator"]["seed"] == 0
 
@@ -528,8 +531,8 @@ class TestKeysAndValues:
             (
                 "selector: {method: action-entropy}",
                 'selector.method is "action-entropy"; expected one of action_covariance, '
-                "action_entropy, fixed, path_entropy, random, state_entropy; did you mean "
-                "action_entropy?",
+                "action_entropy, expected_return, fixed, path_entropy, random, state_entropy; did "
+                "you mean action_entropy?",
             ),
             ("model: {init_mean: [1, 2]}", "is [1, 2] (a list of 2); expected a list of 3"),
             ("model: {init_mean: [1, 2, x]}", 'model.init_mean[2] is "x"; expected a number'),

@@ -36,6 +36,7 @@ CHOSEN = {
     "environment.directory": "robots",
     "environment.arguments": {"port": 7},
     "selector.resolution": 0.25,
+    "selector.estimator": "gaussian_mixture_upper",
     "selector.path_offsets": [1, 3],
     "model.init_mean": [1, 2, 3],
     "model.init_cov": [1, 2, 3],
@@ -45,7 +46,9 @@ CHOSEN = {
 
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
-    (tmp_path / "peg.yaml").write_text("problem: peg_in_hole_2d\n")
+    # A horizon goes with the entropy of the next action.
+    text = "problem: peg_in_hole_2d\nselector: {method: action_entropy}\n"
+    (tmp_path / "peg.yaml").write_text(text)
     return tmp_path / "peg.yaml"
 
 

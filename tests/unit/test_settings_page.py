@@ -59,6 +59,9 @@ def test_each_key_stands_there_with_its_default(section: str, settings: object) 
 )
 def test_each_choice_stands_in_its_row(key: str, settings: type[msgspec.Struct]) -> None:
     (row,) = re.findall(rf"^\| `{key}` \|.*", PAGE, re.MULTILINE)
-    choices = get_args(get_type_hints(settings)[key])
+    hint = get_type_hints(settings)[key]
+    # One that may be None, too, is a union.
+    literals = [each for each in get_args(hint) if get_args(each)] or [hint]
+    choices = [choice for literal in literals for choice in get_args(literal)]
     assert choices
     assert [choice for choice in choices if f"`{choice}`" not in row] == []
