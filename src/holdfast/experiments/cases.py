@@ -72,7 +72,7 @@ class Case(msgspec.Struct, frozen=True, kw_only=True):
         if (
             self.state_resolution is not None
             and selector.method == "state_entropy"
-            and selector.estimator.startswith("gaussian_mixture")
+            and (selector.estimator or "").startswith("gaussian_mixture")
         ):
             selector = msgspec.structs.replace(selector, resolution=self.state_resolution)
         filtering = particle_filter or ParticleFilterSettings()

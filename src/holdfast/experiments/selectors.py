@@ -88,7 +88,7 @@ that they are the executed ones."""
 
 BASELINE = "random"
 
-_DEFAULT = "action entropy, neighbours"
+_DEFAULT = "path entropy, prior neighbours"
 """The project's; how it compares is told whether or not a difference was found."""
 
 _CANDIDATES = (
