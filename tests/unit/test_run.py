@@ -403,7 +403,7 @@ def test_a_configuration_without_a_command(workplace: Workplace) -> None:
             "simulator.max_step=9",
             "holdfast: error: simulator.max_step is not a known key; did you mean max_steps?",
         ),
-        ("selector.method=entropy", "did you mean action_entropy or state_entropy?"),
+        ("selector.method=entropy", "did you mean path_entropy?"),
         (
             "environment.arguments.noise=0.2",
             "write --set 'environment.arguments={noise: 0.2}'",
