@@ -49,6 +49,7 @@ PATHS = [
     ["demo", "--out"],
     ["chaos", "--out"],
     ["experiment", "all", "--out"],
+    ["experiment", "selectors", "--from"],
     ["simulate", "--schedule"],
     ["doctor", "--tls"],
     ["compare"],
