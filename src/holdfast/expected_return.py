@@ -390,6 +390,8 @@ def _contenders(samples: FloatArray, among: Sequence[int]) -> list[int]:
     """Return the sensing actions whose difference from the best one is too close to call."""
     rows = {j: samples[j] for j in among}
     count = samples.shape[1]
+    if count < 2:
+        return list(among)  # One sample has no standard error.
     means = {j: numerics.sum(row) / count for j, row in rows.items()}
     best = max(among, key=lambda j: means[j])
     close = []

@@ -180,6 +180,12 @@ class TestWhatIsChosen:
         assert drawn.min() >= 5
         assert drawn[2] < drawn[:2].max()
 
+    def test_one_sample_is_doubled(self) -> None:
+        settings = settings_of(samples=1, max_observation_samples=8)
+        _, info = choose(Dock(), settings, belief_of(0.3, 0.3, count=200))
+        assert info.samples is not None
+        assert np.isfinite(info.samples).sum(axis=1).min() >= 2
+
     def test_a_horizon_changes_nothing(self) -> None:
         near = settings_of(samples=5)
         far = msgspec.structs.replace(
@@ -380,7 +386,7 @@ class TestSamples:
         assert expected_return._contenders(np.ones((3, 4)), [0, 1, 2]) == [0]
 
     def test_a_single_sample_tells_nothing_about_its_error(self) -> None:
-        assert expected_return._contenders(np.array([[1.0], [2.0]]), [0, 1]) == [1]
+        assert expected_return._contenders(np.array([[1.0], [2.0]]), [0, 1]) == [0, 1]
 
     def test_paired_means(self) -> None:
         nan = np.nan
