@@ -110,7 +110,9 @@ def _followed(
     for number, offset in enumerate(offsets):
         while step < offset:
             own_stages = stages if several_stages else stage
-            actions = problem.execute(contract.policy(problem, states, own_stages))
+            actions = contract.executed_action(
+                problem, contract.policy(problem, states, own_stages)
+            )
             noise_free = NoiseFreeStream(_MOST_DRAWS)
             states = contract.expected_move(problem, states, actions, noise_free)
             if several_stages:

@@ -302,6 +302,15 @@ class TestErrors:
         with pytest.raises(ProblemError, match=r"expected_move of plane.*\(40, 3\)"):
             choose(Wrong(), path(), some_belief(Wrong(), 40, "uniform"))
 
+    @pytest.mark.parametrize("found", [np.zeros((1, 3)), np.zeros(3), [[0.0] * 3]])
+    def test_shape_of_what_is_executed(self, found: Any) -> None:
+        class Wrong(Plane):
+            def execute(self, actions: FloatArray) -> FloatArray:
+                return found  # type: ignore[no-any-return]
+
+        with pytest.raises(ProblemError, match=r"execute of plane returned .*\(40, 3\)"):
+            choose(Wrong(), path(), some_belief(Plane(), 40, "uniform"))
+
     def test_call_of_the_expected_move(self) -> None:
         class Wrong(Drifting):
             def expected_move(self, states: FloatArray) -> FloatArray:  # type: ignore[override]
