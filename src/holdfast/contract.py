@@ -56,6 +56,9 @@ BoolArray = npt.NDArray[np.bool_]
 # may not fulfil it.
 MAX_OBSERVATION_SIZE = 1024
 
+MAX_SENSING_COST = 1e150
+"""So that no sum of prices, and no square of one, is too large for a float."""
+
 _EDGE = 4
 """Entries of a long array that a message has, at either end."""
 
@@ -260,11 +263,11 @@ def sensing_costs(problem: Any) -> FloatArray:
     if (
         costs.dtype.kind not in "fiu"
         or costs.shape != (count,)
-        or not ((costs >= 0.0) & (costs < np.inf)).all()
+        or not ((costs >= 0.0) & (costs <= MAX_SENSING_COST)).all()
     ):
         raise ProblemError(
-            f"sensing_costs of {_name(problem)} is {in_brief(given)}: must be {count} finite "
-            "numbers >= 0, one for each sensing action"
+            f"sensing_costs of {_name(problem)} is {in_brief(given)}: must be {count} "
+            f"numbers from 0 to {MAX_SENSING_COST:g}, one for each sensing action"
         )
     return costs.astype(np.float64)
 
@@ -513,7 +516,10 @@ def known_state_return(problem: Any, states: FloatArray, stages: IntArray) -> Fl
     if function is None:
         return None
     rows = np.ascontiguousarray(states).reshape(-1, states.shape[-1])
-    values = function(rows, np.ascontiguousarray(stages).reshape(-1))
+    rows.setflags(write=False)
+    own_stages = np.ascontiguousarray(stages).reshape(-1)
+    own_stages.setflags(write=False)
+    values = function(rows, own_stages)
     if not _is_array(values, 1) or values.shape != rows.shape[:1]:
         raise _misfit(problem, "known_state_return", values, rows.shape[:1])
     if not _kernel.all_finite(np.ascontiguousarray(values)):

@@ -343,6 +343,18 @@ class TestRollouts:
         np.testing.assert_allclose(found, 1000.0 - steps, rtol=1e-12)
         assert asked == [((4, 2), (4,))] * 4
 
+    @pytest.mark.parametrize("changed", [0, 1])
+    def test_a_return_of_its_own_cannot_change_the_rollouts(self, changed: int) -> None:
+        class InPlace(Dock):
+            def known_state_return(self, *known: Any) -> FloatArray:
+                known[changed][...] = 0
+                return np.zeros(known[0].shape[0])
+
+        clouds = self.ESTIMATES[:, :, np.newaxis]
+        states = self.STATES + 50.0
+        with pytest.raises(ValueError, match="read-only"):
+            rollout_returns(InPlace(), settings_of(), states, self.ESTIMATES, clouds, 0, HYPOTHESES)
+
     @pytest.mark.parametrize(
         ("function", "own", "message"),
         [
@@ -444,11 +456,24 @@ class TestSensingCosts:
             assert contract.sensing_costs(problem).tolist() == [0.0, 0.0, 0.0]
         assert contract.sensing_costs(Dock()).tolist() == [0.0, 0.0, 0.0]
 
+    def test_the_greatest_price(self) -> None:
+        problem = Dock()
+        problem.sensing_costs = (1e150, 1e150, 0.0)  # type: ignore[attr-defined]
+        with np.errstate(all="raise"):
+            chosen, _ = choose(problem, settings_of(), belief_of(0.5, 0.5))
+        assert chosen == 2
+
+    def test_a_greater_price_is_refused_with_its_bound(self) -> None:
+        problem = Dock()
+        problem.sensing_costs = (1.7e308, 1.7e308, 0.0)  # type: ignore[attr-defined]
+        with pytest.raises(ProblemError, match=r"1.7e\+308.*from 0 to 1e\+150"):
+            choose(problem, settings_of(), belief_of(0.5, 0.5))
+
     @pytest.mark.parametrize(
         "costs",
         [(1.0,), (1.0, -0.5, 0.0), (0.0, np.nan, 0.0), (0.0, np.inf, 0.0), 1.0, ("a", "b", "c")],
     )
     def test_a_wrong_price_is_named(self, costs: object) -> None:
         broken: Any = type("Broken", (Dock,), {"sensing_costs": costs})()
-        with pytest.raises(ProblemError, match=r"sensing_costs of dock is .*: must be 3 finite"):
+        with pytest.raises(ProblemError, match=r"sensing_costs of dock is .*: must be 3 numbers"):
             planning.initial_state(broken, settings_of(), 0, 0)
