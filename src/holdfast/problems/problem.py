@@ -128,9 +128,9 @@ class Problem(Protocol):
     states have the actions' resolution, which must then be one number, or an action must have as
     many coordinates as a state.
 
-    It may have ``sensing_costs``, the price of each sensing action in units of reward, numbers of
-    from 0 to 1e150. A trial's reward is less by it at each sensing, and ``expected_return`` weighs it
-    against what sensing gains. Without this attribute sensing costs nothing. "Not looking" is a
+    It may have ``sensing_costs``, the price of each sensing action in units of reward, numbers
+    from 0 to 1e150. A trial's reward is less by it at each sensing, and ``expected_return`` weighs
+    it against what sensing gains. Without this attribute sensing costs nothing. "Not looking" is a
     sensing action like any other: one of price 0 whose observation says nothing (a huge variance).
     """
 
