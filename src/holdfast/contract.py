@@ -26,6 +26,7 @@ __all__ = [
     "executed_action",
     "expected_move",
     "expected_path",
+    "first_reward",
     "goals",
     "has_general_observations",
     "has_own",
@@ -270,6 +271,14 @@ def sensing_costs(problem: Any) -> FloatArray:
             f"numbers from 0 to {MAX_SENSING_COST:g}, one for each sensing action"
         )
     return costs.astype(np.float64)
+
+
+def first_reward(problem: Any) -> float | None:
+    """Return the reward of a trial in which nothing happened yet; None if nothing gives one.
+
+    Looks that have prices are rewards, were they all free; a task action may have none.
+    """
+    return None if getattr(problem, "sensing_costs", None) is None else 0.0
 
 
 def has_general_observations(problem: object) -> bool:

@@ -449,6 +449,15 @@ class TestSensingCosts:
         result = run_trial(problem, settings_of(method="random", particles=30), simulator, 0)
         assert result.reward == -float(result.sensing_decisions)
 
+    def test_free_looks_alone_are_a_reward_of_zero(self) -> None:
+        problem = Free()
+        simulator = SimulatorSettings(max_steps=10, sensing_intervals=4)
+        settings = settings_of(method="fixed", particles=30, sensing_action=2)
+        for costs, reward in (((1.0, 1.0, 0.0), 0.0), ((0.0, 0.0, 0.0), 0.0), (None, None)):
+            problem.sensing_costs = costs  # type: ignore[attr-defined]
+            assert run_trial(problem, settings, simulator, 0).reward == reward
+            assert History(planning.Planner(problem, settings), 0, 0).total_reward == reward
+
     def test_none_is_free(self) -> None:
         for costs in (None, (0.0, 0.0, 0.0), np.zeros(3), [0, 0, 0]):
             problem = Dock()

@@ -156,7 +156,7 @@ def run_trial(
     log = DecisionLog(problem.action_size)
     costs = contract.sensing_costs(problem)
     sensing_ms: list[float] = []
-    total_reward: float | None = None
+    total_reward = contract.first_reward(problem)
     unexplained = 0
     steps = 0
     done = _ask_done(environment)

@@ -111,7 +111,7 @@ class History:
     actions : list of array
         Task actions that the records show to be performed, in order.
     total_reward : float or None
-        None as long as no step had a reward.
+        None as long as no step had a reward, and sensing has no prices.
     pending : array or None
         A task action that was written down and of which nothing more is known.
     paused : bool
@@ -135,7 +135,7 @@ class History:
         self.log = DecisionLog(planner.problem.action_size)
         self._costs = contract.sensing_costs(planner.problem)
         self.actions: list[FloatArray] = []
-        self.total_reward: float | None = None
+        self.total_reward = contract.first_reward(planner.problem)
         self.pending: FloatArray | None = None
         self.paused = False
         self.num_unexplained = 0
