@@ -116,9 +116,10 @@ def check_problem(problem: Any) -> None:
     _check_resolution(problem, "resolution", "an action", problem.action_size)
     if getattr(problem, "state_resolution", None) is not None:
         _check_resolution(problem, "state_resolution", "a state", problem.state_size)
-    variance = np.asarray(getattr(problem, "motion_variance", ()))
-    numbers = variance.dtype.kind in "fiu" and variance.shape == (problem.action_size,)
-    if not numbers or not (variance >= 0.0).all():
+    variance = getattr(problem, "motion_variance", ())
+    numbers = _numbers(variance)
+    fits = numbers is not None and numbers.shape == (problem.action_size,)
+    if numbers is None or not fits or not (numbers >= 0.0).all():
         raise ProblemError(
             f"motion_variance of {name} is {in_brief(variance)}: must be {problem.action_size} "
             "numbers >= 0"
@@ -157,20 +158,27 @@ def check_sizes(problem: Any) -> None:
 
 def _check_resolution(problem: Any, attribute: str, of_what: str, size: int) -> None:
     value = getattr(problem, attribute, None)
-    if isinstance(value, (int, float)):
-        if not 0.0 < value < np.inf:
-            raise ProblemError(
-                f"{attribute} of {problem.name} is {value!r}: must be positive and finite"
-            )
-        return
-    numbers = np.asarray(value)
-    fits = numbers.dtype.kind in "fiu" and numbers.shape == (size,)
+    numbers = _numbers(value)
     # A comparison with NaN is false.
-    if not fits or not ((numbers > 0.0) & (numbers < np.inf)).all():
+    usable = numbers is not None and ((numbers > 0.0) & (numbers < np.inf)).all()
+    if numbers is not None and numbers.ndim == 0 and not usable:
         raise ProblemError(
-            f"{attribute} of {problem.name} is {in_brief(numbers)}: must be one number or {size}, "
+            f"{attribute} of {problem.name} is {numbers.item()!r}: must be positive and finite"
+        )
+    if numbers is None or not usable or numbers.shape not in ((), (size,)):
+        raise ProblemError(
+            f"{attribute} of {problem.name} is {in_brief(value)}: must be one number or {size}, "
             f"one for each coordinate of {of_what}, positive and finite"
         )
+
+
+def _numbers(value: object) -> npt.NDArray[Any] | None:
+    """Return an array, if this is one or more numbers (a truth value is none)."""
+    try:
+        numbers = np.asarray(value)
+    except (TypeError, ValueError):
+        return None  # A ragged list.
+    return numbers if numbers.dtype.kind in "fiu" else None
 
 
 def resolution_of(
@@ -207,23 +215,24 @@ def resolution_of(
                 f"{count} for {_name(problem)}, one for each coordinate of {of_what}"
             )
         return np.array(given, dtype=np.float64)
-    own = problem.resolution
-    if of_states:
-        if getattr(problem, "state_resolution", None) is not None:
-            own = problem.state_resolution
-        elif np.ndim(own) > 0 and problem.state_size != problem.action_size:
-            raise InvalidValueError(
-                f"selector.method state_entropy: resolution of {_name(problem)} has "
-                f"{np.size(own)} numbers, for the coordinates of an action, and a state has "
-                f"{problem.state_size}; give the problem a state_resolution, one number or "
-                f"{problem.state_size}, or write selector.resolution"
-            )
-    if isinstance(own, (int, float)):
-        return own
+    attribute = "resolution"
+    if of_states and getattr(problem, "state_resolution", None) is not None:
+        attribute = "state_resolution"
+    own = getattr(problem, attribute)
     # A configuration asks before check_problem has.
-    if np.asarray(own).dtype.kind not in "fiu":
-        raise ProblemError(f"resolution of {_name(problem)} is {own!r:.80}: must be numbers")
-    return np.asarray(own, dtype=np.float64)
+    numbers = _numbers(own)
+    if numbers is None:
+        raise ProblemError(f"{attribute} of {_name(problem)} is {own!r:.80}: must be numbers")
+    if numbers.ndim == 0:
+        return own if isinstance(own, (int, float)) else float(numbers)
+    if of_states and attribute == "resolution" and problem.state_size != problem.action_size:
+        raise InvalidValueError(
+            f"selector.method state_entropy: resolution of {_name(problem)} has "
+            f"{numbers.size} numbers, for the coordinates of an action, and a state has "
+            f"{problem.state_size}; give the problem a state_resolution, one number or "
+            f"{problem.state_size}, or write selector.resolution"
+        )
+    return numbers.astype(np.float64)
 
 
 def _check_parameters(name: str, function: str, own: Any, parameters: tuple[str, ...]) -> None:
@@ -259,10 +268,10 @@ def sensing_costs(problem: Any) -> FloatArray:
     given = getattr(problem, "sensing_costs", None)
     if given is None:
         return np.zeros(count)
-    costs = np.asarray(given)
+    costs = _numbers(given)
     # A comparison with NaN is false.
     if (
-        costs.dtype.kind not in "fiu"
+        costs is None
         or costs.shape != (count,)
         or not ((costs >= 0.0) & (costs <= MAX_SENSING_COST)).all()
     ):
@@ -422,7 +431,7 @@ def next_stages(
 def _check_stages(problem: Any, function: str, stages: Any, states: FloatArray) -> None:
     shape = states.shape[:-1]
     if not isinstance(stages, np.ndarray) or stages.dtype.kind not in "iu" or stages.shape != shape:
-        raise _misfit(problem, function, stages, shape)
+        raise _misfit(problem, function, stages, shape, "an array of integers")
     if stages.size and (stages.min() < 0 or stages.max() >= problem.num_stages):
         outside = (stages < 0) | (stages >= problem.num_stages)
         bad = np.unravel_index(int(np.argmax(outside)), shape)
@@ -460,7 +469,7 @@ def expected_path(
     found = problem.expected_path(states, stage, offsets, threads)
     shape = (len(offsets), *states.shape)
     if not isinstance(found, tuple) or len(found) != 2:
-        raise _misfit(problem, "expected_path", found, "two arrays")
+        raise _returned(problem, "expected_path", found, "a tuple of two arrays")
     states_at, stages_at = found
     if not _is_array(states_at, 3) or states_at.shape != shape:
         raise _misfit(problem, "expected_path", states_at, shape)
@@ -616,9 +625,15 @@ def in_brief(values: object) -> str:
     ----------
     values : array
     """
-    return np.array2string(
-        np.asarray(values), max_line_width=sys.maxsize, threshold=2 * _EDGE, edgeitems=_EDGE
-    )
+    try:
+        array = np.asarray(values)
+    except (TypeError, ValueError):
+        return _in_short(values, 80)  # A ragged list.
+    return np.array2string(array, max_line_width=sys.maxsize, threshold=2 * _EDGE, edgeitems=_EDGE)
+
+
+def _in_short(value: object, length: int) -> str:
+    return " ".join(repr(value).split())[:length]
 
 
 def _is_array(value: object, dimensions: int) -> bool:
@@ -629,12 +644,18 @@ def _name(problem: Any) -> str:
     return getattr(problem, "name", "") or type(problem).__name__
 
 
-def _misfit(problem: Any, function: str, value: object, shape: object) -> ProblemError:
+def _misfit(
+    problem: Any, function: str, value: object, shape: object, array: str = "a float64 array"
+) -> ProblemError:
+    need = "one number" if shape == () else f"{array} of shape {_written(shape)}"
+    return _returned(problem, function, value, need)
+
+
+def _returned(problem: Any, function: str, value: object, need: str) -> ProblemError:
     if isinstance(value, np.ndarray):
         came = f"{value.dtype} of shape {value.shape}"
     else:
-        came = f"{type(value).__name__} ({value!r:.40})"
-    need = "one number" if shape == () else f"a float64 array of shape {_written(shape)}"
+        came = f"{type(value).__name__} ({_in_short(value, 40)})"
     return ProblemError(f"{function} of {_name(problem)} returned {came}: need {need}")
 
 

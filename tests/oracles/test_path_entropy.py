@@ -332,7 +332,7 @@ class TestErrors:
         [
             (np.full(40, 3), "next_stage of plane has the stage 3 for state"),
             (np.full(40, -1), "next_stage of plane has the stage -1 for state"),
-            (np.zeros(40), "next_stage of plane"),
+            (np.zeros(40), r"next_stage of plane .*: need an array of integers of shape \(40,\)"),
             (1, "next_stage of plane"),
         ],
     )

@@ -163,6 +163,16 @@ def test_a_misfit_is_named(case: str) -> None:
             "coordinate of a state",
         ),
         ("state_resolution", np.array([0.1]), "state_resolution of line"),
+        (
+            "resolution",
+            [[1], [1, 2]],
+            r"^resolution of line is \[\[1\], \[1, 2\]\]: must be one num",
+        ),
+        ("state_resolution", [[1], [1, 2]], r"^state_resolution of line is .*: must be one num"),
+        ("sensing_costs", [[1], [1, 2]], r"sensing_costs of line is .*: must be 2 numbers"),
+        ("motion_variance", [[1], [1, 2]], r"motion_variance of line is .*: must be 1 numbers"),
+        ("resolution", True, "resolution of line is True: must be one number"),
+        ("resolution", np.array(0.0), "resolution of line is 0.0: must be positive and finite"),
         ("motion_variance", np.array([0.1, 0.1]), "motion_variance of line"),
         ("log_likelihood", lambda *_: 0.0, "log_likelihood alone"),
         ("sample_observation", lambda *_: 0.0, "sample_observation alone"),
@@ -172,6 +182,20 @@ def test_an_attribute_is_named(attribute: str, value: object, message: str) -> N
     broken: Any = type("Broken", (Line,), {attribute: value})()
     with pytest.raises(ProblemError, match=message):
         planning.initial_state(broken, SETTINGS, 0, 0)
+
+
+@pytest.mark.parametrize(
+    ("found", "need"),
+    [
+        ([np.zeros((1, 4, 2)), np.zeros((1, 4), np.int64)], "need a tuple of two arrays$"),
+        ((np.zeros((1, 4)), None), r"need a float64 array of shape \(1, 4, 2\)$"),
+        ((np.zeros((1, 4, 2)), np.zeros((1, 4))), r"need an array of integers of shape \(1, 4\)$"),
+    ],
+)
+def test_what_a_path_must_be(found: object, need: str) -> None:
+    problem: Any = type("Wrong", (Line,), {"expected_path": lambda *_: found})()
+    with pytest.raises(ProblemError, match=f"^expected_path of line returned .*: {need}"):
+        contract.expected_path(problem, np.zeros((4, 2)), 0, (3,), 1)
 
 
 class TestResolution:
@@ -189,6 +213,22 @@ class TestResolution:
         for of_states in (False, True):
             assert self.of(None, of_states=of_states, resolution=0.3) == 0.3
             assert self.of(0.2, of_states=of_states, resolution=np.array([0.3])) == 0.2
+
+    @pytest.mark.parametrize("number", [np.float32(0.5), np.array(0.5), np.float64(0.5)])
+    def test_a_number_of_numpy_is_one_number(self, number: Any) -> None:
+        for name, of_states in (("resolution", False), ("state_resolution", True)):
+            assert self.of(None, of_states=of_states, **{name: number}) == 0.5
+            problem: Any = type("Resolved", (Line,), {name: number})()
+            contract.check_problem(problem)
+        problem = type("Whole", (Line,), {"resolution": np.int64(1)})()
+        contract.check_problem(problem)
+        assert contract.resolution_of(problem, None, of_states=False) == 1.0
+
+    @pytest.mark.parametrize("own", [[[1], [1, 2]], "x", True])
+    @pytest.mark.parametrize("name", ["resolution", "state_resolution"])
+    def test_what_is_no_number_is_named(self, name: str, own: object) -> None:
+        with pytest.raises(ProblemError, match=f"^{name} of line is .*: must be numbers"):
+            self.of(None, of_states=name == "state_resolution", **{name: own})
 
     def test_what_is_given_comes_first(self) -> None:
         own = {"resolution": np.array([0.3]), "state_resolution": np.array([0.1, 0.2])}
