@@ -50,7 +50,8 @@ MAX_PATH_OFFSETS = 64
 Count = Annotated[int, msgspec.Meta(ge=1)]
 NonNegativeCount = Annotated[int, msgspec.Meta(ge=0)]
 Positive = Annotated[float, msgspec.Meta(gt=0.0)]
-Resolutions = Annotated[tuple[Positive, ...], msgspec.Meta(min_length=1, max_length=64)]
+Resolution = Annotated[float, msgspec.Meta(ge=1e-150, le=1e150)]
+Resolutions = Annotated[tuple[Resolution, ...], msgspec.Meta(min_length=1, max_length=64)]
 Milliseconds = Annotated[float, msgspec.Meta(gt=0.0, le=3_600_000.0)]
 Seed = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
 Text = Annotated[str, msgspec.Meta(min_length=1, max_length=4096)]
@@ -133,7 +134,8 @@ class SelectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
         policy says or at what the limits leave of it.
     resolution : float, tuple of float or None
         Distance below which two actions (or, for ``state_entropy``, states) do not differ in
-        practice, in their unit; for a mixture, the standard deviation of the noise that blurs them.
+        practice, in their unit, from 1e-150 to 1e150; for a mixture, the standard deviation of the
+        noise that blurs them.
         With as many numbers as coordinates each has its own, in its own unit; then the choice does
         not depend on units, that of ``action_covariance`` included. None takes the problem's
         resolution, and for a mixture its motion noise, unless that has none for a coordinate,
@@ -184,7 +186,7 @@ class SelectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
         | None
     ) = None
     actions: Literal["commanded", "executed"] = "commanded"
-    resolution: Positive | Resolutions | None = None
+    resolution: Resolution | Resolutions | None = None
     path_offsets: Annotated[
         tuple[Annotated[int, msgspec.Meta(ge=0, le=MAX_PATH_STEPS)], ...],
         msgspec.Meta(min_length=1, max_length=MAX_PATH_OFFSETS),

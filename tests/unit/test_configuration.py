@@ -525,9 +525,17 @@ class TestKeysAndValues:
             ("particle_filter: {num_particles: }", "is null; expected a whole number"),
             ("particle_filter: {num_particles: [1]}", "is [1] (a list of 1); expected a whole"),
             ("active_sensing: {discount: 1.5}", "discount is 1.5; expected a number >= 0 and <= 1"),
-            ("selector: {resolution: 0}", "is 0; expected a number > 0 or a list of at least 1"),
+            (
+                "selector: {resolution: 0}",
+                "is 0; expected a number >= 1e-150 and <= 1e+150 or a list",
+            ),
             ("selector: {resolution: [1, 1, 0]}", "selector.resolution[2] is 0; expected a number"),
-            ("selector: {resolution: []}", "resolution is [] (a list of 0); expected a number > 0"),
+            ("selector: {resolution: []}", "resolution is [] (a list of 0); expected a number >="),
+            (
+                "selector:\n  resolution: 1e-160",
+                "line 3: selector.resolution is 1e-160; expected a number >= 1e-150 and <= 1e+150",
+            ),
+            ("selector: {resolution: [1, 1e151, 1]}", "selector.resolution[1] is 1e+151; expected"),
             (
                 "selector: {method: action-entropy}",
                 'selector.method is "action-entropy"; expected one of action_covariance, '
