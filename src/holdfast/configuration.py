@@ -441,8 +441,10 @@ def _build(
         try:
             resolution_of(problem, selector.resolution, of_states=of_states)
         except InvalidValueError as error:
-            place = source.place(("selector", "resolution"))
-            raise ConfigurationError(f"{place}: {error}") from None
+            key = "method" if selector.resolution is None else "resolution"
+            raise source.error(
+                ("selector", key), str(error).removeprefix(f"selector.{key} ")
+            ) from None
     if (
         selector.method in ("action_entropy", "path_entropy", "state_entropy")
         and estimator == "prior_neighbors"

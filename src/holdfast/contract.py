@@ -211,7 +211,7 @@ def resolution_of(
         count = getattr(problem, size)
         if len(given) != count:
             raise InvalidValueError(
-                f"selector.resolution {list(given)}: has {len(given)} numbers; need one number, or "
+                f"selector.resolution is {list(given)}, {len(given)} numbers; need one number, or "
                 f"{count} for {_name(problem)}, one for each coordinate of {of_what}"
             )
         return np.array(given, dtype=np.float64)
@@ -227,7 +227,7 @@ def resolution_of(
         return own if isinstance(own, (int, float)) else float(numbers)
     if of_states and attribute == "resolution" and problem.state_size != problem.action_size:
         raise InvalidValueError(
-            f"selector.method state_entropy: resolution of {_name(problem)} has "
+            f"selector.method is state_entropy, but the resolution of {_name(problem)} has "
             f"{numbers.size} numbers, for the coordinates of an action, and a state has "
             f"{problem.state_size}; give the problem a state_resolution, one number or "
             f"{problem.state_size}, or write selector.resolution"

@@ -297,8 +297,16 @@ class TestResolution:
     def test_another_number_is_refused_with_its_line(self, method: str, write: Write) -> None:
         text = f"problem: peg_in_hole_2d\nselector:\n  method: {method}\n  resolution: [1, 2]"
         message = complaint(write(text))
-        assert "line 4: selector.resolution [1.0, 2.0]: has 2 numbers; need one number" in message
+        assert "line 4: selector.resolution is [1.0, 2.0], 2 numbers; need one number" in message
         assert "3 for peg_in_hole_2d, one for each coordinate of " in message
+
+    def test_another_number_that_was_given_instead_of_the_files(self, write: Write) -> None:
+        path = write("problem: peg_in_hole_2d\nselector: {resolution: [1, 2, 3]}")
+        with pytest.raises(ConfigurationError) as refused:
+            load(path, overrides={"selector.resolution": [0.1]})
+        assert str(refused.value).startswith(
+            f"selector.resolution, given instead of what {path} says, is [0.1], 1 numbers; need "
+        )
 
     def test_states_of_another_number_of_coordinates_need_their_own(
         self, write: Write, tmp_path: Path
@@ -314,7 +322,10 @@ class TestResolution:
         load(write(f"{text}action_entropy}}"))
         load(write(f"{text}state_entropy, resolution: [1, 1, 2]}}"))
         message = complaint(write(f"{text}state_entropy}}"))
-        assert "resolution of passer_by has 2 numbers, for the coordinates of an action" in message
+        assert (
+            "line 2: selector.method is state_entropy, but the resolution of passer_by" in message
+        )
+        assert "has 2 numbers, for the coordinates of an action" in message
         assert "give the problem a state_resolution, one number or 3, or write selector" in message
 
     @pytest.mark.parametrize("method", ["random", "fixed"])

@@ -248,7 +248,7 @@ class TestResolution:
     def test_states_of_another_number_of_coordinates_need_one(self) -> None:
         with pytest.raises(
             InvalidValueError,
-            match=r"selector.method state_entropy: resolution of line has 1 numbers.*and a state "
+            match=r"selector.method is state_entropy, but the resolution of line has 1 .*and a state "
             "has 2; give the problem a state_resolution, one number or 2, or write",
         ):
             self.of(None, of_states=True, resolution=np.array([0.3]))
@@ -256,7 +256,7 @@ class TestResolution:
     def test_another_number_of_numbers(self) -> None:
         with pytest.raises(
             InvalidValueError,
-            match=r"selector.resolution \[0.5, 0.6\]: has 2 numbers; need one number, or 1 for "
+            match=r"selector.resolution is \[0.5, 0.6\], 2 numbers; need one number, or 1 for "
             "line, one for each coordinate of an action",
         ):
             self.of((0.5, 0.6), of_states=False)

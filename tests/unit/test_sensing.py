@@ -338,7 +338,7 @@ class TestBadInput:
     @pytest.mark.parametrize("method", ["action_entropy", "state_entropy", "action_covariance"])
     def test_another_number_of_resolutions_is_named(self, method: str) -> None:
         selector = SelectorSettings(method=method, resolution=(0.1, 0.1, 0.1))  # type: ignore[arg-type]
-        with pytest.raises(InvalidValueError, match=r"selector.resolution .*: has 3 numbers; need"):
+        with pytest.raises(InvalidValueError, match=r"selector.resolution is .*, 3 numbers; need"):
             choose(Coordinates(), settings_of(selector), belief_of(1.0, 1.0))
 
     @pytest.mark.parametrize("method", ["action_entropy", "state_entropy", "action_covariance"])
