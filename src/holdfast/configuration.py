@@ -50,7 +50,7 @@ from holdfast.settings import (
     SelectorSettings,
     SimulatorSettings,
     estimator_of,
-    unfit_for_path_entropy,
+    unfit_for_the_method,
 )
 from holdfast.user_code import account_of_user_error, in_words
 from holdfast.yaml_document import MAX_BYTES, Document, KeyPath, dotted, read, write
@@ -461,7 +461,7 @@ def _build(
         selector=selector,
         sensing_interval=simulator.sensing_intervals,
     )
-    if (unfit := unfit_for_path_entropy(planning)) is not None:
+    if (unfit := unfit_for_the_method(planning)) is not None:
         raise source.error(*unfit)
     num_actions = len(problem.sensing_actions)
     if selector.method == "fixed" and selector.sensing_action >= num_actions:

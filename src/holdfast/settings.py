@@ -29,6 +29,7 @@ __all__ = [
     "estimator_of",
     "path_steps",
     "unfit_for_path_entropy",
+    "unfit_for_the_method",
 ]
 
 MAX_PARTICLES = 10_000_000
@@ -162,8 +163,8 @@ class SelectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
         number, and at the last one for sure.
     max_observation_samples : int
         Bound on the hypothetical observations of a sensing action with ``expected_return``: it
-        begins with ``num_observation_samples`` and doubles them for those sensing actions whose
-        return differs from the best one's by less than two standard errors.
+        begins with ``num_observation_samples``, which must not be more, and doubles them for those
+        sensing actions whose return differs from the best one's by less than two standard errors.
     """
 
     method: Literal[
@@ -389,6 +390,20 @@ def unfit_for_path_entropy(settings: PlanningSettings) -> tuple[tuple[str, str],
     return None
 
 
+def unfit_for_the_method(settings: PlanningSettings) -> tuple[tuple[str, str], str] | None:
+    """Return which key ``selector.method`` cannot use as it is, and why; None if all fit."""
+    if settings.selector.method != "expected_return":
+        return unfit_for_path_entropy(settings)
+    first = settings.active_sensing.num_observation_samples
+    most = settings.selector.max_observation_samples
+    if most >= first:
+        return None
+    return ("selector", "max_observation_samples"), (
+        f"is {most}; with selector.method expected_return it must be at least "
+        f"active_sensing.num_observation_samples, which is {first}"
+    )
+
+
 def check_settings(settings: PlanningSettings) -> None:
     """Check the bounds of settings that were made in Python.
 
@@ -401,6 +416,6 @@ def check_settings(settings: PlanningSettings) -> None:
         msgspec.convert(msgspec.to_builtins(settings), PlanningSettings)
     except (msgspec.ValidationError, TypeError) as error:
         raise InvalidValueError(f"settings: {error}") from error
-    if (unfit := unfit_for_path_entropy(settings)) is not None:
+    if (unfit := unfit_for_the_method(settings)) is not None:
         (section, key), reason = unfit
         raise InvalidValueError(f"settings: {section}.{key} {reason}")

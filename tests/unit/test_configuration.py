@@ -625,6 +625,15 @@ class TestKeysAndValues:
 
 
 class TestTwoKeys:
+    def test_no_fewer_observation_samples_than_to_begin_with(self, write: Write) -> None:
+        text = "problem: peg_in_hole_2d\nactive_sensing: {num_observation_samples: 21}\n"
+        text += "selector:\n  max_observation_samples: %d\n  method: "
+        message = complaint(write(text % 20 + "expected_return"))
+        assert "line 4: selector.max_observation_samples is 20; with" in message
+        assert "at least active_sensing.num_observation_samples, which is 21" in message
+        load(write(text % 21 + "expected_return"))
+        load(write(text % 20 + "path_entropy"))
+
     def test_neighbours_need_as_many_other_particles(self, write: Write) -> None:
         text = "problem: peg_in_hole_2d\nselector: {estimator: nearest_neighbor}\n"
         text += "particle_filter: {num_particles: %d}\n"

@@ -248,7 +248,7 @@ class TestResolution:
     def test_states_of_another_number_of_coordinates_need_one(self) -> None:
         with pytest.raises(
             InvalidValueError,
-            match=r"selector.method is state_entropy, but the resolution of line has 1 .*and a state "
+            match=r"selector.method is state_entropy, but the resolution of .* 1 n.*and a state "
             "has 2; give the problem a state_resolution, one number or 2, or write",
         ):
             self.of(None, of_states=True, resolution=np.array([0.3]))
@@ -283,6 +283,13 @@ def test_a_function_cannot_change_the_belief(function: str) -> None:
         (PlanningSettings(active_sensing=ActiveSensingSettings(horizon=0)), "horizon"),
         (PlanningSettings(active_sensing=ActiveSensingSettings(discount=5.0)), "discount"),
         (PlanningSettings(sensing_interval=-1), "sensing_interval"),
+        (
+            PlanningSettings(
+                active_sensing=ActiveSensingSettings(num_observation_samples=41),
+                selector=SelectorSettings(method="expected_return"),
+            ),
+            r"max_observation_samples is 40; .*num_observation_samples, which is 41",
+        ),
         (PlanningSettings(selector=SelectorSettings(sensing_action=-1)), "sensing_action"),
     ],
 )
