@@ -131,6 +131,11 @@ def expected_returns(
             _sampled_returns(problem, settings, belief, stage, truths, weights, stream)
             - costs[contenders, np.newaxis]
         )
+        if not numerics.all_finite(np.ascontiguousarray(found[contenders])):
+            raise ProblemError(
+                f"the rewards of {problem.name} add up to more than a number can hold in "
+                f"{settings.selector.rollout_steps} steps of expected_return"
+            )
         rounds.append(found)
         drawn += size
         samples = np.concatenate(rounds, axis=1)

@@ -472,6 +472,17 @@ class TestSensingCosts:
             chosen, _ = choose(problem, settings_of(), belief_of(0.5, 0.5))
         assert chosen == 2
 
+    def test_rewards_whose_sum_is_not_finite(self) -> None:
+        class Huge(Dock):
+            def reward(self, states: FloatArray, actions: FloatArray) -> FloatArray:
+                return np.full(states.shape[:-1], -1.7e308)
+
+        with (
+            np.errstate(all="ignore"),
+            pytest.raises(ProblemError, match="rewards of dock add up to more than a number can"),
+        ):
+            choose(Huge(), settings_of(), belief_of(0.5, 0.5))
+
     def test_a_greater_price_is_refused_with_its_bound(self) -> None:
         problem = Dock()
         problem.sensing_costs = (1.7e308, 1.7e308, 0.0)  # type: ignore[attr-defined]
