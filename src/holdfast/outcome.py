@@ -160,7 +160,7 @@ class TrialResult(msgspec.Struct, frozen=True, kw_only=True):
         Task actions performed.
     reward : float or None
         Sum of the rewards of the steps. A step without one adds nothing; None if there were steps
-        and none of them had one.
+        and none of them had one, unless sensing has prices, which are rewards.
     sensing_decisions : int
         Sensing actions chosen.
     mean_sensing_ms : float

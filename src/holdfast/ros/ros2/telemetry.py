@@ -45,7 +45,8 @@ _MAX_NOTES = 1000
 _NICENESS = 10
 
 _ENTROPIES = ("action_entropy", "path_entropy", "state_entropy", "action_covariance")
-"""Methods that compute something for each sensing action; the others only choose."""
+"""Methods that compute something for each sensing action; the others only choose. (What
+``expected_return`` computes are returns, which the message has no field for.)"""
 
 
 class Shown(NamedTuple):
