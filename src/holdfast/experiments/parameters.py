@@ -37,7 +37,7 @@ LEVEL = 0.01
 """Of the tests of steps, and of those of successes: the probability that any difference is claimed
 where there is none."""
 
-_TRIALS = {CHOICE: 16, CLAIM: 80}
+_TRIALS = {CHOICE: 10, CLAIM: 60}
 _QUICK_TRIALS = {CHOICE: 2, CLAIM: 4}
 _MOST_QUICK_PARTICLES = 3.0
 """In a quick run, as a multiple of a problem's."""
