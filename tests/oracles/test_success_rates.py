@@ -28,7 +28,7 @@ def successes(configuration: Configuration, num_particles: int, max_steps: int, 
         ),
     )
     simulator = msgspec.structs.replace(configuration.simulator, max_steps=max_steps, seed=seed)
-    assert planning.selector.method == "action_entropy"
+    assert planning.selector.method == "path_entropy"
     assert planning.sensing_interval == 8
     return sum(
         run_trial(configuration.problem, planning, simulator, trial).success

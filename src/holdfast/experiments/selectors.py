@@ -798,10 +798,7 @@ def _draw_choice(summary: Table) -> Figure:
     figure, panels = plots.grid_of_panels(
         list(_CASES),
         columns=4,
-        title=(
-            "What choosing the sensing action gains (entropies by nearest neighbours; means, 95 % "
-            "intervals)"
-        ),
+        title="What choosing the sensing action gains (means, 95 % intervals)",
         width=11.0,
     )
     for case, panel in panels.items():
