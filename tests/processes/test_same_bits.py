@@ -42,7 +42,11 @@ RUNS: dict[str, tuple[str, int, dict[str, dict[str, object]]]] = {
         4,
         {
             "particle_filter": {"resampling_threshold": 0.3},
-            "selector": {"estimator": "gaussian_mixture_upper", "actions": "executed"},
+            "selector": {
+                "method": "action_entropy",
+                "estimator": "gaussian_mixture_upper",
+                "actions": "executed",
+            },
             "active_sensing": {"horizon": 2, "discount": 0.5},
             "simulator": {"max_steps": 60},
         },

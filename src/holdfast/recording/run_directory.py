@@ -26,6 +26,7 @@ from holdfast.recording.fingerprint import difference, fingerprint
 from holdfast.recording.journal import Journal, Survives, require_writable
 from holdfast.recording.tables import RunSummary, SummaryBuilder, csv_lines
 from holdfast.recording.timings import count_answers, count_verified
+from holdfast.settings import SelectorSettings
 
 __all__ = [
     "CONFIGURATION_NAME",
@@ -430,6 +431,11 @@ def _compared(configuration: Any) -> Any:
         kept["simulator"] = {
             key: value for key, value in kept["simulator"].items() if key != "num_trials"
         }
+    # A run that was begun before there was a key has none; whatever the key says, its method does
+    # not ask for it.
+    if isinstance(kept.get("selector"), Mapping):
+        defaults = msgspec.json.decode(msgspec.json.encode(SelectorSettings()))
+        kept["selector"] = {**defaults, **kept["selector"]}
     # How a world is reached may change between two parts of a run; which one it is may not.
     environment = kept.pop("environment", None)
     if isinstance(environment, Mapping) and environment.get("object") is not None:
