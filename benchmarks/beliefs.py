@@ -14,19 +14,11 @@ import msgspec
 import numpy as np
 
 from holdfast.belief import Belief
-from holdfast.planning import (
-    PlanningState,
-    advance,
-    choose_sensing_action,
-    choose_task_action,
-    initial_state,
-    needs_sensing,
-    observe,
-)
+from holdfast.config.settings import ParticleFilterSettings, PlanningSettings, SelectorSettings
+from holdfast.planning import Planner, PlanningState
 from holdfast.problems.problem import Problem
 from holdfast.randomness import Purpose, stream
-from holdfast.runtime.environment import SimulatedEnvironment
-from holdfast.settings import ParticleFilterSettings, PlanningSettings, SelectorSettings
+from holdfast.robot.environment import SimulatedEnvironment
 
 __all__ = ["concentrated_state", "recorded_trial", "settings_for", "with_sensing"]
 
@@ -54,32 +46,27 @@ def recorded_trial(
 ) -> tuple[list[PlanningState], list[float]]:
     """Run a trial; return its state before each sensing decision and what the decision took.
 
-    Parameters
-    ----------
-    problem : Problem
-    settings : PlanningSettings
-    trial : int
-
     Returns
     -------
     states : list of PlanningState
     seconds : list of float
         Each decision made once, where it belongs, in between everything else that a trial does.
     """
-    state = initial_state(problem, settings, SEED, trial)
+    planner = Planner(problem, settings)
+    state = planner.init(SEED, trial)
     environment = SimulatedEnvironment(problem, SEED, trial)
     states, seconds = [], []
     while not environment.is_done() and state.step < MAX_STEPS:
-        if needs_sensing(settings, state):
+        if planner.needs_sensing(state):
             states.append(state)
             start = time.perf_counter()
-            sensing_action, _ = choose_sensing_action(problem, settings, state)
+            sensing_action, _ = planner.choose_sensing_action(state)
             seconds.append(time.perf_counter() - start)
             observation = environment.perform_sensing(sensing_action)
-            state, _ = observe(problem, settings, state, sensing_action, observation)
-        task_action, _ = choose_task_action(problem, settings, state)
+            state, _ = planner.observe(state, sensing_action, observation)
+        task_action, _ = planner.choose_task_action(state)
         environment.perform(task_action)
-        state = advance(problem, settings, state, task_action)
+        state = planner.advance(state, task_action)
     return states, seconds
 
 

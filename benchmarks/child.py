@@ -20,7 +20,7 @@ from benchmarks.beliefs import SEED, concentrated_state, recorded_trial, setting
 from benchmarks.common import decide, evenly_spread
 from benchmarks.measure import alternate, peak_memory_bytes
 from holdfast import _kernel
-from holdfast.planning import choose_sensing_action, initial_state
+from holdfast.planning import Planner
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 
 
@@ -28,15 +28,16 @@ def large(num_particles: int, deviation: float | None, threads: int, turns: int)
     """Time a decision over many particles; a deviation of None means the initial belief."""
     problem = PegInHole2D()
     settings = settings_for(num_particles, threads)
+    planner = Planner(problem, settings)
     if deviation is None:
-        state = initial_state(problem, settings, SEED, 0)
+        state = planner.init(SEED, 0)
     else:
         state = concentrated_state(num_particles, deviation)
     before = peak_memory_bytes()
     seconds = []
     for _ in range(turns):
         start = time.perf_counter()
-        _, info = choose_sensing_action(problem, settings, state)
+        _, info = planner.choose_sensing_action(state)
         seconds.append(time.perf_counter() - start)
     return {
         "seconds": seconds,
@@ -56,7 +57,7 @@ def decisions(sizes: list[int], threads: int, num_beliefs: int, turns: int) -> d
         states, _ = recorded_trial(problem, settings)
         times = []
         for state in evenly_spread(states, num_beliefs):
-            _, info = choose_sensing_action(problem, settings, state)
+            _, info = Planner(problem, settings).choose_sensing_action(state)
             if info.samples is not None:
                 hashed.update(np.ascontiguousarray(info.samples).tobytes())
             times.append(alternate({"": decide(problem, settings, state)}, turns)[""].ravel())

@@ -13,10 +13,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from benchmarks.report import Result
-from holdfast.planning import PlanningState, choose_sensing_action
+from holdfast.config.settings import PlanningSettings
+from holdfast.planning import Planner, PlanningState
 from holdfast.problems.problem import Problem
-from holdfast.runtime.trials import available_cores
-from holdfast.settings import PlanningSettings
+from holdfast.robot.trials import available_cores
 
 __all__ = [
     "SIZES",
@@ -64,7 +64,7 @@ def decide(
     problem: Problem, settings: PlanningSettings, state: PlanningState
 ) -> Callable[[], object]:
     """Return a call of one decision."""
-    return lambda: choose_sensing_action(problem, settings, state)
+    return lambda: Planner(problem, settings).choose_sensing_action(state)
 
 
 def evenly_spread(states: list[PlanningState], number: int) -> list[PlanningState]:

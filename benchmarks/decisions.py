@@ -11,7 +11,6 @@ from contextlib import contextmanager
 
 import msgspec
 import numpy as np
-import numpy.typing as npt
 
 from benchmarks import literal
 from benchmarks.beliefs import recorded_trial, settings_for
@@ -27,10 +26,11 @@ from benchmarks.common import (
 from benchmarks.measure import alternate, ratio_of_turns
 from benchmarks.report import Bar, Result, Table, milliseconds, paragraph
 from holdfast import _kernel
-from holdfast.planning import PlanningState, choose_sensing_action
+from holdfast.arrays import FloatArray
+from holdfast.config.settings import PlanningSettings, SelectorSettings
+from holdfast.planning import Planner, PlanningState
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.problems.problem import Problem
-from holdfast.settings import PlanningSettings, SelectorSettings
 
 __all__ = [
     "busy_machine",
@@ -41,7 +41,6 @@ __all__ = [
     "ratio",
 ]
 
-FloatArray = npt.NDArray[np.float64]
 
 # What was asked for.
 DECISION_BARS_MS = {100: 0.15, 500: 0.5}
@@ -115,7 +114,7 @@ def decision(context: Context) -> Result:
     return Result(
         [
             paragraph(
-                f"""`holdfast.planning.choose_sensing_action`, peg_in_hole_2d, J = 3, M = 10, k = 5,
+                f"""`Planner.choose_sensing_action`, peg_in_hole_2d, J = 3, M = 10, k = 5,
                 commanded actions, in milliseconds. The beliefs are those of all sensing steps of
                 one trial. On each the call is repeated {turns * repetitions} times, the numbers of
                 threads in turns; a belief's time is its median, the 99th percentile is that of all
@@ -229,7 +228,7 @@ def _require_equal(
     problem: Problem, settings: PlanningSettings, state: PlanningState, entropy: literal.Entropy
 ) -> None:
     """Refuse to compare the times of different work."""
-    _, info = choose_sensing_action(problem, settings, state)
+    _, info = Planner(problem, settings).choose_sensing_action(state)
     _, entropies = literal.choose_sensing_action(problem, settings, state, entropy)
     if info.entropies is None or not (np.abs(info.entropies - entropies) <= EQUAL).all():
         raise RuntimeError(f"entropies {info.entropies} and, literally, {entropies}: not the same")
@@ -245,7 +244,7 @@ def floor(context: Context) -> Result:
         settings = settings_for(num_particles, 1)
         found = []
         for state in evenly_spread(recorded_trial(problem, settings)[0], number):
-            _, info = choose_sensing_action(problem, settings, state)
+            _, info = Planner(problem, settings).choose_sensing_action(state)
             call = decide(problem, settings, state)
             table = np.empty((turns, 3))
             for turn in range(turns):

@@ -48,12 +48,7 @@ class _Client(_Quick):
 
 
 class EchoClient:
-    """Sends bytes to an echo and waits for them, on an event loop of its own.
-
-    Parameters
-    ----------
-    port : int
-    """
+    """Sends bytes to an echo and waits for them, on an event loop of its own."""
 
     def __init__(self, port: int) -> None:
         self._port = port

@@ -1,7 +1,8 @@
 """A cloud far away: how soon its end is found, how soon it is used again, and what loss costs.
 
 Robot and service are the commands as anybody starts them, each in a network of its own; between the
-two, packets take half a round trip each way, or never arrive (:mod:`holdfast.chaos.wide_area`).
+two, packets take half a round trip each way, or never arrive
+(:mod:`holdfast.lab.testbed.wide_area`).
 """
 
 from __future__ import annotations
@@ -10,12 +11,12 @@ from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
+import pandas as pd
 
 from benchmarks.common import Context
 from benchmarks.report import Bar, Result, Table, paragraph
-from holdfast.chaos.wide_area import Transport, why_no_wide_area
-from holdfast.experiments import tables
-from holdfast.experiments.cloud_trials import run_cloud_trials
+from holdfast.lab.studies.cloud_trials import run_cloud_trials
+from holdfast.lab.testbed.wide_area import Transport, why_no_wide_area
 
 __all__ = ["far"]
 
@@ -42,8 +43,8 @@ def far(context: Context) -> Result:
     if reason is not None:
         return Result([f"Not measured: {reason}."])
     rounds = 1 if context.quick else 8
-    killed: dict[Transport, list[tables.Table]] = {transport: [] for transport in _TRANSPORTS}
-    calm: dict[tuple[Transport, float], list[tables.Table]] = {
+    killed: dict[Transport, list[pd.DataFrame]] = {transport: [] for transport in _TRANSPORTS}
+    calm: dict[tuple[Transport, float], list[pd.DataFrame]] = {
         (transport, loss): [] for transport in _TRANSPORTS for loss in (0.0, LOSS)
     }
     for number in range(rounds):
@@ -131,7 +132,7 @@ def far(context: Context) -> Result:
     )
 
 
-def _run(transport: Transport, loss: float, number: int, *, kills: bool) -> tables.Table:
+def _run(transport: Transport, loss: float, number: int, *, kills: bool) -> pd.DataFrame:
     table = run_cloud_trials(
         particles=100,
         transport=transport,
@@ -141,33 +142,31 @@ def _run(transport: Transport, loss: float, number: int, *, kills: bool) -> tabl
         rate_hz=_RATE_HZ,
         kills=kills,
     )
-    if not all(table.columns["identical"]):
+    if not table["identical"].all():
         raise RuntimeError(f"a run over {transport} decided otherwise")
     return table
 
 
-def _of_kills(found: Sequence[tables.Table], name: str) -> npt.NDArray[np.float64]:
+def _of_kills(found: Sequence[pd.DataFrame], name: str) -> npt.NDArray[np.float64]:
     """Return a column of the kills; a run may have ended before it was measured."""
     values: npt.NDArray[np.float64] = np.concatenate(
-        [table.numbers(name)[np.array(table.columns["what"]) == "kill"] for table in found]
+        [table[name][table["what"] == "kill"].to_numpy(float) for table in found]
     )
     return values[~np.isnan(values)]
 
 
-def _round_trips_ms(found: Sequence[tables.Table]) -> npt.NDArray[np.float64]:
+def _round_trips_ms(found: Sequence[pd.DataFrame]) -> npt.NDArray[np.float64]:
     """Return how long task actions took to come from the cloud, less what it computed."""
     trips = []
     for table in found:
-        asked = (np.array(table.columns["what"]) == "task") & (
-            np.array(table.columns["service"]) == "cloud"
-        )
-        trips.append((table.numbers("round_trip_ms") - table.numbers("computed_ms"))[asked])
+        asked = table[(table["what"] == "task") & (table["service"] == "cloud")]
+        trips.append((asked["round_trip_ms"] - asked["computed_ms"]).to_numpy(float))
     return np.concatenate(trips)
 
 
-def _bytes_per_turn(found: Sequence[tables.Table]) -> float:
-    total = sum(float(table.numbers("carried_bytes")[0]) for table in found)
-    return total / sum(table.columns["what"].count("sensing") for table in found)
+def _bytes_per_turn(found: Sequence[pd.DataFrame]) -> float:
+    total = sum(float(table["carried_bytes"].iloc[0]) for table in found)
+    return total / sum(int((table["what"] == "sensing").sum()) for table in found)
 
 
 def _median_and_worst(values: npt.NDArray[np.float64]) -> tuple[float, float]:

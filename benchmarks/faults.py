@@ -15,7 +15,7 @@ from benchmarks.common import Context
 from benchmarks.processes import ServiceProcess
 from benchmarks.report import Bar, Result, Table, milliseconds, paragraph
 from benchmarks.robots import Notebook, configuration_for, robot_in_thread
-from holdfast.runtime.links import RECOVERY_SERVICE
+from holdfast.robot.links import RECOVERY_SERVICE
 
 __all__ = ["kills"]
 
@@ -126,8 +126,8 @@ def _kill_cold(times: _Times, chance: random.Random) -> None:
             notebook.wait_for(lambda: len(notebook.decided) > 20, "decisions of the cloud")
             killed_at = _kill_after_a_request(notebook, cloud, chance)
             _note_kill(times, notebook, cloud, killed_at)
-            launch = notebook.first_told("launch", killed_at)
-            launched = notebook.first_told("launched", killed_at)
+            launch = notebook.first_event("launch", killed_at)
+            launched = notebook.first_event("launched", killed_at)
             first = notebook.first_decided(RECOVERY_SERVICE, killed_at)
             assert launch is not None and launched is not None and first is not None
             times.launched.append(launched.at - launch.at)
@@ -144,7 +144,7 @@ def _kill_warm(
         )
         with robot_in_thread(configuration, directory) as notebook:
             notebook.wait_for(
-                lambda: notebook.first_told("launched", 0.0) is not None, "the local service"
+                lambda: notebook.first_event("launched", 0.0) is not None, "the local service"
             )
             for done in range(number):
                 _kill_and_bring_back(times, notebook, cloud, chance)
@@ -161,16 +161,15 @@ def _kill_and_bring_back(
     cloud.close()
     # The robot's attempts to connect come at their own times.
     time.sleep(chance.uniform(0.1, 0.5))
-    cloud.start()
-    started_at = cloud.started_at
+    started_at = cloud.start().process.spawned_at
     notebook.wait_for(
         lambda: notebook.first_decided(cloud.endpoint, started_at) is not None,
         "a decision of the cloud that was started again",
     )
-    cloud.wait_ready()
+    ready_at = cloud.wait_ready()
     used = notebook.first_decided(cloud.endpoint, started_at)
     assert used is not None
-    times.used_after_ready.append(used.at - cloud.ready_at)
+    times.used_after_ready.append(used.at - ready_at)
     times.used_after_start.append(used.at - started_at)
 
 
@@ -186,7 +185,7 @@ def _kill_after_a_request(
     def on_sent(service: str) -> None:
         if service == cloud.endpoint and not asked.is_set():
             if at_once:
-                killed_at.append(cloud.kill())
+                killed_at.append(cloud.process.kill())
             asked.set()
 
     notebook.on_sent = on_sent
@@ -196,7 +195,7 @@ def _kill_after_a_request(
     if at_once:
         return killed_at[0]
     time.sleep(chance.uniform(0.0, _LATEST_KILL_S))
-    return cloud.kill()
+    return cloud.process.kill()
 
 
 def _note_kill(times: _Times, notebook: Notebook, cloud: ServiceProcess, killed_at: float) -> None:
@@ -207,7 +206,7 @@ def _note_kill(times: _Times, notebook: Notebook, cloud: ServiceProcess, killed_
     found = min(
         told.at
         for name in _LOST
-        if (told := notebook.first_told(name, killed_at, service=cloud.endpoint)) is not None
+        if (told := notebook.first_event(name, killed_at, service=cloud.endpoint)) is not None
     )
     first = notebook.first_decided(RECOVERY_SERVICE, killed_at)
     assert first is not None

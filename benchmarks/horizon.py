@@ -6,24 +6,22 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 import numpy as np
-import numpy.typing as npt
 
 from benchmarks.beliefs import recorded_trial, settings_for
 from benchmarks.common import THREADS, Context, decide, evenly_spread
 from benchmarks.measure import alternate, ratio_of_turns
 from benchmarks.report import Result, Table, milliseconds, paragraph
-from holdfast import _kernel, contract, sensing
+from holdfast import _kernel, checked, sensing
+from holdfast.arrays import FloatArray
 from holdfast.belief import Belief, estimate
-from holdfast.entropy import KernelEstimator, scaled
-from holdfast.experiments.cases import CASES
-from holdfast.experiments.trial_batches import problem_of
+from holdfast.config.settings import PlanningSettings
+from holdfast.estimators import KernelEstimator, scaled
+from holdfast.lab.studies.cases import CASES
+from holdfast.lab.studies.trial_batches import problem_of
 from holdfast.problems.problem import Problem
 from holdfast.randomness import Stream
-from holdfast.settings import PlanningSettings
 
 __all__ = ["horizon", "one_by_one"]
-
-FloatArray = npt.NDArray[np.float64]
 
 
 def one_by_one(
@@ -48,7 +46,7 @@ def one_by_one(
             for step in range(1, horizon):
                 belief = Belief(states, own_weights)
                 estimated = estimate(belief, settings.particle_filter.estimate)
-                own_stage = contract.next_stage(problem, estimated, own_stage)
+                own_stage = checked.next_stage(problem, estimated, own_stage)
                 action = problem.execute(problem.policy(estimated, own_stage))
                 states = problem.move(states, action, motion.substream(i).substream(step))
                 factor *= discount
@@ -57,11 +55,7 @@ def one_by_one(
                     scaled(points, estimator),
                     own_weights.reshape(1, -1),
                     False,
-                    estimator.kind,
-                    estimator.neighbors,
-                    estimator.resolution,
-                    estimator.exponent,
-                    estimator.offset,
+                    *estimator.parameters,
                     1,
                     (1.0,),
                     estimator.prior,

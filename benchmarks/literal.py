@@ -23,11 +23,12 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 from scipy.special import digamma
 
+from holdfast.arrays import FloatArray
 from holdfast.belief import Belief
+from holdfast.config.settings import PlanningSettings
 from holdfast.planning import PlanningState
 from holdfast.problems.problem import Problem
 from holdfast.randomness import Purpose, stream
-from holdfast.settings import PlanningSettings
 
 __all__ = [
     "choose_sensing_action",
@@ -36,9 +37,8 @@ __all__ = [
     "tuned_nearest_neighbor_entropy",
 ]
 
-FloatArray = npt.NDArray[np.float64]
 
-# Of the definition in holdfast.entropy.NearestNeighbor: weights below one of these fractions of the
+# As `holdfast.estimators.NearestNeighbor` says: weights below one of these fractions of the
 # greatest are left out, the first that loses no more than this share of the sum, else the last.
 NEGLIGIBLE = tuple(10.0**-i * (1.0 - 2.0**-40) for i in range(2, 7))
 LOST_SHARE = 0.005
@@ -62,7 +62,6 @@ def choose_sensing_action(
         With observations of state-independent variance and one coordinate per sensing action.
     settings : PlanningSettings
         Of a horizon of 1 and the nearest-neighbour estimate of commanded actions.
-    state : PlanningState
     entropy : callable, optional
         Default: :func:`nearest_neighbor_entropy`.
 
@@ -122,14 +121,12 @@ def nearest_neighbor_entropy(
     resolution: float,
     negligible: tuple[float, ...] = NEGLIGIBLE,
 ) -> float:
-    """Estimate the entropy of weighted points as ``holdfast.entropy.NearestNeighbor`` defines it.
+    """Estimate the entropy of weighted points as ``NearestNeighbor`` defines it.
 
     Parameters
     ----------
     points : array of shape (n, d)
     weights : array of shape (n,)
-    neighbors : int
-    resolution : float
     negligible : tuple of float
         Fractions of the greatest weight to cut at; none keeps every point of non-zero weight.
 

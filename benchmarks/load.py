@@ -26,20 +26,26 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from benchmarks.processes import usage_of
 from benchmarks.robots import configuration_for
 from benchmarks.turns import Turn, recorded_turns
-from holdfast.runtime.robot_process import opening_of
-from holdfast.session.events import Appeared, Ended, Replied, TransportEvent, Vanished
-from holdfast.session.messages import (
+from holdfast.protocol.events import (
+    CallEnded,
+    ReplyReceived,
+    ServiceAppeared,
+    ServiceVanished,
+    TransportEvent,
+)
+from holdfast.protocol.messages import (
     PROTOCOL_VERSION,
     Busy,
     NeedState,
-    Opening,
     Refused,
     Request,
     SensingAnswer,
+    SessionConfiguration,
     TaskAnswer,
     decode_reply,
     encode,
 )
+from holdfast.robot.session_configuration import session_configuration_of
 from holdfast.transport.endpoints import ServiceAddress
 from holdfast.transport.robot_end import StreamRobotTransport
 
@@ -52,9 +58,11 @@ _DRAIN_S = 1.0
 class _Fleet:
     """What all robots share: what they ask, and what came of it."""
 
-    def __init__(self, trials: list[list[Turn]], opening: Opening) -> None:
+    def __init__(
+        self, trials: list[list[Turn]], session_configuration: SessionConfiguration
+    ) -> None:
         self.trials = trials
-        self.opening = opening
+        self.session_configuration = session_configuration
         self.counting = False
         self.task_s: list[float] = []
         self.sensing_s: list[float] = []
@@ -102,7 +110,7 @@ class _Robot:
             state.sensed,
             turn.digest,
             () if hand_over else missing,
-            None if self._opened else fleet.opening,
+            None if self._opened else fleet.session_configuration,
             turn.checkpoint if hand_over else None,
         )
         self._turn = turn
@@ -180,13 +188,13 @@ class _Link:
         await self._transport.close()
 
     def _deliver(self, event: TransportEvent) -> None:
-        if isinstance(event, Replied):
+        if isinstance(event, ReplyReceived):
             self._asked[event.call].replied(event.call, event.payload)
-        elif isinstance(event, Ended):
+        elif isinstance(event, CallEnded):
             self._asked.pop(event.call).ended(event.call)
-        elif isinstance(event, Appeared):
+        elif isinstance(event, ServiceAppeared):
             self.appeared.set()
-        elif isinstance(event, Vanished):
+        elif isinstance(event, ServiceVanished):
             self._fleet.links_lost += 1
 
 
@@ -263,12 +271,10 @@ async def load(
 
     Parameters
     ----------
-    endpoint : str
     process_ids : list of int
         Of the service, to see what it uses.
     num_robots, num_links : int
         Robots, and links that they share.
-    sensing_interval : int
     rate_hz : float
         Turns of each robot a second, evenly spaced, the robots one after another.
     warm_up_s, seconds : float
@@ -280,7 +286,7 @@ async def load(
         )
     problem, settings = configuration.problem, configuration.planning
     trials = [recorded_turns(problem, settings, trial) for trial in range(_NUM_TRIALS)]
-    fleet = _Fleet(trials, opening_of(configuration))
+    fleet = _Fleet(trials, session_configuration_of(configuration))
     links = [_Link(fleet, endpoint) for _ in range(num_links)]
     for link in links:
         try:

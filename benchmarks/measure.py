@@ -16,7 +16,8 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
+
+from holdfast.arrays import FloatArray
 
 __all__ = [
     "OtherLoad",
@@ -26,8 +27,6 @@ __all__ = [
     "ratio_of_turns",
     "without_collection",
 ]
-
-FloatArray = npt.NDArray[np.float64]
 
 
 @contextmanager

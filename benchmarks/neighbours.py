@@ -21,8 +21,8 @@ from benchmarks.processes import ServiceProcess
 from benchmarks.report import Bar, Result, Table, milliseconds, paragraph
 from benchmarks.robots import configuration_for
 from benchmarks.turns import Asker, Turn, recorded_turns
-from holdfast.runtime.robot_process import opening_of
-from holdfast.session.messages import Opening
+from holdfast.protocol.messages import SessionConfiguration
+from holdfast.robot.session_configuration import session_configuration_of
 from holdfast.transport.endpoints import TlsFiles
 from holdfast.transport.key_ring import make_credentials
 
@@ -58,7 +58,7 @@ def neighbours(context: Context) -> Result:
     with tempfile.TemporaryDirectory() as name:
         directory = Path(name)
         configuration = configuration_for(directory, num_trials=1)
-        opening = opening_of(configuration)
+        session_configuration = session_configuration_of(configuration)
         turns = [
             turn
             for trial in range(5 if context.quick else 60)
@@ -66,7 +66,7 @@ def neighbours(context: Context) -> Result:
         ]
         make_credentials(directory / "keys")
         for done, (kind, what) in enumerate(_AT_WORK.items()):
-            waited = _at_work(kind, seconds, opening, turns)
+            waited = _at_work(kind, seconds, session_configuration, turns)
             rows.append([what, str(len(waited)), *_spread(waited)])
             if kind:
                 bars.append(
@@ -79,7 +79,7 @@ def neighbours(context: Context) -> Result:
                 )
             context.progress(0.5 * (done + 1) / len(_AT_WORK))
         for done, (kind, what) in enumerate(_NEW.items()):
-            served = _new(kind, directory / "keys", trickle_s, opening, turns[0])
+            served = _new(kind, directory / "keys", trickle_s, session_configuration, turns[0])
             new_rows.append([what, str(len(served)), *_spread(served)])
             if kind:
                 bars.append(
@@ -111,12 +111,14 @@ def neighbours(context: Context) -> Result:
     )
 
 
-def _at_work(kind: str, seconds: float, opening: Opening, turns: Sequence[Turn]) -> list[float]:
+def _at_work(
+    kind: str, seconds: float, session_configuration: SessionConfiguration, turns: Sequence[Turn]
+) -> list[float]:
     """Return how long a robot waited for each of its answers."""
     waited = []
     with (
         ServiceProcess() as service,
-        Asker(service.endpoint, opening, b"at work, steady.") as asker,
+        Asker(service.endpoint, session_configuration, b"at work, steady.") as asker,
     ):
         _ask(asker, turns[0])  # loads the problem
         with _Neighbour(kind, service.endpoint, seconds):
@@ -129,21 +131,23 @@ def _at_work(kind: str, seconds: float, opening: Opening, turns: Sequence[Turn])
     return waited
 
 
-def _new(kind: str, keys: Path, seconds: float, opening: Opening, first: Turn) -> list[float]:
+def _new(
+    kind: str, keys: Path, seconds: float, session_configuration: SessionConfiguration, first: Turn
+) -> list[float]:
     """Return how long each of many new robots took to its first answer."""
     files = ("authority.pem", "certificate.pem", "key.pem")
     tls = TlsFiles(*(keys / "robot" / each for each in files))
     served: list[float] = []
     options = ("--tls", str(keys / "service"))
     with ServiceProcess(*options, protocol="tls") as service:
-        with Asker(service.endpoint, opening, b"loads it first..", tls) as asker:
+        with Asker(service.endpoint, session_configuration, b"loads it first..", tls) as asker:
             _ask(asker, first)
         with _Neighbour(kind, service.endpoint, seconds, keys / "robot") as neighbour:
             until = time.perf_counter() + seconds
             while time.perf_counter() < until:
                 session = len(served).to_bytes(16, "big")
                 began = time.perf_counter()
-                with Asker(service.endpoint, opening, session, tls) as asker:
+                with Asker(service.endpoint, session_configuration, session, tls) as asker:
                     _ask(asker, first)
                     served.append(time.perf_counter() - began)
                 if neighbour.has_ended:

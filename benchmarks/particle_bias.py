@@ -21,21 +21,14 @@ from typing import NamedTuple
 import numpy as np
 
 from benchmarks.beliefs import settings_for
+from holdfast.arrays import FloatArray
 from holdfast.belief import Belief
-from holdfast.experiments.cases import CASES
-from holdfast.experiments.trial_batches import problem_of
-from holdfast.planning import (
-    PlanningState,
-    advance,
-    choose_sensing_action,
-    choose_task_action,
-    initial_state,
-    needs_sensing,
-    observe,
-)
-from holdfast.problems.problem import FloatArray, Problem
-from holdfast.runtime.environment import SimulatedEnvironment
-from holdfast.settings import PlanningSettings, SelectorSettings
+from holdfast.config.settings import PlanningSettings, SelectorSettings
+from holdfast.lab.studies.cases import CASES
+from holdfast.lab.studies.trial_batches import problem_of
+from holdfast.planning import Planner, PlanningState
+from holdfast.problems.problem import Problem
+from holdfast.robot.environment import SimulatedEnvironment
 
 MANY = 4000
 WANTED = ("three plates", "tight hole", "passer-by", "busy room")
@@ -88,19 +81,20 @@ def beliefs_of(
     """Return states before sensing decisions, a few of each trial."""
     settings = settings_of(Rival("nearest_neighbor", MANY, 10), interval)
     found: list[PlanningState] = []
+    planner = Planner(problem, settings)
     for trial in range(TRIALS):
-        state = initial_state(problem, settings, seed, trial)
+        state = planner.init(seed, trial)
         world = SimulatedEnvironment(problem, seed, trial)
         states = []
         while not world.is_done() and state.step < max_steps:
-            if needs_sensing(settings, state):
+            if planner.needs_sensing(state):
                 states.append(state)
-                sensing_action, _ = choose_sensing_action(problem, settings, state)
+                sensing_action, _ = planner.choose_sensing_action(state)
                 observation = world.perform_sensing(sensing_action)
-                state, _ = observe(problem, settings, state, sensing_action, observation)
-            action, _ = choose_task_action(problem, settings, state)
+                state, _ = planner.observe(state, sensing_action, observation)
+            action, _ = planner.choose_task_action(state)
             world.perform(action)
-            state = advance(problem, settings, state, action)
+            state = planner.advance(state, action)
         kept = rng.choice(len(states), min(IN_EACH_TRIAL, len(states)), replace=False)
         found += [states[index] for index in sorted(kept)]
     return found
@@ -115,7 +109,7 @@ def entropies_of(
     seconds = []
     for _ in range(2):
         start = time.perf_counter()
-        _, info = choose_sensing_action(problem, settings, state)
+        _, info = Planner(problem, settings).choose_sensing_action(state)
         seconds.append(time.perf_counter() - start)
     assert info.entropies is not None
     return info.entropies, min(seconds)

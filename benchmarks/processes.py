@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import socket
 import statistics
@@ -15,12 +14,14 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
+from holdfast.lab.testbed.driver import ServiceCommand
+from holdfast.lab.testbed.processes import HOLDFAST, Process, free_port
+
 __all__ = [
     "CountingProxy",
     "EchoProcess",
     "ServiceProcess",
     "Usage",
-    "free_tcp_port",
     "pipe_round_trip_s",
     "usage_of",
 ]
@@ -37,8 +38,6 @@ class Usage(NamedTuple):
     ----------
     cpu_s : float
         Processor time, in steps of the system's ticks (10 ms).
-    resident_bytes : int
-    threads : int
     """
 
     cpu_s: float
@@ -96,91 +95,36 @@ def pipe_round_trip_s(number: int = 500) -> float:
     return statistics.median(seconds)
 
 
-def free_tcp_port() -> int:
-    """Return a port on which nothing listens now."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
-class ServiceProcess:
-    """``holdfast serve`` on loopback.
+class ServiceProcess(ServiceCommand):
+    """``holdfast serve`` on loopback; ready within a ``with`` statement, killed at its end.
 
     Parameters
     ----------
-    port : int, optional
-        Where it listens; a free one by default.
     options : str
         Further ones.
     protocol : str, optional
         Of its endpoint.
-
-    Attributes
-    ----------
-    started_at, ready_at : float
-        Of :func:`time.monotonic`: just before it was started, and when its ready line came.
     """
 
-    def __init__(self, *options: str, port: int | None = None, protocol: str = "tcp") -> None:
-        self.port = free_tcp_port() if port is None else port
-        self._protocol = protocol
+    def __init__(self, *options: str, protocol: str = "tcp") -> None:
         self._options = options
-        self._process: subprocess.Popen[str] | None = None
-        self._ready = threading.Event()
-        self.started_at = self.ready_at = 0.0
-
-    @property
-    def endpoint(self) -> str:
-        """Where robots find it."""
-        return f"{self._protocol}/127.0.0.1:{self.port}"
-
-    @property
-    def process_id(self) -> int:
-        """Of the process that runs."""
-        assert self._process is not None
-        return self._process.pid
+        super().__init__(self._started, f"{protocol}/127.0.0.1:{free_port()}")
 
     @property
     def process_ids(self) -> list[int]:
         """Of it and of the processes that it has started."""
-        own = self.process_id
+        own = self.process.pid
         children = Path(f"/proc/{own}/task/{own}/children").read_text()
         return [own, *map(int, children.split())]
 
-    def start(self) -> None:
-        """Start it; returns at once."""
-        command = [sys.executable, "-m", "holdfast", "serve", "--listen", self.endpoint]
-        self._ready = threading.Event()
-        self.started_at = time.monotonic()
-        self._process = subprocess.Popen(
-            [*command, "--log", "json", *self._options],
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            text=True,
-        )
-        threading.Thread(target=self._await_line, args=(self._process,), daemon=True).start()
-
-    def wait_ready(self) -> None:
-        """Wait for its ready line."""
-        if not self._ready.wait(_READY_TIMEOUT_S) or self.ready_at == 0.0:
-            raise RuntimeError(f"the service at {self.endpoint} did not become ready")
-
-    def kill(self) -> float:
-        """Kill it as ``kill -9`` does; return when."""
-        assert self._process is not None
-        at = time.monotonic()
-        self._process.kill()
-        return at
+    def wait_ready(self) -> float:
+        """Wait until it is ready; return since when."""
+        return self.process.wait_for("ready", timeout_s=_READY_TIMEOUT_S).at
 
     def close(self) -> None:
         """End it, and wait for that."""
-        process, self._process = self._process, None
-        if process is not None:
-            process.kill()
-            process.wait()
-            if process.stdout is not None:
-                process.stdout.close()
+        self.process.kill()
+        self.process.close(_READY_TIMEOUT_S)
 
     def __enter__(self) -> ServiceProcess:
         self.start()
@@ -194,24 +138,17 @@ class ServiceProcess:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _await_line(self, process: subprocess.Popen[str]) -> None:
-        assert process.stdout is not None
-        line = process.stdout.readline()
-        at = time.monotonic()
-        self.ready_at = at if line and json.loads(line)["event"] == "ready" else 0.0
-        self._ready.set()
+    def _started(self) -> Process:
+        return Process(
+            (*HOLDFAST, "serve", "--listen", self.endpoint, "--log", "json", *self._options)
+        )
 
 
 class EchoProcess:
-    """A bare echo: see echo.py.
-
-    Attributes
-    ----------
-    port : int
-    """
+    """A bare echo: see echo.py."""
 
     def __init__(self) -> None:
-        self.port = free_tcp_port()
+        self.port = free_port()
         self._process = subprocess.Popen(
             [sys.executable, str(_ECHO), str(self.port)],
             stdin=subprocess.PIPE,
@@ -233,8 +170,8 @@ class CountingProxy:
 
     Parameters
     ----------
-    port : int
-        On loopback, to which connections are passed on.
+    endpoint : str
+        To which connections are passed on.
 
     Attributes
     ----------
@@ -244,8 +181,8 @@ class CountingProxy:
         Bytes so far: what TCP carries, without the headers of TCP and below.
     """
 
-    def __init__(self, port: int) -> None:
-        self._target = port
+    def __init__(self, endpoint: str) -> None:
+        self._target = int(endpoint.rpartition(":")[2])
         self._listener = socket.create_server(("127.0.0.1", 0))
         self.port = int(self._listener.getsockname()[1])
         self.to_service = self.to_robot = 0

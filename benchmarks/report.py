@@ -28,9 +28,6 @@ class Bar(NamedTuple):
 
     Attributes
     ----------
-    what : str
-    value, limit : float
-    unit : str
     at_least : bool
         Whether the value must reach the limit; else it must not be above it.
     percentile_99 : float or None

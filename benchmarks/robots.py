@@ -1,6 +1,6 @@
-"""Robots that run here, the production code with a notebook: when what was sent, decided, told.
+"""Robots in this process, the production code with a notebook: when it sent, decided, logged.
 
-The robot is :class:`holdfast.runtime.robot_process.RobotProcess`, with its journal and the links
+The robot is :class:`holdfast.robot.process.RobotProcess`, with its journal and the links
 that the configuration asks for. All that is added stands outside of it: whatever it hands to a
 transport, a log or a table goes through here and gets the time of one clock written on it.
 """
@@ -11,17 +11,16 @@ import contextlib
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from time import monotonic
+from time import time
 from typing import NamedTuple
 
-from holdfast.configuration import Configuration, load
+from holdfast.config.loader import Configuration, load
 from holdfast.outcome import TrialResult
+from holdfast.protocol.events import Timing, TransportEvent
 from holdfast.recording.run_directory import RunDirectory
-from holdfast.runtime.environment import load_environment
-from holdfast.runtime.links import make_links
-from holdfast.runtime.robot_process import RobotProcess
-from holdfast.session.effects import Timing
-from holdfast.session.events import TransportEvent
+from holdfast.robot.environment import load_environment
+from holdfast.robot.links import make_links
+from holdfast.robot.process import RobotProcess
 from holdfast.transport.contract import RobotTransport
 
 __all__ = ["Notebook", "configuration_for", "robot_in_thread", "run_robot"]
@@ -64,7 +63,7 @@ def configuration_for(
     return load(path)
 
 
-class _Told(NamedTuple):
+class _Event(NamedTuple):
     at: float
     name: str
     fields: dict[str, object]
@@ -85,11 +84,11 @@ class _EnoughError(Exception):
 
 
 class Notebook:
-    """What happened to a robot, with the times of :func:`time.monotonic`.
+    """What happened to a robot, with times in seconds since the epoch.
 
     Attributes
     ----------
-    told : list
+    events : list
         Events: ``at``, ``name``, ``fields``.
     decided : list
         Decisions that were used: ``at``, ``timing``.
@@ -104,7 +103,7 @@ class Notebook:
     """
 
     def __init__(self) -> None:
-        self.told: list[_Told] = []
+        self.events: list[_Event] = []
         self.decided: list[_Decided] = []
         self.finished: list[_Finished] = []
         self.num_sent = 0
@@ -117,7 +116,7 @@ class Notebook:
     def event(self, name: str, /, **fields: object) -> None:
         """Note an event."""
         with self._changed:
-            self.told.append(_Told(monotonic(), name, fields))
+            self.events.append(_Event(time(), name, fields))
             self._changed.notify_all()
 
     def close(self) -> None:
@@ -126,7 +125,7 @@ class Notebook:
     def add_timing(self, timing: Timing) -> None:
         """Note a decision."""
         with self._changed:
-            self.decided.append(_Decided(monotonic(), timing))
+            self.decided.append(_Decided(time(), timing))
             self._changed.notify_all()
         if self.on_decided is not None:
             self.on_decided(timing)
@@ -136,7 +135,7 @@ class Notebook:
     def add_result(self, result: TrialResult) -> None:
         """Note a trial."""
         with self._changed:
-            self.finished.append(_Finished(monotonic(), result))
+            self.finished.append(_Finished(time(), result))
             self._changed.notify_all()
 
     def sent(self, service: str) -> None:
@@ -164,12 +163,12 @@ class Notebook:
             if not seen():
                 raise RuntimeError(f"{what}: did not happen within {_PATIENCE_S:g} s")
 
-    def first_told(self, name: str, since: float, **fields: object) -> _Told | None:
+    def first_event(self, name: str, since: float, **fields: object) -> _Event | None:
         """Return the first event of a name and with these fields since some time."""
         return next(
             (
                 each
-                for each in self.told
+                for each in self.events
                 if each.at >= since and each.name == name and fields.items() <= each.fields.items()
             ),
             None,
@@ -208,9 +207,6 @@ def run_robot(
 
     Parameters
     ----------
-    configuration : Configuration
-    directory : Path
-    notebook : Notebook
     rate_hz : float or None
         Task actions a second.
     """

@@ -68,8 +68,6 @@ class Replicas:
     ----------
     directory : Path
         For the file of names, and the services' logs.
-    port : int
-    count : int
     lease_ms : float
         A long one: then what is found is not found by silence.
     """

@@ -75,8 +75,8 @@ for line in sys.stdin:
 
 OURS = """
 import json, sys, time
-from holdfast.ros.active_sensing import Kind, Request
-from holdfast.ros.ros1 import Ros1Client
+from holdfast.ros.active_sensing import DecisionRequest, RequestKind
+from holdfast.ros.ros1_client import Ros1Client
 
 began, known = 0.0, None
 
@@ -86,8 +86,8 @@ def on_event(name, **fields):
         known = time.perf_counter() - began
 
 with Ros1Client("robot", deadline_s=float(sys.argv[1]), on_event=on_event) as client:
-    state = client.decide(Request(Kind.INITIALIZE, seed=4)).state
-    request = Request(Kind.CHOOSE_SENSING_ACTION, state=state)
+    state = client.decide(DecisionRequest(RequestKind.INITIALIZE, seed=4)).state
+    request = DecisionRequest(RequestKind.CHOOSE_SENSING_ACTION, state=state)
     for line in sys.stdin:
         began, known = time.perf_counter(), None
         client.decide(request)

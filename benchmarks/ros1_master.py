@@ -42,7 +42,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import itertools
 
-from tests.ros.graph import Graph, Process
+from tests.ros.graph import Graph, Process, unchanged
 from tests.ros.ros1_processes import wait_for
 
 TOPIC_TOOLS = Path("/usr/lib/topic_tools")
@@ -94,14 +94,6 @@ def start_nodes(graph: Graph, services: int) -> tuple[Process, Process]:
     return caller, listener
 
 
-def settled(graph: Graph) -> dict[str, Any]:
-    """Return what the master knows when that has not changed for a while."""
-    before = None
-    while before != (before := graph.registered()):
-        time.sleep(1.0)
-    return before
-
-
 def epoch(event: dict[str, Any]) -> float:
     return dt.datetime.fromisoformat(event["time"]).timestamp()
 
@@ -148,7 +140,7 @@ def trial(
             wait_for(graph.master_pid)
         guard = graph.guard()
         caller, listener = start_nodes(graph, services)
-        before = settled(graph)
+        before = unchanged(graph.registered, 1.0)
         arrivals = Arrivals(caller)
         try:
             for _ in range(1 if stock else kills):

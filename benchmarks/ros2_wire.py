@@ -13,10 +13,10 @@ from collections.abc import Callable
 from pathlib import Path
 from time import perf_counter
 
-from holdfast.configuration import load
-from holdfast.ros.active_sensing import ActiveSensing, Answer, Kind, Request
+from holdfast.config.loader import load
+from holdfast.ros.active_sensing import ActiveSensing, DecisionAnswer, DecisionRequest, RequestKind
 from holdfast.ros.messages import decode_request, encode_request
-from holdfast.ros.ros2_wire import Ros2Service
+from holdfast.ros.ros2_client import Ros2Service
 
 ROOT = Path(__file__).parents[1]
 EXAMPLE = ROOT / "examples" / "peg_in_hole_2d.yaml"
@@ -38,8 +38,8 @@ def measure(num_particles: int) -> None:
     """Print one line for this many particles."""
     configuration = load(EXAMPLE, overrides={"particle_filter.num_particles": num_particles})
     here = ActiveSensing(configuration)
-    state = here.answer(Request(Kind.INITIALIZE, seed=1)).state
-    request = Request(Kind.CHOOSE_SENSING_ACTION, state=state)
+    state = here.answer(DecisionRequest(RequestKind.INITIALIZE, seed=1)).state
+    request = DecisionRequest(RequestKind.CHOOSE_SENSING_ACTION, state=state)
     data = encode_request(request)
     columns = [
         f"{num_particles:9d}",
@@ -64,7 +64,7 @@ def measure(num_particles: int) -> None:
     print(" ".join(columns))
 
 
-def over_the_wire_ms(path: Path, way: str, port: int, request: Request) -> float:
+def over_the_wire_ms(path: Path, way: str, port: int, request: DecisionRequest) -> float:
     """Return the median time of asking a service that is another process."""
     endpoint = f"tcp/127.0.0.1:{port}"
     # fmt: off
@@ -78,7 +78,7 @@ def over_the_wire_ms(path: Path, way: str, port: int, request: Request) -> float
         service.stdout.readline()
         way_there = Ros2Service("cloud_active_sensing", 0, endpoint)
 
-        def ask() -> Answer:
+        def ask() -> DecisionAnswer:
             answer = way_there.ask(request, 10.0)
             assert not answer.error, answer.message
             return answer

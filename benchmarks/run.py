@@ -32,7 +32,7 @@ from benchmarks.report import (
     write_atomically,
 )
 from holdfast.recording.machine import describe, kernel_hash
-from holdfast.runtime.trials import available_cores
+from holdfast.robot.trials import available_cores
 
 RESULTS = Path(__file__).with_name("RESULTS.md")
 
@@ -44,13 +44,7 @@ QUIET_S = 3.0
 
 
 class Progress:
-    """One line with what runs and the time left; nothing of it runs while something is timed.
-
-    Parameters
-    ----------
-    cases : list of Case
-    quick : bool
-    """
+    """One line with what runs and the time left; nothing of it runs while something is timed."""
 
     def __init__(self, cases: list[Case], quick: bool) -> None:
         self._expected = {
@@ -124,7 +118,6 @@ class Section(NamedTuple):
 
     Attributes
     ----------
-    title : str
     body : str
         In Markdown.
     bars : list of list of str

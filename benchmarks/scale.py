@@ -16,7 +16,7 @@ from benchmarks.beliefs import (
 from benchmarks.common import THREADS, Context, child, decide, threads_in_words
 from benchmarks.measure import alternate, fitted_exponent
 from benchmarks.report import Bar, Result, Table, milliseconds, paragraph
-from holdfast.planning import PlanningState, initial_state
+from holdfast.planning import Planner, PlanningState
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.problems.peg_in_hole_3d import PegInHole3D
 
@@ -108,7 +108,7 @@ def growth(context: Context) -> Result:
     problem = PegInHole2D()
 
     def initial(num_particles: int) -> PlanningState:
-        return initial_state(problem, settings_for(num_particles, threads), SEED, 0)
+        return Planner(problem, settings_for(num_particles, threads)).init(SEED, 0)
 
     columns: dict[str, Callable[[int], PlanningState]] = {
         "initial belief": initial,

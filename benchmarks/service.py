@@ -32,12 +32,12 @@ from benchmarks.report import Bar, Result, Table, milliseconds, paragraph
 from benchmarks.robots import Notebook, configuration_for, run_robot
 from benchmarks.turns import Asker, decided_in_process, recorded_turns
 from holdfast.outcome import TrialResult
-from holdfast.planning import choose_sensing_action, digest, encode_checkpoint, initial_state
+from holdfast.planning import Planner, digest, encode_checkpoint
+from holdfast.protocol.messages import DIGEST_SIZE, encode_floats
+from holdfast.protocol.records import ActingRecord, PerformedRecord
 from holdfast.recording.journal import Journal
-from holdfast.runtime.robot_process import opening_of
-from holdfast.runtime.trial import run_trial
-from holdfast.session.messages import DIGEST_SIZE, numbers_to
-from holdfast.session.records import ActingRecord, PerformedRecord
+from holdfast.robot.session_configuration import session_configuration_of
+from holdfast.robot.trial import run_trial
 
 __all__ = ["capacity", "offload", "paced", "robot_loop", "serve", "wire"]
 
@@ -88,18 +88,18 @@ def offload(context: Context) -> Result:
     ):
         configuration = configuration_for(Path(directory), num_trials=1)
         problem, settings = configuration.problem, configuration.planning
-        opening = opening_of(configuration)
+        session_configuration = session_configuration_of(configuration)
         with (
             EchoClient(echo.port) as bare_echo,
-            Asker(service.endpoint, opening, b"is handed states") as stranger,
-            Asker(service.endpoint, opening, b"follows a robot.") as follower,
+            Asker(service.endpoint, session_configuration, b"is handed states") as stranger,
+            Asker(service.endpoint, session_configuration, b"follows a robot.") as follower,
         ):
             for trial in range(num_trials + 1):
                 for turn in recorded_turns(problem, settings, trial):
                     state = turn.sensing_state
                     checkpoint = encode_checkpoint(state)
                     start = time.perf_counter()
-                    choose_sensing_action(problem, settings, state)
+                    Planner(problem, settings).choose_sensing_action(state)
                     alone_s = time.perf_counter() - start
                     bare = stranger.ask(state, turn.sensing_digest, checkpoint=checkpoint)
                     again = stranger.ask(state, turn.sensing_digest)
@@ -125,8 +125,8 @@ def offload(context: Context) -> Result:
                 # A trial's first question is for a sensing action and nothing else. The service
                 # makes the trial's first state, too, and holds its digest against the robot's.
                 start = time.perf_counter()
-                state = initial_state(problem, settings, configuration.simulator.seed, trial)
-                sensing_action, _ = choose_sensing_action(problem, settings, state)
+                state = Planner(problem, settings).init(configuration.simulator.seed, trial)
+                sensing_action, _ = Planner(problem, settings).choose_sensing_action(state)
                 alone_s = time.perf_counter() - start
                 state_digest = digest(state)[:DIGEST_SIZE]
                 steady = follower.ask(state, state_digest)
@@ -134,11 +134,11 @@ def offload(context: Context) -> Result:
                     raise RuntimeError(f"wrong answer in trial {trial}")
                 note("steady", alone_s, steady.sensing_s, steady.sensing.computed_us)
                 # From the same pause, since a core that has slept is slower.
-                choose_sensing_action(problem, settings, state)
+                Planner(problem, settings).choose_sensing_action(state)
                 note("echo", 0.0, bare_echo.round_trip_s(), 0)
                 time.sleep(0.001)
                 start = time.perf_counter()
-                choose_sensing_action(problem, settings, state)
+                Planner(problem, settings).choose_sensing_action(state)
                 after_pause.append(time.perf_counter() - start)
     wakes_s = pipe_round_trip_s()
     rows = []
@@ -252,10 +252,10 @@ def robot_loop(context: Context) -> Result:
                 for trial in range(num_trials):
                     start = time.perf_counter()
                     result = run_trial(
-                        configuration.problem,
-                        configuration.planning,
-                        configuration.simulator,
+                        Planner(configuration.problem, configuration.planning),
+                        configuration.simulator.seed,
                         trial,
+                        max_steps=configuration.simulator.max_steps,
                     )
                     if trial:
                         note("loop", time.perf_counter() - start, result)
@@ -334,7 +334,7 @@ def _journal_rows(directory: Path, number: int) -> list[list[str]]:
             for step in range(number if survives == "process_crash" else number // 10):
                 records = (
                     PerformedRecord(step, -0.1),
-                    ActingRecord(step + 1, numbers_to([0.1, 0.1, 0.1])),
+                    ActingRecord(step + 1, encode_floats([0.1, 0.1, 0.1])),
                 )
                 start = time.perf_counter()
                 journal.append(0, records)
@@ -432,7 +432,7 @@ def wire(context: Context) -> Result:
         for done, num_particles in enumerate(sizes):
             own = Path(directory) / str(num_particles)
             own.mkdir()
-            with CountingProxy(service.port) as proxy:
+            with CountingProxy(service.endpoint) as proxy:
                 counted, up, seconds = _bytes_per_turn(own, num_particles, proxy)
             median, rare = _quantiles(counted)
             rows.append(
@@ -456,9 +456,11 @@ def wire(context: Context) -> Result:
                 )
             )
             context.progress((done + 1) / (len(sizes) + 1))
-        with CountingProxy(service.port) as proxy:
+        with CountingProxy(service.endpoint) as proxy:
             configuration = configuration_for(Path(directory), num_trials=1)
-            with Asker(proxy.endpoint, opening_of(configuration), b"only looks on...") as asker:
+            with Asker(
+                proxy.endpoint, session_configuration_of(configuration), b"only looks on..."
+            ) as asker:
                 before = proxy.total
                 asker.pause(idle_s)
                 keep_alive = (proxy.total - before) / idle_s
@@ -523,16 +525,16 @@ def serve(context: Context) -> Result:
         pass  # modules that were changed are compiled now
     for number in range(starts):
         with ServiceProcess() as service:
-            ready_s.append(service.ready_at - service.started_at)
+            ready_s.append(service.start_s)
         context.progress(0.4 * (number + 1) / starts)
     rows = []
     idle: dict[str, tuple[float, float]] = {}
 
     def watch(what: str, pause: Callable[[float], None]) -> None:
         pause(1.5)
-        before = usage_of(service.process_id)
+        before = usage_of(service.process.pid)
         pause(idle_s)
-        after = usage_of(service.process_id)
+        after = usage_of(service.process.pid)
         percent = 100.0 * (after.cpu_s - before.cpu_s) / idle_s
         idle[what] = (percent, after.resident_bytes / _MB)
         rows.append(
@@ -542,7 +544,9 @@ def serve(context: Context) -> Result:
     with tempfile.TemporaryDirectory() as directory, ServiceProcess() as service:
         configuration = configuration_for(Path(directory), num_trials=1)
         watch("nobody there", time.sleep)
-        with Asker(service.endpoint, opening_of(configuration), b"looks on, silent") as asker:
+        with Asker(
+            service.endpoint, session_configuration_of(configuration), b"looks on, silent"
+        ) as asker:
             watch("one robot there, silent", asker.pause)
             for turn in recorded_turns(configuration.problem, configuration.planning, 0):
                 asker.ask(turn.state, turn.digest, turn.observations[-1:])
@@ -705,10 +709,13 @@ def _robot_in_a_crowd(seconds: float) -> tuple[str, int]:
     differing = 0
     for trial, finished in enumerate(notebook.finished):
         alone = run_trial(
-            configuration.problem, configuration.planning, configuration.simulator, trial
+            Planner(configuration.problem, configuration.planning),
+            configuration.simulator.seed,
+            trial,
+            max_steps=configuration.simulator.max_steps,
         )
         differing += finished.result.digest != alone.digest
-    told = [each.name for each in notebook.told]
+    told = [each.name for each in notebook.events]
     by_service = [each.timing.service for each in notebook.decided]
     return (
         paragraph(

@@ -12,35 +12,25 @@ from time import perf_counter
 from typing import NamedTuple, Self
 
 from benchmarks.beliefs import MAX_STEPS, SEED
-from holdfast.planning import (
-    PlanningState,
-    advance,
-    choose_sensing_action,
-    choose_task_action,
-    digest,
-    encode_checkpoint,
-    initial_state,
-    needs_sensing,
-    observe,
-)
+from holdfast.config.settings import PlanningSettings
+from holdfast.planning import Planner, PlanningState, digest, encode_checkpoint
 from holdfast.problems.problem import Problem
-from holdfast.runtime.environment import SimulatedEnvironment
-from holdfast.session.events import Appeared, Ended, Replied, TransportEvent
-from holdfast.session.messages import (
+from holdfast.protocol.events import CallEnded, ReplyReceived, ServiceAppeared, TransportEvent
+from holdfast.protocol.messages import (
     DIGEST_SIZE,
     PROTOCOL_VERSION,
     Observed,
-    Opening,
     Reply,
     Request,
     SensingAnswer,
+    SessionConfiguration,
     TaskAnswer,
+    decode_floats,
     decode_reply,
     encode,
-    numbers_from,
-    numbers_to,
+    encode_floats,
 )
-from holdfast.settings import PlanningSettings
+from holdfast.robot.environment import SimulatedEnvironment
 from holdfast.transport.endpoints import ServiceAddress, TlsFiles
 from holdfast.transport.robot_end import StreamRobotTransport
 
@@ -58,19 +48,16 @@ class Turn(NamedTuple):
         In which it is asked: before the first sensing action of a trial, else after one.
     digest : bytes
         Of the state, as it is sent.
-    checkpoint : bytes
     observations : tuple of Observed
         All of the trial that led to the state.
     before : PlanningState or None
         Before the last of them.
     actions : bytes
         The task actions up to the next sensing step.
-    sensing_step : int
     sensing_state : PlanningState
         At that step.
     sensing_digest : bytes
         Of that state.
-    sensing_action : int
     """
 
     state: PlanningState
@@ -98,20 +85,21 @@ class Turn(NamedTuple):
 def recorded_turns(problem: Problem, settings: PlanningSettings, trial: int) -> list[Turn]:
     """Run a trial in process and return all questions that its robot would ask."""
     environment = SimulatedEnvironment(problem, SEED, trial)
-    state = initial_state(problem, settings, SEED, trial)
+    planner = Planner(problem, settings)
+    state = planner.init(SEED, trial)
     observations: tuple[Observed, ...] = ()
     turns = [_turn(problem, settings, state, observations, None)]
     while not environment.is_done() and state.step < MAX_STEPS:
-        if needs_sensing(settings, state):
+        if planner.needs_sensing(state):
             before, sensing_action = state, turns[-1].sensing_action
             observation = environment.perform_sensing(sensing_action)
-            state, _ = observe(problem, settings, state, sensing_action, observation)
-            last = Observed(state.step, sensing_action, numbers_to(observation))
+            state, _ = planner.observe(state, sensing_action, observation)
+            last = Observed(state.step, sensing_action, encode_floats(observation))
             observations = (*observations, last)
             turns.append(_turn(problem, settings, state, observations, before))
-        action, _ = choose_task_action(problem, settings, state)
+        action, _ = planner.choose_task_action(state)
         environment.perform(action)
-        state = advance(problem, settings, state, action)
+        state = planner.advance(state, action)
     return turns
 
 
@@ -123,7 +111,7 @@ def _turn(
     before: PlanningState | None,
 ) -> Turn:
     ahead, actions = _rolled(problem, settings, state)
-    sensing_action, _ = choose_sensing_action(problem, settings, ahead)
+    sensing_action, _ = Planner(problem, settings).choose_sensing_action(ahead)
     return Turn(
         state,
         digest(state)[:DIGEST_SIZE],
@@ -143,22 +131,24 @@ def _rolled(
 ) -> tuple[PlanningState, list[bytes]]:
     """Return the state at the next sensing step, and the task actions that lead there."""
     actions = []
-    while not needs_sensing(settings, state):
-        action, _ = choose_task_action(problem, settings, state)
-        state = advance(problem, settings, state, action)
-        actions.append(numbers_to(action))
+    planner = Planner(problem, settings)
+    while not planner.needs_sensing(state):
+        action, _ = planner.choose_task_action(state)
+        state = planner.advance(state, action)
+        actions.append(encode_floats(action))
     return state, actions
 
 
 def decided_in_process(problem: Problem, settings: PlanningSettings, turn: Turn) -> int:
     """Compute what a service computes for a turn, and nothing else; return the sensing action."""
     state = turn.state
+    planner = Planner(problem, settings)
     if turn.before is not None:
         last = turn.observations[-1]
-        observation = numbers_from(last.observation, len(last.observation) // 8)
-        state, _ = observe(problem, settings, turn.before, last.sensing_action, observation)
+        observation = decode_floats(last.observation, len(last.observation) // 8)
+        state, _ = planner.observe(turn.before, last.sensing_action, observation)
     ahead, _ = _rolled(problem, settings, state)
-    return choose_sensing_action(problem, settings, ahead)[0]
+    return planner.choose_sensing_action(ahead)[0]
 
 
 class Asked(NamedTuple):
@@ -166,7 +156,6 @@ class Asked(NamedTuple):
 
     Attributes
     ----------
-    task, sensing : TaskAnswer, SensingAnswer or None
     task_s, sensing_s : float
         Until that part was there; 0 if it was none.
     """
@@ -182,11 +171,6 @@ class Caller:
 
     Its event loop runs as long as one of its methods does, so a link is kept alive over a pause by
     :meth:`pause` alone.
-
-    Parameters
-    ----------
-    endpoint : str
-    tls : TlsFiles or None
     """
 
     def __init__(self, endpoint: str, tls: TlsFiles | None = None) -> None:
@@ -232,10 +216,10 @@ class Caller:
         return self._replies
 
     def _deliver(self, event: TransportEvent) -> None:
-        if isinstance(event, Replied):
+        if isinstance(event, ReplyReceived):
             reply = decode_reply(event.payload)
             self._replies.append((perf_counter() - self._sent_at, reply))
-        elif isinstance(event, Appeared | Ended):
+        elif isinstance(event, ServiceAppeared | CallEnded):
             self._changed.set()
 
 
@@ -244,18 +228,19 @@ class Asker(Caller):
 
     Parameters
     ----------
-    endpoint : str
-    opening : Opening
     session : bytes
         Of 16 bytes.
-    tls : TlsFiles or None
     """
 
     def __init__(
-        self, endpoint: str, opening: Opening, session: bytes, tls: TlsFiles | None = None
+        self,
+        endpoint: str,
+        session_configuration: SessionConfiguration,
+        session: bytes,
+        tls: TlsFiles | None = None,
     ) -> None:
         super().__init__(endpoint, tls)
-        self._opening: Opening | None = opening
+        self._session_configuration: SessionConfiguration | None = session_configuration
         self._session = session
 
     def ask(
@@ -276,7 +261,7 @@ class Asker(Caller):
             state.sensed,
             state_digest,
             observations,
-            self._opening,
+            self._session_configuration,
             checkpoint,
         )
         asked = Asked(None, None, 0.0, 0.0)
@@ -285,5 +270,5 @@ class Asker(Caller):
                 asked = asked._replace(task=reply, task_s=seconds)
             elif isinstance(reply, SensingAnswer):
                 asked = asked._replace(sensing=reply, sensing_s=seconds)
-        self._opening = None
+        self._session_configuration = None
         return asked

@@ -11,25 +11,26 @@ import os
 import sys
 from pathlib import Path
 
-PACKAGES = ("session", "simulation")
+PACKAGES = ("protocol", "lab/simulation")
 
 INTERPRETED = {
     # Types with class keywords, which the compiler does not know.
-    "session/messages.py",
-    "session/records.py",
-    "session/service_limits.py",
-    "simulation/exploration.py",
-    "simulation/schedule.py",
+    "protocol/messages.py",
+    "protocol/records.py",
+    "protocol/service_limits.py",
+    "protocol/service_statistics.py",
+    "lab/simulation/command.py",
+    "lab/simulation/exploration.py",
+    "lab/simulation/schedule.py",
+    "lab/simulation/schedule_draws.py",
     # Nothing in them takes time.
-    "session/__init__.py",
-    "session/decision_source.py",
-    "simulation/__init__.py",
-    "session/effects.py",
-    "session/events.py",
-    "session/service_effects.py",
-    "session/status.py",
-    "simulation/shrinking.py",
-    "simulation/story.py",
+    "protocol/__init__.py",
+    "lab/simulation/__init__.py",
+    "protocol/events.py",
+    "protocol/status.py",
+    "protocol/verification.py",
+    "lab/simulation/shrinking.py",
+    "lab/simulation/story.py",
 }
 
 

@@ -11,11 +11,11 @@ needed then. Run it with::
 
 import numpy as np
 
+import holdfast as hf
 from holdfast import numerics
-from holdfast.problems.problem import ProblemBase
 
 
-class CorridorDoors(ProblemBase):
+class CorridorDoors(hf.ProblemBase):
     """A robot that is to stop at a place in a corridor; its state is its place x in metres."""
 
     name = "corridor_doors"

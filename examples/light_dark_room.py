@@ -8,10 +8,10 @@ looking along y shows y; both are the noisier, the further the lamp. Run it with
 
 import numpy as np
 
-from holdfast.problems.problem import ProblemBase, Scene
+import holdfast as hf
 
 
-class LightDarkRoom(ProblemBase):
+class LightDarkRoom(hf.ProblemBase):
     """A point robot in a room; states are (x, y) in metres."""
 
     name = "light_dark_room"
@@ -53,4 +53,4 @@ class LightDarkRoom(ProblemBase):
         return (np.abs(states - self.places[1]) < 0.1).all(axis=-1)
 
     def scene(self):
-        return Scene((0, 1), (-1.0, -1.0, 5.0, 4.0), goal=self.places[1], points=self.places[:1])
+        return hf.Scene((0, 1), (-1.0, -1.0, 5.0, 4.0), goal=self.places[1], points=self.places[:1])

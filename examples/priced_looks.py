@@ -10,10 +10,10 @@ where that saves more than it costs. The other ways look along x or y every time
 
 import numpy as np
 
-from holdfast.problems.problem import ProblemBase, Scene
+import holdfast as hf
 
 
-class PricedLooks(ProblemBase):
+class PricedLooks(hf.ProblemBase):
     """A point robot on its way to the origin; states are (x, y) in metres."""
 
     name = "priced_looks"
@@ -52,4 +52,4 @@ class PricedLooks(ProblemBase):
         return (np.abs(states) < 0.1).all(axis=-1)
 
     def scene(self):
-        return Scene((0, 1), (-2.0, -2.0, 4.0, 4.0), goal=(0.0, 0.0))
+        return hf.Scene((0, 1), (-2.0, -2.0, 4.0, 4.0), goal=(0.0, 0.0))

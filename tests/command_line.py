@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import sys
 from pathlib import Path
@@ -10,8 +11,11 @@ from typing import NamedTuple
 import pytest
 
 from holdfast.cli import main
+from holdfast.cli.application import COMMANDS
+from holdfast.runtime.command_line import Options
+from holdfast.service.options import ServeOptions
 
-__all__ = ["Said", "run_here"]
+__all__ = ["Said", "options_of", "run_here"]
 
 
 class Said(NamedTuple):
@@ -50,3 +54,16 @@ def run_here(
     code = ended.value.code or 0
     assert isinstance(code, int), code
     return Said(code, said.out, said.err)
+
+
+def options_of(command: str) -> type[Options]:
+    """Return the class of a command's options."""
+    if command == "serve":
+        return ServeOptions
+    found = vars(importlib.import_module(COMMANDS[command].module)).values()
+    (options,) = (
+        each
+        for each in found
+        if isinstance(each, type) and issubclass(each, Options) and each is not Options
+    )
+    return options

@@ -38,8 +38,8 @@ from tests.wire import (
     hello_of,
 )
 
-from holdfast.session.messages import (
-    MessageError,
+from holdfast.errors import MessageError
+from holdfast.protocol.messages import (
     NeedState,
     Progress,
     Refused,
@@ -49,7 +49,7 @@ from holdfast.session.messages import (
     TaskAnswer,
     decode_reply,
     encode,
-    numbers_to,
+    encode_floats,
 )
 
 __all__ = ["MOMENTS", "Impostor", "Intruder", "Message", "messages", "wrong_actions"]
@@ -75,8 +75,6 @@ class Message(NamedTuple):
 
     Attributes
     ----------
-    name : str
-    data : bytes
     is_whole : bool
         Whether it is made of whole frames, so that what comes after it is read.
     """
@@ -88,7 +86,7 @@ class Message(NamedTuple):
 
 def wrong_actions(number: int) -> bytes:
     """Return moves that are nearly eighty times as long as the problem's longest."""
-    return encode(TaskAnswer(number, 9, numbers_to([7.77] * (_ACTION_SIZE * 9)), 1))
+    return encode(TaskAnswer(number, 9, encode_floats([7.77] * (_ACTION_SIZE * 9)), 1))
 
 
 def _stale(number: int) -> bytes:
@@ -153,7 +151,11 @@ def messages(
         ("with other numbers", {"number": 2**31}),
     ):
         asked = [
-            encode(msgspec.structs.replace(question, opening=None, checkpoint=None, **changes))
+            encode(
+                msgspec.structs.replace(
+                    question, session_configuration=None, checkpoint=None, **changes
+                )
+            )
             for question in questions
         ]
         said = b"".join(call_of(1000 + number, payload) for number, payload in enumerate(asked))
@@ -176,7 +178,6 @@ class Intruder:
 
     Parameters
     ----------
-    endpoint : str
     keys : Path or None
         Directory of its certificate.
     questions : sequence of Request
@@ -363,7 +364,6 @@ class Impostor:
 
     Attributes
     ----------
-    endpoint : str
     received : list of bytes
         Requests that it was asked.
     knocked : int

@@ -4,25 +4,16 @@ from __future__ import annotations
 
 from typing import Any
 
-from holdfast.configuration import Configuration
-from holdfast.planning import (
-    PlanningState,
-    advance,
-    choose_sensing_action,
-    choose_task_action,
-    digest,
-    initial_state,
-    needs_sensing,
-    observe,
-)
-from holdfast.runtime.environment import SimulatedEnvironment
-from holdfast.session.messages import (
+from holdfast.config.loader import Configuration
+from holdfast.planning import Planner, PlanningState, digest
+from holdfast.protocol.messages import (
     DIGEST_SIZE,
     PROTOCOL_VERSION,
     Observed,
     Request,
-    numbers_to,
+    encode_floats,
 )
+from holdfast.robot.environment import SimulatedEnvironment
 
 __all__ = ["questions_of", "request_of"]
 
@@ -48,17 +39,18 @@ def questions_of(configuration: Configuration, session: bytes) -> list[Request]:
     """Return all that the robot of a configuration asks in its first trial, in order."""
     problem, planning = configuration.problem, configuration.planning
     seed = configuration.simulator.seed
-    state = initial_state(problem, planning, seed, 0)
+    planner = Planner(problem, planning)
+    state = planner.init(seed, 0)
     environment = SimulatedEnvironment(problem, seed, 0)
     found = [request_of(state, session, 1)]
     while not environment.is_done() and state.step < configuration.simulator.max_steps:
-        if needs_sensing(planning, state):
-            action, _ = choose_sensing_action(problem, planning, state)
+        if planner.needs_sensing(state):
+            action, _ = planner.choose_sensing_action(state)
             shown = environment.perform_sensing(action)
-            observed = Observed(state.step, action, numbers_to(shown))
-            state, _ = observe(problem, planning, state, action, shown)
+            observed = Observed(state.step, action, encode_floats(shown))
+            state, _ = planner.observe(state, action, shown)
             found.append(request_of(state, session, len(found) + 1, observations=(observed,)))
-        task, _ = choose_task_action(problem, planning, state)
+        task, _ = planner.choose_task_action(state)
         environment.perform(task)
-        state = advance(problem, planning, state, task)
+        state = planner.advance(state, task)
     return found

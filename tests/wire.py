@@ -19,7 +19,7 @@ from typing import Any, NamedTuple, Self
 
 import msgspec
 
-from holdfast.session.messages import Reply, Request, decode_reply, encode
+from holdfast.protocol.messages import Reply, Request, decode_reply, encode
 
 __all__ = [
     "CALL",
@@ -220,8 +220,6 @@ class RawClient(RawLink):
 
     Parameters
     ----------
-    endpoint : str
-    keys : Path or None
     hello : bytes or None
         What it says first.
 

@@ -36,9 +36,9 @@ from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
 from rclpy.node import Node
 
-from holdfast.configuration import load
+from holdfast.config.loader import load
 from holdfast.errors import HoldfastError
-from holdfast.runtime.environment import SimulatedEnvironment
+from holdfast.robot.environment import SimulatedEnvironment
 
 
 class SimulatedRobot(Node):

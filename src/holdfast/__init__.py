@@ -1,5 +1,95 @@
-"""holdfast: choose what to sense, and keep deciding the same whatever fails."""
+"""holdfast: choose what to sense, and keep deciding the same whatever fails.
+
+``import holdfast as hf`` is the public face: all names below. Each is imported when it is first
+used, because the start of a process is part of a robot's recovery.
+"""
 
 from __future__ import annotations
 
+import importlib
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from holdfast.belief import Belief
+    from holdfast.config.loader import load as load_configuration
+    from holdfast.config.settings import (
+        ActiveSensingSettings,
+        ParticleFilterSettings,
+        PlanningSettings,
+        SelectorSettings,
+    )
+    from holdfast.errors import HoldfastError
+    from holdfast.estimators import GaussianMixture, NearestNeighbor, PriorNeighbors, entropy
+    from holdfast.planning import Planner, PlanningState
+    from holdfast.problems.problem import Problem, ProblemBase, Scene
+    from holdfast.problems.registry import make
+    from holdfast.recording.reading import open_run
+    from holdfast.robot.environment import Environment, SimulatedEnvironment
+    from holdfast.robot.trial import run_trial
+
+__all__ = [
+    "ActiveSensingSettings",
+    "Belief",
+    "Environment",
+    "GaussianMixture",
+    "HoldfastError",
+    "NearestNeighbor",
+    "ParticleFilterSettings",
+    "Planner",
+    "PlanningSettings",
+    "PlanningState",
+    "PriorNeighbors",
+    "Problem",
+    "ProblemBase",
+    "Scene",
+    "SelectorSettings",
+    "SimulatedEnvironment",
+    "entropy",
+    "load_configuration",
+    "make",
+    "open_run",
+    "run_trial",
+]
+
 __version__ = "0.1.0"
+
+_PLACES = {
+    "ActiveSensingSettings": "config.settings.ActiveSensingSettings",
+    "ParticleFilterSettings": "config.settings.ParticleFilterSettings",
+    "Belief": "belief.Belief",
+    "Environment": "robot.environment.Environment",
+    "GaussianMixture": "estimators.GaussianMixture",
+    "HoldfastError": "errors.HoldfastError",
+    "NearestNeighbor": "estimators.NearestNeighbor",
+    "Planner": "planning.Planner",
+    "PlanningSettings": "config.settings.PlanningSettings",
+    "PlanningState": "planning.PlanningState",
+    "PriorNeighbors": "estimators.PriorNeighbors",
+    "Problem": "problems.problem.Problem",
+    "ProblemBase": "problems.problem.ProblemBase",
+    "Scene": "problems.problem.Scene",
+    "SimulatedEnvironment": "robot.environment.SimulatedEnvironment",
+    "SelectorSettings": "config.settings.SelectorSettings",
+    "entropy": "estimators.entropy",
+    "load_configuration": "config.loader.load",
+    "make": "problems.registry.make",
+    "open_run": "recording.reading.open_run",
+    "run_trial": "robot.trial.run_trial",
+}
+"""The module of each name, and its name there; type checkers read the imports above."""
+
+if not TYPE_CHECKING:
+
+    def __getattr__(name: str) -> object:
+        """Import a name of the public face (PEP 562)."""
+        if name not in _PLACES:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        module, _, own_name = _PLACES[name].rpartition(".")
+        value = getattr(importlib.import_module(f"{__name__}.{module}"), own_name)
+        globals()[name] = value
+        return value
+
+
+def __dir__() -> list[str]:
+    """Return the public names, imported or not."""
+    return [*__all__, "__version__"]

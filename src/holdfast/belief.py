@@ -1,12 +1,12 @@
-"""The belief: weighted particles, and what can happen to them.
+"""The belief: weighted particles, and the operations on them.
 
 A belief about the state is a set of states ("particles") with weights that sum to 1. Moving the
 robot moves every particle (*predict*); an observation multiplies each weight by how well that
-particle explains it (*update*); and when few particles carry most of the weight, the set is drawn
-anew from itself (*resample*). The functions are pure: they return a new belief and keep the old
-one.
+particle explains it (*update*); and when few particles carry most of the weight, new particles are
+drawn from the set (*resample*). The functions are pure: they return a new belief and do not change
+the old one.
 
-Weights are multiplied as logarithms, so an observation that every particle finds most unlikely
+Weights are multiplied as logarithms, so an observation that is very unlikely under every particle
 still ranks them instead of turning every weight into zero.
 """
 
@@ -17,8 +17,10 @@ from typing import Literal, NamedTuple, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from holdfast import _kernel, contract, numerics
+from holdfast import _kernel, checked, numerics
+from holdfast.arrays import FloatArray, in_brief
 from holdfast.errors import InvalidValueError
+from holdfast.problem_attributes import has_general_observations
 from holdfast.randomness import Stream
 
 __all__ = [
@@ -31,11 +33,11 @@ __all__ = [
     "update",
 ]
 
-FloatArray = npt.NDArray[np.float64]
 
-UNEXPLAINED_DEVIATIONS_SQUARED = 64.0
-"""An observation further than eight standard deviations from every particle is *unexplained*: a
-right model does so with probability below 2e-15 in one dimension."""
+VALIDATION_GATE_SQUARED = 64.0
+"""Square of eight standard deviations. An observation further than this from every particle lies
+outside the validation gate; under a correct model in one dimension its probability is below
+2e-15."""
 
 
 class ObservationModel(Protocol):
@@ -126,19 +128,18 @@ def uniform_weights(count: int) -> FloatArray:
 
 
 class UpdateInfo(NamedTuple):
-    """What an update found.
+    """Diagnostics of an update.
 
     Attributes
     ----------
     effective_sample_size : float
         ``1 / sum(weights**2)`` after the update, from 1 to the number of particles.
     explained : bool
-        False if the observation is more than eight standard deviations from what every particle
-        expects (or, for a general likelihood, impossible under all of them): it lies outside the
-        validation gate.
+        False if the observation lies outside the validation gate of every particle (for a general
+        likelihood: is impossible under all of them).
     mahalanobis_distance : float or None
-        How far, in standard deviations, the observation is from what the nearest particle expects;
-        None for a general likelihood, which has no such thing.
+        Distance of the observation from the nearest particle's prediction, in standard deviations;
+        None for a general likelihood, which has no such distance.
     """
 
     effective_sample_size: float
@@ -147,11 +148,10 @@ class UpdateInfo(NamedTuple):
 
 
 def estimate(belief: Belief, kind: Literal["mean", "most_likely"] = "mean") -> FloatArray:
-    """Return the state that stands for a belief, shape ``(state_size,)``.
+    """Return a point estimate of the state, shape ``(state_size,)``.
 
     Parameters
     ----------
-    belief : Belief
     kind : {"mean", "most_likely"}
         The mean, or the particle of the greatest weight (the first of equals).
     """
@@ -181,34 +181,32 @@ def update(
     Parameters
     ----------
     problem : ObservationModel
-        Gives the mean and variance of the observation in each state, or a method
-        ``log_likelihood(states, sensing_action, observation)`` of its own.
-    belief : Belief
-    sensing_action : int
+        Has the mean and variance of the observation in each state, or a method
+        ``log_likelihood(states, sensing_action, observation)``.
     observation : array of shape (observation_size,)
 
     Returns
     -------
     belief : Belief
-        The same states with new weights. If no particle can have made the observation at all (its
-        log-likelihood is minus infinity everywhere), the belief as it was.
+        The same states with new weights. If the log-likelihood is minus infinity for every
+        particle, the unchanged belief.
     info : UpdateInfo
 
     Raises
     ------
     InvalidValueError
-        If the observation is not finite or of another size than the problem predicts.
+        If the observation is not finite, or its size differs from the prediction.
     ProblemError
-        If what the problem returns is not what its contract says.
+        If the problem violates its contract.
     """
     observed = np.ascontiguousarray(observation, dtype=np.float64).reshape(-1)
     if not numerics.all_finite(observed):
         raise InvalidValueError(
-            f"observation {contract.in_brief(observed)}: every coordinate must be finite"
+            f"observation {in_brief(observed)}: every coordinate must be finite"
         )
-    if not contract.has_general_observations(problem):
-        mean = contract.observation_mean(problem, belief.states, sensing_action)
-        variance = contract.observation_variance(problem, belief.states, sensing_action, mean)
+    if not has_general_observations(problem):
+        mean = checked.observation_mean(problem, belief.states, sensing_action)
+        variance = checked.observation_variance(problem, belief.states, sensing_action, mean)
         if mean.shape[-1] != observed.shape[0]:
             raise InvalidValueError(
                 f"observation of {observed.shape[0]} coordinates: sensing action {sensing_action} "
@@ -217,15 +215,15 @@ def update(
         # A comparison with NaN is false.
         usable = (variance > 0.0).all() and numerics.all_finite(variance)
         if not usable or not numerics.all_finite(mean):
-            raise contract.unusable_prediction(problem, sensing_action, mean, variance)
+            raise checked.unusable_prediction(problem, sensing_action, mean, variance)
         log_likelihood, squared_distance = _gaussian_log_likelihood(
             observed, mean, variance, belief.weights
         )
-        explained = squared_distance <= UNEXPLAINED_DEVIATIONS_SQUARED
+        explained = squared_distance <= VALIDATION_GATE_SQUARED
         distance = float(np.sqrt(squared_distance))
     else:
         distance = None
-        log_likelihood = contract.log_likelihood(problem, belief.states, sensing_action, observed)
+        log_likelihood = checked.log_likelihood(problem, belief.states, sensing_action, observed)
         explained = bool(((log_likelihood > -np.inf) & (belief.weights > 0.0)).any())
     weights, survivors = _kernel.normalize(numerics.log(belief.weights) + log_likelihood, False)
     if survivors == 0:
@@ -240,9 +238,10 @@ def _gaussian_log_likelihood(
 ) -> tuple[FloatArray, float]:
     """Return log p(observed | state) up to a constant, and the least squared distance.
 
-    The distance is Mahalanobis's, from what a particle expects; particles of weight 0 do not count.
+    The distance is the Mahalanobis distance from a particle's prediction; particles of weight 0 do
+    not count.
     """
-    # An observation of 1e200 is as good as one at infinity: no particle explains it.
+    # An overflow to infinity is correct: the observation is outside every validation gate.
     with np.errstate(over="ignore"):
         difference = observed - mean
         squares = difference * difference / variance
@@ -259,18 +258,17 @@ def _gaussian_log_likelihood(
 
 
 def resample(belief: Belief, stream: Stream) -> Belief:
-    """Draw as many particles from the belief as it has, by systematic resampling.
+    """Draw the same number of particles from the belief, by systematic resampling.
 
     Parameters
     ----------
-    belief : Belief
     stream : Stream
-        Gives the one uniform offset.
+        Source of the one uniform offset.
 
     Returns
     -------
     Belief
-        Equally weighted particles; particle n is there ``floor(N w_n)`` or ``ceil(N w_n)`` times.
+        Equally weighted particles; particle n occurs ``floor(N w_n)`` or ``ceil(N w_n)`` times.
 
     Notes
     -----

@@ -1,23 +1,53 @@
-"""What can go wrong, as types.
+"""All exceptions of holdfast.
 
-Every error that holdfast raises on purpose is a :class:`HoldfastError`. Its message names the
-value, the limit that it broke and, where there is one, the key of the configuration, because the
-person who reads it has the file open, not this code.
+Every error that holdfast raises on purpose is a :class:`HoldfastError`, except defects of the
+caller. The message names the value, its bound and the key of the configuration, because its reader
+has the file open, not this code.
 """
 
 from __future__ import annotations
 
 __all__ = [
+    "CallError",
     "CheckpointError",
     "ConfigurationError",
+    "CredentialsError",
+    "DecidedOtherwiseError",
+    "DescriptorError",
+    "EndOfRecordsError",
     "EnvironmentFailedError",
+    "FrameError",
+    "GoneError",
+    "GuardError",
+    "HealthError",
+    "HeldError",
     "HoldfastError",
+    "IllegalTransitionError",
     "InvalidValueError",
+    "KeysExhaustedError",
+    "LostJournalError",
+    "MessageError",
+    "MetricsError",
+    "MissingRosbagsError",
+    "OptionError",
     "OtherCodeError",
+    "OutputError",
+    "OwnDecisionError",
     "ProblemError",
+    "RecordError",
+    "RunError",
+    "ServiceBrokenError",
+    "ServiceProcessError",
+    "ServiceRefusedError",
+    "SilentError",
+    "StaleEpochError",
     "TransportError",
+    "TrialCrashError",
     "TrialError",
+    "UnknownPerformanceError",
     "UnknownProblemError",
+    "UnwritableOutputError",
+    "WorkerDiedError",
 ]
 
 
@@ -34,22 +64,22 @@ class ConfigurationError(HoldfastError):
 
 
 class UnknownProblemError(ConfigurationError):
-    """No problem of that name is registered, nor can it be imported."""
+    """The problem's name is not registered, and its class cannot be imported."""
 
 
 class OtherCodeError(HoldfastError):
-    """The robot's holdfast or problem is other code than the service's, which may decide otherwise.
+    """Robot and service run different code of holdfast or the problem, and may decide differently.
 
     The message names the problem and the digests of both.
     """
 
 
 class ProblemError(HoldfastError):
-    """A problem's own function returned something that the contract does not allow."""
+    """A function of the problem violated its contract."""
 
 
 class EnvironmentFailedError(HoldfastError):
-    """The robot's world raised, stalled, or returned something that the contract does not allow."""
+    """The environment raised, stalled, or violated its contract."""
 
 
 class CheckpointError(HoldfastError):
@@ -57,8 +87,175 @@ class CheckpointError(HoldfastError):
 
 
 class TransportError(HoldfastError):
-    """An endpoint cannot be used: it is malformed, taken, or lacks its credentials."""
+    """An endpoint cannot be used: it is malformed, in use, or lacks credentials."""
 
 
 class TrialError(HoldfastError):
-    """What holdfast refused, or the problem's own code raised, with the trial where it happened."""
+    """An error of holdfast or of the problem's code, with the trial in which it occurred."""
+
+
+class RunError(HoldfastError):
+    """An error that ended a run; the message has the reason and the command.
+
+    Attributes
+    ----------
+    command : str or None
+        The command that continues the run; None if it cannot continue.
+    """
+
+    def __init__(self, error: HoldfastError, command: str | None, exit_code: int = 2) -> None:
+        super().__init__(f"{error}\nGo on with: {command}" if command else str(error))
+        self.reason = str(error)
+        self.command = command
+        self.exit_code = exit_code
+
+
+class OptionError(HoldfastError):
+    """A command-line value is not allowed; the message names the option and the bound."""
+
+
+class UnwritableOutputError(HoldfastError):
+    """The standard output cannot be written, although its reader has not closed it."""
+
+
+class OutputError(HoldfastError):
+    """The output of a run cannot be written or read, or does not belong to this run."""
+
+
+class ServiceRefusedError(HoldfastError):
+    """Every available service refuses to decide, and a retry would not help."""
+
+
+class MessageError(HoldfastError):
+    """Bytes that do not decode to a message within its bounds.
+
+    Attributes
+    ----------
+    code : str
+        As in :class:`Refused`.
+    """
+
+    def __init__(self, code: str, text: str) -> None:
+        super().__init__(text)
+        self.code = code
+
+    def without_traceback(self) -> MessageError:
+        """Return the same error without its traceback.
+
+        Keep this copy beyond the handler: the traceback holds the handler's frame, and with it the
+        message and the error itself, until garbage collection.
+        """
+        return MessageError(self.code, str(self))
+
+
+class RecordError(HoldfastError):
+    """A record of the journal does not decode, or does not follow from those before it."""
+
+
+class StaleEpochError(HoldfastError):
+    """Another process has taken this run over; this robot must stop."""
+
+
+class HeldError(HoldfastError):
+    """The robot holds still: its environment failed. The run can be resumed."""
+
+
+class UnknownPerformanceError(HoldfastError):
+    """The last task action before a crash may or may not have been performed."""
+
+
+class IllegalTransitionError(RuntimeError):
+    """An event that cannot occur in this status: a defect of the caller."""
+
+
+class OwnDecisionError(HoldfastError):
+    """Answers disagree, and the robot's own planner cannot decide between them."""
+
+
+class LostJournalError(OutputError):
+    """The journal was removed or replaced while it was open."""
+
+
+class DecidedOtherwiseError(RecordError):
+    """A recomputed decision of a trial differs from the recorded one.
+
+    Attributes
+    ----------
+    kind : {"sensing", "task"} or None
+        Kind of the recorded decision; None at the end of the records.
+    """
+
+    def __init__(self, trial: int, step: int, kind: str | None) -> None:
+        super().__init__(
+            f"trial {trial}: the decision of step {step} differs when it is computed again: the "
+            "problem is not deterministic, or a service decided differently"
+        )
+        self.step = step
+        self.kind = kind
+
+
+class EndOfRecordsError(RecordError):
+    """The records end before the trial is finished."""
+
+    def __init__(self, trial: int) -> None:
+        super().__init__(f"trial {trial}: its records end before it is finished")
+
+
+class WorkerDiedError(HoldfastError):
+    """A worker process ended unexpectedly."""
+
+
+class TrialCrashError(RuntimeError):
+    """An unexpected error in a worker process; the message holds its traceback."""
+
+
+class GuardError(HoldfastError):
+    """The guard cannot guard the ROS 1 master; the message says why."""
+
+
+class MissingRosbagsError(HoldfastError):
+    """The library rosbags is not installed."""
+
+
+class DescriptorError(HoldfastError):
+    """The process needs more open files and sockets than its limit."""
+
+
+class HealthError(HoldfastError):
+    """The server for health and metrics cannot listen at an address."""
+
+
+class MetricsError(HoldfastError):
+    """A package that metrics need is missing."""
+
+
+class ServiceBrokenError(HoldfastError):
+    """The service's own code failed: a defect. The process must restart."""
+
+
+class ServiceProcessError(HoldfastError):
+    """A process of a service has ended before it served."""
+
+
+class CredentialsError(HoldfastError):
+    """Credentials cannot be made or used; the message names the file and the reason."""
+
+
+class FrameError(TransportError):
+    """Received bytes are no valid frame; the message completes a sentence about the sender."""
+
+
+class CallError(HoldfastError):
+    """No usable answer came."""
+
+
+class SilentError(CallError):
+    """No answer came in time."""
+
+
+class GoneError(CallError):
+    """Nothing listens at the endpoint: its process has ended."""
+
+
+class KeysExhaustedError(TransportError):
+    """A key has encrypted its maximum number of datagrams; a new link has new keys."""

@@ -1,31 +1,31 @@
-"""What a look is worth: the return of acting after it, less its price.
+"""The expected return after each sensing action, less its price.
 
-Imagine the true state and what a sensing action would show of it; update the belief; let the robot
-act by the policy on that belief while the true state moves; and add up the reward. The mean over
-many imagined truths is the expected return after that sensing action. Nothing else says in units
-of reward what sensing gains, so nothing else can be weighed against its price.
+Sample a true state and an observation of it; update the belief; let the robot act by the policy on
+that belief while the true state moves; and add up the reward. The mean over many samples is the
+expected return after that sensing action. It is in units of reward, so it can be weighed against
+the price of sensing.
 
-Done naively, the differences between sensing actions drown in noise: far from the goal all of them
-lead to the same actions, and a return is the sum of a hundred noisy steps. So:
+Sampled naively, the differences between sensing actions drown in noise: far from the goal all of
+them lead to the same actions, and a return is the sum of a hundred noisy steps. So:
 
-- All sensing actions share their truths and the noise of observations and motions (common random
-  numbers). What is left in a difference is the observation's work.
+- All sensing actions share the true states and the noise of observations and motions (common random
+  numbers). A difference then comes from the observations alone.
 - Within a rollout the belief is its estimate, which moves as a few of its particles do.
-- The robot will sense again, and would then know what it has not looked at now. At each of the next
+- The robot will sense again and learn then what it does not sense now. At each of the next
   ``rollout_looks`` sensing steps the rollout forks: with a probability of one over their number the
   state is known from then on, and the known-state policy acts; at the last one it is known for
-  sure. Both branches are followed: no draw decides. With one look this is QMDP (Littman, Cassandra
-  and Kaelbling, "Learning policies for partially observable environments", ICML 1995) over an
-  interval.
-- Where looks cost, the mean price is paid at each later sensing step up to the goal, as by a robot
-  that senses at random from then on: who is at the goal sooner pays less often. If knowledge came
-  for nothing, looks would be put off for ever.
-- Truth i is left out of the posterior that its own observation makes. A robot's true state is not
-  among its particles, and a posterior of few particles that has it would look too good.
+  sure. Both branches are followed: no draw decides. With one such step this is QMDP (Littman,
+  Cassandra and Kaelbling, "Learning policies for partially observable environments", ICML 1995)
+  over an interval.
+- Where sensing has prices, the mean price is paid at each later sensing step up to the goal, as by
+  a robot that senses at random from then on: a robot that is sooner at the goal pays less often. If
+  knowledge were free later, sensing would be put off for ever.
+- True state i is left out of the posterior of its own observation. A robot's true state is not
+  among its particles, and a posterior of few particles with it would be too good.
 - A rollout ends at the goal, or as soon as the state is known and the same after every sensing
-  action: what is left has no part in a difference. Far from the goal, where all of them lead to the
+  action: the rest cancels in every difference. Far from the goal, where all of them lead to the
   same actions, that is soon.
-- The number of truths is doubled, up to a bound, for those sensing actions alone whose paired
+- The number of samples is doubled, up to a bound, for those sensing actions alone whose paired
   difference from the best is less than two standard errors.
 """
 
@@ -35,24 +35,22 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-from holdfast import contract, numerics
+from holdfast import checked, numerics
+from holdfast.arrays import BoolArray, FloatArray, IntArray
 from holdfast.belief import Belief, estimate
+from holdfast.config.settings import PlanningSettings
 from holdfast.errors import ProblemError
+from holdfast.problem_attributes import sensing_costs
 from holdfast.problems.problem import Problem, ProblemBase
 from holdfast.randomness import Stream
-from holdfast.settings import PlanningSettings
 
 __all__ = ["Posteriors", "Returns", "expected_returns", "rollout_returns"]
 
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
-BoolArray = npt.NDArray[np.bool_]
 
 Posteriors = Callable[[Sequence[int], int, Stream], tuple[Sequence[int], FloatArray]]
 """Called with sensing actions, a number M of samples and a stream. Returns the M particles that are
-the truths, and the weights of the posteriors, shape ``(len(sensing_actions), M, N)``."""
+the true states, and the weights of the posteriors, shape ``(len(sensing_actions), M, N)``."""
 
 # Substreams of the stream of hypotheses (1 to 3 are those of holdfast.sensing and the kernel).
 # Further rounds of samples have substreams of the first one.
@@ -64,10 +62,10 @@ _CLOUD = 8
 """Particles that stand for a posterior where it only has to move."""
 
 _CLOSE = 2.0
-"""Standard errors within which a difference is too close to call."""
+"""Standard errors below which a difference counts as undecided."""
 
 _NEGLIGIBLE = 1e-9
-"""Weight of all others below which the truth stays in its posterior: they say nothing, then."""
+"""Weight of all others below which the true state stays in its posterior."""
 
 
 class Returns(NamedTuple):
@@ -96,13 +94,10 @@ def expected_returns(
     hypotheses: Stream,
     posteriors: Posteriors,
 ) -> Returns:
-    """Return what each sensing action is expected to lead to.
+    """Return the expected return after each sensing action.
 
     Parameters
     ----------
-    problem : Problem
-    settings : PlanningSettings
-    belief : Belief
     stage : int
         Stage of the task.
     hypotheses : Stream
@@ -116,7 +111,7 @@ def expected_returns(
         If a function of the problem returns something out of its contract, or a hypothetical
         observation has no likelihood under any particle.
     """
-    costs = contract.sensing_costs(problem)
+    costs = sensing_costs(problem)
     count = costs.shape[0]
     size = settings.active_sensing.num_observation_samples
     limit = max(size, settings.selector.max_observation_samples)
@@ -204,13 +199,12 @@ def rollout_returns(
 
     Parameters
     ----------
-    problem : Problem
     settings : PlanningSettings
         Of it count the discount, the sensing interval and the length of a rollout.
     true_states : array of shape (M, state_size)
-        Where the robots are.
+        Of the robots.
     estimates : array of shape (J, M, state_size)
-        Where they believe to be after each of J observations.
+        The states that they assume after each of J observations.
     clouds : array of shape (J, M, L, state_size)
         Some particles of these beliefs. By their mean displacement the estimates move.
     stage : int
@@ -230,7 +224,7 @@ def rollout_returns(
     rollouts = _Rollouts(problem, settings, true_states, estimates, clouds, stage)
     interval = settings.sensing_interval + 1
     looks = settings.selector.rollout_looks
-    costs = contract.sensing_costs(problem)
+    costs = sensing_costs(problem)
     price = numerics.sum(costs) / costs.shape[0]
     for step in range(settings.selector.rollout_steps):
         later, between = divmod(step, interval)
@@ -280,7 +274,7 @@ class _Rollouts:
         self._end_at_goals()
 
     def pay(self, price: float) -> None:
-        """Pay for a later look wherever the goal is not reached."""
+        """Pay for a later sensing action wherever the goal is not reached."""
         if price > 0.0:
             self._add(self._origins, -price * self._shares)
 
@@ -288,7 +282,7 @@ class _Rollouts:
         """Split each column whose state is not known: with this probability it is from now on."""
         unknown = self._unknown
         shares = self._shares[:, :unknown] * chance
-        value = contract.known_state_return(
+        value = checked.known_state_return(
             self._problem, self._states[:, :unknown], self._stages[:, :unknown]
         )
         if value is not None:
@@ -303,7 +297,7 @@ class _Rollouts:
             self._keep(np.arange(self._origins.shape[0]) >= unknown)
 
     def advance(self, motion: Stream) -> bool:
-        """Take one step; tell whether there is anybody left to take another."""
+        """Take one step; return False if there was none to take."""
         count, unknown = self._origins.shape[0], self._unknown
         if count == 0 or self._factor == 0.0 or not self._shares.any():
             return False
@@ -316,10 +310,10 @@ class _Rollouts:
         _read_only(rows)
         stage: int | IntArray = 0
         if problem.num_stages > 1:
-            stage = contract.next_stages(problem, rows, self._stages.reshape(-1))
+            stage = checked.next_stages(problem, rows, self._stages.reshape(-1))
             self._stages = stage.reshape(shape)
-        commanded = contract.policy(problem, rows, stage)
-        executed = contract.executed_action(problem, commanded)
+        commanded = checked.policy(problem, rows, stage)
+        executed = checked.executed_action(problem, commanded)
         actions = executed.reshape(*shape, -1)
         for_clouds = np.repeat(actions[:, :unknown], cloud, axis=1)
         before = np.concatenate(
@@ -330,13 +324,13 @@ class _Rollouts:
         moved = np.stack(
             [problem.move(*each, motion) for each in zip(before, all_actions, strict=True)]
         )
-        moved = contract.states_of(problem, "move", moved, before.shape)
+        moved = checked.states_of(problem, "move", moved, before.shape)
         self._states = moved[:, :count]
         self._clouds = moved[:, count:].reshape(self._clouds.shape)
         if self._counts_steps:
             self._add(self._origins, -self._shares)
         else:
-            rewards = contract.rewards(problem, self._states.reshape(-1, size), executed)
+            rewards = checked.rewards(problem, self._states.reshape(-1, size), executed)
             self._add(self._origins, self._shares * rewards.reshape(shape))
         self._factor *= self._discount
         self._end_at_goals()
@@ -344,11 +338,11 @@ class _Rollouts:
 
     def _end_at_goals(self) -> None:
         rows = self._states.reshape(-1, self._states.shape[2])
-        reached = contract.goals(self._problem, rows).reshape(self._shares.shape)
+        reached = checked.goals(self._problem, rows).reshape(self._shares.shape)
         self._shares = np.where(reached, 0.0, self._shares)
 
     def drop_decided(self) -> None:
-        """Forget the columns in which nothing can differ any more.
+        """Drop the columns in which nothing can differ any more.
 
         Either the goal is reached in them after every sensing action, or the state is known and the
         same after each: with the same noise the rest is the same, too.
@@ -392,7 +386,7 @@ def _means(clouds: FloatArray) -> FloatArray:
 
 
 def _contenders(samples: FloatArray, among: Sequence[int]) -> list[int]:
-    """Return the sensing actions whose difference from the best one is too close to call."""
+    """Return the sensing actions whose difference from the best one is undecided."""
     rows = {j: samples[j] for j in among}
     count = samples.shape[1]
     if count < 2:
@@ -404,8 +398,8 @@ def _contenders(samples: FloatArray, among: Sequence[int]) -> list[int]:
         differences = rows[best] - rows[j]
         mean = means[best] - means[j]
         away = differences - mean
-        squared_error = numerics.sum(away * away) / (count * max(count - 1, 1))
-        # Of equal returns more samples would tell nothing.
+        squared_error = numerics.sum(away * away) / (count * (count - 1))
+        # More samples of equal returns are equal, too.
         equal = not differences.any() and j != best
         if j == best or (not equal and mean * mean < _CLOSE * _CLOSE * squared_error):
             close.append(j)

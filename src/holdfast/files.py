@@ -1,8 +1,8 @@
-"""Files that are there whole or not at all.
+"""Files that are written completely or not at all.
 
-A file is written beside its place and then renamed to it, because a rename happens at once: a
-reader, or a crash, meets the old file or the new one, never a part. Directories whose files belong
-together, a key and its certificate, appear the same way.
+A file is written under a temporary name in the same directory and then renamed. A rename is atomic:
+after a crash, and for every reader, the path holds the old file or the new one, never a part.
+Directories whose files belong together, such as a key and its certificate, appear the same way.
 """
 
 from __future__ import annotations
@@ -18,11 +18,10 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
-from holdfast.errors import HoldfastError
+from holdfast.errors import OutputError
 
 __all__ = [
     "NewFile",
-    "OutputError",
     "claim_directory",
     "create_directory_atomically",
     "directory_beside",
@@ -44,18 +43,13 @@ _PIPE_TIMEOUT_S = 10.0
 _PIPE_PAUSE_S = 0.02
 
 
-class OutputError(HoldfastError):
-    """The output of a run cannot be written or read, or does not belong to this run."""
-
-
 class NewFile(NamedTuple):
     """A file of a new directory.
 
     Attributes
     ----------
-    content : bytes
     mode : int
-        Its permissions; what the process's umask forbids is taken away from them.
+        Its permissions, before the process's umask.
     """
 
     content: bytes
@@ -63,16 +57,14 @@ class NewFile(NamedTuple):
 
 
 def read_bounded(path: Path, most: int) -> bytes:
-    """Read a file that a person names, and neither wait for ever nor read without end.
+    """Read a file or pipe that the user names, with bounds on size and time.
 
-    A pipe is read, too: a shell's ``<(command)`` is one. It is waited for as long as there is no
-    writer yet, or nothing comes, but only so long.
+    A pipe may be a shell's ``<(command)``. Reading fails after 10 s without a writer or data.
 
     Parameters
     ----------
-    path : Path
     most : int
-        Bytes after which nothing more is read.
+        Maximum number of bytes to read.
 
     Raises
     ------
@@ -105,7 +97,7 @@ def _read_pipe(descriptor: int, most: int, *, named: bool) -> bytes:
         if left_s <= 0.0:
             raise TimeoutError(
                 errno.ETIMEDOUT,
-                f"it is a pipe through which nothing came for {_PIPE_TIMEOUT_S:g} s",
+                f"it is a pipe, and no data arrived for {_PIPE_TIMEOUT_S:g} s",
             )
         if not poll.poll(1e3 * left_s):
             continue
@@ -117,25 +109,23 @@ def _read_pipe(descriptor: int, most: int, *, named: bool) -> bytes:
             content += piece
             deadline = time.monotonic() + _PIPE_TIMEOUT_S
         else:
-            # Nobody has opened it for writing yet.
+            # The pipe has no writer yet.
             time.sleep(_PIPE_PAUSE_S)
     return bytes(content)
 
 
 def write_atomically(path: Path, content: bytes | Iterable[str]) -> None:
-    """Write a file so that no reader, and no crash, ever sees a part of it.
+    """Write a file atomically; a file that exists is replaced.
 
     Parameters
     ----------
-    path : Path
-        Where it shall be; what is there already is replaced.
     content : bytes, str or iterable of str
         Text is encoded as UTF-8, piece by piece.
 
     Raises
     ------
     OutputError
-        If it cannot be written; then whatever was there is unchanged.
+        If it cannot be written; then the path is unchanged.
     """
     pieces: Iterable[bytes]
     if isinstance(content, bytes):
@@ -159,14 +149,14 @@ def write_atomically(path: Path, content: bytes | Iterable[str]) -> None:
 
 
 def remove_unfinished(directory: Path, *, below: bool = False) -> None:
-    """Remove what writers left that were killed; what is young may be of one that writes.
+    """Remove temporary files of killed writers; a young one may belong to a running writer.
 
     Parameters
     ----------
     directory : Path
-        Need not be there.
+        It may be missing.
     below : bool
-        Whether its directories are looked through, too.
+        Whether to search its subdirectories, too.
     """
     latest = time.time() - _LONGEST_WRITE_S
     for path in directory.rglob(".*.tmp") if below else directory.glob(".*.tmp"):
@@ -178,30 +168,30 @@ def remove_unfinished(directory: Path, *, below: bool = False) -> None:
 
 
 def _unfinished(path: Path) -> Path:
-    """Return where a file or directory is made, before it gets its name."""
+    """Return the temporary path of a file or directory."""
     return path.with_name(f".{path.name}.{os.getpid()}.tmp")
 
 
 def create_directory_atomically(path: Path, files: Mapping[str, NewFile]) -> None:
-    """Create a directory that only its owner can enter, and all its files at once.
+    """Create a directory that only its owner can enter, with all its files, atomically.
 
     Parameters
     ----------
     path : Path
-        Where it shall be, in a directory that exists. An empty directory there is replaced.
+        Its parent must exist. An empty directory at this path is replaced.
     files : mapping of str to NewFile
-        By name.
+        The files by name.
 
     Raises
     ------
     OutputError
-        If something is there already, or it cannot be written; then nothing is changed.
+        If the path exists or cannot be written; then nothing is changed.
     """
     temporary = _unfinished(path)
     try:
         temporary.mkdir(mode=0o700)
         for name, new in files.items():
-            # With its mode from the start: a key is at no time open to others.
+            # The mode is set at creation, so that a key is never readable by others.
             flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL
             with os.fdopen(os.open(temporary / name, flags, new.mode), "wb") as file:
                 file.write(new.content)
@@ -211,17 +201,17 @@ def create_directory_atomically(path: Path, files: Mapping[str, NewFile]) -> Non
     except BaseException as error:
         _remove_tree(temporary)
         if isinstance(error, OSError):
-            # A rename onto a directory that has files fails with one of several reasons.
+            # A rename onto a directory with files fails with one of several errors.
             reason = "it exists already" if path.exists() else error.strerror
             raise OutputError(f"{path}: cannot be created: {reason}") from error
         raise
 
 
 def replace_directory(path: Path, files: Mapping[str, NewFile]) -> None:
-    """Put a new directory in the place of one that is there, which is removed.
+    """Replace a directory; the old one is removed.
 
-    No reader ever sees files of both. A process that is killed on the way may leave none there,
-    until :func:`restore_directory` is called.
+    No reader sees files of both. If the process is killed meanwhile, the path may be missing until
+    :func:`restore_directory` is called.
 
     Raises
     ------
@@ -240,14 +230,14 @@ def replace_directory(path: Path, files: Mapping[str, NewFile]) -> None:
 
 
 def restore_directory(path: Path) -> None:
-    """Finish a replacement during which a process was killed, and remove what such ones left.
+    """Complete a replacement whose process was killed, and remove its temporary directories.
 
-    Nobody may be at it meanwhile.
+    No other process may use the directory meanwhile.
 
     Raises
     ------
     OutputError
-        If it cannot be put in its place.
+        If the directory cannot be renamed.
     """
     new, old = _beside(path)
     if old.exists() and not path.exists():
@@ -263,25 +253,25 @@ def restore_directory(path: Path) -> None:
 
 
 def _beside(path: Path) -> tuple[Path, Path]:
-    """Return where a directory waits for its place, and where the one before it goes."""
+    """Return the temporary paths of the new and of the old directory."""
     return path.with_name(f".{path.name}.new"), path.with_name(f".{path.name}.old")
 
 
 def claim_directory(out: Path | None, parent: Path, name: str) -> Path:
-    """Make the directory of a command that writes into an empty one.
+    """Create an empty output directory for a command.
 
     Parameters
     ----------
     out : Path or None
-        It may be there already if it is empty. None: the name in the parent, numbered if taken.
+        The directory; it may exist if it is empty. None: ``name`` in ``parent``, with a number if
+        it exists.
     parent : Path
-        Made if it is not there.
-    name : str
+        Created if missing.
 
     Raises
     ------
     OutputError
-        If it holds something, or cannot be made.
+        If the directory is not empty or cannot be created.
     """
     try:
         if out is not None:
@@ -303,20 +293,19 @@ def claim_directory(out: Path | None, parent: Path, name: str) -> Path:
 
 
 def require_free(path: Path, option: str, *, directory: bool) -> None:
-    """Make sure that something can be made at a place: nothing is there, but what it lies in is.
+    """Check that a file or directory can be created: the path is free, and its parent exists.
 
     Parameters
     ----------
-    path : Path
     option : str
-        By which a person has named it, for messages.
+        The option that named the path, for messages.
     directory : bool
-        Whether it will be a directory: then an empty one may be there.
+        Whether to create a directory: then an empty one may exist.
 
     Raises
     ------
     OutputError
-        If not.
+        If it cannot be created.
     """
     try:
         if directory and path.is_dir():
@@ -326,7 +315,7 @@ def require_free(path: Path, option: str, *, directory: bool) -> None:
                     f"({option})"
                 )
         elif path.is_symlink() or path.exists():
-            raise OutputError(f"{path}: is there already; remove it, or choose another ({option})")
+            raise OutputError(f"{path}: exists already; remove it, or choose another ({option})")
         elif not path.parent.is_dir():
             raise OutputError(f"{path}: cannot be made: there is no directory {path.parent}")
     except OSError as error:
@@ -335,17 +324,17 @@ def require_free(path: Path, option: str, *, directory: bool) -> None:
 
 @contextlib.contextmanager
 def directory_beside(path: Path) -> Iterator[Path]:
-    """Make a directory in which something can grow, and remove it in the end, whatever happens.
+    """Create a temporary directory, and remove it after the block.
 
     Parameters
     ----------
     path : Path
-        Where it shall be when it is whole (:func:`move_into_place`): in the same file system.
+        The final path (:func:`move_into_place`); the directory is created beside it.
 
     Raises
     ------
     OutputError
-        If it cannot be made, or what is inside raises OSError: the disk is full, say.
+        If it cannot be created, or the block raises OSError, as on a full disk.
     """
     temporary = _unfinished(path)
     try:
@@ -358,12 +347,12 @@ def directory_beside(path: Path) -> Iterator[Path]:
 
 
 def move_into_place(made: Path, path: Path) -> None:
-    """Give a file, or a directory of files, its name, once all of it is on the disk.
+    """Write a file, or a directory of files, through to the disk, and rename it to its path.
 
     Raises
     ------
     OutputError
-        If that fails.
+        If a system call fails.
     """
     try:
         for file in sorted(made.iterdir()) if made.is_dir() else [made]:
@@ -378,6 +367,6 @@ def move_into_place(made: Path, path: Path) -> None:
 
 
 def _remove_tree(directory: Path) -> None:
-    import shutil  # which few processes need, and which takes long to load
+    import shutil  # slow to load, and few processes need it
 
     shutil.rmtree(directory, ignore_errors=True)

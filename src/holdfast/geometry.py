@@ -1,12 +1,12 @@
-"""A robot's body among obstacles: whether it collides, and where it ends up when told to move.
+"""A robot's body among obstacles: collisions, and motion that stops at contact.
 
-A *world* is one body and the obstacles that it must not enter. Three questions are asked of it:
-which states collide; where do states end up after an action, when motion stops at contact and then
-gets noise that never ends inside an obstacle; and which states drawn from a Gaussian are free. The
-answers come from the kernel by separating axes and have the same bits on every machine.
+A *world* is one body and the obstacles that it must not enter. It answers three questions. Which
+states collide? Where does an action lead, if motion stops at contact and the noise added after it
+never ends inside an obstacle? Which states drawn from a Gaussian are free? The kernel computes the
+answers with separating axes, and with the same bits on every machine.
 
-A state that touches an obstacle without overlapping it is free. Obstacles are finite: make what
-has no end, like the ground, large (:data:`FAR`).
+A state that touches an obstacle without overlapping it is free. Obstacles are finite; give an
+unbounded one, such as the ground, a large extent (:data:`FAR`).
 """
 
 from __future__ import annotations
@@ -18,27 +18,24 @@ import numpy as np
 import numpy.typing as npt
 
 from holdfast import _kernel
+from holdfast.arrays import BoolArray, FloatArray, IntArray
 from holdfast.errors import InvalidValueError
 from holdfast.randomness import NoiseFreeStream
 
 if TYPE_CHECKING:
     from holdfast.randomness import Stream
 
-__all__ = ["FAR", "MAX_NOISE_ATTEMPTS", "BoolArray", "BoxWorld", "DiscWorld", "RectangleWorld"]
+__all__ = ["FAR", "MAX_NOISE_ATTEMPTS", "BoxWorld", "DiscWorld", "RectangleWorld"]
 
 FAR = 1.0e6
-"""How far an obstacle reaches (in metres) that in idea has no end."""
+"""Extent of an unbounded obstacle, in metres."""
 
 MAX_NOISE_ATTEMPTS = 1000
-"""Draws of noise, the first included, before a state is left as it is without noise."""
-
-FloatArray = npt.NDArray[np.float64]
-BoolArray = npt.NDArray[np.bool_]
-IntArray = npt.NDArray[np.int64]
+"""Draws of noise, the first included, after which a state gets no noise."""
 
 
 class _World:
-    """What the worlds have in common: the checks and the calls into the kernel."""
+    """Base of the worlds: the checks and the calls into the kernel."""
 
     _DIMENSION: int
     _SPACE_DIMENSION: int
@@ -99,16 +96,16 @@ class _World:
     ) -> FloatArray:
         """Move each state by its action, stopped at contact, and add noise that keeps it free.
 
-        The full action is tried first. If it ends in collision, the fraction of it is bisected
-        until the bounds are ``tolerance`` apart, and the last free one is taken. Then noise is
-        drawn, again if it ends in collision, up to :data:`MAX_NOISE_ATTEMPTS` times; failing that
-        there is none. States are independent of each other: state n of the flattened batch takes
-        the same random numbers whatever else is in the batch.
+        The full action is tried first. If it ends in collision, its fraction is bisected until the
+        bounds are ``tolerance`` apart, and the largest free fraction found is used. Then noise is
+        drawn, and drawn again if it ends in collision, up to :data:`MAX_NOISE_ATTEMPTS` times; if
+        all fail, no noise is added. States are independent: state n of the flattened batch uses the
+        same random numbers whatever else is in the batch.
 
         Parameters
         ----------
         states : array of shape (..., d)
-            Free states. (One that collides may stay where it is.)
+            Free states. A colliding state may stay where it is.
         actions : array of shape (..., d)
             Executed actions; they broadcast against ``states``.
         standard_deviation : array of shape (d,)
@@ -116,7 +113,7 @@ class _World:
         tolerance : float
             Fraction of the action, above 0 and below 1.
         stream : Stream
-            Source of the noise; with a :class:`~holdfast.randomness.NoiseFreeStream` there is none.
+            Source of the noise; a :class:`~holdfast.randomness.NoiseFreeStream` adds none.
 
         Returns
         -------
@@ -163,24 +160,24 @@ class _World:
         tolerance: float,
         threads: int,
     ) -> tuple[FloatArray, IntArray]:
-        """Follow a policy of the kernel without noise, each state for itself.
+        """Follow a policy of the kernel without noise, from each state independently.
 
-        The same as asking the problem for its policy, its limits, its motion without noise and its
-        next stage again and again, to the bit, and much faster.
+        The result equals, bit for bit, repeated calls of the problem's policy, limits, motion
+        without noise and next stage; this is much faster.
 
         Parameters
         ----------
         policy : PegPolicy2D, PegPolicy3D or ViaPointPolicy
-            Of the kernel, for this kind of world.
+            A policy of the kernel for this kind of world.
         states : array of shape (n, d)
         stage : int
-            Of all states, to begin with.
+            Initial stage of all states.
         offsets : sequence of int
             Numbers of steps, in ascending order.
         tolerance : float
-            Fraction of an action to which contact is located; 0 for motion that nothing stops.
+            Fraction of an action to which contact is located; 0 for motion without obstacles.
         threads : int
-            At most so many; 0 means all cores. The result does not depend on it.
+            Maximum number; 0 means all cores. The result does not depend on it.
 
         Returns
         -------
@@ -222,20 +219,19 @@ class _World:
         streams: Sequence[Stream],
         threads: int,
     ) -> FloatArray:
-        """Move several beliefs, each by an action and with a stream of its own.
+        """Move several beliefs, each by its own action and with its own stream.
 
-        The result is, bit for bit, that of :meth:`move` for one after the other.
+        The result equals, bit for bit, that of :meth:`move` for each belief in turn.
 
         Parameters
         ----------
         states : array of shape (b, n, d)
         actions : array of shape (b, d)
         standard_deviation : array of shape (d,)
-        tolerance : float
         streams : sequence of Stream
             One for each belief.
         threads : int
-            At most so many; 0 is all.
+            Maximum number; 0 means all cores.
 
         Returns
         -------
@@ -281,14 +277,14 @@ class _World:
         count : int
             Number of states.
         stream : Stream
-            Source of the draws; state n takes the same ones whatever ``count`` is.
+            Source of the draws; state n uses the same ones whatever ``count`` is.
 
         Returns
         -------
         states : array of shape (count, d)
         num_unplaced : int
-            How many of them were in collision at all of :data:`MAX_NOISE_ATTEMPTS` draws. These
-            are set to the mean, which may collide.
+            Number of states that collided in all :data:`MAX_NOISE_ATTEMPTS` draws. These are set to
+            the mean, which may collide.
 
         Raises
         ------
@@ -424,7 +420,7 @@ def _raise_not_finite(name: str, values: FloatArray) -> NoReturn:
 def _explain_move(
     states: FloatArray, actions: FloatArray, standard_deviation: FloatArray, tolerance: float
 ) -> NoReturn:
-    """Raise the error for what the kernel refused."""
+    """Raise the error for arguments that the kernel refused."""
     for name, values in (
         ("states", states),
         ("actions", actions),

@@ -1,8 +1,8 @@
 """Functions of arrays with the same bits on every machine.
 
-NumPy's ``exp``, ``sin`` or ``sum`` may differ in the last bit between processors, because they
-choose their code by processor. What a decision or a digest depends on goes through these instead;
-they are the kernel's, and use only operations that IEEE 754 defines exactly, in a fixed order.
+NumPy's ``exp``, ``sin`` and ``sum`` choose their code by processor, so results may differ in the
+last bit. Decisions and digests depend only on the kernel's functions below, which use operations
+that IEEE 754 defines exactly, in a fixed order.
 """
 
 from __future__ import annotations
@@ -13,15 +13,15 @@ import numpy as np
 import numpy.typing as npt
 
 from holdfast import _kernel
+from holdfast.arrays import FloatArray
 from holdfast.errors import ConfigurationError, InvalidValueError
 
 __all__ = ["all_finite", "arcsin", "cos", "exp", "log", "sin", "sum", "weighted_mean"]
 
-FloatArray = npt.NDArray[np.float64]
 
 try:
     _kernel.simd()
-except RuntimeError as error:  # HOLDFAST_SIMD names an instruction set that is not there
+except RuntimeError as error:  # HOLDFAST_SIMD names an unavailable instruction set
     raise ConfigurationError(str(error)) from error
 
 
@@ -61,7 +61,7 @@ def sum(values: npt.ArrayLike) -> float:  # noqa: A001 - always used as numerics
 
 
 def all_finite(values: FloatArray) -> bool:
-    """Tell whether every value is finite; of few values in less time than NumPy takes."""
+    """Tell whether every value is finite; faster than NumPy for few values."""
     return _kernel.all_finite(values)
 
 

@@ -1,4 +1,4 @@
-"""What is left of a trial: its outcome, and its decisions as bytes, on which runs are compared.
+"""The outcome of a trial, and its decisions as bytes, by which runs are compared.
 
 Every decision is noted in order, in a few bytes, and the hash of these bytes is the trial's digest.
 Two runs decided the same exactly if their digests are equal, on whatever machine they were made,
@@ -10,29 +10,30 @@ from __future__ import annotations
 import hashlib
 import struct
 from collections.abc import Iterator
-from typing import Literal, NamedTuple, TypeAlias
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 import msgspec
 import numpy as np
-import numpy.typing as npt
 
+from holdfast.arrays import FloatArray
 from holdfast.errors import InvalidValueError
+from holdfast.problem_attributes import first_reward, sensing_costs
 
 __all__ = [
+    "TRIAL_COLUMNS",
     "DecisionLog",
     "Decisions",
     "Done",
     "Outcome",
+    "RewardAccount",
     "SensingDecision",
     "TaskDecision",
     "TrialResult",
-    "with_reward",
 ]
 
-FloatArray = npt.NDArray[np.float64]
 
 Done: TypeAlias = bool | Literal["failed"]
-"""What an environment says of its task: it goes on, it has succeeded, or it has failed."""
+"""The state of an environment's task: it goes on, it has succeeded, or it has failed."""
 
 Outcome: TypeAlias = Literal["succeeded", "failed", "truncated"]
 """How a trial ended: the environment terminated it, or it ran out of steps (truncated)."""
@@ -138,13 +139,37 @@ class DecisionLog:
         return Decisions(self._action_size, bytes(self._log))
 
 
-def with_reward(total: float | None, reward: float | None) -> float | None:
-    """Return a sum of rewards with one more of them; None as long as there is none."""
-    return total if reward is None else (total or 0.0) + reward
+class RewardAccount:
+    """A trial's rewards less the costs of its sensing actions.
+
+    Attributes
+    ----------
+    total : float or None
+        None as long as there is neither a reward nor a problem with sensing costs.
+    """
+
+    def __init__(self, problem: Any) -> None:
+        self._costs = sensing_costs(problem)
+        self.total = first_reward(problem)
+
+    def sensed(self, sensing_action: int) -> None:
+        """Subtract the cost of a sensing action."""
+        cost = float(self._costs[sensing_action])
+        if cost > 0.0:
+            self.acted(-cost)
+
+    def acted(self, reward: float | None) -> None:
+        """Add a reward; None is none."""
+        if reward is not None:
+            self.total = (self.total or 0.0) + reward
 
 
 class TrialResult(msgspec.Struct, frozen=True, kw_only=True):
-    """What is left of a trial: one row of ``trials.csv``, and the single sensing times.
+    """The result of a trial. Its scalar fields are the columns of ``trials.csv``.
+
+    A field that is added here, with a default for older journals, is a column
+    (:data:`TRIAL_COLUMNS`); :func:`holdfast.robot.trial.run_trial` fills it in, and for a robot
+    :meth:`holdfast.protocol.records.TrialHistory.result`.
 
     Attributes
     ----------
@@ -199,3 +224,14 @@ class TrialResult(msgspec.Struct, frozen=True, kw_only=True):
         if self.success:
             return "succeeded"
         return "failed" if self.failed else "truncated"
+
+
+TRIAL_COLUMNS = (
+    *(
+        name
+        for name in TrialResult.__struct_fields__
+        if name not in ("failed", "sensing_ms", "decisions")
+    ),
+    "outcome",  # instead of "failed"
+)
+"""The columns of ``trials.csv``."""

@@ -1,20 +1,20 @@
 """Planning as a deterministic state machine: a state, and pure functions of it.
 
 :class:`PlanningState` is everything that the next decision depends on besides the problem and the
-settings. Nothing here reads a clock, a socket or a generator with a state; every random number is
-named by (seed, trial, step, purpose). So whoever holds the state, a cloud service, the robot
-itself, a process started after a crash, makes the same next decision, and a checkpoint is simply
-the state, encoded.
+settings. :class:`Planner` holds these two, and its methods are pure: none reads a clock, a socket
+or a generator with a state, and every random number is named by (seed, trial, step, purpose). So
+every process that has the state makes the same next decision: a cloud service, the robot itself, a
+process started after a crash. A checkpoint is the state, encoded.
 
 One step of the loop::
 
-    if needs_sensing(settings, state):
-        sensing_action, info = choose_sensing_action(problem, settings, state)
+    if planner.needs_sensing(state):
+        sensing_action, info = planner.choose_sensing_action(state)
         observation = environment.perform_sensing(sensing_action)
-        state, info = observe(problem, settings, state, sensing_action, observation)
-    task_action, info = choose_task_action(problem, settings, state)
+        state, info = planner.observe(state, sensing_action, observation)
+    task_action, info = planner.choose_task_action(state)
     environment.perform(task_action)
-    state = advance(problem, settings, state, task_action)
+    state = planner.advance(state, task_action)
 """
 
 from __future__ import annotations
@@ -27,13 +27,15 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from holdfast import contract, numerics, sensing
+from holdfast import checked, numerics, sensing
+from holdfast.arrays import FloatArray, in_brief
 from holdfast.belief import Belief, estimate, resample, uniform_weights, update
+from holdfast.config.settings import MAX_PARTICLES, Method, PlanningSettings, check_settings
 from holdfast.errors import CheckpointError, InvalidValueError, ProblemError
+from holdfast.problem_attributes import check_problem
 from holdfast.problems.problem import Problem
 from holdfast.randomness import Purpose, stream
 from holdfast.sensing import SensingInfo
-from holdfast.settings import MAX_PARTICLES, PlanningSettings, check_settings
 
 __all__ = [
     "Decision",
@@ -42,20 +44,12 @@ __all__ = [
     "PlanningState",
     "SensingInfo",
     "TaskInfo",
-    "advance",
-    "check_state",
-    "choose_sensing_action",
-    "choose_task_action",
     "decode_checkpoint",
     "digest",
     "encode_checkpoint",
-    "initial_state",
     "needs_sensing",
-    "observe",
-    "plan_until_sensing",
 ]
 
-FloatArray = npt.NDArray[np.float64]
 
 CHECKPOINT_VERSION = 1
 
@@ -71,7 +65,6 @@ class PlanningState(NamedTuple):
         Stage of the task (which hole or via point is next).
     sensed : bool
         Whether this step's observation is already part of the belief.
-    belief : Belief
     """
 
     seed: int
@@ -83,7 +76,7 @@ class PlanningState(NamedTuple):
 
 
 class ObservationInfo(NamedTuple):
-    """What folding in an observation found.
+    """The result of updating the belief by an observation.
 
     Attributes
     ----------
@@ -91,7 +84,6 @@ class ObservationInfo(NamedTuple):
         After the update and before resampling; from 1 to the number of particles.
     explained : bool
         False if no particle explains the observation: the belief is valid but not to be trusted.
-    resampled : bool
     mahalanobis_distance : float or None
         How far, in standard deviations, the observation is from what the nearest particle expects;
         None for a general likelihood.
@@ -104,15 +96,14 @@ class ObservationInfo(NamedTuple):
 
 
 class TaskInfo(NamedTuple):
-    """Why a task action was chosen.
+    """The values behind the choice of a task action.
 
     Attributes
     ----------
     estimate : array of shape (state_size,)
-        The state that the policy was asked for: the mean of the belief, or its most likely
-        particle.
+        The state that the policy was given: the mean of the belief, or its most likely particle.
     commanded : array of shape (action_size,)
-        What the policy said; the action itself is what the limits leave of it.
+        The policy's action, before the limits of a step.
     stage : int
         The stage that the action belongs to.
     """
@@ -123,7 +114,7 @@ class TaskInfo(NamedTuple):
 
 
 class Decision(NamedTuple):
-    """All that can be decided in a state before something is sensed again.
+    """All decisions of a state that no further observation can change.
 
     Attributes
     ----------
@@ -140,301 +131,269 @@ class Decision(NamedTuple):
     ahead: PlanningState
 
 
-def initial_state(
-    problem: Problem, settings: PlanningSettings, seed: int, trial: int
-) -> PlanningState:
-    """Return the state before the first step of a trial.
-
-    Parameters
-    ----------
-    problem : Problem
-    settings : PlanningSettings
-    seed : int
-        From 0 to 2**63 - 1.
-    trial : int
-        From 0 to 2**32 - 1.
-
-    Raises
-    ------
-    InvalidValueError
-        If seed, trial or the number of particles is out of bounds.
-    ProblemError
-        If the problem's initial states have the wrong shape or are not finite.
-    """
-    count = settings.particle_filter.num_particles
-    if not 1 <= count <= MAX_PARTICLES:
-        raise InvalidValueError(
-            f"particle_filter.num_particles {count}: allowed are 1 to {MAX_PARTICLES}"
-        )
-    contract.check_problem(problem)
-    check_settings(settings)
-    drawn = problem.initial_states(stream(seed, trial, 0, Purpose.INITIAL_BELIEF), count)
-    states = contract.states_of(problem, "initial_states", drawn, (count, problem.state_size))
-    return PlanningState(seed, trial, 0, 0, False, Belief(states, uniform_weights(count)))
-
-
-def check_state(problem: Problem, settings: PlanningSettings, state: PlanningState) -> None:
-    """Check that a state belongs to a problem and settings: for states that come from outside.
-
-    Raises
-    ------
-    InvalidValueError
-        If the number of particles, their size or the stage is another than theirs.
-    """
-    contract.check_problem(problem)
-    check_settings(settings)
-    count, size = state.belief.states.shape
-    if size != problem.state_size:
-        raise InvalidValueError(
-            f"state of {size} coordinates: {problem.name} has {problem.state_size}"
-        )
-    if count != settings.particle_filter.num_particles:
-        raise InvalidValueError(
-            f"state of {count} particles: particle_filter.num_particles is "
-            f"{settings.particle_filter.num_particles}"
-        )
-    if not 0 <= state.stage < problem.num_stages:
-        raise InvalidValueError(
-            f"stage {state.stage}: {problem.name} has 0 to {problem.num_stages - 1}"
-        )
-
-
 def needs_sensing(settings: PlanningSettings, state: PlanningState) -> bool:
     """Tell whether the next decision is a sensing action (else it is a task action)."""
     return not state.sensed and state.step % (settings.sensing_interval + 1) == 0
 
 
-def choose_sensing_action(
-    problem: Problem, settings: PlanningSettings, state: PlanningState
-) -> tuple[int, SensingInfo]:
-    """Choose the next sensing action.
-
-    Returns
-    -------
-    index : int
-        Index into ``problem.sensing_actions``.
-    info : SensingInfo
-        The expected entropies behind the choice.
-
-    Raises
-    ------
-    InvalidValueError, ProblemError
-        As :func:`holdfast.sensing.choose_sensing_action`.
-    """
-    return sensing.choose_sensing_action(
-        problem,
-        settings,
-        state.belief,
-        state.stage,
-        stream(state.seed, state.trial, state.step, Purpose.HYPOTHESES),
-        stream(state.seed, state.trial, state.step, Purpose.SELECTION),
-    )
-
-
-def observe(
-    problem: Problem,
-    settings: PlanningSettings,
-    state: PlanningState,
-    sensing_action: int,
-    observation: npt.ArrayLike,
-) -> tuple[PlanningState, ObservationInfo]:
-    """Fold an observation into the belief.
-
-    Parameters
-    ----------
-    problem : Problem
-    settings : PlanningSettings
-    state : PlanningState
-    sensing_action : int
-        What was sensed.
-    observation : array of shape (observation_size,)
-        What it showed.
-
-    Returns
-    -------
-    state : PlanningState
-        With ``sensed`` set.
-    info : ObservationInfo
-
-    Raises
-    ------
-    InvalidValueError
-        If the sensing action does not exist, or the observation is not finite or of the wrong
-        size. The state that was passed in is still good.
-    """
-    if not 0 <= sensing_action < len(problem.sensing_actions):
-        raise InvalidValueError(
-            f"sensing action {sensing_action}: {problem.name} has 0 to "
-            f"{len(problem.sensing_actions) - 1}"
-        )
-    belief, found = update(problem, state.belief, sensing_action, observation)
-    count = belief.weights.shape[0]
-    threshold = settings.particle_filter.resampling_threshold * count
-    # Rounding may leave the size of equal weights a little above their number.
-    resampled = threshold == count or found.effective_sample_size <= threshold
-    if resampled:
-        belief = resample(belief, stream(state.seed, state.trial, state.step, Purpose.RESAMPLING))
-    after = state._replace(sensed=True, belief=belief)
-    return after, ObservationInfo(
-        found.effective_sample_size, found.explained, resampled, found.mahalanobis_distance
-    )
-
-
-def choose_task_action(
-    problem: Problem, settings: PlanningSettings, state: PlanningState
-) -> tuple[FloatArray, TaskInfo]:
-    """Choose the next task action: the policy's for the estimate of the state, within its limits.
-
-    Returns
-    -------
-    action : array of shape (action_size,)
-        The executed action.
-    info : TaskInfo
-
-    Raises
-    ------
-    ProblemError
-        If the policy's action is not finite.
-    """
-    estimated = estimate(state.belief, settings.particle_filter.estimate)
-    stage = contract.next_stage(problem, estimated, state.stage)
-    commanded = contract.policy(problem, estimated, stage)
-    action = contract.executed_action(problem, commanded)
-    if not numerics.all_finite(action):
-        raise ProblemError(
-            f"policy of {problem.name} gives {contract.in_brief(action)} in state "
-            f"{contract.in_brief(estimated)}"
-        )
-    return action, TaskInfo(estimated, commanded, stage)
-
-
-def advance(
-    problem: Problem, settings: PlanningSettings, state: PlanningState, task_action: FloatArray
-) -> PlanningState:
-    """Predict the belief by a performed task action and go to the next step.
-
-    Parameters
-    ----------
-    problem : Problem
-    settings : PlanningSettings
-    state : PlanningState
-    task_action : array of shape (action_size,)
-        The executed action.
-
-    Raises
-    ------
-    InvalidValueError
-        If the action is not finite or of the wrong size.
-    ProblemError
-        If the problem moves a particle to a state that is not finite.
-    """
-    action = np.asarray(task_action, dtype=np.float64)
-    if action.shape != (problem.action_size,) or not numerics.all_finite(action):
-        raise InvalidValueError(
-            f"task action {contract.in_brief(action)}: {problem.name} needs "
-            f"{problem.action_size} finite coordinates"
-        )
-    belief = state.belief
-    # Computed again, not taken from whoever calls: the action may come from another machine.
-    estimated = estimate(belief, settings.particle_filter.estimate)
-    stage = contract.next_stage(problem, estimated, state.stage)
-    motion = stream(state.seed, state.trial, state.step, Purpose.PREDICTION)
-    moved = problem.move(belief.states, action, motion)
-    states = contract.states_of(problem, "move", moved, belief.states.shape)
-    return PlanningState(
-        state.seed, state.trial, state.step + 1, stage, False, Belief(states, belief.weights)
-    )
-
-
-def plan_until_sensing(
-    problem: Problem, settings: PlanningSettings, state: PlanningState, max_actions: int
-) -> tuple[list[FloatArray], PlanningState]:
-    """Choose the task actions up to the next sensing step: no observation comes between them.
-
-    Parameters
-    ----------
-    problem : Problem
-    settings : PlanningSettings
-    state : PlanningState
-    max_actions : int
-        Stop after so many.
-
-    Returns
-    -------
-    actions : list of arrays of shape (action_size,)
-        Executed actions; empty if the state has to sense first.
-    ahead : PlanningState
-        The state that they lead to.
-
-    Raises
-    ------
-    ProblemError
-        If a function of the problem breaks its contract.
-    """
-    return Planner(problem, settings).plan_until_sensing(state, max_actions)
-
-
 class Planner:
-    """The functions that change a state, for one problem and its settings.
-
-    Whoever only follows a robot's belief needs no more of this module; and because they are pure,
-    another object in the place of this one may remember what they came to.
+    """Makes all decisions for one problem, as pure functions of a state.
 
     Parameters
     ----------
-    problem : Problem
-    settings : PlanningSettings
+    settings : PlanningSettings, optional
+        Default: ``PlanningSettings()``.
+    particles : int, optional
+        Number of particles, in place of the settings'.
+    method : str, optional
+        How sensing actions are chosen (``"random"``, say), in place of the settings'.
+
+    Raises
+    ------
+    InvalidValueError
+        If the problem is a name, or what is given in place of a setting is out of bounds.
     """
 
-    def __init__(self, problem: Problem, settings: PlanningSettings) -> None:
+    def __init__(
+        self,
+        problem: Problem,
+        settings: PlanningSettings | None = None,
+        *,
+        particles: int | None = None,
+        method: Method | None = None,
+    ) -> None:
+        if isinstance(problem, str):
+            raise InvalidValueError(f"problem is the name {problem!r}: holdfast.make builds it")
         self.problem = problem
-        self.settings = settings
+        self.settings = PlanningSettings() if settings is None else settings
+        if particles is not None:
+            self._replace_setting("particle_filter", "num_particles", particles)
+        if method is not None:
+            self._replace_setting("selector", "method", method)
+        if particles is not None or method is not None:
+            check_settings(self.settings)
 
-    def initial_state(self, seed: int, trial: int) -> PlanningState:
-        """Return the state before the first step; see :func:`initial_state`."""
-        return initial_state(self.problem, self.settings, seed, trial)
+    def _replace_setting(self, section: str, key: str, value: object) -> None:
+        changed = msgspec.structs.replace(getattr(self.settings, section), **{key: value})
+        self.settings = msgspec.structs.replace(self.settings, **{section: changed})
+
+    def init(self, seed: int, trial: int = 0) -> PlanningState:
+        """Return the state before the first step of a trial.
+
+        Parameters
+        ----------
+        seed : int
+            From 0 to 2**63 - 1.
+        trial : int
+            From 0 to 2**32 - 1.
+
+        Raises
+        ------
+        InvalidValueError
+            If seed, trial or a setting is out of bounds.
+        ProblemError
+            If the problem breaks its contract: its initial states are not finite, say.
+        """
+        problem = self.problem
+        count = self.settings.particle_filter.num_particles
+        if not 1 <= count <= MAX_PARTICLES:
+            raise InvalidValueError(
+                f"particle_filter.num_particles {count}: allowed are 1 to {MAX_PARTICLES}"
+            )
+        check_problem(problem)
+        check_settings(self.settings)
+        drawn = problem.initial_states(stream(seed, trial, 0, Purpose.INITIAL_BELIEF), count)
+        states = checked.states_of(problem, "initial_states", drawn, (count, problem.state_size))
+        return PlanningState(seed, trial, 0, 0, False, Belief(states, uniform_weights(count)))
+
+    def check(self, state: PlanningState) -> None:
+        """Check that a state from elsewhere belongs to this problem and these settings.
+
+        Raises
+        ------
+        InvalidValueError
+            If its number of particles, their size or its stage does not fit.
+        """
+        problem = self.problem
+        check_problem(problem)
+        check_settings(self.settings)
+        count, size = state.belief.states.shape
+        if size != problem.state_size:
+            raise InvalidValueError(
+                f"state of {size} coordinates: {problem.name} has {problem.state_size}"
+            )
+        if count != self.settings.particle_filter.num_particles:
+            raise InvalidValueError(
+                f"state of {count} particles: particle_filter.num_particles is "
+                f"{self.settings.particle_filter.num_particles}"
+            )
+        if not 0 <= state.stage < problem.num_stages:
+            raise InvalidValueError(
+                f"stage {state.stage}: {problem.name} has 0 to {problem.num_stages - 1}"
+            )
 
     def needs_sensing(self, state: PlanningState) -> bool:
-        """Tell whether the next decision is a sensing action; see :func:`needs_sensing`."""
+        """Tell whether the next decision is a sensing action (else it is a task action)."""
         return needs_sensing(self.settings, state)
+
+    def choose_sensing_action(self, state: PlanningState) -> tuple[int, SensingInfo]:
+        """Choose the next sensing action, an index into ``problem.sensing_actions``.
+
+        Raises
+        ------
+        InvalidValueError, ProblemError
+            As :func:`holdfast.sensing.choose_sensing_action`.
+        """
+        return sensing.choose_sensing_action(
+            self.problem,
+            self.settings,
+            state.belief,
+            state.stage,
+            stream(state.seed, state.trial, state.step, Purpose.HYPOTHESES),
+            stream(state.seed, state.trial, state.step, Purpose.SELECTION),
+        )
 
     def observe(
         self, state: PlanningState, sensing_action: int, observation: npt.ArrayLike
     ) -> tuple[PlanningState, ObservationInfo]:
-        """Fold an observation into the belief; see :func:`observe`."""
-        return observe(self.problem, self.settings, state, sensing_action, observation)
+        """Update the belief by an observation, and set ``sensed``.
+
+        Parameters
+        ----------
+        observation : array of shape (observation_size,)
+            What the sensing action showed.
+
+        Raises
+        ------
+        InvalidValueError
+            If the sensing action does not exist, or the observation is not finite or of the wrong
+            size.
+        """
+        problem = self.problem
+        if not 0 <= sensing_action < len(problem.sensing_actions):
+            raise InvalidValueError(
+                f"sensing action {sensing_action}: {problem.name} has 0 to "
+                f"{len(problem.sensing_actions) - 1}"
+            )
+        belief, found = update(problem, state.belief, sensing_action, observation)
+        count = belief.weights.shape[0]
+        threshold = self.settings.particle_filter.resampling_threshold * count
+        # Rounding may leave the size of equal weights a little above their number.
+        resampled = threshold == count or found.effective_sample_size <= threshold
+        if resampled:
+            offset = stream(state.seed, state.trial, state.step, Purpose.RESAMPLING)
+            belief = resample(belief, offset)
+        return state._replace(sensed=True, belief=belief), ObservationInfo(
+            found.effective_sample_size, found.explained, resampled, found.mahalanobis_distance
+        )
+
+    def choose_task_action(self, state: PlanningState) -> tuple[FloatArray, TaskInfo]:
+        """Choose the next task action: the policy's for the estimate, within the limits of a step.
+
+        Returns
+        -------
+        action : array of shape (action_size,)
+            The executed action.
+        info : TaskInfo
+
+        Raises
+        ------
+        ProblemError
+            If the policy's action is not finite.
+        """
+        problem = self.problem
+        estimated, stage = self._estimate(state)
+        commanded = checked.policy(problem, estimated, stage)
+        action = checked.executed_action(problem, commanded)
+        if not numerics.all_finite(action):
+            raise ProblemError(
+                f"policy of {problem.name} gives {in_brief(action)} in state {in_brief(estimated)}"
+            )
+        return action, TaskInfo(estimated, commanded, stage)
 
     def advance(self, state: PlanningState, task_action: FloatArray) -> PlanningState:
-        """Predict the belief and go to the next step; see :func:`advance`."""
-        return advance(self.problem, self.settings, state, task_action)
+        """Predict the belief by a performed task action and go to the next step.
 
-    def choose_task_action(self, state: PlanningState) -> FloatArray:
-        """Choose the next task action."""
-        return choose_task_action(self.problem, self.settings, state)[0]
+        Parameters
+        ----------
+        task_action : array of shape (action_size,)
+            The executed action.
+
+        Raises
+        ------
+        InvalidValueError
+            If the action is not finite or of the wrong size.
+        ProblemError
+            If the problem moves a particle to a state that is not finite.
+        """
+        problem = self.problem
+        action = np.asarray(task_action, dtype=np.float64)
+        if action.shape != (problem.action_size,) or not numerics.all_finite(action):
+            raise InvalidValueError(
+                f"task action {in_brief(action)}: {problem.name} needs "
+                f"{problem.action_size} finite coordinates"
+            )
+        # Computed again, not taken from the caller: the action may come from another machine.
+        _, stage = self._estimate(state)
+        states, weights = state.belief
+        motion = stream(state.seed, state.trial, state.step, Purpose.PREDICTION)
+        moved = problem.move(states, action, motion)
+        belief = Belief(checked.states_of(problem, "move", moved, states.shape), weights)
+        return PlanningState(state.seed, state.trial, state.step + 1, stage, False, belief)
 
     def plan_until_sensing(
         self, state: PlanningState, max_actions: int
     ) -> tuple[list[FloatArray], PlanningState]:
-        """Choose the task actions up to the next sensing step; see :func:`plan_until_sensing`."""
+        """Choose the task actions up to the next sensing step: no observation comes between them.
+
+        Returns
+        -------
+        actions : list of arrays of shape (action_size,)
+            At most ``max_actions`` executed actions; empty if the state has to sense first.
+        ahead : PlanningState
+            The state that they lead to.
+        """
         actions: list[FloatArray] = []
         while len(actions) < max_actions and not self.needs_sensing(state):
-            action = self.choose_task_action(state)
+            action, _ = self.choose_task_action(state)
             state = self.advance(state, action)
             actions.append(action)
         return actions, state
 
     def decide(self, state: PlanningState, max_actions: int) -> Decision:
-        """Decide all that can be decided before something is sensed again."""
+        """Make all decisions that no further observation can change."""
         actions, ahead = self.plan_until_sensing(state, max_actions)
-        if not needs_sensing(self.settings, ahead):
-            return Decision(tuple(actions), None, ahead)
-        return Decision(
-            tuple(actions), choose_sensing_action(self.problem, self.settings, ahead)[0], ahead
-        )
+        sensing_action = None
+        if self.needs_sensing(ahead):
+            sensing_action, _ = self.choose_sensing_action(ahead)
+        return Decision(tuple(actions), sensing_action, ahead)
 
     def digest(self, state: PlanningState) -> bytes:
-        """Return 32 bytes that are equal for equal states only; see :func:`digest`."""
+        """Return 32 bytes that are equal exactly when two states are equal, bit for bit."""
         return digest(state)
+
+    def encode(self, state: PlanningState) -> bytes:
+        """Return a checkpoint: the state as bytes."""
+        return encode_checkpoint(state)
+
+    def decode(self, data: bytes | memoryview) -> PlanningState:
+        """Return the state of a checkpoint, checked.
+
+        Raises
+        ------
+        CheckpointError
+            If the bytes are no checkpoint.
+        InvalidValueError
+            If its state does not belong to this problem and these settings.
+        """
+        state = decode_checkpoint(data)
+        self.check(state)
+        return state
+
+    def _estimate(self, state: PlanningState) -> tuple[FloatArray, int]:
+        """Return the state that stands for the belief, and the stage that follows from it."""
+        estimated = estimate(state.belief, self.settings.particle_filter.estimate)
+        return estimated, checked.next_stage(self.problem, estimated, state.stage)
 
 
 def digest(state: PlanningState) -> bytes:
@@ -500,7 +459,7 @@ def encode_checkpoint(state: PlanningState) -> bytes:
 
 
 def decode_checkpoint(data: bytes | memoryview) -> PlanningState:
-    """Decode a state and check it by itself; :func:`check_state` checks it against a problem.
+    """Decode a state and check it by itself; :meth:`Planner.check` checks it against a problem.
 
     Raises
     ------
@@ -527,7 +486,7 @@ def decode_checkpoint(data: bytes | memoryview) -> PlanningState:
     weights.setflags(write=False)
     if not numerics.all_finite(states):
         raise CheckpointError("checkpoint has a state that is not finite")
-    # Numbers from anywhere may overflow; NumPy's warning would tell nothing that is not told here.
+    # A sum of foreign numbers may overflow: the error below says so, NumPy need not warn.
     with np.errstate(over="ignore", invalid="ignore"):
         total = float(weights.sum())
     if not (weights >= 0.0).all() or not abs(total - 1.0) < 1e-6:

@@ -1,10 +1,9 @@
-"""What the policy will do along each particle's own way.
+"""The actions of the policy along each particle's own path.
 
-Two particles may ask for the same action now and for different ones later: both go to the axis of
-the hole, and only above it the angle matters. So follow every particle for itself, without noise,
-as the policy would lead it if its state were known, and look at the actions at several steps of
-that way. Sensing does not move the state: the ways are the same whatever is sensed, and they are
-computed once for a decision.
+Two particles may need the same action now and different ones later: both go to the axis of the
+hole, and only above it the angle matters. So every particle is followed by itself, without noise,
+as the policy would lead it if its state were known, and the actions at several steps of that path
+count. Sensing does not move the state, so the paths are computed once for a decision.
 """
 
 from __future__ import annotations
@@ -12,37 +11,36 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-from holdfast import contract
-from holdfast.entropy import LARGEST, first_unbounded
+from holdfast import checked
+from holdfast.arrays import FloatArray, IntArray, in_brief
+from holdfast.config.settings import PlanningSettings, path_steps, unfit_for_path_entropy
 from holdfast.errors import InvalidValueError, ProblemError
+from holdfast.estimators import LARGEST, first_unbounded
+from holdfast.problem_attributes import has_own
 from holdfast.problems.problem import Problem
 from holdfast.randomness import NoiseFreeStream
-from holdfast.settings import PlanningSettings, path_steps, unfit_for_path_entropy
 
 __all__ = ["PathPoints", "path_points"]
 
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
 
 _STEP = ("policy", "execute", "move", "expected_move", "next_stage")
-"""What a step of the way is made of."""
+"""Functions that a step of the path calls."""
 
 
 _MOST_DRAWS = 1000
-"""Of a move without noise: one that draws more often waits for another number."""
+"""Bound on the draws of a move without noise: one that exceeds it waits for another number."""
 
 
 class PathPoints(NamedTuple):
-    """The actions along the particles' ways.
+    """The actions along the particles' paths.
 
     Attributes
     ----------
     points : array of shape (K, N, action_size)
         The actions of all particles at each of the K offsets.
     factors : tuple of float
-        What the entropy at each offset counts, K of them.
+        Weight of the entropy at each of the K offsets.
     """
 
     points: FloatArray
@@ -52,14 +50,13 @@ class PathPoints(NamedTuple):
 def path_points(
     problem: Problem, settings: PlanningSettings, states: FloatArray, stage: int
 ) -> PathPoints:
-    """Follow every particle along its own noise-free way under the policy.
+    """Follow every particle along its own noise-free path under the policy.
 
-    In each step the policy is asked for the particle's state and stage, its action limited by
-    ``execute``, the state moved by it without noise, and the stage followed.
+    A step is the policy's action for the particle's state and stage, limited by ``execute``, the
+    motion without noise, and the next stage.
 
     Parameters
     ----------
-    problem : Problem
     settings : PlanningSettings
         ``selector.path_offsets``, ``path_unit``, ``path_discount`` and ``actions`` count.
     states : array of shape (N, state_size)
@@ -79,14 +76,14 @@ def path_points(
     offsets = path_steps(settings)
     threads = settings.active_sensing.num_cores
     states_at, stages_at = _followed(problem, states, stage, offsets, threads)
-    points = contract.policy(problem, states_at, stages_at)
+    points = checked.policy(problem, states_at, stages_at)
     if settings.selector.actions == "executed":
-        points = contract.executed_action(problem, points)
+        points = checked.executed_action(problem, points)
     if (bad := first_unbounded(points.reshape(-1, points.shape[-1]))) is not None:
         row, particle = divmod(bad, states.shape[0])
         raise ProblemError(
-            f"policy of {problem.name} returned {contract.in_brief(points[row, particle])} in "
-            f"state {contract.in_brief(states_at[row, particle])}, {offsets[row]} steps on: every "
+            f"policy of {problem.name} returned {in_brief(points[row, particle])} in "
+            f"state {in_brief(states_at[row, particle])}, {offsets[row]} steps on: every "
             f"coordinate must be finite and at most {LARGEST:g}"
         )
     selector = settings.selector
@@ -97,9 +94,9 @@ def _followed(
     problem: Problem, states: FloatArray, stage: int, offsets: tuple[int, ...], threads: int
 ) -> tuple[FloatArray, int | IntArray]:
     """Return the states at each offset, shape (K, N, state_size), and the stages there, (K, N)."""
-    if contract.has_own(problem, "expected_path", _STEP):
-        states_at, stages_at = contract.expected_path(problem, states, stage, offsets, threads)
-        # One stage for all is the same, and most policies look it up once then.
+    if has_own(problem, "expected_path", _STEP):
+        states_at, stages_at = checked.expected_path(problem, states, stage, offsets, threads)
+        # An integer is faster than equal stages for all: most policies then select once.
         first = stages_at.flat[0]
         return states_at, int(first) if (stages_at == first).all() else stages_at
     states_at = np.empty((len(offsets), *states.shape))
@@ -110,13 +107,11 @@ def _followed(
     for number, offset in enumerate(offsets):
         while step < offset:
             own_stages = stages if several_stages else stage
-            actions = contract.executed_action(
-                problem, contract.policy(problem, states, own_stages)
-            )
+            actions = checked.executed_action(problem, checked.policy(problem, states, own_stages))
             noise_free = NoiseFreeStream(_MOST_DRAWS)
-            states = contract.expected_move(problem, states, actions, noise_free)
+            states = checked.expected_move(problem, states, actions, noise_free)
             if several_stages:
-                stages = contract.next_stages(problem, states, stages)
+                stages = checked.next_stages(problem, states, stages)
             step += 1
         states_at[number] = states
         stages_at[number] = stages

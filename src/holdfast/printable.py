@@ -1,9 +1,8 @@
-r"""Text from outside, made fit for a terminal.
+r"""Untrusted text, escaped for a terminal.
 
-What a terminal is sent it obeys: an escape in a service's message, in a key of a file or in an
-exception's text can clear the screen, set the window's title, or write over the line that says what
-is wrong. So everything that was not written here goes through this before it is shown, and is seen
-as what it is: ``\x1b[2J``.
+A terminal executes control characters: an escape sequence in a service's message, a key of a file
+or an exception's text can clear the screen, set the window's title, or overwrite an error message.
+So untrusted text is escaped before it is printed: ``\x1b[2J``.
 """
 
 from __future__ import annotations
@@ -12,13 +11,12 @@ __all__ = ["printable"]
 
 
 def printable(text: str, *, keep: str = "\n\t") -> str:
-    """Return a text in which whatever a terminal does not show as a letter is an escape.
+    """Return the text with each unprintable character escaped.
 
     Parameters
     ----------
-    text : str
     keep : str
-        Characters that stay as they are.
+        Characters that are not escaped.
     """
     if text.isprintable():
         return text

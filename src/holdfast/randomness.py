@@ -16,9 +16,9 @@ import math
 from typing import TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 
 from holdfast import _kernel
+from holdfast.arrays import FloatArray
 from holdfast.errors import InvalidValueError, ProblemError
 
 __all__ = ["NOISE_FREE", "NoiseFreeStream", "Purpose", "Stream", "stream"]
@@ -60,7 +60,7 @@ class Stream:
     def __init__(self, words: Words) -> None:
         self.words = words
 
-    def normal(self, shape: int | tuple[int, ...] = ()) -> npt.NDArray[np.float64]:
+    def normal(self, shape: int | tuple[int, ...] = ()) -> FloatArray:
         """Return standard normal deviates of the given shape.
 
         Parameters
@@ -75,7 +75,7 @@ class Stream:
         """
         return _kernel.normals(self.words, _size(shape)).reshape(shape)
 
-    def uniform(self, shape: int | tuple[int, ...] = ()) -> npt.NDArray[np.float64]:
+    def uniform(self, shape: int | tuple[int, ...] = ()) -> FloatArray:
         """Return deviates that are uniform on [0, 1), of the given shape; as :meth:`normal`."""
         return _kernel.uniforms(self.words, _size(shape)).reshape(shape)
 
@@ -130,12 +130,12 @@ class NoiseFreeStream(Stream):
                 "give the problem an expected_move(states, actions), which path_entropy uses"
             )
 
-    def normal(self, shape: int | tuple[int, ...] = ()) -> npt.NDArray[np.float64]:
+    def normal(self, shape: int | tuple[int, ...] = ()) -> FloatArray:
         """Return zeros of the given shape."""
         self._count()
         return np.zeros(shape)
 
-    def uniform(self, shape: int | tuple[int, ...] = ()) -> npt.NDArray[np.float64]:
+    def uniform(self, shape: int | tuple[int, ...] = ()) -> FloatArray:
         """Return halves of the given shape."""
         self._count()
         return np.full(shape, 0.5)

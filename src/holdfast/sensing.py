@@ -1,12 +1,12 @@
 """Choosing what to sense.
 
-Look ahead by one observation: for each sensing action, imagine what it might show, update the
-belief by it, and ask how uncertain the robot would then be about what to **do**. The sensing
-action with the least expected entropy of the task actions wins (*action entropy*). Asking instead
-how uncertain it would be about where it *is* (*state entropy*) spends sensing on differences that
-change no action. Asking how far the task actions would spread (*action covariance*, the trace of
-their covariance) is simpler, and sees how far two different actions are from each other, which
-entropy does not. Two choices that imagine nothing, *random* and *fixed*, are there to compare with.
+Look ahead by one observation: for each sensing action, sample what it might show, update the belief
+by it, and measure how uncertain the robot would then be about its next **action**. The sensing
+action with the least expected entropy of the task actions wins (*action entropy*). The entropy of
+the state (*state entropy*) spends sensing on differences that change no action. The spread of the
+task actions (*action covariance*, the trace of their covariance) is simpler, and sees how far two
+different actions are from each other, which entropy does not. Two methods that look ahead at
+nothing, *random* and *fixed*, are there to compare with.
 
 Source: Greigarn, Branicky and Çavuşoğlu, "Task-oriented active sensing via action entropy
 minimization", IEEE Access, 2019; Algorithm 2 of the thesis that the configuration files come from.
@@ -18,11 +18,13 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-from holdfast import _kernel, contract, numerics
+from holdfast import _kernel, checked, numerics
+from holdfast.arrays import FloatArray, in_brief
 from holdfast.belief import Belief, estimate
-from holdfast.entropy import (
+from holdfast.config.settings import NEIGHBOR_ESTIMATORS, PlanningSettings, estimator_of
+from holdfast.errors import InvalidValueError, ProblemError
+from holdfast.estimators import (
     LARGEST,
     MAX_PRIOR_NEIGHBORS_POINTS,
     TOTAL_VARIANCE,
@@ -35,16 +37,14 @@ from holdfast.entropy import (
     scale_of,
     scaled,
 )
-from holdfast.errors import InvalidValueError, ProblemError
 from holdfast.expected_return import expected_returns
 from holdfast.policy_path import path_points
+from holdfast.problem_attributes import has_general_observations, resolution_of
 from holdfast.problems.problem import Problem
 from holdfast.randomness import Stream
-from holdfast.settings import PlanningSettings, estimator_of
 
 __all__ = ["SensingInfo", "choose_sensing_action"]
 
-FloatArray = npt.NDArray[np.float64]
 
 # Substreams of the stream of hypotheses; 1 is the kernel's own, for the observation noise.
 _HORIZON_MOTION = 2
@@ -55,7 +55,7 @@ _LARGEST_BLOCK = 2**20
 
 
 class SensingInfo(NamedTuple):
-    """Why a sensing action was chosen.
+    """The values behind the choice of a sensing action.
 
     Attributes
     ----------
@@ -68,7 +68,7 @@ class SensingInfo(NamedTuple):
     samples : array of shape (J, M) or None
         The entropies of the single hypothetical observations, whose means ``entropies`` are.
     likelihoods, visits : int
-        Work done: likelihoods evaluated and distances between points looked at.
+        Work done: likelihoods evaluated and distances between points computed.
     """
 
     entropies: FloatArray | None
@@ -89,9 +89,6 @@ def choose_sensing_action(
 
     Parameters
     ----------
-    problem : Problem
-    settings : PlanningSettings
-    belief : Belief
     stage : int
         Stage of the task.
     hypotheses : Stream
@@ -136,7 +133,7 @@ def choose_sensing_action(
     points = sets.reshape(-1, sets.shape[-1])
     threads = settings.active_sensing.num_cores
     several_steps = settings.active_sensing.horizon > 1
-    if contract.has_general_observations(problem):
+    if has_general_observations(problem):
         particles = _stratified(
             belief.weights, settings.active_sensing.num_observation_samples, hypotheses
         )
@@ -157,11 +154,7 @@ def choose_sensing_action(
             settings.active_sensing.num_observation_samples,
             hypotheses.words,
             scaled(points, estimator),
-            estimator.kind,
-            estimator.neighbors,
-            estimator.resolution,
-            estimator.exponent,
-            estimator.offset,
+            *estimator.parameters,
             threads,
             factors,
             estimator.prior,
@@ -224,7 +217,7 @@ def _greatest_return(
         nonlocal likelihoods
         likelihoods += len(actions) * samples * belief.weights.shape[0]
         truths = _stratified(belief.weights, samples, stream)
-        if contract.has_general_observations(problem):
+        if has_general_observations(problem):
             log_weights = _general_log_weights(problem, belief, actions, truths, stream)
             rows = [_kernel.normalize(row, False)[0] for row in log_weights]
             return truths, np.array(rows).reshape(len(actions), samples, -1)
@@ -247,10 +240,10 @@ def _points_of(
     if settings.selector.method == "state_entropy":
         return lambda states, _: states
     if settings.selector.actions == "executed":
-        return lambda states, stage: contract.executed_action(
-            problem, contract.policy(problem, states, stage)
+        return lambda states, stage: checked.executed_action(
+            problem, checked.policy(problem, states, stage)
         )
-    return lambda states, stage: contract.policy(problem, states, stage)
+    return lambda states, stage: checked.policy(problem, states, stage)
 
 
 def _estimator(
@@ -260,14 +253,14 @@ def _estimator(
     dimension = points.shape[1]
     selector = settings.selector
     of_states = selector.method == "state_entropy"
-    resolution = contract.resolution_of(problem, selector.resolution, of_states=of_states)
+    resolution = resolution_of(problem, selector.resolution, of_states=of_states)
     each_its_own = not isinstance(resolution, (int, float))
     if selector.method == "action_covariance":
         if not each_its_own:
             return TOTAL_VARIANCE
         return TOTAL_VARIANCE._replace(scale=scale_of(np.asarray(resolution), dimension)[0])
     kind = estimator_of(selector, points.shape[0])
-    if kind in {"nearest_neighbor", "prior_neighbors"}:
+    if kind in NEIGHBOR_ESTIMATORS:
         neighbors = settings.active_sensing.num_nearest_neighbors
         if neighbors >= points.shape[0]:
             raise InvalidValueError(
@@ -305,8 +298,8 @@ def _noise_variance(problem: Problem, own: FloatArray) -> FloatArray:
 def _require_bounded(problem: Problem, points: FloatArray, states: FloatArray, which: str) -> None:
     if (bad := first_unbounded(points)) is not None:
         raise ProblemError(
-            f"policy of {problem.name} returned {contract.in_brief(points[bad])} in {which} "
-            f"{contract.in_brief(states[bad])}: every coordinate must be finite and at most "
+            f"policy of {problem.name} returned {in_brief(points[bad])} in {which} "
+            f"{in_brief(states[bad])}: every coordinate must be finite and at most "
             f"{LARGEST:g}"
         )
 
@@ -323,8 +316,8 @@ def _predictions(
     means = []
     variances = []
     for action in actions:
-        means.append(contract.observation_mean(problem, states, action))
-        variances.append(contract.observation_variance(problem, states, action, means[-1]))
+        means.append(checked.observation_mean(problem, states, action))
+        variances.append(checked.observation_variance(problem, states, action, means[-1]))
     sizes = [mean.shape[-1] for mean in means]
     predicted = np.empty((sum(sizes), count))
     varying = any(variance.ndim > 1 for variance in variances)
@@ -342,7 +335,7 @@ def _predictions(
         for action, mean, own_variance in zip(actions, means, variances, strict=True):
             right = (own_variance > 0.0).all() and numerics.all_finite(own_variance)
             if not right or not numerics.all_finite(mean):
-                raise contract.unusable_prediction(problem, action, mean, own_variance)
+                raise checked.unusable_prediction(problem, action, mean, own_variance)
     return sizes, predicted, variance
 
 
@@ -361,14 +354,14 @@ def _general_log_weights(
     rows = []
     for action in actions:
         for i, particle in enumerate(particles):
-            observation = contract.sample_observation(
+            observation = checked.sample_observation(
                 problem,
                 belief.states[particle],
                 action,
                 hypotheses.substream(_GENERAL_OBSERVATIONS).substream(i),
             )
             rows.append(
-                log_prior + contract.log_likelihood(problem, belief.states, action, observation)
+                log_prior + checked.log_likelihood(problem, belief.states, action, observation)
             )
     return np.ascontiguousarray(rows, dtype=np.float64)
 
@@ -400,11 +393,7 @@ def _entropies(
         np.ascontiguousarray(scaled(points, estimator)),
         weights,
         logarithms,
-        estimator.kind,
-        estimator.neighbors,
-        estimator.resolution,
-        estimator.exponent,
-        estimator.offset,
+        *estimator.parameters,
         threads,
         factors,
         estimator.prior,
@@ -468,11 +457,11 @@ def _later_of_some(
             # operations may have other bits for many estimates at once.
             belief = Belief(states[row], weights[row])
             estimated = estimate(belief, settings.particle_filter.estimate)
-            stages[row] = contract.next_stage(problem, estimated, stages[row])
-            commanded = contract.policy(problem, estimated, stages[row])
-            actions[row] = contract.executed_action(problem, commanded)
+            stages[row] = checked.next_stage(problem, estimated, stages[row])
+            commanded = checked.policy(problem, estimated, stages[row])
+            actions[row] = checked.executed_action(problem, commanded)
         streams = [motion.substream(step) for motion in motions]
-        states = contract.move_each(problem, states, actions, streams, threads)
+        states = checked.move_each(problem, states, actions, streams, threads)
         factor *= sensing.discount
         points = _points_by_stage(points_of, states, stages)
         flat_states = states.reshape(-1, states.shape[-1])
@@ -480,11 +469,7 @@ def _later_of_some(
         later += factor * _kernel.entropies_of_each(
             scaled(points, estimator).reshape(count, -1, points.shape[1]),
             weights,
-            estimator.kind,
-            estimator.neighbors,
-            estimator.resolution,
-            estimator.exponent,
-            estimator.offset,
+            *estimator.parameters,
             threads,
             estimator.prior,
         )

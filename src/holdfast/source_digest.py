@@ -1,18 +1,16 @@
 """Which code decides: digests of sources, equal wherever the same sources lie.
 
-Two processes decide alike only if they run the same code. A version tells that of a release, but
-not of a problem that a person is still writing, nor of a checkout in which something was changed.
-So what is compared are the sources themselves, byte by byte: neither the machine nor the version of
-Python changes them, nor whether a module is compiled. The kernel is told by the sources that it was
-built of.
+Two processes decide alike only if they run the same code. A version identifies a release, but not a
+problem that its author is still writing, nor a changed checkout. So the sources themselves are
+compared, byte by byte: they do not depend on the machine, on the version of Python or on whether a
+module is compiled. For the kernel these are the sources that it was built from.
 
-A problem's code is that of the module that a configuration names, of the problem's class, of the
-classes that it is derived from, and of all that these import from beside them, or from a folder
-below that they have put on the import path. It is read from the sources, not from what happens to
-be loaded: of two processes with the same code one may have loaded more. So what nobody can see from
-there is not part of it: files of data, modules that are compiled and have no source here, other
-packages that are installed, a module imported under a name made at run time, and one in another
-folder that is imported only while a function runs.
+A problem's code is the module that a configuration names, the module of the problem's class, those
+of its base classes, and all that these import from beside them, or from a folder below that they
+have put on the import path. It is read from the sources, because of two processes with the same
+code one may have loaded more. Not part of it are files of data, compiled modules without source,
+other installed packages, a module imported under a name made at run time, one in another folder
+that is imported only while a function runs, and imports for type checkers alone.
 """
 
 from __future__ import annotations
@@ -36,14 +34,14 @@ _DIGEST_SIZE = 8
 _SOURCE_DIGEST_SIZE = 32
 
 _LIBRARIES = frozenset({"numpy", "msgspec"})
-"""Of other people, and the same for all problems; a class may be derived from one of theirs."""
+"""Libraries that a problem's class may be derived from; they are no part of its code."""
 
 
 @functools.cache
 def core_version() -> str:
     """Return holdfast's version and the digest of what decides in it, such as ``0.1.0+3f...``.
 
-    That is its kernel, its problems, and the modules beside this one.
+    That is its kernel, its problems, its settings, and the modules beside this one.
     """
     digest = hashlib.blake2b(_kernel.sources().encode(), digest_size=_DIGEST_SIZE)
     for path in sorted(_core_files()):
@@ -54,7 +52,8 @@ def core_version() -> str:
 
 @functools.cache
 def _core_files() -> frozenset[Path]:
-    return frozenset((*_PACKAGE.glob("*.py"), *(_PACKAGE / "problems").glob("*.py")))
+    folders = (_PACKAGE, _PACKAGE / "config", _PACKAGE / "problems")
+    return frozenset(path for folder in folders for path in folder.glob("*.py"))
 
 
 def problem_digest(problem_class: type, named_in: str | None = None) -> str:
@@ -62,7 +61,6 @@ def problem_digest(problem_class: type, named_in: str | None = None) -> str:
 
     Parameters
     ----------
-    problem_class : type
     named_in : str or None
         As for :func:`problem_sources`.
     """
@@ -75,11 +73,10 @@ def problem_digest(problem_class: type, named_in: str | None = None) -> str:
 def problem_sources(problem_class: type, named_in: str | None = None) -> dict[str, str]:
     """Return the digest of each source of a problem's code beyond holdfast's core.
 
-    It is what is on the disk now: whoever wants to know what was loaded asks at once.
+    The sources are read from the disk now: to identify loaded code, call this at once.
 
     Parameters
     ----------
-    problem_class : type
     named_in : str or None
         Module that the problem's name in a configuration leads to
         (:func:`holdfast.problems.registry.problem_module`). It need not be the one in which the
@@ -139,7 +136,7 @@ def _loaded_below(base: Path, module: str) -> Path | None:
 def _is_users(path: Path) -> bool:
     """Tell whether a source is a user's: in a folder of libraries, others' lie beside it."""
     # A service that starts has no need of it, and a robot may wait for that service.
-    from holdfast.user_code import is_users_file
+    from holdfast.config.user_code import is_users_file
 
     return is_users_file(str(path))
 
@@ -214,9 +211,18 @@ def _imported_by(path: Path, name: str, *, places: bool) -> list[tuple[str, bool
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda)
     ]
     later = {node for function in functions for node in ast.walk(function)}
+    for_types = {
+        node
+        for choice in ast.walk(tree)
+        if isinstance(choice, ast.If) and ast.unparse(choice.test).endswith("TYPE_CHECKING")
+        for statement in choice.body
+        for node in ast.walk(statement)
+        if not ast.unparse(choice.test).startswith("not ")
+    }
     return [
         (module, node not in later)
         for node in ast.walk(tree)
+        if node not in for_types
         for module in _imported_in(node, path, name, places=places)
     ]
 

@@ -14,35 +14,22 @@ from typing import NamedTuple
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests.contracts.test_transport import (
-    LEASE_MS,
-    Inbox,
-    Received,
-    StreamWire,
-    authority,
-    echo,
-    robot_tls,
-    service_tls,
-    socket_directory,
-    until,
-)
+from tests.contracts.wires import LEASE_MS, Inbox, Received, StreamWire, echo, until
 from tests.ports import free_port
 from tests.relay import Relay, relay
 
-from holdfast.chaos.proxy import Direction, Impairment, Proxy
 from holdfast.errors import TransportError
-from holdfast.session.events import Appeared, Ended, Replied, Vanished
-from holdfast.transport import datagrams as datagram_links
-from holdfast.transport import sealing
+from holdfast.lab.testbed.proxy import Direction, Impairment, Proxy
+from holdfast.protocol.events import CallEnded, ReplyReceived, ServiceAppeared, ServiceVanished
+from holdfast.transport import datagram_cipher
+from holdfast.transport import datagram_links as datagram_links
 from holdfast.transport.contract import IncomingCall
-from holdfast.transport.datagrams import RobotDatagramLink, ServiceDatagramLink
+from holdfast.transport.datagram_cipher import AssociationKeys, DatagramCipher
+from holdfast.transport.datagram_links import RobotDatagramLink, ServiceDatagramLink
 from holdfast.transport.endpoints import ServiceAddress, TlsFiles
 from holdfast.transport.exchanges import MAX_PAYLOAD_BYTES
 from holdfast.transport.robot_end import StreamRobotTransport
-from holdfast.transport.sealing import Keys, Sealing
 from holdfast.transport.service_end import StreamServiceTransport
-
-__all__ = ["authority", "robot_tls", "service_tls", "socket_directory"]  # fixtures
 
 
 @pytest.fixture
@@ -81,7 +68,7 @@ def link_of(robot: StreamRobotTransport) -> RobotDatagramLink:
 async def at_rest(link: RobotDatagramLink) -> None:
     """Wait until a link has no datagram to send for a while, unless it is asked."""
     loop = asyncio.get_running_loop()
-    await until(lambda: link._questions.due > loop.time() + 1.0)
+    await until(lambda: link._exchange.due > loop.time() + 1.0)
 
 
 def link_at(service: StreamServiceTransport, number: int = 0) -> ServiceDatagramLink:
@@ -104,7 +91,10 @@ def stranger(to: tuple[str, int]) -> Iterator[socket.socket]:
 
 async def answers(robot: StreamRobotTransport, inbox: Inbox, call: int) -> None:
     robot.call("cloud", call, b"question %d" % call)
-    assert await inbox.of_call(call) == [Replied(call, b"question %d" % call), Ended(call)]
+    assert await inbox.of_call(call) == [
+        ReplyReceived(call, b"question %d" % call),
+        CallEnded(call),
+    ]
 
 
 class TestWhatGoesWhichWay:
@@ -125,11 +115,11 @@ class TestWhatGoesWhichWay:
     async def test_what_is_longer_is(self, udp: StreamWire) -> None:
         robot, inbox, _ = await connected(udp)
         link = link_of(robot)
-        before = link._sealing, 0 if link._sealing is None else link._sealing._counter
+        before = link._cipher, 0 if link._cipher is None else link._cipher._counter
         for size in (MAX_PAYLOAD_BYTES + 1, 100_000):
             robot.call("cloud", size, bytes(size))
-            assert await inbox.of_call(size) == [Replied(size, bytes(size)), Ended(size)]
-        assert link._sealing is before[0]
+            assert await inbox.of_call(size) == [ReplyReceived(size, bytes(size)), CallEnded(size)]
+        assert link._cipher is before[0]
         assert before[0] is not None and before[0]._counter - before[1] <= 2  # probes
 
     async def test_a_service_at_all_addresses_answers_from_the_one_that_was_called(
@@ -137,7 +127,7 @@ class TestWhatGoesWhichWay:
     ) -> None:
         port = free_port("0.0.0.0")
         service = StreamServiceTransport(
-            "cloud", boot="b1", listen=[f"udp/0.0.0.0:{port}"], tls=service_tls
+            "cloud", incarnation="b1", listen=[f"udp/0.0.0.0:{port}"], tls=service_tls
         )
         await service.start(echo)
         robot = StreamRobotTransport(
@@ -151,8 +141,8 @@ class TestWhatGoesWhichWay:
     async def test_where_somebody_has_the_port_the_service_takes_another(
         self, udp: StreamWire
     ) -> None:
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as somebody:
-            somebody.bind(place_of(udp))
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+            other.bind(place_of(udp))
             robot, inbox, _ = await connected(udp)
             await answers(robot, inbox, 1)
 
@@ -167,23 +157,23 @@ class TestStrangers:
 
         robot, inbox, service = await connected(udp, serve)
         link = link_at(service)
-        assert link._sealing is not None
-        number = link._sealing.association
-        forger = Sealing(Keys.draw(number), service=False)
+        assert link._cipher is not None
+        number = link._cipher.association
+        forger = DatagramCipher(AssociationKeys.draw(number), service=False)
         question = b"\1\0" + (7).to_bytes(4, "big") * 2 + b"\0\0" + b"forged"
         reply = b"\2\0" + (1).to_bytes(4, "big") + b"\x80\0" + b"forged"
-        service_forger = Sealing(Keys.draw(number), service=True)
+        service_forger = DatagramCipher(AssociationKeys.draw(number), service=True)
         with stranger(place_of(udp)) as to_service:
             for k in range(50):
-                to_service.send(forger.seal(question))
+                to_service.send(forger.encrypt(question))
                 to_service.send(bytes(k))
                 to_service.send(number.to_bytes(4, "big") + bytes(60 + k))
-                link._put(service_forger.seal(reply))  # as if from the service's address
+                link._put(service_forger.encrypt(reply))  # as if from the service's address
                 await answers(robot, inbox, k)
             with pytest.raises(BlockingIOError):
                 to_service.recv(1)
         assert received == [b"question %d" % k for k in range(50)]
-        assert Vanished("cloud", "b1") not in inbox
+        assert ServiceVanished("cloud", "b1") not in inbox
 
     async def test_associations_cannot_be_guessed(self, udp: StreamWire) -> None:
         """Whoever does not see a robot's datagrams makes none that have to be deciphered."""
@@ -191,7 +181,7 @@ class TestStrangers:
         other = udp.robot("cloud")
         other.start(Inbox())
         await until(lambda: other.sends_datagrams("cloud"))
-        sealings = [link_at(service, number)._sealing for number in range(2)]
+        sealings = [link_at(service, number)._cipher for number in range(2)]
         first, second = (each.association for each in sealings if each is not None)
         assert abs(first - second) > 1  # unless two draws of 32 bits are as near as that
 
@@ -202,13 +192,13 @@ class TestStrangers:
         other.start(other_inbox)
         await until(lambda: other.sends_datagrams("cloud"))
         theirs, ours = link_at(service, 0), link_at(service, 1)
-        assert theirs._sealing is not None and ours._sealing is not None
+        assert theirs._cipher is not None and ours._cipher is not None
         mine = link_of(other)
-        assert mine._sealing is not None
+        assert mine._cipher is not None
         question = b"\1\0" + (1).to_bytes(4, "big") * 2 + b"\0\0" + b"as another"
         # Sealed with its own keys, and said to be of the other's association.
-        datagram = mine._sealing.seal(question)
-        for association in (theirs._sealing.association, 0, 2**32 - 1):
+        datagram = mine._cipher.encrypt(question)
+        for association in (theirs._cipher.association, 0, 2**32 - 1):
             with stranger(place_of(udp)) as to_service:
                 to_service.send(association.to_bytes(4, "big") + datagram[4:])
         robot.call("cloud", 5, b"mine")
@@ -227,32 +217,32 @@ class TestStrangers:
         greedy.start(greedy_inbox)
         await until(lambda: greedy.sends_datagrams("cloud"))
         ours, at_service = link_of(greedy), link_at(service, 1)
-        assert ours._sealing is not None
+        assert ours._cipher is not None
         for k in range(1, 6001):
             question = b"\1\0" + k.to_bytes(4, "big") * 2 + b"\0\0flood"
             # As the system would hand them over, if it kept as many.
-            at_service.take_datagram(ours._sealing.seal(question), ("127.0.0.1", 9))
+            at_service.take_datagram(ours._cipher.encrypt(question), ("127.0.0.1", 9))
         assert at_service.ended
         assert at_service.reason == "sends more datagrams than can be heard beside those of others"
         assert 0 < len(calls) < 6000 - 4096
-        await greedy_inbox.wait_for(Vanished("cloud", "b1"))
+        await greedy_inbox.wait_for(ServiceVanished("cloud", "b1"))
         await answers(robot, inbox, 6)
-        assert Vanished("cloud", "b1") not in inbox
+        assert ServiceVanished("cloud", "b1") not in inbox
 
     async def test_keys_are_of_no_use_once_the_certificate_is_revoked(
         self, udp: StreamWire
     ) -> None:
         calls: list[bytes] = []
         robot, inbox, service = await connected(udp, noting(calls))
-        kept, at_service = link_of(robot)._sealing, link_at(service)
+        kept, at_service = link_of(robot)._cipher, link_at(service)
         assert kept is not None
         assert service.end_links(lambda peer: "is revoked" if peer.name == "robot" else None) == 1
         with stranger(place_of(udp)) as to_service:
             for k in range(1, 200):
                 question = b"\1\0" + k.to_bytes(4, "big") * 2 + b"\0\0stolen"
-                at_service.take_datagram(kept.seal(question), ("127.0.0.1", 9))
-                to_service.send(kept.seal(question))
-            await inbox.wait_for(Vanished("cloud", "b1"))
+                at_service.take_datagram(kept.encrypt(question), ("127.0.0.1", 9))
+                to_service.send(kept.encrypt(question))
+            await inbox.wait_for(ServiceVanished("cloud", "b1"))
             await inbox.appeared(times=2)
             await until(lambda: robot.sends_datagrams("cloud"))
             await answers(robot, inbox, 1)  # over a new link, behind all of these
@@ -293,7 +283,7 @@ class TestStrangers:
         held: list[bytes] = []
         put = link._put
         monkeypatch.setattr(link, "_put", held.append)
-        link._questions.probe(asyncio.get_running_loop().time())
+        link._exchange.probe(asyncio.get_running_loop().time())
         monkeypatch.setattr(link, "_put", put)
         await answers(robot, inbox, 1)
         before = link_at(service)._peer_address
@@ -309,7 +299,7 @@ class TestStrangers:
     async def test_a_robot_whose_answers_are_led_elsewhere_is_answered_all_the_same(
         self, udp: StreamWire, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        """Each datagram of the robot comes first from somebody who has copied it on its way."""
+        """Each datagram of the robot arrives first from an attacker who has copied it."""
         robot, inbox, service = await connected(udp)
         link, at_service = link_of(robot), link_at(service)
         assert link._socket is not None
@@ -329,7 +319,7 @@ class TestStrangers:
             await answers(robot, inbox, 30)
             await until(lambda: at_service._peer_address == ours)
         assert link_of(robot) is link
-        assert Vanished("cloud", "b1") not in inbox
+        assert ServiceVanished("cloud", "b1") not in inbox
 
     @given(data=st.lists(st.binary(max_size=80), max_size=5), tail=st.binary(max_size=40))
     @settings(max_examples=30, deadline=None)
@@ -390,7 +380,7 @@ async def answers_of(robot: StreamRobotTransport, inbox: Inbox, calls: Received)
     call = await calls.next()
     assert call.payload == b"other"
     echo(call)
-    assert await inbox.of_call(1) == [Replied(1, b"other"), Ended(1)]
+    assert await inbox.of_call(1) == [ReplyReceived(1, b"other"), CallEnded(1)]
 
 
 class TestEnds:
@@ -403,22 +393,22 @@ class TestEnds:
             robot.call("cloud", 1, b"in the middle")
             first = await calls.next()
             heal = await asyncio.to_thread(stream.impair, Impairment(cut=True))
-            await until(lambda: link.adrift)
+            await until(lambda: link.without_stream)
             robot.call("cloud", 2, b"without a stream")
             second = await calls.next()
             echo(second)
-            assert await inbox.of_call(2) == [Replied(2, b"without a stream"), Ended(2)]
+            assert await inbox.of_call(2) == [ReplyReceived(2, b"without a stream"), CallEnded(2)]
             await asyncio.to_thread(heal)
             await until(lambda: link_of(robot) is not link)
             echo(first)
-            assert await inbox.of_call(1) == [Replied(1, b"in the middle"), Ended(1)]
+            assert await inbox.of_call(1) == [ReplyReceived(1, b"in the middle"), CallEnded(1)]
             robot.call("cloud", 3, bytes(100_000))
             echo(await calls.next())
             assert len(await inbox.of_call(3)) == 2
             await until(lambda: link.ended)
-            assert [e for e in inbox.events if isinstance(e, Appeared | Vanished)] == [
-                Appeared("cloud", "b1")
-            ]
+            assert [
+                e for e in inbox.events if isinstance(e, ServiceAppeared | ServiceVanished)
+            ] == [ServiceAppeared("cloud", "b1")]
 
     @pytest.mark.parametrize("direction", ["both", "to_service", "to_robot"])
     async def test_a_stream_that_is_held_up_ends_nothing(
@@ -436,12 +426,12 @@ class TestEnds:
             robot.call("cloud", 2, bytes(100_000))
             assert len(await inbox.of_call(2)) == 2
             assert link_of(robot) is link
-            assert [event for event, _ in udp.told if event == "robot_disconnected"] == []
+            assert [event for event, _ in udp.events if event == "robot_disconnected"] == []
 
     async def test_where_no_datagram_gets_through_it_is_told_and_all_goes_on_the_stream(
         self, udp: StreamWire, robot_tls: TlsFiles, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr(datagram_links, "_CLOSED_TO_DATAGRAMS_S", 0.1)
+        monkeypatch.setattr(datagram_links, "_BLOCKED_AFTER_S", 0.1)
         await udp.service("cloud", "b1").start(echo)
         _, target = place_of(udp)
         entry = free_port()
@@ -450,7 +440,7 @@ class TestEnds:
             robot = StreamRobotTransport(
                 {"cloud": ServiceAddress(f"udp/127.0.0.1:{entry}")},
                 tls=robot_tls,
-                on_closed_to_datagrams=closed.append,
+                on_datagrams_blocked=closed.append,
             )
             inbox = Inbox()
             robot.start(inbox)
@@ -466,12 +456,12 @@ class TestEnds:
         async with on_a_line(udp) as (robot, inbox, stream, datagrams):
             link = link_of(robot)
             await asyncio.to_thread(stream.impair, Impairment(cut=True))
-            await until(lambda: link.adrift)
+            await until(lambda: link.without_stream)
             await answers(robot, inbox, 1)
             datagrams.close()
-            await inbox.wait_for(Vanished("cloud", "b1"))
+            await inbox.wait_for(ServiceVanished("cloud", "b1"))
             robot.call("cloud", 2, b"nobody is there")
-            assert await inbox.of_call(2) == [Ended(2)]
+            assert await inbox.of_call(2) == [CallEnded(2)]
 
     async def test_a_port_that_is_closed_is_a_service_that_is_gone(self, udp: StreamWire) -> None:
         """Although its stream, held open by a line that has fallen silent, says nothing."""
@@ -480,12 +470,12 @@ class TestEnds:
             await at_rest(link_of(robot))
             await asyncio.to_thread(stream.impair, Impairment(silent=True))
             await asyncio.to_thread(datagrams.close)  # from now on the system answers
-            sealing = link_of(robot)._sealing
-            assert sealing is not None
-            before = sealing._counter
+            cipher = link_of(robot)._cipher
+            assert cipher is not None
+            before = cipher._counter
             robot.call("cloud", 1, b"question")
-            await inbox.wait_for(Vanished("cloud", "b1"), Ended(1))
-            assert sealing._counter == before + 1  # the question was enough
+            await inbox.wait_for(ServiceVanished("cloud", "b1"), CallEnded(1))
+            assert cipher._counter == before + 1  # the question was enough
 
     async def test_who_cannot_quote_what_was_sent_is_not_believed(
         self, udp: StreamWire, robot_tls: TlsFiles
@@ -517,7 +507,7 @@ class TestEnds:
             lines.enter_context(relay(entry, target))
             await answers(robot, inbox, 2)
             assert link_of(robot) is link
-            assert Vanished("cloud", "b1") not in inbox
+            assert ServiceVanished("cloud", "b1") not in inbox
             await robot.close()
 
     async def test_a_service_that_closes_has_answered_before(
@@ -531,14 +521,14 @@ class TestEnds:
         monkeypatch.setattr(link, "_put", lambda _: None)  # lost
         echo(call)
         await service.close()
-        assert await inbox.of_call(1) == [Replied(1, b"last"), Ended(1)]
+        assert await inbox.of_call(1) == [ReplyReceived(1, b"last"), CallEnded(1)]
 
     async def test_keys_that_are_used_up_make_way_for_new_ones(
         self, udp: StreamWire, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         robot, _, _ = await connected(udp)
         link = link_of(robot)
-        monkeypatch.setattr(sealing, "MAX_DATAGRAMS", 10)
+        monkeypatch.setattr(datagram_cipher, "MAX_DATAGRAMS", 10)
         for call in range(20):
             robot.call("cloud", call, b"question")
         await until(lambda: robot.sends_datagrams("cloud") and link_of(robot) is not link)
@@ -571,7 +561,7 @@ class TestWhatGoesTogether:
             if end == "robot":
                 StreamRobotTransport({"cloud": ServiceAddress(place, True)}, tls=robot_tls)
             else:
-                StreamServiceTransport("cloud", boot="b1", connect=[place], tls=service_tls)
+                StreamServiceTransport("cloud", incarnation="b1", connect=[place], tls=service_tls)
 
     @pytest.mark.parametrize("end", ["robot", "service"])
     def test_without_the_package_it_is_said_how_to_get_it(
@@ -587,11 +577,11 @@ class TestWhatGoesTogether:
                 StreamRobotTransport({"c": ServiceAddress("udp/127.0.0.1:1")}, tls=robot_tls)
             else:
                 StreamServiceTransport(
-                    "cloud", boot="b1", listen=["udp/127.0.0.1:0"], tls=service_tls
+                    "cloud", incarnation="b1", listen=["udp/127.0.0.1:0"], tls=service_tls
                 )
 
     def test_without_credentials(self) -> None:
         with pytest.raises(TransportError, match="udp needs credentials"):
             StreamRobotTransport({"cloud": ServiceAddress("udp/127.0.0.1:1")})
         with pytest.raises(TransportError, match="udp needs credentials"):
-            StreamServiceTransport("cloud", boot="b1", listen=["udp/127.0.0.1:0"])
+            StreamServiceTransport("cloud", incarnation="b1", listen=["udp/127.0.0.1:0"])

@@ -8,17 +8,18 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from holdfast.arrays import FloatArray, IntArray
 from holdfast.problems import registry
-from holdfast.problems.problem import FloatArray, IntArray, Problem
+from holdfast.problems.problem import Problem
 from holdfast.randomness import Purpose, stream
 
 SEED = 11
 LEADING_SHAPES = [(), (1,), (13,), (3, 5), (2, 3, 4), (0,)]
 INITIAL = stream(SEED, 0, 0, Purpose.INITIAL_BELIEF)
 OF_EXPERIMENTS = [
-    "holdfast.experiments.light_dark:LightDark",
-    "holdfast.experiments.busy_room:BusyRoom",
-    "holdfast.experiments.vdp_tag:VdpTag",
+    "holdfast.lab.studies.light_dark:LightDark",
+    "holdfast.lab.studies.busy_room:BusyRoom",
+    "holdfast.lab.studies.vdp_tag:VdpTag",
 ]
 MOTION = stream(SEED, 0, 0, Purpose.PREDICTION)
 

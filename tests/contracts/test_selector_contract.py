@@ -7,36 +7,41 @@ of threads; nothing changed that was handed in; finite entropies even where a be
 from __future__ import annotations
 
 import itertools
+from typing import get_args
 
 import msgspec
 import numpy as np
 import pytest
 
+from holdfast.arrays import FloatArray
 from holdfast.belief import Belief
-from holdfast.problems import registry
-from holdfast.problems.problem import FloatArray, Problem
-from holdfast.randomness import Purpose, stream
-from holdfast.sensing import SensingInfo, choose_sensing_action
-from holdfast.settings import (
+from holdfast.config.settings import (
+    ENTROPY_METHODS,
+    UNINFORMED_METHODS,
     ActiveSensingSettings,
+    Estimator,
     ParticleFilterSettings,
     PlanningSettings,
     SelectorSettings,
 )
+from holdfast.problems import registry
+from holdfast.problems.problem import Problem
+from holdfast.randomness import Purpose, stream
+from holdfast.sensing import SensingInfo, choose_sensing_action
 
 SEED = 17
 COUNT = 60
 
 LOOKING = [
     SelectorSettings(
-        method=method,  # type: ignore[arg-type]
-        estimator=estimator,  # type: ignore[arg-type]
+        method=method,
+        estimator=estimator,
         actions=actions,  # type: ignore[arg-type]
         resolution=0.05,
     )
     for method, estimator, actions in itertools.product(
-        ("action_entropy", "path_entropy", "state_entropy"),
-        ("nearest_neighbor", "prior_neighbors", "gaussian_mixture_upper", "gaussian_mixture_lower"),
+        sorted(ENTROPY_METHODS),
+        get_args(Estimator),
         ("commanded", "executed"),
     )
 ]
@@ -62,7 +67,7 @@ SELECTORS = [
 
 
 def describe(selector: SelectorSettings) -> str:
-    if selector.method in {"random", "fixed"}:
+    if selector.method in UNINFORMED_METHODS:
         return selector.method
     resolution = "" if selector.resolution else "default "
     return f"{resolution}{selector.method} {selector.estimator} {selector.actions}"
@@ -120,7 +125,7 @@ class TestEverySelector:
         index, info = choose(problem, settings_of(selector), belief_of(problem))
         assert type(index) is int
         assert 0 <= index < count
-        if selector.method in {"random", "fixed"}:
+        if selector.method in UNINFORMED_METHODS:
             assert info == SensingInfo(None, None, 0, 0)
             return
         assert info.entropies is not None
@@ -139,7 +144,7 @@ class TestEverySelector:
         choose(problem, settings, belief, step=1)
         again = Belief(belief.states.copy(), belief.weights.copy())
         assert as_bytes(choose(problem, settings, again)) == first
-        if selector.method not in {"random", "fixed"}:
+        if selector.method not in UNINFORMED_METHODS:
             assert as_bytes(choose(problem, settings, belief, step=1))[2] != first[2]
 
     def test_nothing_is_changed(self, problem: Problem, selector: SelectorSettings) -> None:

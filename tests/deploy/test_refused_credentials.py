@@ -194,7 +194,7 @@ def test_what_the_log_of_a_robot_says_of_a_refusal(protocol: str, home: Path, si
     standing.show("crossed")
     told = standing.robot.wait_for("credentials")["reason"]
     assert told.endswith(
-        "cannot be used: key.pem is not the key of certificate.pem; those of before stay in use"
+        "cannot be used: key.pem is not the key of certificate.pem; the previous ones stay in use"
     )
     cloud.kill()
 

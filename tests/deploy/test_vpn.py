@@ -41,7 +41,7 @@ from tests.processes.faults import (
     wait_until,
 )
 
-from holdfast.chaos.namespace import NetworkNamespace
+from holdfast.lab.testbed.namespace import NetworkNamespace
 
 MAKE_PROFILES = Path(__file__).parents[2] / "deploy" / "vpn" / "make-profiles"
 TOOLS = {
@@ -205,9 +205,7 @@ class Tunnel:
 
     Parameters
     ----------
-    internet : Internet
     kind : {"openvpn", "wireguard"}
-    directory : Path
     stack : ExitStack
         Ends it.
     """

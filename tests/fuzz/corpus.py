@@ -9,44 +9,35 @@ from typing import NamedTuple
 import numpy as np
 from tests.questions import request_of
 
-from holdfast.planning import (
-    PlanningState,
-    advance,
-    choose_sensing_action,
-    choose_task_action,
-    encode_checkpoint,
-    initial_state,
-    needs_sensing,
-    observe,
-)
+from holdfast.config.settings import ActiveSensingSettings, ParticleFilterSettings, PlanningSettings
+from holdfast.planning import Planner, PlanningState, encode_checkpoint
 from holdfast.problems import registry
 from holdfast.problems.problem import Problem
-from holdfast.runtime.environment import SimulatedEnvironment
-from holdfast.session.messages import (
+from holdfast.protocol.messages import (
     CHECKSUM_SIZE,
     DIGEST_SIZE,
     Busy,
     NeedState,
     Observed,
-    Opening,
     Progress,
     Refused,
     Reply,
     Request,
     SensingAnswer,
+    SessionConfiguration,
     TaskAnswer,
     encode,
-    numbers_to,
+    encode_floats,
 )
-from holdfast.session.records import (
+from holdfast.protocol.records import (
     ActingRecord,
+    LocalTookOverRecord,
     ObservedRecord,
     PausedRecord,
     PerformedRecord,
     Record,
-    RecoveredRecord,
 )
-from holdfast.settings import ActiveSensingSettings, ParticleFilterSettings, PlanningSettings
+from holdfast.robot.environment import SimulatedEnvironment
 from holdfast.source_digest import core_version, problem_digest
 
 __all__ = [
@@ -57,10 +48,10 @@ __all__ = [
     "checkpoints",
     "configurations",
     "content_of",
-    "opening_of",
     "records",
     "replies",
     "requests",
+    "session_configuration_of",
     "turns",
 ]
 
@@ -94,20 +85,22 @@ class Turn(NamedTuple):
     observed: tuple[Observed, ...]
 
 
-def opening_of(
+def session_configuration_of(
     name: str = PROBLEM,
     seed: int = SEED,
     model: dict[str, object] | None = None,
     planning: PlanningSettings = PLANNING,
-) -> Opening:
+) -> SessionConfiguration:
     """Return what a robot with a problem of holdfast's, or one that is nowhere, says of its run."""
-    return Opening(name, model or {}, {}, planning, seed, core_version(), _NO_CODE_OF_ITS_OWN)
+    return SessionConfiguration(
+        name, model or {}, {}, planning, seed, core_version(), _NO_CODE_OF_ITS_OWN
+    )
 
 
-def problem_of(opening: Opening) -> Problem:
+def problem_of(session_configuration: SessionConfiguration) -> Problem:
     """Build the problem that an opening names."""
-    built: Problem = registry.problem_class(opening.problem).from_settings(
-        opening.model, opening.state_space_planner
+    built: Problem = registry.problem_class(session_configuration.problem).from_settings(
+        session_configuration.model, session_configuration.state_space_planner
     )
     return built
 
@@ -115,22 +108,23 @@ def problem_of(opening: Opening) -> Problem:
 @cache
 def turns(name: str = PROBLEM, count: int = 6, trial: int = 0) -> tuple[Turn, ...]:
     """Return the states of a robot's first turns, as the planner itself goes through them."""
-    problem = problem_of(opening_of(name))
-    state = initial_state(problem, PLANNING, SEED, trial)
+    problem = problem_of(session_configuration_of(name))
+    planner = Planner(problem, PLANNING)
+    state = planner.init(SEED, trial)
     environment = SimulatedEnvironment(problem, SEED, trial)
     observed: tuple[Observed, ...] = ()
     found = [Turn(state, observed)]
     while len(found) < count:
-        if needs_sensing(PLANNING, state):
-            action, _ = choose_sensing_action(problem, PLANNING, state)
+        if planner.needs_sensing(state):
+            action, _ = planner.choose_sensing_action(state)
             shown = environment.perform_sensing(action)
-            observed = (*observed, Observed(state.step, action, numbers_to(shown)))
-            state, _ = observe(problem, PLANNING, state, action, shown)
+            observed = (*observed, Observed(state.step, action, encode_floats(shown)))
+            state, _ = planner.observe(state, action, shown)
             found.append(Turn(state, observed))
         else:
-            task, _ = choose_task_action(problem, PLANNING, state)
+            task, _ = planner.choose_task_action(state)
             environment.perform(task)
-            state = advance(problem, PLANNING, state, task)
+            state = planner.advance(state, task)
     return tuple(found)
 
 
@@ -138,7 +132,7 @@ def requests(session: bytes = b"s" * 16, epoch: int = 1) -> list[Request]:
     """Return requests of every shape, each of which a service can answer."""
     found: list[Request] = []
     for name in (PROBLEM, "peg_in_hole_2d"):
-        opening = opening_of(name)
+        session_configuration = session_configuration_of(name)
         for turn in turns(name):
             state = turn.state
             for told, restored in ((False, False), (True, False), (True, True), (False, True)):
@@ -149,7 +143,7 @@ def requests(session: bytes = b"s" * 16, epoch: int = 1) -> list[Request]:
                         len(found) + 1,
                         epoch=epoch,
                         observations=() if restored else turn.observed,
-                        opening=opening if told else None,
+                        session_configuration=session_configuration if told else None,
                         checkpoint=encode_checkpoint(state) if restored else None,
                     )
                 )
@@ -159,7 +153,7 @@ def requests(session: bytes = b"s" * 16, epoch: int = 1) -> list[Request]:
 def replies() -> list[Reply]:
     """Return a reply of each kind."""
     return [
-        TaskAnswer(17, 2, numbers_to(np.arange(6.0)), 250),
+        TaskAnswer(17, 2, encode_floats(np.arange(6.0)), 250),
         SensingAnswer(17, 44, 2, b"e" * DIGEST_SIZE, 80),
         Progress(17, True),
         NeedState(17, False),
@@ -171,12 +165,12 @@ def replies() -> list[Reply]:
 def records() -> list[Record]:
     """Return a record of each kind."""
     return [
-        ObservedRecord(8, 1, numbers_to([0.5]), bytes(range(32)), 1.5),
-        ActingRecord(8, numbers_to([0.25, -0.5])),
+        ObservedRecord(8, 1, encode_floats([0.5]), bytes(range(32)), 1.5),
+        ActingRecord(8, encode_floats([0.25, -0.5])),
         PerformedRecord(8, -1.0),
         PerformedRecord(9, None),
         PausedRecord(),
-        RecoveredRecord(2),
+        LocalTookOverRecord(2),
     ]
 
 

@@ -23,8 +23,9 @@ import yaml
 from tests.fuzz import message_pack, targets
 from tests.fuzz.mutations import Mutator
 
-from holdfast import planning, yaml_document
-from holdfast.session import messages, records
+from holdfast import planning
+from holdfast.config import yaml_document
+from holdfast.protocol import messages, records
 
 __all__ = ["main"]
 

@@ -25,17 +25,17 @@ from tests.fuzz import corpus
 from tests.fuzz.mutations import Mutator
 from tests.wire import CALL, END, LAST, REPLY, Frame, RawClient, frame_of, hello_of
 
-from holdfast.session.messages import (
+from holdfast.config.settings import ActiveSensingSettings, ParticleFilterSettings, PlanningSettings
+from holdfast.errors import MessageError
+from holdfast.protocol.messages import (
     MAX_OBSERVATIONS,
-    MessageError,
     Observed,
     Refused,
     Request,
     decode_reply,
     encode,
-    sealed,
+    with_checksum,
 )
-from holdfast.settings import ActiveSensingSettings, ParticleFilterSettings, PlanningSettings
 
 __all__ = ["HostileMessages", "Message", "main"]
 
@@ -105,7 +105,7 @@ class HostileMessages:
 
     def _sealed(self, content: bytes) -> bytes:
         """Return it with its checksum, mostly: without, no more of it is looked at."""
-        return sealed(content) if self._chance.random() < 0.8 else content
+        return with_checksum(content) if self._chance.random() < 0.8 else content
 
     def _request(self, key: bytes) -> Request:
         request = self._chance.choice(self._requests)
@@ -172,8 +172,14 @@ class HostileMessages:
         if name.startswith("multitier"):
             holes = [{"center": [4.0, 6.0 - 0.01 * number], "depth": 0.01} for number in range(900)]
             model = {"holes": holes}
-        opening = corpus.opening_of(name, chance.randrange(2**63), model, planning)
-        return encode(msgspec.structs.replace(request, opening=opening, checkpoint=None))
+        session_configuration = corpus.session_configuration_of(
+            name, chance.randrange(2**63), model, planning
+        )
+        return encode(
+            msgspec.structs.replace(
+                request, session_configuration=session_configuration, checkpoint=None
+            )
+        )
 
     def _costly(self) -> bytes:
         """Return a question that keeps a worker busy for some tenths of a second."""
@@ -181,9 +187,15 @@ class HostileMessages:
             particle_filter=ParticleFilterSettings(num_particles=30_000),
             active_sensing=ActiveSensingSettings(num_observation_samples=10, num_cores=0),
         )
-        opening = corpus.opening_of(seed=self._chance.randrange(2**63), planning=planning)
+        session_configuration = corpus.session_configuration_of(
+            seed=self._chance.randrange(2**63), planning=planning
+        )
         request = self._request(self._chance.randbytes(16))
-        changes = {"opening": opening, "checkpoint": None, "observations": ()}
+        changes = {
+            "session_configuration": session_configuration,
+            "checkpoint": None,
+            "observations": (),
+        }
         return encode(msgspec.structs.replace(request, **changes))
 
     def _frames(self) -> bytes:
@@ -208,12 +220,10 @@ class _Client:
 
     Parameters
     ----------
-    endpoint : str
     outstanding : int
         Calls that may be open at a time.
     deaf_s : float
         Now and then nothing is read for this long.
-    seed : int
     """
 
     def __init__(self, endpoint: str, outstanding: int, deaf_s: float, seed: int) -> None:

@@ -28,10 +28,11 @@ from tests.fuzz.measuring import Watch, flatness
 from tests.fuzz.raw_connections import RawConnections
 from tests.processes.faults import PROBLEMS, Process, Robot, Service, Site, document_of, events_of
 
-from holdfast.configuration import load
+from holdfast.config.loader import load
+from holdfast.config.settings import OffloadSettings
+from holdfast.planning import Planner
 from holdfast.recording.journal import Journal
-from holdfast.runtime.trial import run_trial
-from holdfast.settings import OffloadSettings
+from holdfast.robot.trial import run_trial
 
 __all__ = ["HonestRobots", "main", "run_live"]
 
@@ -64,9 +65,6 @@ class HonestRobots:
 
     Parameters
     ----------
-    site : Site
-    service : Service
-    seed : int
     trials : int
         Of each run.
     """
@@ -120,10 +118,10 @@ class HonestRobots:
             with Journal.read(out / "journal.sqlite") as journal:
                 for result in journal.results(with_decisions=True):
                     expected = run_trial(
-                        configuration.problem,
-                        configuration.planning,
-                        configuration.simulator,
+                        Planner(configuration.problem, configuration.planning),
+                        configuration.simulator.seed,
                         result.trial,
+                        max_steps=configuration.simulator.max_steps,
                     )
                     trials += 1
                     decisions += result.steps + result.sensing_decisions
@@ -269,7 +267,6 @@ def run_live(
         That the hostile clients send, besides the one that does not read.
     seed : int
         Of what they send, and of the robots.
-    directory : Path
     clients : int
         Hostile ones, beside the one that does not read.
     trials : int

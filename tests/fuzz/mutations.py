@@ -21,7 +21,6 @@ class Mutator:
 
     Parameters
     ----------
-    chance : random.Random
     specimens : sequence of bytes
         Valid messages.
     """

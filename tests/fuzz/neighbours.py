@@ -26,7 +26,7 @@ from tests.wire import CALL, RawClient, RawLink, frame_of, hello_of
 
 from holdfast.belief import Belief
 from holdfast.planning import PlanningState, encode_checkpoint
-from holdfast.session.messages import encode
+from holdfast.protocol.messages import encode
 
 __all__ = ["KINDS", "main"]
 
@@ -160,8 +160,10 @@ def _silent(visit: _Visit) -> None:
 def _large(visit: _Visit) -> None:
     """A robot that hands over a belief as large as a message can be, again and again."""
     belief = Belief(np.zeros((_PARTICLES, 3)), np.full(_PARTICLES, 1.0 / _PARTICLES))
-    request = next(each for each in corpus.requests() if each.opening and each.checkpoint)
-    state = PlanningState(request.opening.seed, 0, 0, 0, False, belief)  # type: ignore[union-attr]
+    request = next(
+        each for each in corpus.requests() if each.session_configuration and each.checkpoint
+    )
+    state = PlanningState(request.session_configuration.seed, 0, 0, 0, False, belief)  # type: ignore[union-attr]
     request = msgspec.structs.replace(
         request, session=b"has a large one.", checkpoint=encode_checkpoint(state)
     )

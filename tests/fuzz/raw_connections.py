@@ -29,14 +29,12 @@ class RawConnections:
     ----------
     port : int
         Of loopback.
-    seed : int
 
     Attributes
     ----------
     made, held : int
         Connections that were made, and those of them that said the first half of something and
         were left open.
-    bytes_sent : int
     """
 
     def __init__(self, port: int, seed: int) -> None:

@@ -27,9 +27,10 @@ import msgspec
 from tests.fuzz.measuring import Watch, flatness
 from tests.processes.faults import PROBLEMS, Robot, Service, Site, document_of, events_of
 
-from holdfast.configuration import load
+from holdfast.config.loader import load
+from holdfast.planning import Planner
 from holdfast.recording.journal import Journal
-from holdfast.runtime.trial import run_trial
+from holdfast.robot.trial import run_trial
 
 __all__ = ["main", "run_soak"]
 
@@ -46,10 +47,10 @@ def _compare(file: Path, out: Path, most: int = 200) -> tuple[int, list[str]]:
         results = list(journal.results())[-most:]
     for result in results:
         expected = run_trial(
-            configuration.problem,
-            configuration.planning,
-            configuration.simulator,
+            Planner(configuration.problem, configuration.planning),
+            configuration.simulator.seed,
             result.trial,
+            max_steps=configuration.simulator.max_steps,
         )
         if (result.digest, result.reward) != (expected.digest, expected.reward):
             findings.append(f"{out.name}, trial {result.trial}: other decisions")

@@ -10,8 +10,14 @@ from hypothesis import strategies as st
 from tests.fuzz.mutations import Mutator
 
 from holdfast.belief import Belief
+from holdfast.config.settings import (
+    ActiveSensingSettings,
+    ParticleFilterSettings,
+    PlanningSettings,
+    SelectorSettings,
+)
 from holdfast.planning import PlanningState
-from holdfast.session.messages import (
+from holdfast.protocol.messages import (
     DIGEST_SIZE,
     MAX_OBSERVATIONS,
     MAX_TASK_ACTIONS,
@@ -19,28 +25,22 @@ from holdfast.session.messages import (
     Busy,
     NeedState,
     Observed,
-    Opening,
     Progress,
     Refused,
     Reply,
     Request,
     SensingAnswer,
+    SessionConfiguration,
     TaskAnswer,
-    numbers_to,
+    encode_floats,
 )
-from holdfast.session.records import (
+from holdfast.protocol.records import (
     ActingRecord,
+    LocalTookOverRecord,
     ObservedRecord,
     PausedRecord,
     PerformedRecord,
     Record,
-    RecoveredRecord,
-)
-from holdfast.settings import (
-    ActiveSensingSettings,
-    ParticleFilterSettings,
-    PlanningSettings,
-    SelectorSettings,
 )
 
 __all__ = ["records", "replies", "requests", "spoilt", "states"]
@@ -48,7 +48,7 @@ __all__ = ["records", "replies", "requests", "spoilt", "states"]
 words = st.integers(0, 2**32 - 1)
 digests = st.binary(min_size=DIGEST_SIZE, max_size=DIGEST_SIZE)
 finite = st.floats(allow_nan=False, allow_infinity=False)
-numbers = st.lists(finite, max_size=12).map(numbers_to)
+numbers = st.lists(finite, max_size=12).map(encode_floats)
 plain_data: st.SearchStrategy[object] = st.recursive(
     st.none() | st.booleans() | st.integers(-(2**63), 2**64 - 1) | finite | st.text(max_size=20),
     lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=8), inner),
@@ -83,8 +83,8 @@ plannings = st.builds(
     ),
     sensing_interval=st.integers(0, 1000),
 )
-openings = st.builds(
-    Opening,
+session_configurations = st.builds(
+    SessionConfiguration,
     problem=st.text(min_size=1, max_size=60),
     model=sections,
     state_space_planner=sections,
@@ -101,7 +101,7 @@ _asked = {
     "step": words,
     "sensed": st.booleans(),
     "digest": digests,
-    "opening": st.none() | openings,
+    "session_configuration": st.none() | session_configurations,
 }
 requests: st.SearchStrategy[Request] = st.builds(
     Request,
@@ -144,7 +144,7 @@ records: st.SearchStrategy[Record] = st.one_of(
     st.builds(ActingRecord, step=words, action=numbers),
     st.builds(PerformedRecord, step=words, reward=st.none() | finite),
     st.just(PausedRecord()),
-    st.builds(RecoveredRecord, times=words),
+    st.builds(LocalTookOverRecord, times=words),
 )
 
 

@@ -15,22 +15,28 @@ import numpy as np
 from tests.fuzz import corpus
 from tests.wire import MAGIC, frame_of, hello_of
 
-from holdfast import yaml_document
-from holdfast.errors import CheckpointError, ConfigurationError, InvalidValueError
-from holdfast.planning import check_state, decode_checkpoint, digest, encode_checkpoint
+from holdfast.config import yaml_document
+from holdfast.errors import (
+    CheckpointError,
+    ConfigurationError,
+    FrameError,
+    InvalidValueError,
+    MessageError,
+    RecordError,
+)
+from holdfast.planning import Planner, decode_checkpoint, digest, encode_checkpoint
 from holdfast.problems.problem import Problem
-from holdfast.session.messages import (
+from holdfast.protocol.messages import (
     MAX_OBSERVATIONS,
     MAX_TASK_ACTIONS,
     PROTOCOL_VERSION,
-    MessageError,
     decode_reply,
     decode_request,
     encode,
-    sealed,
+    with_checksum,
 )
-from holdfast.session.records import RecordError, decode_record, encode_record
-from holdfast.transport.frames import WIRE_VERSION, FrameError, decode_hello
+from holdfast.protocol.records import decode_record, encode_record
+from holdfast.transport.frames import WIRE_VERSION, decode_hello
 
 __all__ = ["SPECIMENS", "TARGETS"]
 
@@ -44,7 +50,7 @@ def check_request(data: bytes) -> None:
     if not data:
         return
     try:
-        decoded = decode_request(sealed(data))
+        decoded = decode_request(with_checksum(data))
     except MessageError as error:
         assert error.code in _CODES
         assert len(str(error)) < 2000
@@ -62,7 +68,7 @@ def check_reply(data: bytes) -> None:
     if not data:
         return
     try:
-        decoded = decode_reply(sealed(data))
+        decoded = decode_reply(with_checksum(data))
     except MessageError as error:
         assert error.code == "malformed"
         assert len(str(error)) < 2000
@@ -85,7 +91,7 @@ def check_record(data: bytes) -> None:
 
 @functools.cache
 def _problem() -> Problem:
-    return corpus.problem_of(corpus.opening_of())
+    return corpus.problem_of(corpus.session_configuration_of())
 
 
 def check_checkpoint(data: bytes) -> None:
@@ -101,7 +107,7 @@ def check_checkpoint(data: bytes) -> None:
     assert not states.flags.writeable
     assert digest(decode_checkpoint(encode_checkpoint(state))) == digest(state)
     try:
-        check_state(_problem(), corpus.PLANNING, state)
+        Planner(_problem(), corpus.PLANNING).check(state)
     except InvalidValueError:
         return
     assert states.shape == (corpus.PLANNING.particle_filter.num_particles, _problem().state_size)

@@ -28,7 +28,7 @@ from tests.wire import (
     hello_of,
 )
 
-from holdfast.session.messages import encode
+from holdfast.protocol.messages import encode
 from holdfast.transport.frames import FrameDecoder
 
 MAX_BYTES = 2000
@@ -63,7 +63,7 @@ def decoded(said: bytes, cuts: list[int]) -> tuple[list[tuple[int, int, int]], b
     for begin, end in zip([0, *cuts], [*cuts, len(said)], strict=True):
         for frame in decoder.feed(said[begin:end]):
             assert len(frame.payload) <= FIRST_BOUND
-            found.append((frame.kind, frame.call, frame.passed_over_bytes or len(frame.payload)))
+            found.append((frame.kind, frame.call, frame.skipped_bytes or len(frame.payload)))
         if decoder.error is not None:
             return found, False
         assert decoder.held_bytes <= FIRST_BOUND + 9
@@ -112,7 +112,7 @@ def test_a_length_alone_takes_no_memory() -> None:
     tracemalloc.start()
     try:
         (frame,) = decoder.feed(struct.pack("<IBI", 2**32 - 1, CALL, 1))
-        assert frame.passed_over_bytes == 2**32 - 1
+        assert frame.skipped_bytes == 2**32 - 1
         for _ in range(200):
             assert decoder.feed(bytes(100_000)) == []
         assert decoder.held_bytes == 0

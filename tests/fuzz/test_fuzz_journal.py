@@ -18,11 +18,11 @@ from pathlib import Path
 import pytest
 from hypothesis import strategies as st
 from tests.fuzz.examples import always, examples
-from tests.unit.test_journal_steps import TRIAL, all_records, records_of, result_of
+from tests.unit.test_journal import TRIAL, all_records, records_of, result_of
 
-from holdfast.errors import InvalidValueError
-from holdfast.files import OutputError
-from holdfast.recording.journal import SCHEMA_VERSION, Journal
+from holdfast.errors import InvalidValueError, OutputError
+from holdfast.recording.journal import Journal
+from holdfast.recording.journal_reader import SCHEMA_VERSION
 
 STEPS = 6
 FILES = ("journal.sqlite", "journal.sqlite-wal")

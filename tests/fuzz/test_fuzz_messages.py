@@ -13,8 +13,8 @@ from tests.fuzz.mutations import Mutator
 from tests.fuzz.targets import SPECIMENS, TARGETS
 
 from holdfast.planning import PlanningState, decode_checkpoint, digest, encode_checkpoint
-from holdfast.session.messages import Reply, Request, decode_reply, decode_request, encode
-from holdfast.session.records import Record, decode_record, encode_record
+from holdfast.protocol.messages import Reply, Request, decode_reply, decode_request, encode
+from holdfast.protocol.records import Record, decode_record, encode_record
 
 DECODED = sorted(TARGETS)
 

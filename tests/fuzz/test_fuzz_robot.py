@@ -16,12 +16,20 @@ from hypothesis import strategies as st
 from tests.fuzz import corpus
 from tests.fuzz.examples import always, examples
 from tests.fuzz.mutations import Mutator
-from tests.unit.test_session_robot import LOCAL, World
+from tests.robot_world import LOCAL, World
 
-from holdfast.session.dispatcher import Dispatcher
-from holdfast.session.effects import Effect, Send, Stop
-from holdfast.session.events import Appeared, Ended, Replied, Vanished
-from holdfast.session.messages import (
+from holdfast.config.settings import SimulatorSettings
+from holdfast.protocol.dispatcher import Dispatcher
+from holdfast.protocol.events import (
+    CallEnded,
+    Halt,
+    ReplyReceived,
+    RobotEffect,
+    Send,
+    ServiceAppeared,
+    ServiceVanished,
+)
+from holdfast.protocol.messages import (
     Busy,
     NeedState,
     Progress,
@@ -30,10 +38,9 @@ from holdfast.session.messages import (
     SensingAnswer,
     TaskAnswer,
     encode,
-    numbers_to,
-    sealed,
+    encode_floats,
+    with_checksum,
 )
-from holdfast.settings import SimulatorSettings
 
 ONE_TRIAL = SimulatorSettings(num_trials=1, max_steps=14, seed=11)
 
@@ -60,32 +67,32 @@ class HostileWorld(World):
             for _ in range(self.chance.randint(1, 4)):
                 self.after(self.chance.uniform(0.0, 0.02), self.hostile(effect.call))
 
-    def reply(self, call: int, reply: Reply) -> list[Effect]:
+    def reply(self, call: int, reply: Reply) -> list[RobotEffect]:
         self.seen.append(corpus.content_of(reply))
         return super().reply(call, reply)
 
-    def hostile(self, call: int) -> Callable[[], list[Effect]]:
+    def hostile(self, call: int) -> Callable[[], list[RobotEffect]]:
         """Return what delivers something, to this call or to any."""
 
-        def deliver() -> list[Effect]:
+        def deliver() -> list[RobotEffect]:
             any_call = self.chance.choice((call, call, call + 1, call - 1, 0, -1, 2**63))
             if self.chance.random() < 0.1:
-                return self.robot.handle(Ended(any_call), self.now)
+                return self.robot.handle(CallEnded(any_call), self.now)
             if self.chance.random() < 0.1:
                 name = self.chance.choice((*self.services, "nobody"))
                 boot = self.chance.choice(("", "0", "1", "other"))
-                event = self.chance.choice((Appeared, Vanished))
+                event = self.chance.choice((ServiceAppeared, ServiceVanished))
                 if name in self.services:
                     # A transport that erred finds that out.
                     self.after(0.05, lambda: self.truth(name))
                 return self.robot.handle(event(name, boot), self.now)
-            return self.robot.handle(Replied(any_call, self.payload(any_call)), self.now)
+            return self.robot.handle(ReplyReceived(any_call, self.payload(any_call)), self.now)
 
         return deliver
 
-    def truth(self, name: str) -> list[Effect]:
+    def truth(self, name: str) -> list[RobotEffect]:
         service = self.services[name]
-        event = Appeared if service.up else Vanished
+        event = ServiceAppeared if service.up else ServiceVanished
         return self.robot.handle(event(name, str(service.boot)), self.now)
 
     def payload(self, call: int) -> bytes:
@@ -94,12 +101,12 @@ class HostileWorld(World):
             case "beyond":
                 count = self.chance.randint(1, 4)
                 far = [self.chance.choice((-1.0, 1.0)) * self.chance.uniform(0.2, 9.0)]
-                return encode(TaskAnswer(call % 2**32, count, numbers_to(far * 3 * count), 1))
+                return encode(TaskAnswer(call % 2**32, count, encode_floats(far * 3 * count), 1))
             case "late" if self.seen:
                 return self.other_number(self.chance.choice(self.seen), call)
             case "nonsense":
                 nonsense = self.chance.randbytes(self.chance.choice((0, 1, 20, 300)))
-                return sealed(nonsense) if self.chance.random() < 0.5 else nonsense
+                return with_checksum(nonsense) if self.chance.random() < 0.5 else nonsense
             case "shapeless":
                 return encode(self.chance.choice(self.impossible(call)))
             case "mild":
@@ -123,21 +130,21 @@ class HostileWorld(World):
         try:
             fields = msgspec.msgpack.decode(content)
         except (msgspec.DecodeError, RecursionError, UnicodeDecodeError, ValueError):
-            return sealed(content)
+            return with_checksum(content)
         if isinstance(fields, list) and len(fields) > 1 and fields[0] in (1, 2, 6):
             fields[1] = (call + 1) % 2**32 or 1
-            return sealed(msgspec.msgpack.encode(fields))
-        return sealed(content)
+            return with_checksum(msgspec.msgpack.encode(fields))
+        return with_checksum(content)
 
     def impossible(self, call: int) -> list[Reply]:
         """Return answers of that number which cannot be answers to any question of this robot."""
         number = call % 2**32
-        nothing, long = numbers_to([]), numbers_to([0.1] * 3 * 64)
+        nothing, long = encode_floats([]), encode_floats([0.1] * 3 * 64)
         return [
             TaskAnswer(number, 64, long, 1),
             TaskAnswer(number, 4, nothing, 1),
-            TaskAnswer(number, 4, numbers_to([float("nan")] * 12), 1),
-            TaskAnswer(number, 4, numbers_to([0.0] * 12)[:-1], 1),
+            TaskAnswer(number, 4, encode_floats([float("nan")] * 12), 1),
+            TaskAnswer(number, 4, encode_floats([0.0] * 12)[:-1], 1),
             SensingAnswer(number, 0, 2**32 - 1, bytes(16), 1),
             SensingAnswer(number, 2**32 - 1, 0, bytes(16), 1),
             SensingAnswer(number, 5, 0, bytes(16), 1),
@@ -152,7 +159,7 @@ def test_whatever_comes_the_decisions_are_the_same(examples: int) -> None:
         world.run(until_s=600.0)
         assert world.stopped is None, world.stopped
         world.assert_same_as_without_faults()
-        dispatcher = world.robot._dispatcher
+        dispatcher = world.robot._source
         assert isinstance(dispatcher, Dispatcher)
         calls = dispatcher._calls._open
         assert len(calls) <= 4 * len(world.services)
@@ -183,7 +190,7 @@ def test_a_service_that_is_nothing_but_hostile(examples: int) -> None:
         world.start()
         world.after(10.0, list)  # a robot without any service waits for nothing else
         world.run(until_s=5.0)
-        assert not [effect for _, effect in world.trace if isinstance(effect, Stop)]
+        assert not [effect for _, effect in world.trace if isinstance(effect, Halt)]
         for result in world.results:
             assert LOCAL in world.services
             world.assert_same_as_without_faults()

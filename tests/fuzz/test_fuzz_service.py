@@ -23,11 +23,17 @@ from hypothesis.stateful import (
 )
 from tests.fuzz import corpus, strategies
 from tests.fuzz.targets import SPECIMENS
-from tests.unit.test_session_service import Bench, Robot, content, planning_of
+from tests.unit.test_protocol_service import Bench, Robot, content, planning_of
 
-from holdfast.session.messages import Observed, Opening, Request, encode, sealed
-from holdfast.session.service_calls import MAX_WORD
-from holdfast.session.service_sessions import Session, Work
+from holdfast.protocol.messages import (
+    MAX_WORD,
+    Observed,
+    Request,
+    SessionConfiguration,
+    encode,
+    with_checksum,
+)
+from holdfast.protocol.service_sessions import PendingTask, Session
 
 HONEST = (1, 2)
 KEYS = st.integers(100, 115)
@@ -55,7 +61,7 @@ class HostileRobots(RuleBasedStateMachine):
         max_sessions=st.sampled_from((2, 3, 12)),
         max_waiting=st.sampled_from((1, 3, 100)),
         max_state_bytes=st.sampled_from((100, 2000, 1 << 20)),
-        max_opening_bytes=st.sampled_from((1000, 1 << 20)),
+        max_configuration_bytes=st.sampled_from((1000, 1 << 20)),
         answers_per_session=st.integers(1, 8),
         max_calls_per_request=st.integers(1, 3),
         max_sessions_per_robot=st.sampled_from((None, 1, 2)),
@@ -106,7 +112,7 @@ class HostileRobots(RuleBasedStateMachine):
 
     @rule(payload=strategies.spoilt(SPECIMENS["request"]), seals=st.booleans())
     def spoilt_bytes(self, payload: bytes, seals: bool) -> None:
-        self.hostile(sealed(payload) if seals else payload)
+        self.hostile(with_checksum(payload) if seals else payload)
 
     @rule(request=strategies.requests)
     def a_request_of_any_content(self, request: Request) -> None:
@@ -131,8 +137,12 @@ class HostileRobots(RuleBasedStateMachine):
                     request = msgspec.structs.replace(request, observations=tuple(kept))
                 case "own":
                     planning = planning_of(chance.choice((0, 5, 10**6)), chance.choice((1, 4, 150)))
-                    opening = Opening("capsule_robot", {}, {}, planning, chance.randrange(3))
-                    request = msgspec.structs.replace(request, opening=opening)
+                    session_configuration = SessionConfiguration(
+                        "capsule_robot", {}, {}, planning, chance.randrange(3)
+                    )
+                    request = msgspec.structs.replace(
+                        request, session_configuration=session_configuration
+                    )
                 case "number" | "trial" | "step" as field:
                     request = msgspec.structs.replace(request, **{field: chance.choice(words)})
                 case _:
@@ -193,14 +203,14 @@ class HostileRobots(RuleBasedStateMachine):
             assert content(answer) == robot.right_answer()
 
 
-def works_of(session: Session) -> list[Work]:
-    return list(session.works.values())
+def works_of(session: Session) -> list[PendingTask]:
+    return list(session.pending.values())
 
 
 def check_limits(bench: Bench, limits: dict[str, Any]) -> None:
     """Measure all that a service holds."""
     service, statistics = bench.service, bench.service.statistics
-    sessions, lines, calls = service._sessions, service._lines, service._calls
+    sessions, queue, calls = service._sessions, service._queue, service._calls
     kept = list(sessions._sessions.values())
     assert statistics.sessions == len(kept) <= limits["max_sessions"]
     epochs = list(sessions._epochs)
@@ -213,9 +223,9 @@ def check_limits(bench: Bench, limits: dict[str, Any]) -> None:
         theirs = [session for session in kept if session.owner == owner]
         holding = sessions._holdings[owner]
         assert holding.sessions == len(theirs)
-        assert holding.newcomers == sum(not session.served for session in theirs)
+        assert holding.unserved == sum(not session.served for session in theirs)
         assert holding.state_bytes == sum(session.num_bytes for session in theirs)
-        assert holding.opening_bytes == sum(len(session.opening) for session in theirs)
+        assert holding.configuration_bytes == sum(len(session.configuration) for session in theirs)
         if owner is not None and limits["max_sessions_per_robot"] is not None:
             assert len(theirs) <= limits["max_sessions_per_robot"]
             known = [session for session in theirs if not session.newcomer and not session.served]
@@ -224,49 +234,49 @@ def check_limits(bench: Bench, limits: dict[str, Any]) -> None:
     assert sum(session.num_bytes for session in kept) == sessions.state_bytes
     assert sum(session.size() for session in kept) <= sessions.state_bytes
     assert sessions.state_bytes <= limits["max_state_bytes"]
-    assert sum(len(session.opening) for session in kept) == sessions.opening_bytes
-    assert sessions.opening_bytes <= limits["max_opening_bytes"] or len(kept) == 1
+    assert sum(len(session.configuration) for session in kept) == sessions.configuration_bytes
+    assert sessions.configuration_bytes <= limits["max_configuration_bytes"] or len(kept) == 1
     assert all(len(session.answers) <= limits["answers_per_session"] for session in kept)
     # Works.
-    works = [work for session in kept for work in works_of(session)]
-    running = list(lines._running.values())
-    waiting = [work for work in works if not work.running]
+    tasks = [task for session in kept for task in works_of(session)]
+    running = list(queue._running.values())
+    waiting = [task for task in tasks if not task.running]
     assert statistics.running == len(running) == len(bench.jobs) <= bench.workers
     assert statistics.waiting == len(waiting)
-    lined_up = [*lines._urgent, *lines._newcomers, *lines._later]
-    held = [work for session in kept for work in session.held if work is not None]
-    assert {id(work) for work in waiting} == {id(work) for work in (*lined_up, *held)}
-    assert set(lines._waiting_of) == {work.session.owner for work in waiting}
-    for owner in (*lines._waiting_of, "all"):
-        loads = lines._waiting if owner == "all" else lines._waiting_of[owner]
+    lined_up = [*queue._urgent, *queue._newcomers, *queue._later]
+    held = list(queue._held.values())
+    assert {id(task) for task in waiting} == {id(task) for task in (*lined_up, *held)}
+    assert set(queue._waiting_of) == {task.session.owner for task in waiting}
+    for owner in (*queue._waiting_of, "all"):
+        loads = queue._waiting if owner == "all" else queue._waiting_of[owner]
         for newcomer in (False, True):
             some = [
-                work
-                for work in waiting
-                if work.newcomer == newcomer and owner in ("all", work.session.owner)
+                task
+                for task in waiting
+                if task.newcomer == newcomer and owner in ("all", task.session.owner)
             ]
             load = loads.of(newcomer=newcomer)
             assert load.num == len(some)
-            assert load.num_bytes == sum(work.size for work in some)
-            assert abs(load.cost_s - sum(work.cost_s for work in some)) < 1e-6
-    requested = [work for work in waiting if work.request is not None]
+            assert load.num_bytes == sum(task.size for task in some)
+            assert abs(load.cost_s - sum(task.cost_s for task in some)) < 1e-6
+    requested = [task for task in waiting if task.request is not None]
     # Whoever was served before finds room, if newcomers have taken that of all, and so does one
     # owner, if another has.
     assert len(requested) <= max(limits["max_waiting"], 2 * bench.workers) + 2 * bench.workers
-    newcomers = sum(work.newcomer for work in requested)
+    newcomers = sum(task.newcomer for task in requested)
     assert newcomers <= max((limits["max_waiting"] + 1) // 2, bench.workers)
     for session in kept:
-        assert sum(not work.running for work in works_of(session)) <= 2
-        assert len(session.works) <= 4
+        assert sum(not task.running for task in works_of(session)) <= 2
+        assert len(session.pending) <= 4
         assert not session.closed
-    for work in works:
-        assert work.request is None or work.request.opening is None
+    for task in tasks:
+        assert task.request is None or task.request.session_configuration is None
     # Calls: each waits for one work that is still to be done.
-    attached = [record for work in works for record in work.calls.values()]
+    attached = [record for task in tasks for record in task.calls.values()]
     assert len(attached) == len(calls) == statistics.calls
     assert all(calls._calls[record.call] is record for record in attached)
     most = 2 * limits["max_calls_per_request"]
-    assert all(len(work.calls) <= most for work in works)
+    assert all(len(task.calls) <= most for task in tasks)
     assert set(calls._calls) == set(bench.replies) - bench.ended
     # Problems.
     pool = service._problems._idle

@@ -18,12 +18,12 @@ from typing import Any
 
 from tests.fuzz import corpus
 from tests.questions import request_of
-from tests.unit.test_session_service import Robot as ReferenceRobot
-from tests.unit.test_session_service import content
+from tests.unit.test_protocol_service import Robot as ReferenceRobot
+from tests.unit.test_protocol_service import content
 from tests.wire import RawClient
 
 from holdfast.planning import encode_checkpoint
-from holdfast.session.messages import NeedState, encode
+from holdfast.protocol.messages import NeedState, encode
 
 __all__ = ["main"]
 
@@ -66,7 +66,7 @@ def main() -> None:
         time.sleep(options.pause * 2 * chance.random())
         name = chance.choice(_PROBLEMS)
         session = chance.randbytes(16)
-        opening = corpus.opening_of(name)
+        session_configuration = corpus.session_configuration_of(name)
         last = chance.randint(1, len(corpus.turns(name)))
         leaves = chance.random() < 0.3
         for number, turn in enumerate(corpus.turns(name)[:last]):
@@ -77,7 +77,7 @@ def main() -> None:
                 session,
                 number + 1,
                 observations=() if restored else turn.observed,
-                opening=opening,
+                session_configuration=session_configuration,
                 checkpoint=encode_checkpoint(state) if restored else None,
             )
             if leaves and number == last - 1:

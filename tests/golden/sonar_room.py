@@ -9,7 +9,8 @@ from __future__ import annotations
 import numpy as np
 
 from holdfast import numerics
-from holdfast.problems.problem import FloatArray, IntArray, ProblemBase
+from holdfast.arrays import FloatArray, IntArray
+from holdfast.problems.problem import ProblemBase
 from holdfast.randomness import Stream
 
 OUTLIERS = 0.2

@@ -21,13 +21,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple, get_args, get_type_hints
 
-from holdfast.configuration import Configuration, load
-from holdfast.experiments.cases import CASES
+from holdfast.config.loader import Configuration, load
+from holdfast.config.settings import SelectorSettings
+from holdfast.lab.studies.cases import CASES
 from holdfast.outcome import TrialResult
 from holdfast.problems import registry
 from holdfast.recording.tables import SummaryBuilder
-from holdfast.runtime.trials import run_trials
-from holdfast.settings import SelectorSettings
+from holdfast.robot.trials import run_trials
 
 ROOT = Path(__file__).parents[2]
 TABLE = Path(__file__).with_name("digests.csv")
@@ -146,7 +146,7 @@ def _resolutions() -> Iterator[Run]:
         PLAIN,
         4,
         states,
-        "holdfast.experiments.passer_by:PasserBy",
+        "holdfast.lab.studies.passer_by:PasserBy",
     )
 
 

@@ -6,12 +6,14 @@ Shares no code with the kernel; SciPy's digamma, NumPy's sorting.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from scipy.special import digamma
 
-FloatArray = npt.NDArray[np.float64]
+from holdfast.arrays import FloatArray, IntArray
 
 
 def significant(weights: FloatArray) -> npt.NDArray[np.bool_]:
@@ -33,17 +35,29 @@ def log_unit_ball(dimension: int) -> float:
     return float(0.5 * dimension * math.log(math.pi) - math.lgamma(0.5 * dimension + 1.0))
 
 
-def nearest_neighbor_entropy(
-    points: FloatArray, weights: FloatArray, neighbors: int, resolution: float
-) -> float:
-    kept = significant(weights)
-    points, weights = points[kept], weights[kept] / weights[kept].sum()
+class Neighborhood(NamedTuple):
+    """What lies about one point.
+
+    Attributes
+    ----------
+    within, others : array of int
+        The other points in the neighbourhood, and all others.
+    terms : float
+        The part of the point's entropy that no weight changes: ``log c_d + d log r + log q -
+        psi(q)``.
+    """
+
+    within: IntArray
+    others: IntArray
+    terms: float
+
+
+def neighborhoods(
+    points: FloatArray, neighbors: int, resolution: float
+) -> Iterator[tuple[int, Neighborhood]]:
+    """Yield each of two or more points with its neighbourhood."""
     count, dimension = points.shape
-    log_ball = log_unit_ball(dimension)
-    if count == 1:
-        return float(log_ball + dimension * math.log(resolution))
     k = min(neighbors, count - 1)
-    total = 0.0
     for n in range(count):
         others = np.delete(np.arange(count), n)
         # Squares compared with squares, as a radius that is a square root would move ties apart.
@@ -55,17 +69,35 @@ def nearest_neighbor_entropy(
         tolerance = 1.0 + 2.0**-40
         resolved = kth > resolution * resolution * tolerance
         radius_squared = (kth if resolved else resolution * resolution) * tolerance
-        within = squared <= radius_squared
-        q = k if resolved else int(within.sum())
-        mass = weights[others][within].sum() / weights[others].sum()
-        total += weights[n] * (
-            -math.log(mass)
-            + log_ball
+        within = others[squared <= radius_squared]
+        q = k if resolved else len(within)
+        terms = (
+            log_unit_ball(dimension)
             + 0.5 * dimension * math.log(radius_squared)
             + math.log(q)
             - digamma(q)
         )
-    return float(total)
+        yield n, Neighborhood(within, others, float(terms))
+
+
+def single_point_entropy(dimension: int, resolution: float) -> float:
+    return log_unit_ball(dimension) + dimension * math.log(resolution)
+
+
+def nearest_neighbor_entropy(
+    points: FloatArray, weights: FloatArray, neighbors: int, resolution: float
+) -> float:
+    kept = significant(weights)
+    points, weights = points[kept], weights[kept] / weights[kept].sum()
+    if len(points) == 1:
+        return single_point_entropy(points.shape[1], resolution)
+    return float(
+        sum(
+            weights[n]
+            * (near.terms - math.log(weights[near.within].sum() / weights[near.others].sum()))
+            for n, near in neighborhoods(points, neighbors, resolution)
+        )
+    )
 
 
 def prior_neighbors_entropy(
@@ -78,31 +110,11 @@ def prior_neighbors_entropy(
     weights = np.where(significant(weights), weights, 0.0)
     weights = weights / weights.sum()
     points, weights, prior = points[prior > 0.0], weights[prior > 0.0], prior[prior > 0.0]
-    count, dimension = points.shape
-    log_ball = log_unit_ball(dimension)
-    if count == 1:
-        return float(log_ball + dimension * math.log(resolution))
-    k = min(neighbors, count - 1)
+    if len(points) == 1:
+        return single_point_entropy(points.shape[1], resolution)
     total = 0.0
-    for n in range(count):
-        others = np.delete(np.arange(count), n)
-        squared = np.zeros(count - 1)
-        for coordinate in range(dimension):
-            squared += (points[others, coordinate] - points[n, coordinate]) ** 2
-        kth = np.partition(squared, k - 1)[k - 1]
-        tolerance = 1.0 + 2.0**-40
-        resolved = kth > resolution * resolution * tolerance
-        radius_squared = (kth if resolved else resolution * resolution) * tolerance
-        within = others[squared <= radius_squared]
-        q = k if resolved else len(within)
-        share = prior[within].sum() / prior[others].sum()
-        total += prior[n] * (
-            -math.log(share)
-            + log_ball
-            + 0.5 * dimension * math.log(radius_squared)
-            + math.log(q)
-            - digamma(q)
-        )
+    for n, (within, others, terms) in neighborhoods(points, neighbors, resolution):
+        total += prior[n] * (terms - math.log(prior[within].sum() / prior[others].sum()))
         if weights[n] > 0.0:
             before, after = (
                 (w[within].sum() + 0.05 * w[n]) / (w[others].sum() + 0.05 * w[n])

@@ -11,8 +11,8 @@ import fcl
 import numpy as np
 import pytest
 
-from holdfast.geometry import BoolArray, BoxWorld, DiscWorld, RectangleWorld
-from holdfast.problems.problem import FloatArray
+from holdfast.arrays import BoolArray, FloatArray
+from holdfast.geometry import BoxWorld, DiscWorld, RectangleWorld
 from holdfast.randomness import Purpose, stream
 
 NUM_POSES = 3000

@@ -14,21 +14,21 @@ import pytest
 from benchmarks.horizon import one_by_one
 from tests.golden.sonar_room import SonarRoom
 
-from holdfast import _kernel, contract, sensing
+from holdfast import _kernel, checked, sensing
+from holdfast.arrays import FloatArray
 from holdfast.belief import Belief
-from holdfast.experiments.busy_room import BusyRoom
-from holdfast.experiments.light_dark import LightDark
-from holdfast.problems import registry
-from holdfast.problems.peg_in_hole_2d import PegInHole2D
-from holdfast.problems.problem import FloatArray
-from holdfast.randomness import Purpose, Stream, stream
-from holdfast.sensing import choose_sensing_action
-from holdfast.settings import (
+from holdfast.config.settings import (
     ActiveSensingSettings,
     ParticleFilterSettings,
     PlanningSettings,
     SelectorSettings,
 )
+from holdfast.lab.studies.busy_room import BusyRoom
+from holdfast.lab.studies.light_dark import LightDark
+from holdfast.problems import registry
+from holdfast.problems.peg_in_hole_2d import PegInHole2D
+from holdfast.randomness import Purpose, Stream, stream
+from holdfast.sensing import choose_sensing_action
 
 PROBLEMS: dict[str, Callable[[], Any]] = {
     **{
@@ -56,7 +56,7 @@ def on_the_way(problem: Any, count: int) -> tuple[Belief, int]:
     stage = 0
     for step in range(42):
         mean = states.mean(axis=0)
-        stage = contract.next_stage(problem, mean, stage)
+        stage = checked.next_stage(problem, mean, stage)
         action = problem.execute(problem.policy(mean, stage))
         states = problem.move(states, action, draws.substream(2).substream(step))
     weights = draws.substream(1).uniform(count)

@@ -1,6 +1,6 @@
 """The particle filter against the Kalman filter, which is exact where all is linear and Gaussian.
 
-The filter is the one that plans: `planning.observe` and `planning.advance` on a problem of one and
+The filter is the one that plans: `Planner.observe` and `Planner.advance` on a problem of one and
 of two dimensions. Its belief of N particles errs from the exact one by O(1 / sqrt N) at random and
 by O(1 / N) in the mean, at every step, because it forgets. So the errors of independent runs on the
 same observations are a sample of mean zero up to 10 / N, in units of the exact deviation: a t-test
@@ -17,11 +17,12 @@ import numpy.typing as npt
 import pytest
 from scipy import stats
 
-from holdfast import planning
+from holdfast.arrays import FloatArray, IntArray
 from holdfast.belief import estimate
-from holdfast.problems.problem import FloatArray, IntArray, ProblemBase
+from holdfast.config.settings import ParticleFilterSettings, PlanningSettings
+from holdfast.planning import Planner
+from holdfast.problems.problem import ProblemBase
 from holdfast.randomness import Purpose, Stream, stream
-from holdfast.settings import ParticleFilterSettings, PlanningSettings
 
 FALSE_ALARM = 1e-6
 NUM_PARTICLES = 20_000
@@ -138,7 +139,8 @@ def test_mean_and_covariance(name: str, resampling_threshold: float) -> None:
     )
     observations = true_observations(problem)
     exact = KalmanFilter(problem)
-    states = [planning.initial_state(problem, settings, 5, run) for run in range(RUNS)]
+    planner = Planner(problem, settings)
+    states = [planner.init(5, run) for run in range(RUNS)]
     resampled = []
 
     def compare() -> None:
@@ -161,14 +163,12 @@ def test_mean_and_covariance(name: str, resampling_threshold: float) -> None:
         if sensing_action is not None:
             exact.update(sensing_action, observations[step])
             for run, state in enumerate(states):
-                states[run], info = planning.observe(
-                    problem, settings, state, sensing_action, observations[step]
-                )
+                states[run], info = planner.observe(state, sensing_action, observations[step])
                 assert info.explained
                 resampled.append(info.resampled)
             compare()
         exact.predict(action)
-        states = [planning.advance(problem, settings, state, action) for state in states]
+        states = [planner.advance(state, action) for state in states]
         compare()
     expected = {1.0: {True}, 0.5: {True, False}, 0.0: {False}}
     assert set(resampled) == expected[resampling_threshold]

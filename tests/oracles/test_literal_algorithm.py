@@ -18,27 +18,20 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 from benchmarks import literal
 from tests.oracles.reference_entropy import nearest_neighbor_entropy
 
+from holdfast.arrays import FloatArray
 from holdfast.belief import Belief
-from holdfast.planning import (
-    PlanningState,
-    advance,
-    choose_sensing_action,
-    choose_task_action,
-    initial_state,
-    needs_sensing,
-    observe,
-)
-from holdfast.problems.peg_in_hole_2d import PegInHole2D
-from holdfast.problems.peg_in_hole_3d import PegInHole3D
-from holdfast.problems.problem import FloatArray, Problem
-from holdfast.randomness import Purpose, stream
-from holdfast.runtime.environment import SimulatedEnvironment
-from holdfast.settings import (
+from holdfast.config.settings import (
     ActiveSensingSettings,
     ParticleFilterSettings,
     PlanningSettings,
     SelectorSettings,
 )
+from holdfast.planning import Planner, PlanningState
+from holdfast.problems.peg_in_hole_2d import PegInHole2D
+from holdfast.problems.peg_in_hole_3d import PegInHole3D
+from holdfast.problems.problem import Problem
+from holdfast.randomness import Purpose, stream
+from holdfast.robot.environment import SimulatedEnvironment
 
 # The sum of some thousand terms of about 10 nats, each with a relative error of a few 1e-15.
 TOLERANCE = 1e-9
@@ -57,7 +50,7 @@ def settings_of(num_particles: int) -> PlanningSettings:
 def assert_same_decision(
     problem: Problem, settings: PlanningSettings, state: PlanningState
 ) -> FloatArray:
-    index, info = choose_sensing_action(problem, settings, state)
+    index, info = Planner(problem, settings).choose_sensing_action(state)
     assert info.entropies is not None
     for estimate in ESTIMATES:
         literal_index, entropies = literal.choose_sensing_action(problem, settings, state, estimate)
@@ -72,19 +65,20 @@ def assert_same_decision(
 @pytest.mark.parametrize("num_particles", [50, 200])
 def test_every_decision_of_a_trial(problem: Problem, num_particles: int) -> None:
     settings = settings_of(num_particles)
-    state = initial_state(problem, settings, seed=11, trial=2)
+    planner = Planner(problem, settings)
+    state = planner.init(seed=11, trial=2)
     environment = SimulatedEnvironment(problem, seed=11, trial=2)
     decisions = 0
     while not environment.is_done() and state.step < 60:
-        if needs_sensing(settings, state):
+        if planner.needs_sensing(state):
             assert_same_decision(problem, settings, state)
-            action, _ = choose_sensing_action(problem, settings, state)
+            action, _ = planner.choose_sensing_action(state)
             decisions += 1
             observation = environment.perform_sensing(action)
-            state, _ = observe(problem, settings, state, action, observation)
-        task_action, _ = choose_task_action(problem, settings, state)
+            state, _ = planner.observe(state, action, observation)
+        task_action, _ = planner.choose_task_action(state)
         environment.perform(task_action)
-        state = advance(problem, settings, state, task_action)
+        state = planner.advance(state, task_action)
     assert decisions >= 5
 
 
@@ -132,7 +126,7 @@ def test_number_of_samples_and_neighbors() -> None:
             num_cores=1, num_observation_samples=4, num_nearest_neighbors=9
         ),
     )
-    assert_same_decision(problem, settings, initial_state(problem, settings, seed=1, trial=0))
+    assert_same_decision(problem, settings, Planner(problem, settings).init(seed=1, trial=0))
 
 
 def test_a_resolution_for_each_coordinate() -> None:
@@ -143,4 +137,4 @@ def test_a_resolution_for_each_coordinate() -> None:
             method="action_entropy", estimator="nearest_neighbor", resolution=(0.1, 0.02, 0.5)
         ),
     )
-    assert_same_decision(problem, settings, initial_state(problem, settings, seed=1, trial=0))
+    assert_same_decision(problem, settings, Planner(problem, settings).init(seed=1, trial=0))

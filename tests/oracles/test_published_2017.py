@@ -2,7 +2,7 @@
 
 The rows are those that the logs of 2017 end with: of 1,000 trials the number of successes, and the
 mean reward over the successful ones. Emulated are the filter's defects
-(:mod:`holdfast.experiments.emulation_2017`); the worlds and policies are holdfast's own.
+(:mod:`holdfast.lab.studies.emulation_2017`); the worlds and policies are holdfast's own.
 
 Two tests per row, both two-sided: Fisher's exact test of the numbers of successes, and a comparison
 of the mean rewards as normal variables. The table has no standard deviations, so that of 2017 is
@@ -81,11 +81,12 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from holdfast.experiments.emulation_2017 import Emulation, drawn_particle, emulate, likelihoods
-from holdfast.experiments.published_2017 import PublishedRow, published_rows, series_of
-from holdfast.experiments.trial_batches import problem_of
+from holdfast.arrays import FloatArray
+from holdfast.lab.studies.emulation_2017 import Emulation, drawn_particle, emulate, likelihoods
+from holdfast.lab.studies.published_2017 import PublishedRow, published_rows, series_of
+from holdfast.lab.studies.trial_batches import problem_of
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
-from holdfast.problems.problem import FloatArray, Problem
+from holdfast.problems.problem import Problem
 
 SEED = 2017
 FAMILY_WISE_LEVEL = 0.001

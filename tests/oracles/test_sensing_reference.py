@@ -23,16 +23,17 @@ from tests.oracles.reference_entropy import (
 )
 
 from holdfast import _kernel
+from holdfast.arrays import FloatArray, IntArray
 from holdfast.belief import Belief
-from holdfast.problems.problem import FloatArray, IntArray, Problem, ProblemBase
-from holdfast.randomness import Purpose, Stream, stream
-from holdfast.sensing import _stratified, choose_sensing_action
-from holdfast.settings import (
+from holdfast.config.settings import (
     ActiveSensingSettings,
     ParticleFilterSettings,
     PlanningSettings,
     SelectorSettings,
 )
+from holdfast.problems.problem import Problem, ProblemBase
+from holdfast.randomness import Purpose, Stream, stream
+from holdfast.sensing import _stratified, choose_sensing_action
 
 TOLERANCE = 1e-9
 
@@ -397,20 +398,6 @@ def test_action_covariance_counts_far_particles_of_small_weight() -> None:
     assert found.max() > 10.0 * found.min()
 
 
-def test_action_covariance_with_a_general_likelihood() -> None:
-    selector = SelectorSettings(method="action_covariance")
-    settings = settings_of(samples=8, horizon=2, selector=selector)
-    inner = Plane()
-    hypotheses = stream(33, 0, 1, Purpose.HYPOTHESES)
-    general: Problem = General(inner, hypotheses, 8)  # type: ignore[assignment]
-    belief = some_belief(inner, 70, "weighted")
-    _, info = choose_sensing_action(general, settings, belief, 0, hypotheses, hypotheses)
-    _, expected = choose_sensing_action(inner, settings, belief, 0, hypotheses, hypotheses)
-    assert info.samples is not None
-    assert expected.samples is not None
-    np.testing.assert_allclose(info.samples, expected.samples, rtol=0.0, atol=TOLERANCE)
-
-
 @pytest.mark.parametrize("neighbors", [1, 5, 30])
 @pytest.mark.parametrize("samples", [1, 2, 13])
 def test_numbers_of_samples_and_neighbours(samples: int, neighbors: int) -> None:
@@ -448,9 +435,20 @@ def test_horizon_by_the_most_likely_particle() -> None:
 
 
 @pytest.mark.parametrize("inner", [Plane(), LightDark()], ids=lambda p: p.name)
-def test_general_likelihood_with_the_same_draws(inner: Plane) -> None:
+@pytest.mark.parametrize(
+    ("selector", "horizon"),
+    [
+        (None, 1),
+        (SelectorSettings(method="action_covariance"), 2),
+        (SelectorSettings(method="path_entropy", estimator="nearest_neighbor"), 1),
+        (SelectorSettings(method="path_entropy", estimator="gaussian_mixture_upper"), 1),
+    ],
+)
+def test_general_likelihood_with_the_same_draws(
+    inner: Plane, selector: SelectorSettings | None, horizon: int
+) -> None:
     """A problem that gives its log-likelihood and draws as a Gaussian would decides the same."""
-    settings = settings_of(samples=8)
+    settings = settings_of(samples=8, horizon=horizon, selector=selector)
     for kind in ("weighted", "zeros"):
         belief = some_belief(inner, 70, kind)
         hypotheses = stream(33, 0, 1, Purpose.HYPOTHESES)

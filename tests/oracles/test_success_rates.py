@@ -13,8 +13,9 @@ import msgspec
 import pytest
 from scipy import stats
 
-from holdfast.configuration import Configuration, load
-from holdfast.runtime.trial import run_trial
+from holdfast.config.loader import Configuration, load
+from holdfast.planning import Planner
+from holdfast.robot.trial import run_trial
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 TRUE_RATE = 0.995
@@ -31,7 +32,12 @@ def successes(configuration: Configuration, num_particles: int, max_steps: int, 
     assert planning.selector.method == "path_entropy"
     assert planning.sensing_interval == 8
     return sum(
-        run_trial(configuration.problem, planning, simulator, trial).success
+        run_trial(
+            Planner(configuration.problem, planning),
+            simulator.seed,
+            trial,
+            max_steps=simulator.max_steps,
+        ).success
         for trial in range(simulator.num_trials)
     )
 

@@ -16,22 +16,23 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from holdfast import _kernel, planning, sensing
-from holdfast.experiments.light_dark import LightDark
-from holdfast.planning import PlanningState
-from holdfast.problems.capsule_robot import CapsuleRobot
-from holdfast.problems.multitier_peg_in_hole_2d import MultitierPegInHole2D
-from holdfast.problems.peg_in_hole_2d import PegInHole2D
-from holdfast.problems.peg_in_hole_3d import PegInHole3D
-from holdfast.problems.problem import FloatArray, IntArray, ProblemBase
-from holdfast.randomness import Stream
-from holdfast.runtime.environment import SimulatedEnvironment
-from holdfast.settings import (
+from holdfast import _kernel, sensing
+from holdfast.arrays import FloatArray, IntArray
+from holdfast.config.settings import (
     ActiveSensingSettings,
     ParticleFilterSettings,
     PlanningSettings,
     SelectorSettings,
 )
+from holdfast.lab.studies.light_dark import LightDark
+from holdfast.planning import Planner, PlanningState
+from holdfast.problems.capsule_robot import CapsuleRobot
+from holdfast.problems.multitier_peg_in_hole_2d import MultitierPegInHole2D
+from holdfast.problems.peg_in_hole_2d import PegInHole2D
+from holdfast.problems.peg_in_hole_3d import PegInHole3D
+from holdfast.problems.problem import ProblemBase
+from holdfast.randomness import Stream
+from holdfast.robot.environment import SimulatedEnvironment
 
 PEG = PegInHole2D()
 
@@ -169,20 +170,21 @@ def choices_of(
         sensing_interval=2,
     )
     environment = SimulatedEnvironment(problem, 7, trial)
-    state = planning.initial_state(problem, settings, 7, trial)
+    planner = Planner(problem, settings)
+    state = planner.init(7, trial)
     found, entropies = [], []
     while not environment.is_done() and state.step < 45:
         action, order = None, ()
-        if planning.needs_sensing(settings, state):
-            action, info = planning.choose_sensing_action(problem, settings, state)
+        if planner.needs_sensing(state):
+            action, info = planner.choose_sensing_action(state)
             assert info.entropies is not None
             order = tuple(np.argsort(info.entropies, kind="stable").tolist())
             entropies.append(info.entropies)
             shown = environment.perform_sensing(action)
-            state, _ = planning.observe(problem, settings, state, action, shown)
-        task_action, _ = planning.choose_task_action(problem, settings, state)
+            state, _ = planner.observe(state, action, shown)
+        task_action, _ = planner.choose_task_action(state)
         environment.perform(task_action)
-        state = planning.advance(problem, settings, state, task_action)
+        state = planner.advance(state, task_action)
         found.append(Choice(action, order, (task_action / actions).tobytes()))
     return found, entropies
 
@@ -288,18 +290,19 @@ def states() -> list[PlanningState]:
         selector=SelectorSettings(method="action_entropy", estimator="nearest_neighbor")
     )
     found = []
+    planner = Planner(PEG, settings)
     for trial in range(12):
         environment = SimulatedEnvironment(PEG, 7, trial)
-        state = planning.initial_state(PEG, settings, 7, trial)
+        state = planner.init(7, trial)
         while not environment.is_done() and state.step < 200:
-            if planning.needs_sensing(settings, state):
+            if planner.needs_sensing(state):
                 found.append(state)
-                action, _ = planning.choose_sensing_action(PEG, settings, state)
+                action, _ = planner.choose_sensing_action(state)
                 shown = environment.perform_sensing(action)
-                state, _ = planning.observe(PEG, settings, state, action, shown)
-            task_action, _ = planning.choose_task_action(PEG, settings, state)
+                state, _ = planner.observe(state, action, shown)
+            task_action, _ = planner.choose_task_action(state)
             environment.perform(task_action)
-            state = planning.advance(PEG, settings, state, task_action)
+            state = planner.advance(state, task_action)
     return found
 
 
@@ -318,8 +321,8 @@ def share_of_other_choices(
         there = state._replace(
             belief=state.belief._replace(states=np.ascontiguousarray(state.belief.states * SCALE))
         )
-        here, _ = planning.choose_sensing_action(unscaled, settings, state)
-        chosen, _ = planning.choose_sensing_action(rescaled, settings, there)
+        here, _ = Planner(unscaled, settings).choose_sensing_action(state)
+        chosen, _ = Planner(rescaled, settings).choose_sensing_action(there)
         others += here != chosen
     return others / len(states)
 

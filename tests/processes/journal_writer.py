@@ -11,9 +11,9 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
-from tests.unit.test_journal_steps import records_of, result_of
+from tests.unit.test_journal import records_of, result_of
 
-from holdfast.files import OutputError
+from holdfast.errors import OutputError
 from holdfast.recording.journal import Journal
 
 

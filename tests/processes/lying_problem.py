@@ -19,9 +19,8 @@ import time
 import numpy as np
 import numpy.typing as npt
 
+from holdfast.arrays import FloatArray
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
-
-FloatArray = npt.NDArray[np.float64]
 
 VARIABLE = "HOLDFAST_TEST_LIE"
 OWN_PLANNER_HANGS = "HOLDFAST_TEST_OWN_PLANNER_HANGS"

@@ -6,6 +6,7 @@ robot's own local service too, without asking the demo.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import signal
@@ -22,10 +23,12 @@ from typing import Self
 import msgspec
 import pytest
 
-from holdfast.cli.story import Findings
+from holdfast.lab.demo.scenario import Findings
+from holdfast.lab.testbed.processes import marked_processes
 from holdfast.recording.compare import compare_runs
 
 COMMAND = [sys.executable, "-c", "from holdfast.cli import main; main()"]
+MARK = "HOLDFAST_TEST_MARK"
 PATIENCE_S = 240.0
 ATTEMPTS = 3
 STANDSTILL_S = 0.1
@@ -36,8 +39,7 @@ class Demo:
     """A demo that is going on, without a terminal."""
 
     def __init__(self, directory: Path, *arguments: str) -> None:
-        self.mark = f"HOLDFAST_TEST_MARK={uuid.uuid4().hex}"
-        name, _, value = self.mark.partition("=")
+        self.mark = uuid.uuid4().hex
         self.out = directory / "out"
         temporary = directory / "tmp"
         temporary.mkdir()
@@ -45,7 +47,7 @@ class Demo:
         self.process = subprocess.Popen(
             [*COMMAND, "demo", "--quick", "--out", str(self.out), *arguments],
             cwd=directory,
-            env={**os.environ, name: value, "TMPDIR": str(temporary)},
+            env={**os.environ, MARK: self.mark, "TMPDIR": str(temporary)},
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
@@ -55,15 +57,11 @@ class Demo:
     def others(self) -> dict[int, str]:
         """Processes that live and came from the demo, by what they were asked to do."""
         found = {}
-        for entry in Path("/proc").iterdir():
-            if not entry.name.isdigit() or int(entry.name) == self.process.pid:
-                continue
-            try:
-                if self.mark.encode() in (entry / "environ").read_bytes().split(b"\0"):
-                    command = (entry / "cmdline").read_bytes().replace(b"\0", b" ").decode()
-                    found[int(entry.name)] = command
-            except OSError:
-                continue  # it has ended, or is somebody else's
+        for pid in marked_processes(MARK, self.mark):
+            with contextlib.suppress(OSError):
+                command = Path(f"/proc/{pid}/cmdline").read_bytes().replace(b"\0", b" ").decode()
+                found[pid] = command
+        found.pop(self.process.pid, None)
         return found
 
     def read_until(self, text: str) -> str:
@@ -223,7 +221,7 @@ def test_a_process_that_ends_by_itself_ends_the_demo(directory: Path) -> None:
         os.kill(robots[0], signal.SIGKILL)
         output, rest = demo.process.communicate(timeout=PATIENCE_S)
         assert demo.process.returncode == 2
-        assert "holdfast: error: the process of the robot ended with SIGKILL; see " in rest
+        assert "holdfast: error: the robot ended with SIGKILL; see " in rest
         assert str(demo.out / "robot.log") in rest
         assert (demo.out / "robot.log").exists()
         assert "identical" not in output

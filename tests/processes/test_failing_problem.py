@@ -39,7 +39,7 @@ DOCUMENT = {
     ("error", "code", "text"),
     [
         ("ValueError", "failed", "ValueError: the map ends here"),
-        # Of the machines: unit/test_session_robot.py.
+        # Of the machines: unit/test_dispatcher.py.
         pytest.param(
             *("MemoryError", "out_of_memory", "MemoryError: Unable to allocate 7 GiB"),
             marks=pytest.mark.slow,

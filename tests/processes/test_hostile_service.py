@@ -21,7 +21,7 @@ from tests.processes.faults import (
     events_of,
 )
 
-from holdfast.session.messages import sealed
+from holdfast.protocol.messages import with_checksum
 from holdfast.transport.frames import CALL, LAST, FrameDecoder, encode_frame, encode_hello
 
 FLAPS = 80
@@ -60,7 +60,7 @@ class HostileService:
             while data := link.recv(65536):
                 for frame in decoder.feed(data):
                     if frame.kind == CALL:
-                        link.sendall(encode_frame(LAST, frame.call, sealed(b"rubbish")))
+                        link.sendall(encode_frame(LAST, frame.call, with_checksum(b"rubbish")))
 
     def flap(self) -> None:
         """End the link, and as many that the robot opens after it."""

@@ -22,6 +22,7 @@ from tests.processes.faults import (
     events_of,
 )
 
+from holdfast.lab.testbed.records import LogEvent
 from holdfast.transport.key_ring import make_credentials, revoke_credentials
 
 PEG = "peg_in_hole_2d"
@@ -48,7 +49,7 @@ def cloud_of(site: Site, home: Path, *options: str) -> Service:
     )
 
 
-def reload(cloud: Service, count: int = 1) -> dict[str, object]:
+def reload(cloud: Service, count: int = 1) -> LogEvent:
     cloud.process.signal(signal.SIGHUP)
     return cloud.process.wait_for("credentials_reloaded", count)
 
@@ -154,7 +155,7 @@ def test_credentials_that_cannot_be_used_are_told_and_not_used(
     cloud.process.signal(signal.SIGHUP)
     told = cloud.process.wait_for("credentials")
     assert "revoked.pem: is no revocation list" in told["reason"]
-    assert "those of before stay in use" in told["reason"]
+    assert "the previous ones stay in use" in told["reason"]
     robot = Story(site, references, document_of(PEG)).run(
         cloud, options=("--tls", str(home / "anna"))
     )
@@ -225,7 +226,6 @@ class Mounted:
 
     Parameters
     ----------
-    directory : Path
     first : Path
         The credentials to begin with.
     """
@@ -270,7 +270,7 @@ def test_what_is_renewed_where_it_is_mounted_is_read_without_a_signal(
     assert told["links_ended"] == 0
     for failure in cloud.process.matching("credentials"):
         assert "key.pem: is not the key of" in failure["reason"]
-        assert "those of before stay in use" in failure["reason"]
+        assert "the previous ones stay in use" in failure["reason"]
     assert len(cloud.process.matching("credentials")) == processes
 
     revoke_credentials(home, names=["berta"])

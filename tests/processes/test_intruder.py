@@ -24,9 +24,9 @@ from tests.processes.test_tls import secure
 from tests.questions import questions_of
 from tests.wire import GOODBYE, HELLO, RawLink, hello_of
 
-from holdfast.configuration import load
+from holdfast.config.loader import load
 from holdfast.recording.journal import Journal
-from holdfast.runtime.robot_process import opening_of
+from holdfast.robot.session_configuration import session_configuration_of
 
 DOCUMENT = document_of("peg_in_hole_2d")
 
@@ -79,7 +79,9 @@ class Raid:
         configuration = load(self._story.file)
         asked = questions_of(configuration, session)
         own = msgspec.structs.replace(
-            asked[0], session=os.urandom(16), opening=opening_of(configuration)
+            asked[0],
+            session=os.urandom(16),
+            session_configuration=session_configuration_of(configuration),
         )
         self.intruder = Intruder(self._cloud.endpoint, self._keys, asked, own)
         self._thread = threading.Thread(target=self._run, daemon=True)

@@ -13,7 +13,7 @@ import tempfile
 from pathlib import Path
 
 import pytest
-from tests.unit.test_journal_steps import all_records, records_of
+from tests.unit.test_journal import all_records, records_of
 
 from holdfast.recording.journal import Journal
 

@@ -19,9 +19,9 @@ from pathlib import Path
 import pytest
 from tests.ports import free_port
 
-from holdfast.configuration import load
-from holdfast.runtime.links import make_links
-from holdfast.runtime.logs import NullEventLog
+from holdfast.config.loader import load
+from holdfast.robot.links import make_links
+from holdfast.runtime.events import NullEventLog
 from holdfast.transport.frames import FrameDecoder, decode_hello
 
 ROOT = Path(__file__).parents[2]

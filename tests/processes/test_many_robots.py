@@ -17,27 +17,27 @@ from tests.processes.faults import (
     Service,
     Site,
     Story,
-    World,
     assert_identical,
     document_of,
     events_of,
     in_order,
 )
+from tests.processes.world import World
 from tests.questions import request_of
 from tests.wire import RawClient
 
-from holdfast.configuration import Configuration, load
-from holdfast.planning import initial_state
-from holdfast.runtime.robot_process import opening_of
-from holdfast.session.messages import (
+from holdfast.config.loader import Configuration, load
+from holdfast.planning import Planner
+from holdfast.protocol.messages import (
     PROTOCOL_VERSION,
     Progress,
     Refused,
     Request,
     SensingAnswer,
     encode,
-    sealed,
+    with_checksum,
 )
+from holdfast.robot.session_configuration import session_configuration_of
 from holdfast.transport.contract import DEFAULT_MAX_MESSAGE_BYTES
 
 PEG = "peg_in_hole_2d"
@@ -67,10 +67,12 @@ def client(cloud: Service) -> Iterator[Client]:
 
 def first_request(configuration: Configuration, **changes: Any) -> Request:
     """Return the first question of a run."""
-    state = initial_state(
-        configuration.problem, configuration.planning, configuration.simulator.seed, 0
+    state = Planner(configuration.problem, configuration.planning).init(
+        configuration.simulator.seed, 0
     )
-    request = request_of(state, bytes(range(16)), 1, opening=opening_of(configuration))
+    request = request_of(
+        state, bytes(range(16)), 1, session_configuration=session_configuration_of(configuration)
+    )
     return msgspec.structs.replace(request, **changes)
 
 
@@ -81,16 +83,18 @@ class TestNeighbours:
         story = Story(site, references, document_of(PEG))
         configuration = load(story.file)
         good = first_request(configuration)
-        assert good.opening is not None
+        assert good.session_configuration is not None
         random = np.random.default_rng(11)
 
         def another_problem(name: str) -> bytes:
-            assert good.opening is not None
+            assert good.session_configuration is not None
             return encode(
                 msgspec.structs.replace(
                     good,
                     session=random.bytes(16),
-                    opening=msgspec.structs.replace(good.opening, problem=name),
+                    session_configuration=msgspec.structs.replace(
+                        good.session_configuration, problem=name
+                    ),
                 )
             )
 
@@ -108,7 +112,7 @@ class TestNeighbours:
             for size in range(0, len(whole), 37):
                 assert client.refused(whole[:size]).code == "damaged"
             for _ in range(50):
-                nonsense = sealed(random.bytes(200))
+                nonsense = with_checksum(random.bytes(200))
                 assert client.refused(nonsense).code in ("malformed", "version")
             large = bytes(DEFAULT_MAX_MESSAGE_BYTES + 1)
             assert client.refused(large).code == "too_large"

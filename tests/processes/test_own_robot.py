@@ -24,14 +24,21 @@ import numpy as np
 import pytest
 from tests.ports import free_port
 
-from holdfast.configuration import Configuration, load
+from holdfast.arrays import FloatArray
+from holdfast.config.loader import Configuration, load
 from holdfast.outcome import Done
+from holdfast.planning import Planner
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
-from holdfast.problems.problem import FloatArray
-from holdfast.runtime.environment import Environment, EnvironmentMaker, load_environment
-from holdfast.runtime.performer import Performer, make_performer
-from holdfast.runtime.trial import run_trial
-from holdfast.session.events import Acted, Begun, EnvironmentEvent, EnvironmentFailed, Sensed
+from holdfast.protocol.events import (
+    Acted,
+    EnvironmentEvent,
+    EnvironmentFailed,
+    EnvironmentReady,
+    Sensed,
+)
+from holdfast.robot.environment import Environment, EnvironmentMaker, load_environment
+from holdfast.robot.environment_runner import EnvironmentRunner, make_runner
+from holdfast.robot.trial import run_trial
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "own_robot"
 PATIENCE_S = 60.0
@@ -250,10 +257,16 @@ class TestTrial:
     ) -> None:
         controller.start()
         configuration = configuration_for(controller)
-        arguments = (configuration.problem, configuration.planning, configuration.simulator, 2)
+        planner = Planner(configuration.problem, configuration.planning)
         maker = load_environment(configuration)
         quiet: Any = maker(2)
-        expected = run_trial(*arguments, environment=quiet)
+        expected = run_trial(
+            planner,
+            configuration.simulator.seed,
+            2,
+            max_steps=configuration.simulator.max_steps,
+            environment=quiet,
+        )
         quiet.close()
         assert expected.success
         moves = controller.moves()
@@ -261,7 +274,13 @@ class TestTrial:
         (controller.directory / "performed.log").unlink()
 
         robot: Any = maker(2)
-        result = run_trial(*arguments, environment=Meddling(robot, controller))
+        result = run_trial(
+            planner,
+            configuration.simulator.seed,
+            2,
+            max_steps=configuration.simulator.max_steps,
+            environment=Meddling(robot, controller),
+        )
         robot.close()
         assert result.digest == expected.digest
         assert result.reward == expected.reward
@@ -273,10 +292,10 @@ class TestTrial:
         maker = load_environment(configuration)
         assert maker.simulated
         result = run_trial(
-            configuration.problem,
-            configuration.planning,
-            configuration.simulator,
+            Planner(configuration.problem, configuration.planning),
+            configuration.simulator.seed,
             0,
+            max_steps=configuration.simulator.max_steps,
             environment=maker(0),
         )
         assert result.success
@@ -288,27 +307,29 @@ def test_without_its_controller_the_example_says_why_in_time() -> None:
     controller = Controller(Path())
     controller.port = free_port()
     maker = load_environment(configuration_for(controller, {"connect_timeout_s": 0.1}))
-    failed = Watched(maker).begin()
+    watched = Watched(maker)
+    failed = watched.begin()
     assert isinstance(failed, EnvironmentFailed)
     assert "Connection refused" in failed.text
+    watched.runner.close()
 
 
 class Watched:
-    """A performer with the queue of its events."""
+    """A runner with the queue of its events."""
 
     def __init__(self, maker: EnvironmentMaker, trial: int = 0, *, resumed: bool = False) -> None:
         self.queue: SimpleQueue[EnvironmentEvent] = SimpleQueue()
-        self.performer: Performer = make_performer(maker, trial, self.queue.put, resumed=resumed)
+        self.runner: EnvironmentRunner = make_runner(maker, trial, self.queue.put, resumed=resumed)
 
     def event(self) -> EnvironmentEvent:
         return self.queue.get(timeout=PATIENCE_S)
 
     def begin(self) -> EnvironmentEvent:
-        self.performer.begin()
+        self.runner.begin()
         return self.event()
 
     def perform(self, step: int) -> EnvironmentEvent:
-        self.performer.perform(step, np.array([-0.1, 0.0, 0.0]))
+        self.runner.perform(step, np.array([-0.1, 0.0, 0.0]))
         return self.event()
 
 
@@ -320,7 +341,7 @@ class TestFailures:
         controller.start("--silent-at", "2", "--silent-s", "3")
         maker = load_environment(configuration_for(controller, timeout_ms=1000.0))
         first = Watched(maker)
-        assert first.begin() == Begun(False, None)
+        assert first.begin() == EnvironmentReady(False, None)
         assert isinstance(first.perform(0), Acted)
         assert isinstance(first.perform(1), Acted)
         failed = first.perform(2)
@@ -334,12 +355,12 @@ class TestFailures:
         # A new process of the robot would do this; the controller answers once it speaks again.
         patient = load_environment(configuration_for(controller))
         again = Watched(patient, resumed=True)
-        assert again.begin() == Begun(False, 3)
+        assert again.begin() == EnvironmentReady(False, 3)
         assert isinstance(again.perform(3), Acted)
         assert [move["step"] for move in controller.moves()] == [0, 1, 2, 3]
         assert not [move for move in controller.moves() if "error" in move]
-        first.performer.close()
-        again.performer.close()
+        first.runner.close()
+        again.runner.close()
 
     def test_no_controller_at_all(self, controller: Controller) -> None:
         controller.port = free_port()
@@ -349,20 +370,20 @@ class TestFailures:
         assert isinstance(failed, EnvironmentFailed)
         assert failed.text.startswith("environment:SocketRobot raised ConnectionRefusedError")
         assert f'File "{EXAMPLE / "environment.py"}", line ' in failed.text
-        assert not failed.performance_unknown
-        watched.performer.close()
+        assert not failed.action_in_doubt
+        watched.runner.close()
 
     def test_a_controller_in_another_trial_is_not_resumed(self, controller: Controller) -> None:
         controller.start()
         maker = load_environment(configuration_for(controller))
         first = Watched(maker, trial=0)
-        assert isinstance(first.begin(), Begun)
-        first.performer.close()
+        assert isinstance(first.begin(), EnvironmentReady)
+        first.runner.close()
         other = Watched(maker, trial=1, resumed=True)
         failed = other.begin()
         assert isinstance(failed, EnvironmentFailed)
         assert "RuntimeError: the controller is in trial 0, not in 1" in failed.text
-        other.performer.close()
+        other.runner.close()
 
 
 ROBOT = """\
@@ -371,9 +392,9 @@ from queue import SimpleQueue
 
 import numpy as np
 
-from holdfast.configuration import load
-from holdfast.runtime.environment import load_environment
-from holdfast.runtime.performer import make_performer
+from holdfast.config.loader import load
+from holdfast.robot.environment import load_environment
+from holdfast.robot.environment_runner import make_runner
 
 file, port, timeout_ms, steps = sys.argv[1:]
 configuration = load(file, overrides={
@@ -382,14 +403,14 @@ configuration = load(file, overrides={
     "environment.timeout_ms": float(timeout_ms),
 })
 events = SimpleQueue()
-performer = make_performer(load_environment(configuration), 0, events.put)
-performer.begin()
+runner = make_runner(load_environment(configuration), 0, events.put)
+runner.begin()
 print(events.get(), flush=True)
 for step in range(int(steps)):
-    performer.perform(step, np.array([-0.1, 0.0, 0.0]))
+    runner.perform(step, np.array([-0.1, 0.0, 0.0]))
     print("performing", flush=True)
     print(events.get(), flush=True)
-performer.close()
+runner.close()
 """
 
 
@@ -420,14 +441,14 @@ class TestProcesses:
             process.kill()
         again = Watched(load_environment(configuration_for(controller)), resumed=True)
         begun = again.begin()
-        assert isinstance(begun, Begun)
+        assert isinstance(begun, EnvironmentReady)
         # The controller counts a motion that goes on as what it becomes, and nothing is lost.
         assert begun.steps_performed == len(controller.moves())
         for step in range(len(controller.moves()), 3):
             assert isinstance(again.perform(step), Acted)
         assert [move["step"] for move in controller.moves()] == [0, 1, 2]
         assert not [move for move in controller.moves() if "error" in move]
-        again.performer.close()
+        again.runner.close()
 
     def test_stopped_for_longer_than_the_timeout(self, controller: Controller) -> None:
         """A robot that was stopped itself does not blame its controller for the time."""
@@ -451,15 +472,15 @@ def wait_for_exit(process: subprocess.Popen[str], timeout_s: float) -> bool:
     return True
 
 
-def test_sensing_through_the_performer(controller: Controller) -> None:
+def test_sensing_through_the_runner(controller: Controller) -> None:
     controller.start()
     watched = Watched(load_environment(configuration_for(controller)))
-    assert isinstance(watched.begin(), Begun)
-    watched.performer.sense(0, 1)
+    assert isinstance(watched.begin(), EnvironmentReady)
+    watched.runner.sense(0, 1)
     sensed = watched.event()
     assert isinstance(sensed, Sensed)
     assert sensed.observation.shape == (1,)
-    watched.performer.close()
+    watched.runner.close()
     operator = controller.connect()
     assert operator.ask(do="sense", coordinate=1)["value"] == sensed.observation[0]
     operator.close()

@@ -264,7 +264,7 @@ class TestOutput:
             check=False,
         )
         assert done.returncode == 0
-        assert done.stdout.startswith("Usage: holdfast run ")
+        assert done.stdout.startswith("usage: holdfast run ")
         assert "<bool>" not in done.stdout
 
     def test_version(self, workplace: Path) -> None:

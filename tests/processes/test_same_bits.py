@@ -64,8 +64,8 @@ from pathlib import Path
 import numpy as np
 
 from holdfast import _kernel
-from holdfast.configuration import load
-from holdfast.runtime import trials
+from holdfast.config.loader import load
+from holdfast.robot import trials
 
 # As if workers cost nothing to start: they take all trials but the first.
 trials._WORKER_START_S = 0.0

@@ -12,7 +12,6 @@ import urllib.error
 import urllib.request
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
@@ -23,7 +22,6 @@ from tests.processes.faults import (
     References,
     Service,
     Site,
-    World,
     assert_identical,
     document_of,
     events_of,
@@ -31,6 +29,7 @@ from tests.processes.faults import (
     wait_for_end,
     wait_until,
 )
+from tests.processes.world import World
 
 PATIENCE_S = 30.0
 PEG = "peg_in_hole_2d"
@@ -172,7 +171,7 @@ class TestEnding:
         ("number", "code"),
         [
             (signal.SIGTERM, 0),
-            # As test_serve.py has them of one process, by the same handlers.
+            # As test_service_process.py has them of one process, by the same handlers.
             pytest.param(signal.SIGINT, 130, marks=pytest.mark.slow),
             pytest.param(signal.SIGHUP, 129, marks=pytest.mark.slow),
         ],
@@ -288,8 +287,8 @@ class TestRefusing:
         assert ended.wait() == 2, ended.account()
         assert not ended.matching("ready")
         (error,) = ended.events
-        assert error["event"] == "error"
-        return json.dumps(error)
+        assert error.name == "error"
+        return json.dumps(dict(error.fields))
 
     def test_an_address_that_is_taken(self, site: Site) -> None:
         with socket.socket() as taken:
@@ -315,6 +314,6 @@ def test_events_name_the_processes(site: Site) -> None:
     pid = children(cloud)[0]
     os.kill(pid, signal.SIGKILL)
     started = cloud.process.wait_for("process_started")
-    ended: dict[str, Any] = cloud.process.matching("process_ended")[0]
+    ended = cloud.process.matching("process_ended")[0]
     assert (ended["pid"], ended["reason"]) == (pid, "was ended by SIGKILL")
     assert started["pid"] in children(cloud)

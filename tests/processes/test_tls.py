@@ -31,8 +31,8 @@ PEG = "peg_in_hole_2d"
 UDP_AND_SLOWLY_TLS = pytest.mark.parametrize(
     "protocol", ["udp", pytest.param("tls", marks=pytest.mark.slow)]
 )
-# Who lets whom in, test_credentials.py has of links in one process; here it is that nothing is
-# decided by who is not.
+# test_transport_credentials.py shows who lets whom in, with links in one process; this shows that a
+# refused service decides nothing.
 TLS_AND_SLOWLY_UDP = pytest.mark.parametrize(
     "protocol", ["tls", pytest.param("udp", marks=pytest.mark.slow)]
 )
@@ -87,7 +87,7 @@ def test_a_service_of_another_authority_is_not_believed(
     assert_not_believed(cloud, keys, site, references)
 
 
-@pytest.mark.slow  # of links in one process: TestOnRealLinks in test_credentials.py
+@pytest.mark.slow  # of links in one process: TestOnRealLinks in test_transport_credentials.py
 @pytest.mark.parametrize("protocol", ["tls", "udp"])
 def test_a_service_at_another_address_than_it_was_certified_for_is_not_believed(
     protocol: str, keys: Path, site: Site, references: References

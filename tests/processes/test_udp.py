@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from tests.contracts.test_datagram_links import at_rest
-from tests.contracts.test_transport import Inbox, until
+from tests.contracts.wires import Inbox, until
 from tests.ports import free_port
 from tests.processes.faults import (
     References,
@@ -20,10 +20,10 @@ from tests.processes.faults import (
 )
 from tests.relay import relay
 
-from holdfast.chaos.proxy import Impairment, Proxy
-from holdfast.session.events import Ended, Vanished
+from holdfast.lab.testbed.proxy import Impairment, Proxy
+from holdfast.protocol.events import CallEnded, ServiceVanished
 from holdfast.transport.credentials import load_credentials
-from holdfast.transport.datagrams import RobotDatagramLink
+from holdfast.transport.datagram_links import RobotDatagramLink
 from holdfast.transport.endpoints import ServiceAddress
 from holdfast.transport.robot_end import StreamRobotTransport
 
@@ -141,13 +141,13 @@ async def test_a_killed_service_is_known_by_its_closed_port(site: Site, keys: Pa
             robot.start(inbox)
             await until(lambda: robot.sends_datagrams("cloud"))
             link = robot._services["cloud"].current
-            assert isinstance(link, RobotDatagramLink) and link._sealing is not None
+            assert isinstance(link, RobotDatagramLink) and link._cipher is not None
             await at_rest(link)
-            sealing, before = link._sealing, link._sealing._counter
+            sealing, before = link._cipher, link._cipher._counter
             await asyncio.to_thread(stream.impair, Impairment(silent=True))
             await asyncio.to_thread(cloud.kill)
             robot.call("cloud", 1, b"is anybody there?")
-            await inbox.wait_for(Vanished("cloud", inbox.boots()[0]), Ended(1))
-            assert link.reason == "is gone: nobody has its port any more"
+            await inbox.wait_for(ServiceVanished("cloud", inbox.incarnations()[0]), CallEnded(1))
+            assert link.reason == "is gone: its port is closed"
             assert sealing._counter == before + 1
             await robot.close()

@@ -1,4 +1,4 @@
-"""The robot's end of a world that lives in the test's own process (``faults.World``).
+"""The robot's end of a world that lives in the test's own process (``world.World``).
 
 A class as a user writes one: it knows nothing of holdfast. It is imported by the robots of the
 tests, by its name in their configuration.
@@ -11,9 +11,8 @@ import socket
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-FloatArray = npt.NDArray[np.float64]
+from holdfast.arrays import FloatArray
 
 
 class PlainWorldClient:

@@ -22,7 +22,7 @@ import rclpy
 from rclpy.executors import MultiThreadedExecutor
 from rclpy.node import Node
 
-from holdfast.configuration import load
+from holdfast.config.loader import load
 from holdfast.errors import ConfigurationError, EnvironmentFailedError
 from holdfast.ros.ros2_environment import cancel_ros_environments, make_ros_environment
 

@@ -10,7 +10,7 @@ import subprocess
 import sys
 import time
 import xmlrpc.client
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -96,8 +96,6 @@ class Process:
 
     Parameters
     ----------
-    words : list of str
-    environment : mapping
     place : Path
         A file for what it prints, without its ending.
     reads : bool
@@ -162,7 +160,6 @@ class Graph(AtMaster):
 
     Parameters
     ----------
-    directory : Path
     environment : mapping
         Of ROS 1.
     """
@@ -332,8 +329,14 @@ def start_everything(graph: Graph) -> tuple[Process, Process]:
 
 
 def settled(graph: Graph) -> dict[str, list[str]]:
-    """Return what is listed when nothing has changed for a moment."""
+    """Return the listing once it has not changed for a moment."""
+    listing: dict[str, list[str]] = unchanged(graph.listed, 0.2)
+    return listing
+
+
+def unchanged(read: Callable[[], Any], for_s: float) -> Any:
+    """Return a value that has been the same for so long."""
     before = None
-    while before != (before := graph.listed()):
-        time.sleep(0.2)
+    while before != (before := read()):
+        time.sleep(for_s)
     return before

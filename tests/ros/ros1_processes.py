@@ -38,7 +38,6 @@ class AtMaster:
     ----------
     environment : mapping
         Of ROS 1.
-    directory : Path
     port : int, optional
         The master's; None takes a free one.
     **variables

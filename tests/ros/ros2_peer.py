@@ -27,8 +27,8 @@ from rclpy.action import ActionClient
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
-from holdfast.configuration import load
-from holdfast.runtime.environment import SimulatedEnvironment
+from holdfast.config.loader import load
+from holdfast.robot.environment import SimulatedEnvironment
 
 Decide = holdfast_interfaces.srv.Decide
 Run = holdfast_interfaces.action.Run

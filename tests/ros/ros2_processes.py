@@ -5,10 +5,12 @@ from __future__ import annotations
 import contextlib
 import json
 import queue
+import signal
 import subprocess
 import threading
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from time import monotonic
 from typing import Any
 
 WAIT_S = 120.0
@@ -89,3 +91,65 @@ class Driver(Process):
         answer = self.end(self.begin(what, *arguments, **more))
         assert "error" in answer, answer
         return str(answer["error"])
+
+
+class ObservedProcess:
+    """A process whose output and errors are read all the time, line by line."""
+
+    def __init__(self, command: list[str], environment: dict[str, str], cwd: Path) -> None:
+        self.process = subprocess.Popen(
+            command,
+            env=environment,
+            cwd=cwd,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        self.output: queue.Queue[str] = queue.Queue()
+        self.errors: list[str] = []
+        self._threads = [
+            threading.Thread(target=self._read_output, daemon=True),
+            threading.Thread(target=self._read_errors, daemon=True),
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    def _read_output(self) -> None:
+        assert self.process.stdout is not None
+        for line in self.process.stdout:
+            self.output.put(line)
+
+    def _read_errors(self) -> None:
+        assert self.process.stderr is not None
+        for line in self.process.stderr:
+            self.errors.append(line)
+
+    def said(self) -> str:
+        return "".join(self.errors)
+
+    def wait_for(self, text: str, count: int = 1) -> None:
+        """Wait until the standard error has a text so often."""
+        deadline = monotonic() + WAIT_S
+        while self.said().count(text) < count:
+            assert monotonic() < deadline, f"{text!r} was not said:\n{self.said()}"
+            assert self.process.poll() is None, self.said()
+            threading.Event().wait(0.02)
+
+    def kill(self) -> None:
+        self.process.kill()
+        self.end()
+
+    def end(self) -> int:
+        code = self.process.wait(WAIT_S)
+        for thread in self._threads:
+            thread.join(WAIT_S)
+        for stream in (self.process.stdin, self.process.stdout, self.process.stderr):
+            assert stream is not None
+            with contextlib.suppress(OSError):
+                stream.close()
+        return code
+
+    def interrupt(self, number: signal.Signals = signal.SIGINT) -> int:
+        self.process.send_signal(number)
+        return self.end()

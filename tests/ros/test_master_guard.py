@@ -16,7 +16,8 @@ from tests.ros.conftest import PATIENCE_S
 from tests.ros.graph import Graph, count, keeps_on, replaced, settled, start_everything, topic_tool
 from tests.ros.ros1_processes import SYSTEM_PYTHON, wait_for
 
-from holdfast.ros.master.settings import GuardError, MasterAddress
+from holdfast.errors import GuardError
+from holdfast.ros.master.settings import MasterAddress
 
 GUARD = (sys.executable, "-m", "holdfast", "ros1-guard")
 KILLS = 10
@@ -154,6 +155,8 @@ class TestItsOwnMaster:
         assert sorted(silent) == ["/stopped_a", "/stopped_b"]
         stopped[0].end()
         wait_for(lambda: "/stopped_a" not in graph.registered()["nodes"])
+        # The guard reports what it has unregistered, a moment later.
+        wait_for(lambda: graph.events(guard, "nodes_gone"))
         assert [event["gone"] for event in graph.events(guard, "nodes_gone")] == [["/stopped_a"]]
         os.kill(stopped[1].process.pid, signal.SIGCONT)
         graph.run("rosservice", "call", "/work_b")

@@ -12,9 +12,9 @@ import pytest
 from tests.ros.conftest import ROOT, left_out
 from tests.ros.ros1_processes import SYSTEM_PYTHON, Ros1, ros1_in
 
-from holdfast.ros.active_sensing import Kind, Request
-from holdfast.ros.ros1 import Ros1Service
-from holdfast.transport.tcpros import Surroundings
+from holdfast.ros.active_sensing import DecisionRequest, RequestKind
+from holdfast.ros.ros1_client import Ros1Service
+from holdfast.transport.tcpros import RosEnvironment
 
 EXAMPLE = ROOT / "examples" / "peg_in_hole_2d.yaml"
 CLOUD = "cloud_active_sensing"
@@ -83,9 +83,9 @@ def test_catkin_builds_it_and_roscpp_calls_it(around: Ros1, tmp_path: Path) -> N
         directory=tmp_path,
     )
     around.serve(CLOUD, EXAMPLE)
-    service = Ros1Service(CLOUD, Surroundings.of(around.environment))
-    state = service.ask(Request(Kind.INITIALIZE, seed=4), 30.0).state
-    answer = service.ask(Request(Kind.CHOOSE_SENSING_ACTION, state=state), 30.0)
+    service = Ros1Service(CLOUD, RosEnvironment.of(around.environment))
+    state = service.ask(DecisionRequest(RequestKind.INITIALIZE, seed=4), 30.0).state
+    answer = service.ask(DecisionRequest(RequestKind.CHOOSE_SENSING_ACTION, state=state), 30.0)
     service.close()
     for way in ((), ("persistent",)):
         said = around.run(str(tmp_path / "stock"), CLOUD, *way).split()

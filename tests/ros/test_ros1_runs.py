@@ -31,9 +31,9 @@ from tests.ros.ros1_processes import Ros1, ros1_in, wait_for
 from tests.ros.test_ros1_service import CLOUD as TYPED_CLOUD
 from tests.ros.test_ros1_service import EXAMPLE, Robot
 from tests.ros.test_ros1_service import RECOVERY as TYPED_RECOVERY
-from tests.unit.test_active_sensing import in_process
+from tests.unit.test_ros_client import in_process
 
-from holdfast.configuration import load
+from holdfast.config.loader import load
 
 PEG = "peg_in_hole_2d"
 CLOUD = "cloud_active_sensing"
@@ -113,10 +113,6 @@ def test_the_master_is_killed_and_then_the_cloud(site: RosSite, references: Refe
 
 class Kills:
     """Kills of a guarded master, and how long it takes until everything is listed again.
-
-    Parameters
-    ----------
-    graph : Graph
 
     Attributes
     ----------

@@ -18,15 +18,15 @@ import numpy as np
 import pytest
 from tests.ros.conftest import line_of
 from tests.ros.ros1_processes import SYSTEM_PYTHON, Ros1, ros1_in, wait_for
-from tests.unit.test_active_sensing import in_process
+from tests.unit.test_ros_client import in_process
 
-from holdfast.configuration import Configuration, load
+from holdfast.config.loader import Configuration, load
 from holdfast.errors import TransportError
-from holdfast.ros.active_sensing import Answer, ErrorCode, Kind, Request
+from holdfast.ros.active_sensing import DecisionAnswer, DecisionRequest, ErrorCode, RequestKind
 from holdfast.ros.messages import md5_sum
-from holdfast.ros.ros1 import Ros1Client, Ros1Service
-from holdfast.ros.ros1_service import MAX_WAITING, Ros1ActiveSensing
-from holdfast.transport.tcpros import Surroundings, decode_header, encode_header
+from holdfast.ros.ros1_client import Ros1Client, Ros1Service
+from holdfast.ros.ros1_service import MAX_WAITING, Ros1Server
+from holdfast.transport.tcpros import RosEnvironment, decode_header, encode_header
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "peg_in_hole_2d.yaml"
 CLOUD, RECOVERY = "cloud_active_sensing", "cloud_active_sensing_recovery"
@@ -38,8 +38,8 @@ def around(ros1: Mapping[str, str], tmp_path: Path) -> Iterator[Ros1]:
 
 
 @pytest.fixture
-def here(around: Ros1) -> Surroundings:
-    return Surroundings.of(around.environment)
+def here(around: Ros1) -> RosEnvironment:
+    return RosEnvironment.of(around.environment)
 
 
 @pytest.fixture
@@ -91,15 +91,15 @@ print(json.dumps(said))
 
 
 def test_a_stock_client_in_rospy_asks_and_is_told_its_mistakes(
-    around: Ros1, here: Surroundings
+    around: Ros1, here: RosEnvironment
 ) -> None:
     around.serve(CLOUD, EXAMPLE)
     once, standing = json.loads(around.run(SYSTEM_PYTHON, "-c", STOCK))
     assert once == standing
     chosen, entropies, error, message, actions, *mistakes = once
     service = Ros1Service(CLOUD, here)
-    state = service.ask(Request(Kind.INITIALIZE, seed=4, trial=1), 30.0).state
-    answer = service.ask(Request(Kind.CHOOSE_SENSING_ACTION, state=state), 30.0)
+    state = service.ask(DecisionRequest(RequestKind.INITIALIZE, seed=4, trial=1), 30.0).state
+    answer = service.ask(DecisionRequest(RequestKind.CHOOSE_SENSING_ACTION, state=state), 30.0)
     assert (chosen, entropies) == (answer.sensing_action, answer.entropies.tolist())
     assert (error, message) == (ErrorCode.OK, "")
     assert len(actions) > 0
@@ -113,11 +113,11 @@ def test_a_stock_client_in_rospy_asks_and_is_told_its_mistakes(
 ROBOT = """
 import json, sys, time
 import rospy
-from holdfast.configuration import load
-from holdfast.ros.active_sensing import Kind, Request
-from holdfast.ros.ros1 import Ros1Client
-from holdfast.runtime.environment import SimulatedEnvironment
-from holdfast.session.status import Status
+from holdfast.config.loader import load
+from holdfast.ros.active_sensing import DecisionRequest, RequestKind
+from holdfast.ros.ros1_client import Ros1Client
+from holdfast.robot.environment import SimulatedEnvironment
+from holdfast.protocol.status import Status
 
 settings = load(sys.argv[1])
 simulator = settings.simulator
@@ -128,19 +128,21 @@ with Ros1Client(
     on_event=lambda name, **fields: statuses.append(fields.get("status", name)),
 ) as client:
     world = SimulatedEnvironment(settings.problem, simulator.seed, 0)
-    state = client.decide(Request(Kind.INITIALIZE, seed=simulator.seed, trial=0)).state
+    request = DecisionRequest(RequestKind.INITIALIZE, seed=simulator.seed, trial=0)
+    state = client.decide(request).state
     done = False
     while not done:
         # Whoever watches may do harm here, and says when it is done.
         print(len(made), flush=True)
         if sys.stdin.readline() == "wait for the cloud\\n":
             while client.status is not Status.KEEP_ALIVE:
-                client.decide(Request(Kind.INITIALIZE))
+                client.decide(DecisionRequest(RequestKind.INITIALIZE))
                 time.sleep(0.01)
-        chosen = client.decide(Request(Kind.CHOOSE_SENSING_ACTION, state=state)).sensing_action
+        request = DecisionRequest(RequestKind.CHOOSE_SENSING_ACTION, state=state)
+        chosen = client.decide(request).sensing_action
         made.append(chosen)
-        answer = client.decide(Request(
-            Kind.CHOOSE_TASK_ACTIONS, state=state, sensing_action=chosen,
+        answer = client.decide(DecisionRequest(
+            RequestKind.CHOOSE_TASK_ACTIONS, state=state, sensing_action=chosen,
             observation=world.perform_sensing(chosen)))
         state = answer.state
         for action in answer.task_actions:
@@ -220,51 +222,51 @@ def test_a_run_decides_as_in_process_whatever_happens_to_the_cloud(
 
 
 def test_a_dead_service_that_the_master_still_lists_is_found_without_waiting(
-    around: Ros1, here: Surroundings
+    around: Ros1, here: RosEnvironment
 ) -> None:
     cloud = around.serve(CLOUD, EXAMPLE)
     standing, new = Ros1Service(CLOUD, here), Ros1Service(CLOUD, here)
-    standing.ask(Request(Kind.INITIALIZE), 30.0)
+    standing.ask(DecisionRequest(RequestKind.INITIALIZE), 30.0)
     cloud.kill()
     cloud.wait()
     assert around.service_uri(CLOUD) is not None
     for service in (standing, new):
         with pytest.raises(TransportError, match=r"nobody listens at .* the master says it is"):
-            service.ask(Request(Kind.INITIALIZE), 3600.0)
+            service.ask(DecisionRequest(RequestKind.INITIALIZE), 120.0)
     around.serve(CLOUD, EXAMPLE)
     for service in (standing, new):
-        assert service.ask(Request(Kind.INITIALIZE), 30.0).error is ErrorCode.OK
+        assert service.ask(DecisionRequest(RequestKind.INITIALIZE), 30.0).error is ErrorCode.OK
         service.close()
 
 
 def test_a_stopped_service_costs_no_more_than_the_deadline(
-    around: Ros1, here: Surroundings
+    around: Ros1, here: RosEnvironment
 ) -> None:
     cloud = around.serve(CLOUD, EXAMPLE)
     standing, new = Ros1Service(CLOUD, here), Ros1Service(CLOUD, here)
-    standing.ask(Request(Kind.INITIALIZE), 30.0)
+    standing.ask(DecisionRequest(RequestKind.INITIALIZE), 30.0)
     cloud.send_signal(signal.SIGSTOP)
     for service in (standing, new, standing):
         with pytest.raises(TransportError, match=r"no answer in 0\.2 s"):
-            service.ask(Request(Kind.INITIALIZE), 0.2)
+            service.ask(DecisionRequest(RequestKind.INITIALIZE), 0.2)
     cloud.send_signal(signal.SIGCONT)
     for service in (standing, new):
-        assert service.ask(Request(Kind.INITIALIZE), 30.0).error is ErrorCode.OK
+        assert service.ask(DecisionRequest(RequestKind.INITIALIZE), 30.0).error is ErrorCode.OK
         service.close()
 
 
 def test_a_question_that_hangs_ends_when_its_asker_is_closed(
-    around: Ros1, here: Surroundings
+    around: Ros1, here: RosEnvironment
 ) -> None:
     cloud = around.serve(CLOUD, EXAMPLE)
     service = Ros1Service(CLOUD, here)
-    service.ask(Request(Kind.INITIALIZE), 30.0)
+    service.ask(DecisionRequest(RequestKind.INITIALIZE), 30.0)
     cloud.send_signal(signal.SIGSTOP)
     said: list[str] = []
 
     def ask() -> None:
         with pytest.raises(TransportError) as caught:
-            service.ask(Request(Kind.INITIALIZE), 3600.0)
+            service.ask(DecisionRequest(RequestKind.INITIALIZE), 120.0)
         said.append(str(caught.value))
 
     asking = threading.Thread(target=ask)
@@ -278,24 +280,24 @@ def test_a_question_that_hangs_ends_when_its_asker_is_closed(
 
 
 class TestTheMasterDies:
-    def test_calls_to_a_service_that_lives_go_on(self, around: Ros1, here: Surroundings) -> None:
+    def test_calls_to_a_service_that_lives_go_on(self, around: Ros1, here: RosEnvironment) -> None:
         around.serve(CLOUD, EXAMPLE)
         service = Ros1Service(CLOUD, here)
-        service.ask(Request(Kind.INITIALIZE), 30.0)
+        service.ask(DecisionRequest(RequestKind.INITIALIZE), 30.0)
         assert around.master is not None
         around.master.kill()
         around.master.wait()
-        assert service.ask(Request(Kind.INITIALIZE), 30.0).error is ErrorCode.OK
+        assert service.ask(DecisionRequest(RequestKind.INITIALIZE), 30.0).error is ErrorCode.OK
         # Even over a new connection: it is where it was.
         service._disconnect()
-        assert service.ask(Request(Kind.INITIALIZE), 30.0).error is ErrorCode.OK
+        assert service.ask(DecisionRequest(RequestKind.INITIALIZE), 30.0).error is ErrorCode.OK
         service.close()
         never_seen = Ros1Service(CLOUD, here)
         with pytest.raises(TransportError, match=f"there is no master at .*{around.port}"):
-            never_seen.ask(Request(Kind.INITIALIZE), 30.0)
+            never_seen.ask(DecisionRequest(RequestKind.INITIALIZE), 30.0)
 
     def test_a_master_that_knows_nothing_is_told_again(
-        self, around: Ros1, here: Surroundings
+        self, around: Ros1, here: RosEnvironment
     ) -> None:
         around.serve(CLOUD, EXAMPLE)
         assert around.master is not None
@@ -307,26 +309,26 @@ class TestTheMasterDies:
             assert f"/{CLOUD}" in around.run("rosservice", "list").split()
 
     def test_a_master_that_stands_still_holds_up_no_call(
-        self, around: Ros1, here: Surroundings
+        self, around: Ros1, here: RosEnvironment
     ) -> None:
         cloud = around.serve(CLOUD, EXAMPLE)
         service = Ros1Service(CLOUD, here)
-        service.ask(Request(Kind.INITIALIZE), 30.0)
+        service.ask(DecisionRequest(RequestKind.INITIALIZE), 30.0)
         assert around.master is not None
         around.master.send_signal(signal.SIGSTOP)
         service._disconnect()
-        assert service.ask(Request(Kind.INITIALIZE), 30.0).error is ErrorCode.OK
+        assert service.ask(DecisionRequest(RequestKind.INITIALIZE), 30.0).error is ErrorCode.OK
         never_seen = Ros1Service(CLOUD, here)
         with pytest.raises(TransportError, match=r"no answer"):
-            never_seen.ask(Request(Kind.INITIALIZE), 0.3)
+            never_seen.ask(DecisionRequest(RequestKind.INITIALIZE), 0.3)
         around.master.send_signal(signal.SIGCONT)
-        assert never_seen.ask(Request(Kind.INITIALIZE), 30.0).error is ErrorCode.OK
+        assert never_seen.ask(DecisionRequest(RequestKind.INITIALIZE), 30.0).error is ErrorCode.OK
         assert cloud.poll() is None
         service.close()
         never_seen.close()
 
     def test_a_service_can_be_started_before_its_master(
-        self, around: Ros1, here: Surroundings
+        self, around: Ros1, here: RosEnvironment
     ) -> None:
         assert around.master is not None
         around.master.kill()
@@ -346,9 +348,9 @@ def test_rosnode_kill_ends_it(around: Ros1) -> None:
     assert around.service_uri(CLOUD) is None
 
 
-def test_what_a_robot_decides_can_be_watched(around: Ros1, here: Surroundings) -> None:
+def test_what_a_robot_decides_can_be_watched(around: Ros1, here: RosEnvironment) -> None:
     around.serve(CLOUD, EXAMPLE)
-    with Ros1Client("arm", surroundings=here, deadline_s=30.0) as client:
+    with Ros1Client("arm", ros_environment=here, deadline_s=30.0) as client:
         wait_for(lambda: "/arm" in around.run("rosnode", "list").split(), "the node is listed")
         kinds = {
             "status": "std_msgs/String",
@@ -366,14 +368,16 @@ def test_what_a_robot_decides_can_be_watched(around: Ros1, here: Surroundings) -
             for topic in ("sensing_action", "task_actions")
         }
         wait_for(
-            lambda: all(client.topic(each).num_subscribers for each in echoes),
+            lambda: all(client.topic(each).subscribers for each in echoes),
             "both are subscribed",
         )
-        state = client.decide(Request(Kind.INITIALIZE, seed=4)).state
-        chosen = client.decide(Request(Kind.CHOOSE_SENSING_ACTION, state=state)).sensing_action
+        state = client.decide(DecisionRequest(RequestKind.INITIALIZE, seed=4)).state
+        chosen = client.decide(
+            DecisionRequest(RequestKind.CHOOSE_SENSING_ACTION, state=state)
+        ).sensing_action
         answer = client.decide(
-            Request(
-                Kind.CHOOSE_TASK_ACTIONS,
+            DecisionRequest(
+                RequestKind.CHOOSE_TASK_ACTIONS,
                 state=state,
                 sensing_action=chosen,
                 observation=np.array([0.1]),
@@ -408,7 +412,7 @@ def place_of(around: Ros1) -> tuple[str, int]:
     ids=["http", "length", "cut_off", "neither", "large_request"],
 )
 def test_who_speaks_otherwise_is_hung_up_on_and_nobody_else(
-    around: Ros1, here: Surroundings, said: bytes
+    around: Ros1, here: RosEnvironment, said: bytes
 ) -> None:
     around.serve(CLOUD, EXAMPLE)
     with socket.create_connection(place_of(around), 30.0) as stream:
@@ -416,7 +420,7 @@ def test_who_speaks_otherwise_is_hung_up_on_and_nobody_else(
         while stream.recv(4096):
             pass
     service = Ros1Service(CLOUD, here)
-    assert service.ask(Request(Kind.INITIALIZE), 30.0).error is ErrorCode.OK
+    assert service.ask(DecisionRequest(RequestKind.INITIALIZE), 30.0).error is ErrorCode.OK
     service.close()
 
 
@@ -452,17 +456,18 @@ def test_a_request_that_is_no_message_is_answered_with_the_reason(around: Ros1) 
 
 
 async def test_too_many_requests_at_once_are_told_so(
-    around: Ros1, here: Surroundings, configuration: Configuration
+    around: Ros1, here: RosEnvironment, configuration: Configuration
 ) -> None:
-    service = Ros1ActiveSensing(configuration, surroundings=here)
+    service = Ros1Server(configuration, ros_environment=here)
     hold = threading.Event()
-    service._thread.submit(hold.wait)
-    assert await service.start()
+    service._decisions.submit(hold.wait)
+    assert service.start()
     loop = asyncio.get_running_loop()
     asked = [Ros1Service(CLOUD, here) for _ in range(MAX_WAITING + 1)]
     with ThreadPoolExecutor(len(asked)) as askers:
         answers = [
-            loop.run_in_executor(askers, each.ask, Request(Kind.INITIALIZE), 60.0) for each in asked
+            loop.run_in_executor(askers, each.ask, DecisionRequest(RequestKind.INITIALIZE), 60.0)
+            for each in asked
         ]
         (busy,), _ = await asyncio.wait(answers, return_when=asyncio.FIRST_COMPLETED)
         hold.set()
@@ -471,22 +476,24 @@ async def test_too_many_requests_at_once_are_told_so(
     assert sorted(errors) == [ErrorCode.OK] * MAX_WAITING + [ErrorCode.BUSY]
     for each in asked:
         each.close()
-    await service.close()
+    service.close(1.0)
 
 
 async def test_a_defect_costs_its_request_alone(
-    around: Ros1, here: Surroundings, configuration: Configuration
+    around: Ros1, here: RosEnvironment, configuration: Configuration
 ) -> None:
     told: list[str] = []
-    service = Ros1ActiveSensing(
-        configuration, surroundings=here, on_event=lambda name, **_: told.append(name)
+    service = Ros1Server(
+        configuration, ros_environment=here, on_event=lambda name, **_: told.append(name)
     )
-    assert await service.start()
+    assert service.start()
     asker = Ros1Service(CLOUD, here)
     loop = asyncio.get_running_loop()
 
-    async def ask() -> Answer:
-        return await loop.run_in_executor(None, asker.ask, Request(Kind.INITIALIZE), 30.0)
+    async def ask() -> DecisionAnswer:
+        return await loop.run_in_executor(
+            None, asker.ask, DecisionRequest(RequestKind.INITIALIZE), 30.0
+        )
 
     answers, service._answers = service._answers, None  # type: ignore[assignment]
     with pytest.raises(TransportError, match="it answers: the service has failed: AttributeError"):
@@ -495,4 +502,4 @@ async def test_a_defect_costs_its_request_alone(
     assert (await ask()).error is ErrorCode.OK
     assert told == ["ros_master", "ros_request_failed"]
     asker.close()
-    await service.close()
+    service.close(1.0)

@@ -12,8 +12,8 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import pytest
-from tests.contracts import test_transport as contract
-from tests.contracts.test_transport import (
+from tests.contracts import test_transport_contract as contract
+from tests.contracts.wires import (
     LEASE_MS,
     Inbox,
     Received,
@@ -29,7 +29,7 @@ from tests.ports import free_port
 from tests.ros.ros1_processes import HOLDFAST, Ros1, ros1_in, wait_for
 
 from holdfast.errors import TransportError
-from holdfast.session.events import Appeared, Ended, Replied, Vanished
+from holdfast.protocol.events import CallEnded, ReplyReceived, ServiceAppeared, ServiceVanished
 from holdfast.transport.ros1 import EXCHANGE
 from holdfast.transport.service_end import StreamServiceTransport
 from holdfast.transport.tcpros import encode_header
@@ -63,7 +63,7 @@ class TestProcesses:
     @pytest.fixture
     def start(self, wire: RosWire) -> Start:
         wire.lease_ms = LEASE_MS
-        return lambda boot: service_process(wire.endpoint("cloud"), boot)
+        return lambda incarnation: service_process(wire.endpoint("cloud"), incarnation)
 
     test_kill = _OF_PROCESSES.test_kill_in_mid_call_ends_the_call_and_the_next_process_is_seen
     test_stop = _OF_PROCESSES.test_a_stopped_process_is_lost_after_the_lease_and_found_again
@@ -99,14 +99,14 @@ async def test_links_outlive_the_master_and_come_back_without_one(
     try:
         robot.call("cloud", 1, b"question")
         echo(await calls.next())
-        assert await inbox.of_call(1) == [Replied(1, b"question"), Ended(1)]
+        assert await inbox.of_call(1) == [ReplyReceived(1, b"question"), CallEnded(1)]
         # A link that breaks is made anew, to where the service was last.
         robot._services["cloud"].current.end("broken by the test", abort=True)  # type: ignore[attr-defined]
-        await inbox.wait_for(Vanished("cloud", "b1"))
+        await inbox.wait_for(ServiceVanished("cloud", "b1"))
         await inbox.appeared(times=2)
         robot.call("cloud", 2, b"question")
         echo(await calls.next())
-        assert await inbox.of_call(2) == [Replied(2, b"question"), Ended(2)]
+        assert await inbox.of_call(2) == [ReplyReceived(2, b"question"), CallEnded(2)]
     finally:
         around.start_master()
     await until(lambda: around.service_uri("cloud/exchange") is not None)
@@ -118,7 +118,7 @@ async def test_a_robot_is_told_why_it_finds_nobody(around: Ros1, wire: RosWire) 
     await until(lambda: bool(wire.refusals))
     assert "the ROS master does not say where it is" in wire.refusals[0][1]
     await wire.service("cloud", "b1").start(echo)
-    await inbox.wait_for(Appeared("cloud", "b1"))
+    await inbox.wait_for(ServiceAppeared("cloud", "b1"))
 
 
 async def test_a_service_that_is_started_again_is_found_at_its_new_port(
@@ -132,7 +132,7 @@ async def test_a_service_that_is_started_again_is_found_at_its_new_port(
             await inbox.appeared(times=times)
             assert await answered(robot, inbox, numbers)
             process.send_signal(signal.SIGKILL)
-            await inbox.wait_for(Vanished("cloud", f"b{times}"))
+            await inbox.wait_for(ServiceVanished("cloud", f"b{times}"))
 
 
 async def opened(around: Ros1, wire: RosWire) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
@@ -204,9 +204,9 @@ async def test_a_name_that_a_dead_process_has_taken_is_taken_back(
 @pytest.mark.parametrize("name", ["", "a b", "/", "a//b", "7up", "x" * 201])
 def test_names_that_ros_does_not_allow_are_refused(name: str) -> None:
     with pytest.raises(TransportError, match="is no name in ROS 1"):
-        StreamServiceTransport("cloud", boot="b", listen=[f"ros1/{name}"])
+        StreamServiceTransport("cloud", incarnation="b", listen=[f"ros1/{name}"])
 
 
 def test_a_robot_cannot_listen_over_ros_1() -> None:
     with pytest.raises(TransportError, match="it is the service that is offered"):
-        StreamServiceTransport("cloud", boot="b", connect=["ros1/robot"])
+        StreamServiceTransport("cloud", incarnation="b", connect=["ros1/robot"])

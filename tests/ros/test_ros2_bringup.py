@@ -19,8 +19,9 @@ from tests.ros.conftest import Ros2, left_out
 from tests.ros.domains import own_domain
 from tests.ros.ros2_processes import WAIT_S, Process
 
-from holdfast.configuration import load
-from holdfast.runtime.trial import run_trial
+from holdfast.config.loader import load
+from holdfast.planning import Planner
+from holdfast.robot.trial import run_trial
 
 PACKAGE = "holdfast_bringup"
 
@@ -130,7 +131,12 @@ def bring_up(ros2: Ros2, tmp_path: Path) -> Iterator[BringUp]:
 def in_process(configuration: Path) -> list[list[Any]]:
     """Return what the trial comes to without ROS."""
     read = load(configuration)
-    result = run_trial(read.problem, read.planning, read.simulator, 0)
+    result = run_trial(
+        Planner(read.problem, read.planning),
+        read.simulator.seed,
+        0,
+        max_steps=read.simulator.max_steps,
+    )
     return [[result.trial, result.outcome, result.steps, result.digest]]
 
 

@@ -12,8 +12,8 @@ from tests.ros.conftest import ROOT, Ros2
 from tests.ros.domains import own_domain
 from tests.ros.ros2_processes import Driver, Process
 
-from holdfast.configuration import load
-from holdfast.runtime.environment import SimulatedEnvironment
+from holdfast.config.loader import load
+from holdfast.robot.environment import SimulatedEnvironment
 
 CONFIGURATION = ROOT / "examples" / "peg_in_hole_2d.yaml"
 ACTION = [-0.25, 0.125, 0.5]

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
-import queue
 import signal
-import subprocess
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -20,10 +17,12 @@ import pytest
 from tests.ports import free_port
 from tests.ros.conftest import Ros2
 from tests.ros.domains import own_domain
+from tests.ros.ros2_processes import ObservedProcess
 
-from holdfast.configuration import load
+from holdfast.config.loader import load
+from holdfast.planning import Planner
+from holdfast.robot.trial import run_trial
 from holdfast.ros.poses import pose_layout
-from holdfast.runtime.trial import run_trial
 
 ROOT = Path(__file__).parents[2]
 CONFIGURATION = ROOT / "examples" / "peg_in_hole_2d.yaml"
@@ -38,75 +37,18 @@ def in_process(trials: int = TRIALS, seed: int = SEED) -> list[list[Any]]:
     """Return what the trials come to without any process but this one."""
     configuration = load(CONFIGURATION, seed=seed)
     results = [
-        run_trial(configuration.problem, configuration.planning, configuration.simulator, trial)
+        run_trial(
+            Planner(configuration.problem, configuration.planning),
+            configuration.simulator.seed,
+            trial,
+            max_steps=configuration.simulator.max_steps,
+        )
         for trial in range(trials)
     ]
     return [[result.trial, result.outcome, result.steps, result.digest] for result in results]
 
 
-class Lines:
-    """A process whose output is read all the time, line by line."""
-
-    def __init__(self, command: list[str], environment: dict[str, str], cwd: Path) -> None:
-        self.process = subprocess.Popen(
-            command,
-            env=environment,
-            cwd=cwd,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-        self.output: queue.Queue[str] = queue.Queue()
-        self.errors: list[str] = []
-        self._threads = [
-            threading.Thread(target=self._read_output, daemon=True),
-            threading.Thread(target=self._read_errors, daemon=True),
-        ]
-        for thread in self._threads:
-            thread.start()
-
-    def _read_output(self) -> None:
-        assert self.process.stdout is not None
-        for line in self.process.stdout:
-            self.output.put(line)
-
-    def _read_errors(self) -> None:
-        assert self.process.stderr is not None
-        for line in self.process.stderr:
-            self.errors.append(line)
-
-    def said(self) -> str:
-        return "".join(self.errors)
-
-    def wait_for(self, text: str, count: int = 1) -> None:
-        """Wait until the standard error has a text so often."""
-        deadline = monotonic() + PATIENCE_S
-        while self.said().count(text) < count:
-            assert monotonic() < deadline, f"{text!r} was not said:\n{self.said()}"
-            assert self.process.poll() is None, self.said()
-            threading.Event().wait(0.02)
-
-    def kill(self) -> None:
-        self.process.kill()
-        self.end()
-
-    def end(self) -> int:
-        code = self.process.wait(PATIENCE_S)
-        for thread in self._threads:
-            thread.join(PATIENCE_S)
-        for stream in (self.process.stdin, self.process.stdout, self.process.stderr):
-            assert stream is not None
-            with contextlib.suppress(OSError):
-                stream.close()
-        return code
-
-    def interrupt(self, number: signal.Signals = signal.SIGINT) -> int:
-        self.process.send_signal(number)
-        return self.end()
-
-
-class Peer(Lines):
+class Peer(ObservedProcess):
     """Another process of ROS."""
 
     def read(self) -> Any:
@@ -151,9 +93,9 @@ class Ros:
         self._ros2 = ros2
         self.directory = directory
         self.environment = {**ros2.environment, "ROS_DOMAIN_ID": str(domain)}
-        self.started: list[Lines] = []
+        self.started: list[ObservedProcess] = []
 
-    def node(self, *, wait: bool = True, **parameters: Any) -> Lines:
+    def node(self, *, wait: bool = True, **parameters: Any) -> ObservedProcess:
         """Start the node; ``a__b`` stands for ``a.b``."""
         values = {
             "configuration": str(CONFIGURATION),
@@ -165,7 +107,7 @@ class Ros:
         }
         words = [word for key, value in values.items() for word in ("-p", f"{key}:={value}")]
         command = [str(self._ros2.python), "-m", "holdfast.ros.ros2", "--ros-args", *words]
-        node = Lines(command, self.environment, self.directory)
+        node = ObservedProcess(command, self.environment, self.directory)
         self.started.append(node)
         if wait:
             node.wait_for("]: active" if values["autostart"] == "true" else "]: unconfigured")
@@ -178,7 +120,7 @@ class Ros:
         assert peer.read() == {"ready": True}
         return peer
 
-    def robot(self, motion_s: float) -> Lines:
+    def robot(self, motion_s: float) -> ObservedProcess:
         """Start a robot that is another process of ROS."""
         script = ROOT / "examples" / "ros2" / "simulated_robot.py"
         configuration = self.directory / "robot.yaml"
@@ -186,14 +128,14 @@ class Ros:
         values = {"configuration": configuration, "motion_s": motion_s}
         words = [word for key, value in values.items() for word in ("-p", f"{key}:={value}")]
         command = [str(self._ros2.python), str(script), "--ros-args", *words]
-        robot = Lines(command, self.environment, self.directory)
+        robot = ObservedProcess(command, self.environment, self.directory)
         self.started.append(robot)
         return robot
 
-    def service(self, port: int) -> Lines:
+    def service(self, port: int) -> ObservedProcess:
         endpoint = f"tcp/127.0.0.1:{port}"
         command = [str(self._ros2.python), "-m", "holdfast", "serve", "--listen", endpoint]
-        service = Lines(command, dict(os.environ), self.directory)
+        service = ObservedProcess(command, dict(os.environ), self.directory)
         self.started.append(service)
         assert "listening" in service.output.get(timeout=PATIENCE_S)
         return service

@@ -21,21 +21,21 @@ import numpy as np
 import pytest
 from tests.ports import free_port
 from tests.ros.conftest import ROOT, left_out, line_of
-from tests.unit.test_active_sensing import EXAMPLE, configuration, decisions, in_process
+from tests.unit.test_ros_client import EXAMPLE, configuration, decisions, in_process
 
-from holdfast.configuration import Configuration
+from holdfast.config.loader import Configuration
+from holdfast.robot.environment import SimulatedEnvironment
 from holdfast.ros.active_sensing import (
     ActiveSensing,
-    Answer,
+    DecisionAnswer,
+    DecisionRequest,
     ErrorCode,
-    Request,
     checked_state,
     no_state,
 )
-from holdfast.ros.client import ActiveSensingClient, Service
+from holdfast.ros.client import ActiveSensingClient, DecisionService
 from holdfast.ros.messages import type_hash
-from holdfast.ros.ros2_wire import Ros2Service
-from holdfast.runtime.environment import SimulatedEnvironment
+from holdfast.ros.ros2_client import Ros2Service
 
 PATIENCE_S = 30.0
 NAME = "cloud_active_sensing"
@@ -159,7 +159,7 @@ class ThroughPeer:
     def __init__(self, process: subprocess.Popen[str]) -> None:
         self._process = process
 
-    def ask(self, request: Request, deadline_s: float) -> Answer:
+    def ask(self, request: DecisionRequest, deadline_s: float) -> DecisionAnswer:
         fields = {
             **request._asdict(),
             "kind": int(request.kind),
@@ -172,7 +172,7 @@ class ThroughPeer:
         answer = json.loads(line_of(self._process))
         size = answer["action_size"]
         actions = array(answer["task_actions"])
-        return Answer(
+        return DecisionAnswer(
             ErrorCode(answer["error"]),
             answer["message"],
             answer["configuration"],
@@ -191,14 +191,14 @@ class Nobody:
 
     name = "nobody"
 
-    def ask(self, request: Request, deadline_s: float) -> Answer:
+    def ask(self, request: DecisionRequest, deadline_s: float) -> DecisionAnswer:
         raise AssertionError("the first service has answered nothing")
 
     def close(self) -> None:
         pass
 
 
-def trial_of(way: Service, settings: Configuration) -> list[Any]:
+def trial_of(way: DecisionService, settings: Configuration) -> list[Any]:
     simulator = settings.simulator
     with ActiveSensingClient(way, Nobody(), PATIENCE_S) as client:
         world = SimulatedEnvironment(settings.problem, simulator.seed, TRIAL)
@@ -238,7 +238,7 @@ def test_a_peer_answers_us(peer: str, peers_python: Path) -> None:
         assert process.stdin is not None and process.stdout is not None
         for line in process.stdout:
             asked = json.loads(line)
-            request = Request(
+            request = DecisionRequest(
                 asked["kind"],
                 asked["configuration"],
                 asked["seed"],

@@ -10,9 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from holdfast.simulation.schedule import parse_schedule
-from holdfast.simulation.story import story_lines
-from holdfast.simulation.world import Outcome, Simulator
+from holdfast.lab.simulation.outcome import RunOutcome
+from holdfast.lab.simulation.schedule import parse_schedule
+from holdfast.lab.simulation.story import story_lines
+from holdfast.lab.simulation.world import Simulator
 
 STORIES = sorted(Path(__file__).parent.glob("*.story"))
 RULE = "----\n"
@@ -23,7 +24,7 @@ def simulator() -> Simulator:
     return Simulator()
 
 
-def ending(outcome: Outcome) -> str:
+def ending(outcome: RunOutcome) -> str:
     if outcome.violation is not None:
         return f"VIOLATION: {outcome.violation}"
     if outcome.held is not None:

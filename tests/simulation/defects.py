@@ -21,17 +21,18 @@ from contextlib import ExitStack, contextmanager
 from typing import Any, NamedTuple, TypeAlias
 from unittest import mock
 
-from holdfast.session import replies, service
-from holdfast.session.dispatcher import Dispatcher
-from holdfast.session.failure_detector import FailureDetector
-from holdfast.session.launches import Launches
-from holdfast.session.question import Question
-from holdfast.session.robot import Robot
-from holdfast.session.service import Service
-from holdfast.session.service_jobs import Job
-from holdfast.session.service_sessions import Sessions
-from holdfast.simulation.schedule import RunSettings, Schedule, draw_schedule
-from holdfast.simulation.world import Simulator
+from holdfast.lab.simulation.schedule import RunSettings, SimulationSchedule
+from holdfast.lab.simulation.schedule_draws import draw_schedule
+from holdfast.lab.simulation.world import Simulator
+from holdfast.protocol import requests, service
+from holdfast.protocol.dispatcher import Dispatcher
+from holdfast.protocol.failure_detector import FailureDetector
+from holdfast.protocol.question import Question
+from holdfast.protocol.restart_policy import RestartPolicy
+from holdfast.protocol.robot import Robot
+from holdfast.protocol.service import Service
+from holdfast.protocol.service_jobs import Job
+from holdfast.protocol.service_sessions import Session, SessionTable
 
 __all__ = [
     "DEFECTS",
@@ -55,7 +56,6 @@ class Edit(NamedTuple):
     ----------
     owner : class or module
         Where the function is looked up when it is called.
-    function : str
     before, after : str
         ``before`` stands in its source exactly once. Both are indented as the line is on which
         that begins.
@@ -83,10 +83,8 @@ class Defect(NamedTuple):
 
     Attributes
     ----------
-    name : str
     story : str
         What a careless engineer would have done.
-    changes : tuple of Change
     """
 
     name: str
@@ -101,7 +99,6 @@ class Finding(NamedTuple):
     ----------
     seed : int
         The first, counted from 0, whose run has a violation.
-    violation : str
     """
 
     seed: int
@@ -160,7 +157,7 @@ def without_faults(defect: Defect, trials: range) -> str | None:
     with applied(defect):
         simulator = Simulator()
         for trial in trials:
-            violation = simulator.run(Schedule(RunSettings(trial=trial))).violation
+            violation = simulator.run(SimulationSchedule(RunSettings(trial=trial))).violation
             if violation is not None:
                 return violation
     return None
@@ -178,7 +175,7 @@ def seeds_needed(defect: Defect, limit: int = LIMIT) -> Finding | None:
     return None
 
 
-def violation_of(defect: Defect, schedule: Schedule) -> str | None:
+def violation_of(defect: Defect, schedule: SimulationSchedule) -> str | None:
     """Return what one schedule shows of a defect."""
     with applied(defect):
         return Simulator().run(schedule).violation
@@ -202,7 +199,7 @@ class _DrawingJob(Job):
         named = self._request or self._state
         assert named is not None
         if self.kind == "sensing":
-            _, positions = self.drawn.setdefault(id(self._opening), (self._opening, {}))
+            _, positions = self.drawn.setdefault(id(self._configuration), (self._configuration, {}))
             self.position = positions.get(named.trial, 0)
             positions[named.trial] = self.position + 1
 
@@ -223,13 +220,13 @@ def _defect(name: str, story: str, *changes: Change) -> None:
 _defect(
     "stale_epoch_accepted",
     "The service answers whoever asks, also a process of the robot that has been replaced.",
-    Edit(Service, "_received", "if request.epoch < epoch:", "if False:"),
+    Edit(Service, "_handle", "if request.epoch < epoch:", "if False:"),
 )
 _defect(
     "new_epoch_not_noted",
     "The service drops what a robot's last process waited for, but does not note the epoch of the "
     "next one.",
-    Edit(Service, "_take_over", "session.epoch = epoch", "pass"),
+    Edit(Session, "take_over", "self.epoch = epoch", "pass"),
 )
 _defect(
     "old_process_still_served",
@@ -240,7 +237,7 @@ _defect(
 _defect(
     "epoch_forgotten_with_session",
     "A service that forgets a robot's session also forgets which of its processes was the last.",
-    Edit(Sessions, "forget", "self.note_epoch(session.key, session.epoch)", "pass"),
+    Edit(SessionTable, "forget", "self.note_epoch(session.key, session.epoch)", "pass"),
 )
 _defect(
     "draws_by_position",
@@ -249,18 +246,16 @@ _defect(
     Edit(
         Job,
         "_computed",
-        "choose_sensing_action(problem, planning, self._state)",
+        "choose_sensing_action(self._state)",
         "choose_sensing_action(\n"
-        "    problem, planning, self._state._replace(\n"
-        "        step=self.position * (planning.sensing_interval + 1)))",
+        "    self._state._replace(step=self.position * (planning.sensing_interval + 1)))",
     ),
     Edit(
         Job,
         "_computed",
-        "choose_sensing_action(problem, planning, state)",
+        "choose_sensing_action(state)",
         "choose_sensing_action(\n"
-        "    problem, planning, state._replace(\n"
-        "        step=self.position * (planning.sensing_interval + 1)))",
+        "    state._replace(step=self.position * (planning.sensing_interval + 1)))",
     ),
 )
 _defect(
@@ -269,9 +264,11 @@ _defect(
     "told that the call is over.",
     Edit(
         Service,
-        "_answer_known",
-        "following = part.following",
-        "self._effects.append(End(call))\nreturn _Fate.ANSWERED\nfollowing = part.following",
+        "_answer_from_cache",
+        "following = answer.following",
+        "self._effects.append(EndCall(call))\n"
+        "return _Disposition.ANSWERED\n"
+        "following = answer.following",
     ),
 )
 _defect(
@@ -279,11 +276,11 @@ _defect(
     "A task part that is answered from memory ends the call; the sensing part is not thought of.",
     Edit(
         Service,
-        "_answer_known",
+        "_answer_from_cache",
         "if rest is not None:\n    self._calls.attach(",
-        "if part.num_actions:\n"
-        "    self._effects.append(End(call))\n"
-        "    return _Fate.ANSWERED\n"
+        "if answer.num_actions:\n"
+        "    self._effects.append(EndCall(call))\n"
+        "    return _Disposition.ANSWERED\n"
         "if rest is not None:\n"
         "    self._calls.attach(",
     ),
@@ -293,23 +290,28 @@ _defect(
     "Answers are remembered by step, not by the digest of the state.",
     Edit(
         Service,
-        "_answer_known",
-        "part = session.answers.get(request.digest)",
+        "_answer_from_cache",
+        "answer = session.answers.get(request.digest)",
         "asked = request.step, request.sensed\n"
-        "part = next((kept for kept in session.answers.values()\n"
-        "             if (kept.step, kept.sensed) == asked), None)",
+        "answer = next((kept for kept in session.answers.values()\n"
+        "               if (kept.step, kept.sensed) == asked), None)",
     ),
     Edit(
         Service,
-        "_answer_known",
-        "if (part.trial, part.step, part.sensed) != (request.trial, request.step, request.sensed):",
+        "_answer_from_cache",
+        "if (answer.trial, answer.step, answer.sensed) != asked:",
         "if False:",
     ),
 )
 _defect(
     "restored_unverified",
     "A checkpoint is restored without looking at the digest, nor at the checksum of its request.",
-    Edit(service, "decode_request", "_unsealed(payload)", "memoryview(payload)[:-CHECKSUM_SIZE]"),
+    Edit(
+        service,
+        "decode_request",
+        "_checked_content(payload)",
+        "memoryview(payload)[:-CHECKSUM_SIZE]",
+    ),
     Edit(
         Job, "_restored", "if planner.digest(state)[:DIGEST_SIZE] != request.digest:", "if False:"
     ),
@@ -317,19 +319,19 @@ _defect(
 _defect(
     "held_work_left",
     "A request that waited for the robot's one before is not lined up when that has run.",
-    Edit(Service, "finished", "self._lines.let_go_on(session)", "pass"),
+    Edit(Service, "finished", "self._queue.release_held(session)", "pass"),
 )
 _defect(
     "forgotten_at_work",
     "A robot that was not heard is forgotten even while something is computed for it.",
-    Edit(Sessions, "idle_at", "if session is None or session.works:", "if session is None:"),
+    Edit(SessionTable, "idle_at", "if session is None or session.pending:", "if session is None:"),
 )
 _defect(
     "idle_by_difference",
     "Whether a robot was not heard for too long is told by a difference of times, when to look by "
     "a sum.",
     Edit(
-        Sessions,
+        SessionTable,
         "idle",
         "due > now",
         "now - next(iter(self._sessions.values())).used_at < self._limits.max_idle_s",
@@ -338,12 +340,12 @@ _defect(
 _defect(
     "superseded_calls_left",
     "The calls of a request that a newer one has replaced are dropped instead of ended.",
-    Edit(Service, "_supersede", "self._calls.end(work)", "self._calls.released(work)"),
+    Edit(Service, "_supersede", "self._calls.end(task)", "self._calls.detach(task)"),
 )
 _defect(
     "late_calls_left",
     "The call of a request that comes after a newer one is dropped instead of ended.",
-    Edit(Service, "_received", "self._effects.append(End(call))", "pass"),
+    Edit(Service, "_handle", "self._effects.append(EndCall(call))", "pass"),
 )
 
 # -- messages --------------------------------------------------------------------------------------
@@ -351,24 +353,34 @@ _defect(
 _defect(
     "reply_checksum_ignored",
     "The robot leaves it to TCP to find damaged replies.",
-    Edit(replies, "decode_reply", "_unsealed(payload)", "memoryview(payload)[:-CHECKSUM_SIZE]"),
+    Edit(
+        requests,
+        "decode_reply",
+        "_checked_content(payload)",
+        "memoryview(payload)[:-CHECKSUM_SIZE]",
+    ),
 )
 _defect(
     "request_checksum_ignored",
     "The service leaves it to TCP to find damaged requests.",
-    Edit(service, "decode_request", "_unsealed(payload)", "memoryview(payload)[:-CHECKSUM_SIZE]"),
+    Edit(
+        service,
+        "decode_request",
+        "_checked_content(payload)",
+        "memoryview(payload)[:-CHECKSUM_SIZE]",
+    ),
 )
 _defect(
     "reply_number_ignored",
     "A reply is taken for the answer to the call that it comes in, whatever number it repeats.",
-    Edit(replies, "_check_number", "if reply.number != asked and not unread:", "if False:"),
+    Edit(requests, "_check_number", "if reply.number != asked and not unread:", "if False:"),
 )
 _defect(
     "reply_matched_by_kind",
     "Any sensing answer is taken for the one that is waited for; its number, its step and its "
     "state are not looked at.",
     Edit(
-        replies,
+        requests,
         "_check_number",
         "if reply.number != asked and not unread:",
         "if reply.number != asked and not unread and not isinstance(reply, SensingAnswer):",
@@ -402,8 +414,8 @@ _defect(
     Edit(
         Robot,
         "_next_action",
-        "self._in_environment = True\nself._effects.append(Act(state.step, action))",
-        "self._in_environment = True",
+        "self._awaits_environment = True\nself._effects.append(Act(state.step, action))",
+        "self._awaits_environment = True",
     ),
 )
 _defect(
@@ -426,7 +438,7 @@ _defect(
     "A restarted robot takes the action that it last wrote down as performed.",
     Edit(
         Robot,
-        "_settle_performance",
+        "_settle_pending_action",
         "if history.pending is not None and performed == known + 1:",
         "if history.pending is not None:",
     ),
@@ -437,7 +449,7 @@ _defect(
     "performed.",
     Edit(
         Robot,
-        "_settle_performance",
+        "_settle_pending_action",
         "if performed is None:",
         "if history.pending is not None:\n    return history.pending\nif performed is None:",
     ),
@@ -447,7 +459,7 @@ _defect(
     "Where the environment cannot tell whether the last action was performed, it is performed.",
     Edit(
         Robot,
-        "_settle_performance",
+        "_settle_pending_action",
         "if not resumed or (",
         "if history.pending is not None:\n    return history.pending\nif not resumed or (",
     ),
@@ -455,7 +467,7 @@ _defect(
 _defect(
     "journal_tail_trusted",
     "After a power cut the journal is taken for complete.",
-    Edit(Robot, "_settle_performance", "(history.paused or tail_is_certain)", "True"),
+    Edit(Robot, "_settle_pending_action", "(history.paused or tail_is_certain)", "True"),
 )
 _defect(
     "paused_while_performing",
@@ -463,8 +475,8 @@ _defect(
     Edit(
         Robot,
         "_go_on",
-        "if history is None or self._in_environment or self._stopped:",
-        "if history is None or (self._in_environment and not self._pausing) or self._stopped:",
+        "if history is None or self._awaits_environment or self._stopped:",
+        "if history is None or (self._awaits_environment and not self._pausing) or self._stopped:",
     ),
 )
 
@@ -476,19 +488,24 @@ _defect(
     Edit(
         Robot,
         "handle",
-        "self._dispatcher.handle(event, now)",
-        "self._dispatcher.handle(event, now)\n"
-        "question = self._dispatcher.question\n"
+        "self._source.handle(event, now)",
+        "self._source.handle(event, now)\n"
+        "question = self._source.question\n"
         "tasks_come = getattr(event, 'payload', b'..')[1] == 1\n"
-        "if tasks_come and question is not None and question.tasks is not None:\n"
-        "    self._in_environment = False",
+        "if tasks_come and question is not None and question.task_actions is not None:\n"
+        "    self._awaits_environment = False",
     ),
 )
 _defect(
     "suspected_never_asked",
     "A service that is suspected is asked nothing, so it can never show that it lives.",
-    Edit(Dispatcher, "_hold_and_retry", "service.detector.present\n", "service.detector.trusted\n"),
-    Edit(Dispatcher, "_try_at", "not service.detector.present", "not service.detector.trusted"),
+    Edit(Dispatcher, "_hold_and_retry", "replica.detector.present\n", "replica.detector.trusted\n"),
+    Edit(
+        requests.OpenRequests,
+        "probe_at",
+        "not replica.detector.present",
+        "not replica.detector.trusted",
+    ),
 )
 _defect(
     "given_up_cloud_never_tried",
@@ -498,38 +515,43 @@ _defect(
     Edit(
         Dispatcher,
         "_appeared",
-        "self.status is Status.LOCAL_RECOVERY\nand question",
-        "False\nand question",
+        "self._tracker.is_recovering and question",
+        "False and question",
     ),
 )
 _defect(
     "old_process_taken_for_new",
     "The news that a service's process is gone is believed of the process that took its place.",
-    Edit(FailureDetector, "vanished", "if boot != self.boot:", "if self.boot is None:"),
+    Edit(
+        FailureDetector,
+        "vanished",
+        "if incarnation != self.incarnation:",
+        "if self.incarnation is None:",
+    ),
 )
 _defect(
     "launch_tried_once",
     "A local service that could not be started is not started again.",
-    Edit(Launches, "failed", "if self._launch_after is not None:", "if True:"),
+    Edit(RestartPolicy, "failed", "if self._launch_after is not None:", "if True:"),
 )
 _defect(
     "silence_not_timed",
     "No alarm is set while a service is being asked, for sooner or later it will answer.",
     Edit(
         Dispatcher,
-        "_next_wakeup",
-        "due += [service.detector.deadline() for service in services]",
+        "next_wakeup",
+        "due += [replica.detector.deadline() for replica in services]",
         "pass",
     ),
-    Edit(Dispatcher, "_next_wakeup", "elif question.needed_at is not None:", "elif False:"),
+    Edit(Dispatcher, "next_wakeup", "elif question.needed_at is not None:", "elif False:"),
 )
 _defect(
     "retry_not_timed",
     "No alarm is set for when a service may be asked again.",
     Edit(
         Dispatcher,
-        "_next_wakeup",
-        "if service.detector.present and service.refused is None",
+        "next_wakeup",
+        "if replica.detector.present and replica.refusal is None",
         "if False",
     ),
 )
@@ -540,7 +562,7 @@ _defect(
         Dispatcher,
         "_appeared",
         "# It need not wait for the next turn",
-        "self._change_status(Cause.CLOUD_ANSWERED, 'seen', now)\n# It need not wait",
+        "self._tracker.change(Cause.CLOUD_ANSWERED, 'seen', now)\n# It need not wait",
     ),
 )
 _defect(
@@ -554,14 +576,14 @@ _defect(
     Edit(
         Dispatcher,
         "_replied",
-        "elif news is News.ANSWERED and",
-        "if news is News.ANSWERED and",
+        "elif outcome is ReplyOutcome.ANSWERED and",
+        "if outcome is ReplyOutcome.ANSWERED and",
     ),
 )
 _defect(
     "cloud_lost_twice",
     "That the cloud is lost is noticed whatever the status is.",
-    Edit(Dispatcher, "_note_lost_cloud", "and self.status is not Status.LOCAL_RECOVERY", ""),
+    Edit(Dispatcher, "_note_lost_cloud", "and not self._tracker.is_recovering", ""),
 )
 
 

@@ -11,9 +11,9 @@ from tests.simulation.defects import (
     without_faults,
 )
 
-from holdfast.session import calls
-from holdfast.simulation.schedule import parse_schedule
-from holdfast.simulation.world import Simulator
+from holdfast.lab.simulation.schedule import parse_schedule
+from holdfast.lab.simulation.world import Simulator
+from holdfast.protocol import requests
 
 # The moments that it takes, as the simulator found them, made small.
 FOUND_AT_ONCE = [
@@ -78,7 +78,7 @@ def test_a_defect_is_where_it_says(name: str) -> None:
 
 
 def test_a_defect_that_says_nothing_is_an_error() -> None:
-    gone = Defect("gone", "", (Edit(calls.Calls, "send", "no such line", "pass"),))
+    gone = Defect("gone", "", (Edit(requests.OpenRequests, "send", "no such line", "pass"),))
     with pytest.raises(ValueError, match="gone: send has 0 times"), applied(gone):
         pass
 
@@ -91,7 +91,7 @@ def test_a_reply_to_another_process_of_the_robot_is_not_taken() -> None:
         "pause_robot at=0.2 down_s=0.001\n"
     )
     assert Simulator().run(schedule).violation is None
-    numbers = Edit(calls.Calls, "__init__", "epoch % _EPOCHS * _NUMBERS_OF_EPOCH", "0")
+    numbers = Edit(requests.OpenRequests, "__init__", "epoch % _EPOCHS * _NUMBERS_OF_EPOCH", "0")
     with applied(Defect("numbers_begin_anew", "", (numbers,))):
         violation = Simulator().run(schedule).violation
     assert violation is not None

@@ -6,32 +6,37 @@ import msgspec
 import numpy as np
 import pytest
 
-from holdfast.outcome import TrialResult
-from holdfast.planning import Planner, PlanningState
-from holdfast.problems.peg_in_hole_2d import PegInHole2D
-from holdfast.session.records import ActingRecord, PerformedRecord
-from holdfast.session.robot import History
-from holdfast.settings import PlanningSettings
-from holdfast.simulation.agenda import Agenda, Clock
-from holdfast.simulation.checkers import StatusChecker, WireChecker, check_size
-from holdfast.simulation.disk import Disk
-from holdfast.simulation.memory import RememberingPlanner
-from holdfast.simulation.schedule import (
+from holdfast.config.settings import PlanningSettings
+from holdfast.lab.errors import Violation
+from holdfast.lab.simulation.checkers import StatusChecker, WireChecker, check_size
+from holdfast.lab.simulation.disk import Disk
+from holdfast.lab.simulation.environment_model import EnvironmentModel
+from holdfast.lab.simulation.event_queue import Clock, EventQueue
+from holdfast.lab.simulation.memo_cache import MemoizingPlanner
+from holdfast.lab.simulation.reference_runs import (
+    ReferenceRun,
+    ReferenceRuns,
+    ReferenceStep,
+    Repeats,
+)
+from holdfast.lab.simulation.schedule import (
     Crash,
     MessageFault,
     RunSettings,
-    Schedule,
+    SimulationSchedule,
     Stop,
-    draw_schedule,
 )
-from holdfast.simulation.shrinking import shrink
-from holdfast.simulation.surroundings import Surroundings, Violation
-from holdfast.simulation.twins import Deed, Repeats, Twin, Twins
+from holdfast.lab.simulation.schedule_draws import draw_schedule
+from holdfast.lab.simulation.shrinking import shrink
+from holdfast.outcome import TrialResult
+from holdfast.planning import Planner, PlanningState
+from holdfast.problems.peg_in_hole_2d import PegInHole2D
+from holdfast.protocol.records import ActingRecord, PerformedRecord, TrialHistory
 
 
 class TestAgenda:
     def test_order(self) -> None:
-        agenda = Agenda()
+        agenda = EventQueue()
         seen: list[str] = []
         agenda.after(2.0, seen.append, "c")
         agenda.after(1.0, seen.append, "a")
@@ -43,7 +48,7 @@ class TestAgenda:
         assert agenda.now == 2.0
 
     def test_clocks(self) -> None:
-        agenda = Agenda()
+        agenda = EventQueue()
         clock = Clock(agenda, 1e6, 0.97)
         assert clock.now() == 1e6
         due = clock.now() + 0.25
@@ -100,9 +105,9 @@ class TestDisk:
         assert unfinished.is_complete
 
 
-def twin() -> Twin:
+def twin() -> ReferenceRun:
     deeds = tuple(
-        Deed(
+        ReferenceStep(
             0 if step == 0 else None,
             np.zeros(1),
             np.full(2, float(step)).tobytes(),
@@ -111,21 +116,21 @@ def twin() -> Twin:
         )
         for step in range(3)
     )
-    return Twin(deeds, False, "digest")
+    return ReferenceRun(deeds, False, "digest")
 
 
-class OneTwin(Twins):
+class OneTwin(ReferenceRuns):
     """A world in which whatever is sensed again leads to another end."""
 
     def __init__(self) -> None:
         pass
 
-    def get(self, trial: int, max_steps: int, repeats: Repeats = ()) -> Twin:
+    def get(self, trial: int, max_steps: int, repeats: Repeats = ()) -> ReferenceRun:
         return twin()._replace(digest=f"digest{repeats or ''}")
 
 
-def surroundings(*, shows_the_same: bool = False) -> Surroundings:
-    return Surroundings(0, 3, OneTwin(), shows_the_same=shows_the_same)
+def surroundings(*, shows_the_same: bool = False) -> EnvironmentModel:
+    return EnvironmentModel(0, 3, OneTwin(), shows_the_same=shows_the_same)
 
 
 def result(steps: int, digest: str) -> TrialResult:
@@ -260,7 +265,7 @@ class TestWireChecker:
 
 def test_what_grows_is_found_wherever_it_is() -> None:
     planner = Planner(PegInHole2D(), PlanningSettings())
-    history = History(planner, 1, 0)
+    history = TrialHistory(planner, 1, 0)
     check_size("the robot", history)
     history.sensing_ms += [1.0] * 600
     with pytest.raises(Violation, match="the robot holds a list of 600 entries"):
@@ -291,16 +296,16 @@ class TestMemory:
                 self.calls += 1
                 return state._replace(step=state.step + (2 if self.calls > 1 else 1))
 
-        planner = RememberingPlanner(Impure(PegInHole2D(), PlanningSettings()))
-        state = planner.initial_state(1, 0)
+        planner = MemoizingPlanner(Impure(PegInHole2D(), PlanningSettings()))
+        state = planner.init(1, 0)
         with pytest.raises(Violation, match="another state"):
             for _ in range(200):
                 planner.advance(state, np.zeros(3))
 
     def test_the_same_is_not_computed_again(self) -> None:
-        planner = RememberingPlanner(Planner(PegInHole2D(), PlanningSettings()))
-        state = planner.initial_state(1, 0)
-        assert planner.initial_state(1, 0) is state
+        planner = MemoizingPlanner(Planner(PegInHole2D(), PlanningSettings()))
+        state = planner.init(1, 0)
+        assert planner.init(1, 0) is state
         after = planner.advance(state, np.zeros(3))
         assert planner.advance(state, np.zeros(3)) is after
         assert planner.advance(state, np.full(3, 0.1)) is not after
@@ -315,19 +320,19 @@ class TestShrinking:
             for number in range(40)
         )
         run = RunSettings(trial=9, replicas=3, deadline_ms=5.0, act_s=0.02)
-        schedule = Schedule(run, (*noise[:20], stop, *noise[20:], crash))
+        schedule = SimulationSchedule(run, (*noise[:20], stop, *noise[20:], crash))
         asked = []
 
-        def fails(candidate: Schedule) -> bool:
+        def fails(candidate: SimulationSchedule) -> bool:
             asked.append(candidate)
             return {stop, crash} <= set(candidate.faults) and candidate.run.act_s == 0.02
 
-        assert shrink(schedule, fails) == Schedule(RunSettings(act_s=0.02), (stop, crash))
+        assert shrink(schedule, fails) == SimulationSchedule(RunSettings(act_s=0.02), (stop, crash))
         assert len(asked) < 500
 
     def test_services_of_faults_are_kept(self) -> None:
         drop = MessageFault(service="cloud-2", direction="to", number=0, what="drop")
-        schedule = Schedule(RunSettings(replicas=2), (drop,))
+        schedule = SimulationSchedule(RunSettings(replicas=2), (drop,))
         assert shrink(schedule, lambda candidate: drop in candidate.faults) == schedule
 
     def test_it_ends(self) -> None:

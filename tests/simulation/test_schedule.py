@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import pytest
 
-from holdfast.simulation.schedule import (
+from holdfast.lab.errors import ScheduleError
+from holdfast.lab.simulation.schedule import (
     Crash,
     KillRobot,
     MessageFault,
     RunSettings,
-    Schedule,
-    ScheduleError,
-    draw_schedule,
+    SimulationSchedule,
     parse_schedule,
 )
+from holdfast.lab.simulation.schedule_draws import draw_schedule
 
 
 @pytest.mark.parametrize("seed", range(200))
@@ -44,7 +44,7 @@ def test_all_kinds_of_faults_are_drawn() -> None:
 
 
 def test_text_is_as_short_as_it_can_be() -> None:
-    schedule = Schedule(
+    schedule = SimulationSchedule(
         RunSettings(replicas=2, deadline_ms=15.0),
         (
             Crash(service="cloud-2", at=0.5),
@@ -59,7 +59,7 @@ def test_text_is_as_short_as_it_can_be() -> None:
         "message service=local direction=from number=3 what=drop\n"
     )
     assert parse_schedule(f"\n# a comment\n{schedule.text()}") == schedule
-    assert parse_schedule("") == Schedule(RunSettings())
+    assert parse_schedule("") == SimulationSchedule(RunSettings())
 
 
 @pytest.mark.parametrize(

@@ -4,21 +4,22 @@ from __future__ import annotations
 
 import pytest
 
-from holdfast.simulation.exploration import Tally, explore
-from holdfast.simulation.schedule import (
+from holdfast.lab.simulation.exploration import ExplorationTally, explore
+from holdfast.lab.simulation.outcome import RunOutcome
+from holdfast.lab.simulation.schedule import (
     NUM_TRIALS,
     Crash,
     Crowd,
     KillRobot,
     RunSettings,
-    Schedule,
+    SimulationSchedule,
     Slow,
     Stop,
-    draw_schedule,
     parse_schedule,
 )
-from holdfast.simulation.story import story_lines
-from holdfast.simulation.world import Outcome, Simulator
+from holdfast.lab.simulation.schedule_draws import draw_schedule
+from holdfast.lab.simulation.story import story_lines
+from holdfast.lab.simulation.world import Simulator
 
 
 @pytest.fixture(scope="module")
@@ -26,7 +27,7 @@ def simulator() -> Simulator:
     return Simulator()
 
 
-def fine(outcome: Outcome) -> bool:
+def fine(outcome: RunOutcome) -> bool:
     return outcome.violation is None and outcome.held is None
 
 
@@ -34,7 +35,7 @@ def fine(outcome: Outcome) -> bool:
 @pytest.mark.parametrize("num_trials", [1, 2])
 def test_without_faults(trial: int, num_trials: int, simulator: Simulator) -> None:
     run = RunSettings(trial=trial, num_trials=num_trials)
-    outcome = simulator.run(Schedule(run))
+    outcome = simulator.run(SimulationSchedule(run))
     assert fine(outcome)
     # One request and two parts of an answer for each turn, and one for the first sensing action.
     assert outcome.messages < 30
@@ -54,7 +55,7 @@ def test_the_robot_is_killed_between_any_two_effects(boundary: int, simulator: S
     kill = KillRobot(boundary=boundary, down_s=0.01)
     for environment in ("counting", "simulated"):
         run = RunSettings(trial=boundary % NUM_TRIALS, environment=environment)
-        assert fine(simulator.run(Schedule(run, (kill,))))
+        assert fine(simulator.run(SimulationSchedule(run, (kill,))))
 
 
 @pytest.mark.parametrize("lost", [0, 1, 2, 100])
@@ -62,8 +63,8 @@ def test_power_is_cut(lost: int, simulator: Simulator) -> None:
     for boundary in range(10, 90, 11):
         kill = KillRobot(boundary=boundary, power_cut=True, lost_appends=lost)
         careful = RunSettings(journal_survives="power_cut")
-        assert fine(simulator.run(Schedule(careful, (kill,))))
-        outcome = simulator.run(Schedule(RunSettings(), (kill,)))
+        assert fine(simulator.run(SimulationSchedule(careful, (kill,))))
+        outcome = simulator.run(SimulationSchedule(RunSettings(), (kill,)))
         assert outcome.violation is None
         if lost > 1:
             # It can only say that it does not know.
@@ -73,7 +74,7 @@ def test_power_is_cut(lost: int, simulator: Simulator) -> None:
 def test_without_a_local_service_it_waits_for_the_cloud(simulator: Simulator) -> None:
     gone = Crash(service="cloud-1", at=0.1, down_s=0.2)
     run = RunSettings(launch="never")
-    assert fine(simulator.run(Schedule(run, (gone,))))
+    assert fine(simulator.run(SimulationSchedule(run, (gone,))))
 
 
 def test_faults_that_never_happened_are_told(simulator: Simulator) -> None:
@@ -135,7 +136,7 @@ def test_crowds_last_until_all_of_them_are_served(
 ) -> None:
     """By one worker; and the robot may be told to come back a second later."""
     run = RunSettings(replicas=2, launch="never", workers=1, sensing_s=0.03, act_s=1.0)
-    outcome = simulator.run(Schedule(run, (SIXTY, *others)))
+    outcome = simulator.run(SimulationSchedule(run, (SIXTY, *others)))
     assert fine(outcome)
     assert outcome.duration_s - outcome.recovery_s == pytest.approx(served_s + 1.0)
 
@@ -150,9 +151,9 @@ def test_seeds(first: int, simulator: Simulator) -> None:
 def test_several_processes_see_what_one_sees() -> None:
     tallies = []
     for jobs in (1, 2):
-        tally = Tally()
+        tally = ExplorationTally()
 
-        def on_batch(seeds: range, seen: Tally, tally: Tally = tally) -> bool:
+        def on_batch(seeds: range, seen: ExplorationTally, tally: ExplorationTally = tally) -> bool:
             assert len(seeds) == seen.runs == 20
             tally.add(seen)
             return True
@@ -168,7 +169,7 @@ def test_the_first_finding_is_the_first() -> None:
     """Whichever process is done sooner."""
     seen = []
 
-    def on_batch(seeds: range, tally: Tally) -> bool:
+    def on_batch(seeds: range, tally: ExplorationTally) -> bool:
         assert tally.runs == len(seeds)
         seen.append(seeds.start)
         return len(seen) < 4
@@ -179,9 +180,9 @@ def test_the_first_finding_is_the_first() -> None:
 
 @pytest.mark.slow
 def test_ten_thousand_seeds() -> None:
-    tally = Tally()
+    tally = ExplorationTally()
 
-    def on_batch(seeds: range, seen: Tally) -> bool:
+    def on_batch(seeds: range, seen: ExplorationTally) -> bool:
         tally.add(seen)
         return not tally.findings
 

@@ -16,7 +16,7 @@ THREADS = 7
 # All of them live at the same time: what one arena is free of, the next thread would take.
 PROGRAM = f"""
 import ctypes, sys, threading
-from holdfast.runtime.allocator import limit_arenas
+from holdfast.service.allocator import limit_arenas
 
 if sys.argv[1] == "limited":
     limit_arenas()

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from holdfast.arrays import FloatArray
 from holdfast.belief import (
     Belief,
     effective_sample_size,
@@ -16,7 +17,6 @@ from holdfast.belief import (
     update,
 )
 from holdfast.errors import InvalidValueError, ProblemError
-from holdfast.problems.problem import FloatArray
 from holdfast.randomness import Purpose, stream
 
 STREAM = stream(21, 0, 0, Purpose.RESAMPLING)

@@ -9,13 +9,14 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from holdfast.chaos.measures import FaultTimes
-from holdfast.chaos.report import ChaosSummary, kind_rows, summarise, write_tables
-from holdfast.chaos.schedule import FaultKind
-from holdfast.chaos.series import TRIALS_NAME, Series, SeriesPlan
-from holdfast.chaos.trial import CancelledTrialError, Pace, TrialOutcome, Verdict
-from holdfast.cli.chaos import _write_table
-from holdfast.files import OutputError
+from holdfast.errors import OutputError
+from holdfast.lab.chaos.command import _write_table
+from holdfast.lab.chaos.report import ChaosSummary, kind_rows, summarise, write_tables
+from holdfast.lab.chaos.series import TRIALS_NAME, Series, SeriesPlan
+from holdfast.lab.chaos.trial import Pace, TrialOutcome, Verdict
+from holdfast.lab.errors import CancelledTrialError
+from holdfast.lab.testbed.fault_times import FaultTimes
+from holdfast.lab.testbed.faults import FaultKind
 
 PLAN = SeriesPlan(
     seed=4,
@@ -129,7 +130,7 @@ def test_the_table_tells_behind_how_many_times_it_stands(tmp_path: Path) -> None
 
 @pytest.mark.slow
 def test_figures(tmp_path: Path) -> None:
-    from holdfast.chaos.figure import draw_figures
+    from holdfast.lab.chaos.figure import draw_figures
 
     names = draw_figures(tmp_path, summary(), outcomes())
     assert names == ["launch.png", "launch.svg", "failback.png", "failback.svg"]
@@ -139,7 +140,7 @@ def test_figures(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_the_same_series_gives_the_same_figure(tmp_path: Path) -> None:
-    from holdfast.chaos.figure import draw_figures
+    from holdfast.lab.chaos.figure import draw_figures
 
     for name in ("one", "other"):
         (tmp_path / name).mkdir()
@@ -150,7 +151,7 @@ def test_the_same_series_gives_the_same_figure(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_figures_of_nothing(tmp_path: Path) -> None:
-    from holdfast.chaos.figure import draw_figures
+    from holdfast.lab.chaos.figure import draw_figures
 
     nothing = summarise(PLAN, [], trials=1, jobs=1, left_out={})
     assert len(draw_figures(tmp_path, nothing, [])) == 4
@@ -171,7 +172,7 @@ class TestSeries:
                 raise CancelledTrialError("given up")
             return outcome(number, verdict="identical" if number % 3 else "diverged")
 
-        monkeypatch.setattr("holdfast.chaos.series.run_chaos_trial", run)
+        monkeypatch.setattr("holdfast.lab.chaos.series.run_chaos_trial", run)
 
     @staticmethod
     def run(series: Series, trials: int, jobs: int = 1) -> list[int]:

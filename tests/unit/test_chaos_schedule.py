@@ -7,17 +7,9 @@ from collections import Counter
 import msgspec
 import pytest
 
-from holdfast.chaos.schedule import (
-    DESCRIPTIONS,
-    NEEDS_NAMESPACE,
-    NEEDS_PROXY,
-    WIRES,
-    FaultKind,
-    Schedule,
-    draw_schedule,
-    kinds_over,
-)
-from holdfast.chaos.series import SeriesPlan
+from holdfast.lab.chaos.schedule import WIRES, Schedule, draw_schedule, kinds_over
+from holdfast.lab.chaos.series import SeriesPlan
+from holdfast.lab.testbed.faults import DESCRIPTIONS, NEEDS_NAMESPACE, NEEDS_PROXY, FaultKind
 
 ALL = tuple(FaultKind)
 WITHOUT_NFTABLES = tuple(kind for kind in FaultKind if kind not in NEEDS_NAMESPACE)

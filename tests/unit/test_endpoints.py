@@ -11,11 +11,11 @@ import pytest
 from holdfast.errors import TransportError
 from holdfast.transport.endpoints import (
     Endpoint,
-    PrivateSocket,
     TlsFiles,
     check_credentials,
     parse_endpoint,
 )
+from holdfast.transport.private_socket import PrivateSocket
 
 
 @pytest.mark.parametrize(

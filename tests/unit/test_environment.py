@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from holdfast.configuration import load
+from holdfast.arrays import FloatArray
+from holdfast.config.loader import load
 from holdfast.errors import (
     ConfigurationError,
     EnvironmentFailedError,
@@ -21,9 +22,9 @@ from holdfast.errors import (
 )
 from holdfast.problems import registry
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
-from holdfast.problems.problem import FloatArray, Problem
+from holdfast.problems.problem import Problem
 from holdfast.randomness import Purpose, Stream, stream
-from holdfast.runtime.environment import (
+from holdfast.robot.environment import (
     CountingEnvironment,
     Environment,
     EnvironmentMaker,

@@ -12,19 +12,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from holdfast.transport.datagram_cipher import OVERHEAD, ReplayWindow
 from holdfast.transport.exchanges import (
     KEEP_ALIVE_S,
-    MAX_ANSWERS,
+    MAX_CACHED_REQUESTS,
     MAX_DATAGRAM_BYTES,
-    MAX_EARLY_BYTES,
     MAX_PAYLOAD_BYTES,
-    Answers,
-    Part,
-    Questions,
-    RoundTrips,
-    Ways,
+    MAX_REORDERED_BYTES,
+    ReceivedReply,
+    RobotExchange,
+    ServiceExchange,
 )
-from holdfast.transport.sealing import OVERHEAD, ReplayWindow
+from holdfast.transport.redundancy import Paths
 
 
 class Sent(NamedTuple):
@@ -35,7 +34,7 @@ class Sent(NamedTuple):
 
 
 class Network:
-    """A robot and a service, and two ways between them.
+    """A robot and a service, and two paths between them.
 
     The service answers ``parts`` parts, each after ``work_s``, and then ends the call.
     """
@@ -63,19 +62,19 @@ class Network:
         self._order = itertools.count()
         self.sent: dict[str, list[Sent]] = {"robot": [], "service": []}
         self.asked: list[bytes] = []
-        self.parts_of: dict[int, list[Part]] = {}
+        self.parts_of: dict[int, list[ReceivedReply]] = {}
         self.done_at: dict[int, float] = {}
         self.drop: Callable[[str, int], bool] = lambda _who, _kind: False
         self._windows = {"robot": ReplayWindow(), "service": ReplayWindow()}
         self._counters = {"robot": itertools.count(), "service": itertools.count()}
-        self.questions = Questions(self._ways("robot"))
-        self.answers = Answers(self._ways("service"))
+        self.robot = RobotExchange(self._paths("robot"))
+        self.service = ServiceExchange(self._paths("service"))
 
-    def _ways(self, who: str) -> Ways:
-        return Ways(
+    def _paths(self, who: str) -> Paths:
+        return Paths(
             lambda message: self._datagram(who, message),
             lambda _number, message: self._on_stream(who, message),
-            lambda: self._windows[who].lost,
+            lambda: self._windows[who].num_lost,
         )
 
     def _datagram(self, who: str, message: bytes) -> None:
@@ -103,12 +102,12 @@ class Network:
 
     def _take(self, who: str, message: bytes, *, datagram: bool) -> None:
         if who == "robot":
-            for part in self.questions.received(message, self.now, datagram=datagram):
+            for part in self.robot.received(message, self.now, datagram=datagram):
                 self.parts_of.setdefault(part.call, []).append(part)
                 if part.last:
                     self.done_at[part.call] = self.now
         else:
-            arrived = self.answers.received(message, datagram=datagram)
+            arrived = self.service.received(message, datagram=datagram)
             if arrived is not None:
                 self.asked.append(arrived.payload)
                 self._work(arrived.number, 0)
@@ -118,7 +117,7 @@ class Network:
         payload = None if last else self.answer + b"%d" % part
 
         def answer() -> None:
-            self.answers.reply(number, payload, self.now, last=last)
+            self.service.reply(number, payload, self.now, last=last)
             if not last:
                 self._work(number, part + 1)
 
@@ -133,16 +132,16 @@ class Network:
         while not until():
             due = min(
                 self._queue[0][0] if self._queue else math.inf,
-                self.questions.due,
-                self.answers.due,
+                self.robot.due,
+                self.service.due,
             )
             assert due <= end, f"nothing in {limit_s} s of its time"
             self.now = max(self.now, due)
             if self._queue and self._queue[0][0] <= self.now:
                 heapq.heappop(self._queue)[2]()
             else:
-                self.questions.expire(self.now)
-                self.answers.expire(self.now)
+                self.robot.expire(self.now)
+                self.service.expire(self.now)
 
     def wait(self, seconds: float) -> None:
         done: list[bool] = []
@@ -150,10 +149,10 @@ class Network:
         self.run(lambda: bool(done), seconds + 1.0)
 
     def is_open(self) -> bool:
-        return self.questions.open
+        return self.robot.open
 
     def begin(self) -> None:
-        self.questions.begin(self.now)
+        self.robot.begin(self.now)
         if self.datagrams:
             self.run(self.is_open)
             self.wait(1.0)  # until it is known whether any are lost
@@ -161,13 +160,13 @@ class Network:
     def ask(self, call: int, payload: bytes = bytes(75)) -> float:
         """Ask, wait for the answer, and return how long it took."""
         began = self.now
-        self.questions.ask(call, payload, self.now)
+        self.robot.send(call, payload, self.now)
         self.run(lambda: call in self.done_at)
         return self.done_at[call] - began
 
-    def expected(self, call: int) -> list[Part]:
-        replies = [Part(call, self.answer + b"%d" % k, False) for k in range(self.parts)]
-        return [*replies, Part(call, None, True)]
+    def expected(self, call: int) -> list[ReceivedReply]:
+        replies = [ReceivedReply(call, self.answer + b"%d" % k, False) for k in range(self.parts)]
+        return [*replies, ReceivedReply(call, None, True)]
 
     def datagrams_of(self, who: str) -> list[Sent]:
         return [sent for sent in self.sent[who] if sent.datagram]
@@ -229,7 +228,7 @@ class TestTheBeginning:
 
     def test_the_first_questions_are_sent_twice_and_no_others(self) -> None:
         network = Network(delay_s=0.04)
-        network.questions.begin(0.0)
+        network.robot.begin(0.0)
         network.run(network.is_open)
         for call in range(50):
             network.ask(call)
@@ -241,7 +240,7 @@ class TestTheBeginning:
         times = []
         for seed in range(60):
             network = Network(delay_s=0.0435, loss=0.05, seed=seed)
-            network.questions.begin(0.0)
+            network.robot.begin(0.0)
             network.run(network.is_open)
             for call in range(15):
                 times.append(network.ask(call))
@@ -342,21 +341,21 @@ class TestLoss:
             parts=parts,
             seed=seed,
         )
-        network.questions.begin(0.0)
+        network.robot.begin(0.0)
         calls = range(30)
         for call in calls:
             size = 2 * MAX_PAYLOAD_BYTES if call % 7 == 3 else 75
-            network.questions.ask(call, bytes([call]) * size, network.now)
+            network.robot.send(call, bytes([call]) * size, network.now)
             network.wait(0.01)
         network.run(lambda: len(network.done_at) == len(calls), 600.0)
         for call in calls:
             assert network.parts_of[call] == network.expected(call)
         assert sorted(payload[0] for payload in network.asked) == list(calls)
-        assert network.questions.calls == []
+        assert not network.robot._requests
 
 
 class TestManyAreLost:
-    """As while somebody floods the service's port: what comes from there is not lost."""
+    """While the service's port is flooded: only datagrams to it are lost."""
 
     @staticmethod
     def flooded(seed: int, loss: float = 0.5, delay_s: float = 0.0005) -> Network:
@@ -401,8 +400,8 @@ class TestManyAreLost:
         for call in range(150):
             network.ask(call)
         # What the service sends there does not come; what the robot sends comes first.
-        ways = network.answers._sender.ways
-        network.answers._sender.ways = ways._replace(stream=lambda _number, _message: None)
+        paths = network.service._sender.paths
+        network.service._sender.paths = paths._replace(stream=lambda _number, _message: None)
         for call in range(150, 200):
             network.ask(call)
             assert network.parts_of[call] == network.expected(call)
@@ -477,7 +476,7 @@ class TestTheStream:
 
     def test_a_large_question_is_not_copied(self) -> None:
         """Nobody else is heard meanwhile."""
-        answers = Answers(Ways(lambda _: None, lambda _n, _m: None, lambda: 0))
+        answers = ServiceExchange(Paths(lambda _: None, lambda _n, _m: None, lambda: 0))
         message = bytearray(b"\1\0" + (1).to_bytes(4, "big") * 2 + b"\0\0" + bytes(2_000_000))
         arrived = answers.received(cast(bytes, message), datagram=False)
         assert arrived is not None and len(arrived.payload) == 2_000_000
@@ -510,7 +509,7 @@ class TestTheStream:
     def test_answers_that_are_on_their_way_when_datagrams_stop(self) -> None:
         network = Network(work_s=0.5, parts=4)
         network.begin()
-        network.questions.ask(1, bytes(75), network.now)
+        network.robot.send(1, bytes(75), network.now)
         network.wait(0.7)
         network.datagrams = False
         network.run(lambda: 1 in network.done_at)
@@ -527,35 +526,35 @@ class TestTheStream:
         network = Network()
         network.begin()
         network.drop = lambda who, _kind: who == "service"
-        network.questions.ask(1, bytes(75), network.now)
+        network.robot.send(1, bytes(75), network.now)
         network.wait(0.06)
         began = network.now
-        network.answers.flush()
+        network.service.flush()
         network.run(lambda: 1 in network.done_at)
         assert network.parts_of[1] == network.expected(1)
         assert network.done_at[1] - began <= 0.05
 
     def test_what_was_passed_over_because_it_is_too_large(self) -> None:
         network = Network()
-        network.questions.ask(5, bytes(75), 0.0)
-        assert network.questions.passed_over(1) == [Part(5, None, True)]
-        assert network.questions.passed_over(1) == []
-        assert network.answers.passed_over(1)
-        assert not network.answers.passed_over(1)
-        network.questions.ask(6, bytes(75), 0.0)
-        network.answers.passed_over(2)
-        network.answers.reply(2, b"too large", 0.0, last=True)
+        network.robot.send(5, bytes(75), 0.0)
+        assert network.robot.oversized(1) == [ReceivedReply(5, None, True)]
+        assert network.robot.oversized(1) == []
+        assert network.service.oversized(1)
+        assert not network.service.oversized(1)
+        network.robot.send(6, bytes(75), 0.0)
+        network.service.oversized(2)
+        network.service.reply(2, b"too large", 0.0, last=True)
         network.run(lambda: 6 in network.done_at)
-        assert network.parts_of[6] == [Part(6, b"too large", True)]
+        assert network.parts_of[6] == [ReceivedReply(6, b"too large", True)]
 
 
 class TestBounds:
     def test_a_call_that_is_forgotten_is_heard_of_no_more(self) -> None:
         network = Network(work_s=1.0)
         network.begin()
-        network.questions.ask(1, bytes(75), network.now)
+        network.robot.send(1, bytes(75), network.now)
         network.wait(0.2)
-        network.questions.forget(1)
+        network.robot.abandon(1)
         assert network.ask(2) > 0
         assert 1 not in network.parts_of
         before = len(network.sent["robot"])
@@ -565,62 +564,39 @@ class TestBounds:
     def test_answers_are_kept_until_the_robot_has_them(self) -> None:
         network = Network()
         network.begin()
-        for call in range(5 * MAX_ANSWERS):
+        for call in range(5 * MAX_CACHED_REQUESTS):
             network.ask(call)
         # All but the last are settled, so a late copy of an old question is no new one.
         late = b"\1\0" + b"\0\0\0\1" * 2 + b"\0\0" + bytes(75)
-        assert network.answers.received(late, datagram=True) is None
-        assert len(network.asked) == 5 * MAX_ANSWERS
+        assert network.service.received(late, datagram=True) is None
+        assert len(network.asked) == 5 * MAX_CACHED_REQUESTS
 
     def test_parts_without_those_before_them_take_no_more_memory_than_the_bound(self) -> None:
-        questions = Questions(Ways(lambda _: None, lambda _, __: None, lambda: 0))
-        questions.ask(7, bytes(2000), 0.0)
-        part = bytes(MAX_EARLY_BYTES // 4)
+        robot = RobotExchange(Paths(lambda _: None, lambda _, __: None, lambda: 0))
+        robot.send(7, bytes(2000), 0.0)
+        part = bytes(MAX_REORDERED_BYTES // 4)
         found = []
         for index in range(1, 6):  # never the first
             reply = b"\2\0" + (1).to_bytes(4, "big") + index.to_bytes(2, "big") + part
-            found.append(questions.received(reply, 0.0, datagram=False))
-        assert found == [[], [], [], [], [Part(7, None, True)]]
-        assert questions.calls == []
+            found.append(robot.received(reply, 0.0, datagram=False))
+        assert found == [[], [], [], [], [ReceivedReply(7, None, True)]]
+        assert not robot._requests
 
     def test_no_more_answers_are_kept_than_the_bound(self) -> None:
-        answers = Answers(Ways(lambda _: None, lambda _n, _m: None, lambda: 0))
-        for number in range(1, 3 * MAX_ANSWERS):
+        answers = ServiceExchange(Paths(lambda _: None, lambda _n, _m: None, lambda: 0))
+        for number in range(1, 3 * MAX_CACHED_REQUESTS):
             question = b"\1\0" + number.to_bytes(4, "big") + b"\0\0\0\1\0\0x"
             assert answers.received(question, datagram=True) is not None
             answers.reply(number, b"answer", 0.0, last=True)
-        assert len(answers._answers) == MAX_ANSWERS
+        assert len(answers._cached) == MAX_CACHED_REQUESTS
 
     @given(st.binary(max_size=60), st.booleans())
     def test_arbitrary_messages_do_no_harm(self, message: bytes, datagram: bool) -> None:
         network = Network()
         network.begin()
-        network.questions.ask(1, bytes(75), network.now)
-        network.questions.received(message, network.now, datagram=datagram)
-        network.answers.received(message, datagram=datagram)
+        network.robot.send(1, bytes(75), network.now)
+        network.robot.received(message, network.now, datagram=datagram)
+        network.service.received(message, datagram=datagram)
         for kind in range(7):
-            network.questions.received(bytes((kind, 0)) + message, network.now, datagram=datagram)
-            network.answers.received(bytes((kind, 0)) + message, datagram=datagram)
-
-
-class TestRoundTrips:
-    def test_as_in_the_standard(self) -> None:
-        trips = RoundTrips()
-        assert trips.patience_s == 0.2
-        trips.add(0.1)
-        assert trips.patience_s == pytest.approx(0.1 + 4 * 0.05)
-        trips.add(0.1)
-        assert trips.patience_s == pytest.approx(0.1 + 4 * 0.0375)
-        trips.add(0.2)
-        assert trips.smoothed_s == pytest.approx(0.1125)
-        assert trips.patience_s == pytest.approx(0.1125 + 4 * (0.75 * 0.0375 + 0.25 * 0.1))
-
-    def test_the_margin_is_never_less_than_ten_milliseconds_nor_the_sum_more_than_a_second(
-        self,
-    ) -> None:
-        trips = RoundTrips()
-        for _ in range(200):
-            trips.add(0.0002)
-        assert trips.patience_s == pytest.approx(0.0102, abs=1e-6)
-        trips.add(30.0)
-        assert trips.patience_s == 1.0
+            network.robot.received(bytes((kind, 0)) + message, network.now, datagram=datagram)
+            network.service.received(bytes((kind, 0)) + message, datagram=datagram)

@@ -11,7 +11,7 @@ import pytest
 
 from holdfast.errors import EnvironmentFailedError
 from holdfast.problems.registry import problem_class
-from holdfast.ros.executive import Call, Code, Executive, ExecutiveEnvironment
+from holdfast.ros.executive import DecideCode, DecideRequest, DecisionHandover, ExecutiveEnvironment
 
 FOREVER_S = 60.0
 
@@ -33,8 +33,8 @@ def robot() -> Iterator[Robot]:
     robot.pool.shutdown()
 
 
-def executive(interval: int = 1) -> Executive:
-    return Executive(problem_class("peg_in_hole_2d")(), interval)
+def executive(interval: int = 1) -> DecisionHandover:
+    return DecisionHandover(problem_class("peg_in_hole_2d")(), interval)
 
 
 def observation() -> np.ndarray:
@@ -45,27 +45,27 @@ def test_a_trial_goes_from_call_to_call(robot: Robot) -> None:
     meeting = executive(interval=1)
     world = ExecutiveEnvironment(meeting, trial=3)
     sensed = robot.ask(world.perform_sensing, 2)
-    first = meeting.call(Call(), FOREVER_S)
-    assert first.code == Code.OK
+    first = meeting.call(DecideRequest(), FOREVER_S)
+    assert first.code == DecideCode.OK
     assert first.due is not None
     assert (first.due.trial, first.due.number, first.due.sensing_action) == (3, 1, 2)
 
     acted = robot.ask(world.perform, np.array([1.0, 2.0]))
-    second = meeting.call(Call(3, 1, np.array([0.5])), FOREVER_S)
+    second = meeting.call(DecideRequest(3, 1, np.array([0.5])), FOREVER_S)
     assert np.asarray(sensed.result()).tolist() == [0.5]
     assert second.due is not None
     assert (second.due.number, second.due.sensing_action) == (2, None)
     assert second.due.task_action.tolist() == [1.0, 2.0]
 
     again = robot.ask(world.perform, np.array([3.0, 4.0]))
-    third = meeting.call(Call(3, 2, reward=-1.5), FOREVER_S)
+    third = meeting.call(DecideRequest(3, 2, reward=-1.5), FOREVER_S)
     assert acted.result() == -1.5
     assert world.is_done() is False
     assert third.due is not None
     assert (third.due.number, third.due.step) == (4, 1)
 
-    robot.ask(meeting.end, Code.FINISHED, "all")
-    assert meeting.call(Call(3, 4, done="failed"), FOREVER_S).code == Code.FINISHED
+    robot.ask(meeting.end, DecideCode.FINISHED, "all")
+    assert meeting.call(DecideRequest(3, 4, done="failed"), FOREVER_S).code == DecideCode.FINISHED
     assert again.result() is None
     assert world.is_done() == "failed"
 
@@ -74,15 +74,15 @@ def test_a_repeated_call_gets_the_same_decision(robot: Robot) -> None:
     meeting = executive()
     world = ExecutiveEnvironment(meeting)
     robot.ask(world.perform_sensing, 0)
-    first = meeting.call(Call(), FOREVER_S).due
+    first = meeting.call(DecideRequest(), FOREVER_S).due
     assert first is not None
-    assert meeting.call(Call(), FOREVER_S).due is first
+    assert meeting.call(DecideRequest(), FOREVER_S).due is first
     robot.ask(world.perform, np.zeros(2))
-    answer = Call(0, 1, observation())
+    answer = DecideRequest(0, 1, observation())
     second = meeting.call(answer, FOREVER_S).due
     assert second is not None
     assert meeting.call(answer, FOREVER_S).due is second
-    meeting.end(Code.ENDED, "over")
+    meeting.end(DecideCode.ENDED, "over")
 
 
 @pytest.mark.parametrize(
@@ -105,74 +105,89 @@ def test_after_a_crash_the_call_before_is_known_as_such(
         robot.ask(world.perform_sensing, 0)
     else:
         robot.ask(world.perform, np.zeros(2))
-    reply = meeting.call(Call(*before, observation()), FOREVER_S)
-    assert reply.code == Code.OK
+    reply = meeting.call(DecideRequest(*before, observation()), FOREVER_S)
+    assert reply.code == DecideCode.OK
     assert reply.due is not None
     assert (reply.due.trial, reply.due.step) == (5, step)
-    meeting.end(Code.ENDED, "over")
+    meeting.end(DecideCode.ENDED, "over")
 
 
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (Call(0, 3, observation()), "trial 0, number 3: trial 0, number 1 is to be answered"),
-        (Call(2, 1, observation()), "trial 2, number 1: trial 0, number 1 is to be answered"),
-        (Call(0, 1), "observation of 0 values: sensing action 0 of peg_in_hole_2d has 1"),
-        (Call(0, 1, np.zeros(4)), "observation of 4 values: sensing action 0 of peg_in_hole_2d"),
-        (Call(0, 1, np.array([np.nan])), "observation[0] is nan: must be a finite number"),
-        (Call(0, 1, observation(), np.inf), "reward inf: must be a finite number"),
-        (Call(0, 1, observation(), done=True), "done says that it has succeeded: number 1 is a se"),
-        (Call(0, 1, observation(), done="failed"), "done says that the task has failed: number 1"),
+        (
+            DecideRequest(0, 3, observation()),
+            "trial 0, number 3: trial 0, number 1 is to be answered",
+        ),
+        (
+            DecideRequest(2, 1, observation()),
+            "trial 2, number 1: trial 0, number 1 is to be answered",
+        ),
+        (DecideRequest(0, 1), "observation of 0 values: sensing action 0 of peg_in_hole_2d has 1"),
+        (
+            DecideRequest(0, 1, np.zeros(4)),
+            "observation of 4 values: sensing action 0 of peg_in_hole_2d",
+        ),
+        (DecideRequest(0, 1, np.array([np.nan])), "observation[0] is nan: must be a finite number"),
+        (DecideRequest(0, 1, observation(), np.inf), "reward inf: must be a finite number"),
+        (
+            DecideRequest(0, 1, observation(), done=True),
+            "done says that it has succeeded: number 1 is a se",
+        ),
+        (
+            DecideRequest(0, 1, observation(), done="failed"),
+            "done says that the task has failed: number 1",
+        ),
     ],
 )
-def test_a_bad_answer_changes_nothing(robot: Robot, call: Call, message: str) -> None:
+def test_a_bad_answer_changes_nothing(robot: Robot, call: DecideRequest, message: str) -> None:
     meeting = executive()
     sensed = robot.ask(ExecutiveEnvironment(meeting).perform_sensing, 0)
-    assert meeting.call(Call(), FOREVER_S).code == Code.OK
+    assert meeting.call(DecideRequest(), FOREVER_S).code == DecideCode.OK
     reply = meeting.call(call, FOREVER_S)
-    assert reply.code == Code.BAD_REQUEST
+    assert reply.code == DecideCode.BAD_REQUEST
     assert message in reply.message
     assert not sensed.done()
-    meeting.end(Code.ENDED, "over")
+    meeting.end(DecideCode.ENDED, "over")
 
 
 def test_a_task_action_shows_nothing(robot: Robot) -> None:
     meeting = executive()
     robot.ask(ExecutiveEnvironment(meeting, 0, 1).perform, np.zeros(2))
-    assert meeting.call(Call(), FOREVER_S).code == Code.OK
-    reply = meeting.call(Call(0, 4, observation()), FOREVER_S)
+    assert meeting.call(DecideRequest(), FOREVER_S).code == DecideCode.OK
+    reply = meeting.call(DecideRequest(0, 4, observation()), FOREVER_S)
     assert "observation of 1 values: number 4 is a task action" in reply.message
-    meeting.end(Code.ENDED, "over")
+    meeting.end(DecideCode.ENDED, "over")
 
 
 def test_who_waits_too_long_is_told_to_ask_again() -> None:
-    assert executive().call(Call(), 0.0).code == Code.HOLDING
+    assert executive().call(DecideRequest(), 0.0).code == DecideCode.HOLDING
 
 
 def test_an_answer_is_not_taken_twice_while_the_robot_thinks(robot: Robot) -> None:
     meeting = executive()
     sensed = robot.ask(ExecutiveEnvironment(meeting).perform_sensing, 0)
-    meeting.call(Call(), FOREVER_S)
-    assert meeting.call(Call(0, 1, np.array([1.0])), 0.0).code == Code.HOLDING
+    meeting.call(DecideRequest(), FOREVER_S)
+    assert meeting.call(DecideRequest(0, 1, np.array([1.0])), 0.0).code == DecideCode.HOLDING
     assert np.asarray(sensed.result()).tolist() == [1.0]
-    assert meeting.call(Call(0, 1, np.array([9.0])), 0.0).code == Code.HOLDING
-    assert meeting.call(Call(0, 7), 0.0).code == Code.BAD_REQUEST
+    assert meeting.call(DecideRequest(0, 1, np.array([9.0])), 0.0).code == DecideCode.HOLDING
+    assert meeting.call(DecideRequest(0, 7), 0.0).code == DecideCode.BAD_REQUEST
 
 
 def test_a_run_that_ends_lets_all_go(robot: Robot) -> None:
     meeting = executive()
     sensed = robot.ask(ExecutiveEnvironment(meeting).perform_sensing, 0)
-    assert meeting.call(Call(), FOREVER_S).code == Code.OK
+    assert meeting.call(DecideRequest(), FOREVER_S).code == DecideCode.OK
     asked = threading.Event()
 
     def wait() -> object:
         asked.set()
-        return meeting.call(Call(0, 0), FOREVER_S)
+        return meeting.call(DecideRequest(0, 0), FOREVER_S)
 
-    meeting.end(Code.ENDED, "the node was deactivated")
+    meeting.end(DecideCode.ENDED, "the node was deactivated")
     with pytest.raises(EnvironmentFailedError, match="deactivated"):
         sensed.result()
-    assert meeting.call(Call(0, 1, observation()), FOREVER_S).code == Code.ENDED
+    assert meeting.call(DecideRequest(0, 1, observation()), FOREVER_S).code == DecideCode.ENDED
     assert wait() is not None
     assert asked.is_set()
 

@@ -10,24 +10,26 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from holdfast import contract, expected_return, planning
+from holdfast import expected_return
+from holdfast.arrays import FloatArray, IntArray
 from holdfast.belief import Belief
-from holdfast.errors import ProblemError
-from holdfast.expected_return import rollout_returns
-from holdfast.outcome import SensingDecision
-from holdfast.problems.problem import FloatArray, IntArray, ProblemBase
-from holdfast.randomness import Purpose, Stream, stream
-from holdfast.runtime.trial import run_trial
-from holdfast.sensing import SensingInfo, choose_sensing_action
-from holdfast.session.records import ObservedRecord
-from holdfast.session.robot import History
-from holdfast.settings import (
+from holdfast.config.settings import (
     ActiveSensingSettings,
     ParticleFilterSettings,
     PlanningSettings,
     SelectorSettings,
     SimulatorSettings,
 )
+from holdfast.errors import ProblemError
+from holdfast.expected_return import rollout_returns
+from holdfast.outcome import SensingDecision
+from holdfast.planning import Planner
+from holdfast.problem_attributes import sensing_costs
+from holdfast.problems.problem import ProblemBase
+from holdfast.protocol.records import ObservedRecord, TrialHistory
+from holdfast.randomness import Purpose, Stream, stream
+from holdfast.robot.trial import run_trial
+from holdfast.sensing import SensingInfo, choose_sensing_action
 
 HYPOTHESES = stream(43, 0, 0, Purpose.HYPOTHESES)
 SELECTION = stream(43, 0, 0, Purpose.SELECTION)
@@ -415,7 +417,10 @@ class TestSensingCosts:
     def test_a_trial_pays_for_each_look(self) -> None:
         settings = settings_of(method="random", particles=30)
         simulator = SimulatorSettings(max_steps=60, sensing_intervals=4)
-        free, paid = (run_trial(each, settings, simulator, 1) for each in (Dock(), Priced()))
+        free, paid = (
+            run_trial(Planner(each, settings), simulator.seed, 1, max_steps=simulator.max_steps)
+            for each in (Dock(), Priced())
+        )
         assert free.digest == paid.digest
         assert free.decisions is not None
         prices = Priced.sensing_costs
@@ -427,8 +432,8 @@ class TestSensingCosts:
         np.testing.assert_allclose(paid.reward, expected, rtol=1e-12)
 
     def test_a_robot_pays_for_each_look(self) -> None:
-        planner = planning.Planner(Priced(), settings_of(method="random", particles=30))
-        history = History(planner, 0, 0)
+        planner = Planner(Priced(), settings_of(method="random", particles=30))
+        history = TrialHistory(planner, 0, 0)
         observation = np.array([0.5])
         for sensing_action, total in ((0, -0.5), (1, -0.75), (2, -0.75)):
             after, info = planner.observe(history.state, sensing_action, observation)
@@ -440,13 +445,18 @@ class TestSensingCosts:
                 sensing_ms=0.0,
             )
             history.observed(record, after, explained=info.explained)
-            assert history.total_reward == total
+            assert history.rewards.total == total
 
     def test_a_price_alone_is_a_reward(self) -> None:
         problem = Free()
         problem.sensing_costs = (1.0, 1.0, 1.0)  # type: ignore[attr-defined]
         simulator = SimulatorSettings(max_steps=10, sensing_intervals=4)
-        result = run_trial(problem, settings_of(method="random", particles=30), simulator, 0)
+        result = run_trial(
+            Planner(problem, settings_of(method="random", particles=30)),
+            simulator.seed,
+            0,
+            max_steps=simulator.max_steps,
+        )
         assert result.reward == -float(result.sensing_decisions)
 
     def test_free_looks_alone_are_a_reward_of_zero(self) -> None:
@@ -455,15 +465,20 @@ class TestSensingCosts:
         settings = settings_of(method="fixed", particles=30, sensing_action=2)
         for costs, reward in (((1.0, 1.0, 0.0), 0.0), ((0.0, 0.0, 0.0), 0.0), (None, None)):
             problem.sensing_costs = costs  # type: ignore[attr-defined]
-            assert run_trial(problem, settings, simulator, 0).reward == reward
-            assert History(planning.Planner(problem, settings), 0, 0).total_reward == reward
+            assert (
+                run_trial(
+                    Planner(problem, settings), simulator.seed, 0, max_steps=simulator.max_steps
+                ).reward
+                == reward
+            )
+            assert TrialHistory(Planner(problem, settings), 0, 0).rewards.total == reward
 
     def test_none_is_free(self) -> None:
         for costs in (None, (0.0, 0.0, 0.0), np.zeros(3), [0, 0, 0]):
             problem = Dock()
             problem.sensing_costs = costs  # type: ignore[attr-defined]
-            assert contract.sensing_costs(problem).tolist() == [0.0, 0.0, 0.0]
-        assert contract.sensing_costs(Dock()).tolist() == [0.0, 0.0, 0.0]
+            assert sensing_costs(problem).tolist() == [0.0, 0.0, 0.0]
+        assert sensing_costs(Dock()).tolist() == [0.0, 0.0, 0.0]
 
     def test_the_greatest_price(self) -> None:
         problem = Dock()
@@ -496,4 +511,4 @@ class TestSensingCosts:
     def test_a_wrong_price_is_named(self, costs: object) -> None:
         broken: Any = type("Broken", (Dock,), {"sensing_costs": costs})()
         with pytest.raises(ProblemError, match=r"sensing_costs of dock is .*: must be 3 numbers"):
-            planning.initial_state(broken, settings_of(), 0, 0)
+            Planner(broken, settings_of()).init(0, 0)

@@ -30,19 +30,21 @@ from rosbags.typesys import Stores, get_typestore
 from tests.command_line import Said, run_here
 
 from holdfast.belief import Belief
-from holdfast.configuration import Configuration, load
+from holdfast.config.loader import Configuration, load
 from holdfast.outcome import SensingDecision, TaskDecision, TrialResult
+from holdfast.planning import Planner
+from holdfast.problems.registry import BUILT_IN
+from holdfast.protocol.records import ActingRecord, ObservedRecord
 from holdfast.recording.journal import Journal
+from holdfast.robot.trial import NullObserver, SensingStep, TaskStep, run_trial
 from holdfast.ros.poses import PoseLayout, pose_layout
-from holdfast.runtime.trial import NullObserver, SensingStep, TaskStep, run_trial
-from holdfast.session.records import ActingRecord, ObservedRecord
 
 PEG = """\
 problem: peg_in_hole_2d
 particle_filter: {num_particles: 25}
 simulator: {num_trials: 2, max_steps: 20, sensing_intervals: 3, seed: 5}
 """
-PROBLEMS = ("peg_in_hole_2d", "multitier_peg_in_hole_2d", "capsule_robot", "peg_in_hole_3d")
+PROBLEMS = tuple(BUILT_IN)
 
 OWN_PROBLEM = '''
 import numpy as np
@@ -145,10 +147,10 @@ def seen_in(configuration: Configuration, trials: range) -> list[Seen]:
     observers = [Seen() for _ in trials]
     for trial, observer in zip(trials, observers, strict=True):
         run_trial(
-            configuration.problem,
-            configuration.planning,
-            configuration.simulator,
+            Planner(configuration.problem, configuration.planning),
+            configuration.simulator.seed,
             trial,
+            max_steps=configuration.simulator.max_steps,
             observer=observer,
         )
     return observers
@@ -228,17 +230,13 @@ def built_in(
     (directory / "run.yaml").write_text(PEG.replace("peg_in_hole_2d", request.param))
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(directory)
-        from typer.testing import CliRunner
+        from holdfast.cli.application import run_application
 
-        from holdfast.cli.application import app
-
-        runner = CliRunner()
         for words in (
             ["run", "run.yaml", "--out", "run", "-q"],
             ["export", "run", "--mcap", "run.mcap", "--csv", "tables", "-q"],
         ):
-            result = runner.invoke(app, words, catch_exceptions=False)
-            assert result.exit_code == 0, result.output
+            assert run_application(words) == 0
     configuration = load(directory / "run.yaml")
     yield configuration, directory, seen_in(configuration, range(2))
 
@@ -730,7 +728,7 @@ class TestDecisionsAreCompared:
         make_run(capsys, tmp_path, PEG.replace("peg_in_hole_2d", "cart:Cart"))
         (tmp_path / "cart.py").write_text(OWN_PROBLEM.replace("POSE", "").replace("0.3", "0.45"))
         said = export(capsys, tmp_path, "--csv", "tables", "--mcap", "run.mcap", code=2)
-        assert "trial 0 is decided otherwise at step 0 when it is computed again" in said.stderr
+        assert "trial 0: the decision of step 0 differs when it is computed again" in said.stderr
         assert "the problem's source has changed since (module cart)" in said.stderr
         assert not (tmp_path / "tables").exists()
         assert not (tmp_path / "run.mcap").exists()
@@ -758,7 +756,7 @@ class TestDecisionsAreCompared:
             for result in results:
                 journal.add(result)
         said = export(capsys, tmp_path, "--csv", "tables", code=2)
-        assert "trial 1 is decided otherwise at step 0" in said.stderr
+        assert "trial 1: the decision of step 0 differs" in said.stderr
         assert "--trials leaves it out" in said.stderr
         assert not (tmp_path / "tables").exists()
         export(capsys, tmp_path, "--csv", "tables", "--trials", "0:1")
@@ -822,13 +820,13 @@ class TestRefusals:
         [
             ((), "nothing to write: give --mcap FILE or --csv DIR, or both"),
             (("--csv", "there"), "there: holds files already; remove it, or choose another"),
-            (("--csv", "run.yaml"), "run.yaml: is there already; remove it, or choose another"),
-            (("--mcap", "run.yaml"), "run.yaml: is there already; remove it, or choose another"),
-            (("--mcap", "there"), "there: is there already"),
+            (("--csv", "run.yaml"), "run.yaml: exists already; remove it, or choose another"),
+            (("--mcap", "run.yaml"), "run.yaml: exists already; remove it, or choose another"),
+            (("--mcap", "there"), "there: exists already"),
             (("--mcap", "no/run.mcap"), "there is no directory no"),
             (("--csv", "one", "--mcap", "one"), "--mcap and --csv are both one; give two places"),
             (("--csv", "one", "--trials", "5"), "--trials is '5'; allowed are two whole numbers"),
-            (("--csv", "one", "--trials", "1:1"), "the second number must be above the first"),
+            (("--csv", "one", "--trials", "1:1"), "allowed are A:B with B above A"),
             (("--csv", "one", "--trials", "2:9"), "has no trial from 2 to 8 (--trials); it has 2"),
             (("--csv", "one", "--rate", "0"), "--rate is '0'; allowed are numbers from 0.001"),
         ],
@@ -853,7 +851,7 @@ class TestRefusals:
         [
             ("nothing", "there is no such directory or journal, so no run to export"),
             ("empty", "holds no journal.sqlite, so no run to export"),
-            ("run.yaml", "run.yaml: is neither the directory of a run nor its journal"),
+            ("run.yaml", "run.yaml: is not a journal; name the directory of a run"),
         ],
     )
     def test_what_is_no_run(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from holdfast.session.failure_detector import FailureDetector
+from holdfast.protocol.failure_detector import FailureDetector
 
 
 def present() -> FailureDetector:
@@ -38,13 +38,13 @@ def test_the_same_token_again_is_no_news() -> None:
 def test_silence_counts_only_while_something_is_awaited() -> None:
     detector = present()
     assert detector.deadline() is None
-    assert not detector.fell_silent(1e9)
+    assert not detector.suspect_if_silent(1e9)
     detector.asked(10.0)
     assert detector.deadline() == 10.25
-    assert not detector.fell_silent(10.2)
-    assert detector.fell_silent(10.25)
+    assert not detector.suspect_if_silent(10.2)
+    assert detector.suspect_if_silent(10.25)
     assert detector.suspicion == "no sign of progress for 250 ms"
-    assert not detector.fell_silent(11.0), "suspected only once"
+    assert not detector.suspect_if_silent(11.0), "suspected only once"
     assert detector.deadline() is None
 
 
@@ -52,8 +52,8 @@ def test_any_sign_moves_the_deadline_and_clears_a_suspicion() -> None:
     detector = present()
     detector.asked(0.0)
     detector.heard(0.2)
-    assert not detector.fell_silent(0.4)
-    assert detector.fell_silent(0.45)
+    assert not detector.suspect_if_silent(0.4)
+    assert detector.suspect_if_silent(0.45)
     detector.heard(5.0)
     assert detector.trusted
     assert detector.deadline() == 5.25

@@ -13,12 +13,13 @@ import pytest
 
 from holdfast import files
 from holdfast.cli import main
+from holdfast.errors import OutputError
 from holdfast.files import (
-    OutputError,
     directory_beside,
     move_into_place,
     read_bounded,
     require_free,
+    write_atomically,
 )
 
 
@@ -157,9 +158,9 @@ class TestMadeBesideItsPlace:
         (tmp_path / "file").touch()
         (tmp_path / "link").symlink_to("nothing")
         for name in ("file", "link"):
-            with pytest.raises(OutputError, match=rf"{name}: is there already; .* \(--out\)"):
+            with pytest.raises(OutputError, match=rf"{name}: exists already; .* \(--out\)"):
                 require_free(tmp_path / name, "--out", directory=directory)
-        with pytest.raises(OutputError, match=r"holds files already|is there already"):
+        with pytest.raises(OutputError, match=r"holds files already|exists already"):
             require_free(tmp_path, "--out", directory=directory)
         with pytest.raises(OutputError, match="there is no directory"):
             require_free(tmp_path / "no" / "place", "--out", directory=directory)
@@ -168,3 +169,32 @@ class TestMadeBesideItsPlace:
         (tmp_path / "empty").mkdir()
         if directory:
             require_free(tmp_path / "empty", "--out", directory=True)
+
+
+class TestAtomicFiles:
+    def test_text_bytes_and_lines(self, tmp_path: Path) -> None:
+        path = tmp_path / "file"
+        for content, expected in (
+            ("θ", "θ"),
+            (b"bytes", "bytes"),
+            (iter(["a\n", "b\n"]), "a\nb\n"),
+        ):
+            write_atomically(path, content)
+            assert path.read_text(encoding="utf-8") == expected
+        assert [entry.name for entry in tmp_path.iterdir()] == ["file"]
+
+    def test_a_failure_leaves_the_old_file_and_nothing_else(self, tmp_path: Path) -> None:
+        path = tmp_path / "file"
+        write_atomically(path, "old")
+
+        def lines() -> list[str]:
+            raise ZeroDivisionError
+
+        with pytest.raises(ZeroDivisionError):
+            write_atomically(path, (line for _ in range(1) for line in lines()))
+        assert path.read_text() == "old"
+        assert [entry.name for entry in tmp_path.iterdir()] == ["file"]
+
+    def test_a_missing_directory_is_named(self, tmp_path: Path) -> None:
+        with pytest.raises(OutputError, match="missing/file: cannot be written: No such file"):
+            write_atomically(tmp_path / "missing" / "file", "text")

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from holdfast.errors import FrameError
 from holdfast.transport.frames import (
     CALL,
     END,
@@ -20,7 +21,6 @@ from holdfast.transport.frames import (
     WIRE_VERSION,
     Frame,
     FrameDecoder,
-    FrameError,
     Hello,
     decode_hello,
     encode_frame,

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from holdfast.arrays import FloatArray
 from holdfast.errors import InvalidValueError
 from holdfast.geometry import FAR, MAX_NOISE_ATTEMPTS, BoxWorld, DiscWorld, RectangleWorld
-from holdfast.problems.problem import FloatArray
 from holdfast.randomness import Purpose, Stream, stream
 
 World = DiscWorld | RectangleWorld | BoxWorld

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from holdfast import _kernel
-from holdfast.problems.problem import FloatArray, IntArray
+from holdfast.arrays import FloatArray, IntArray
 
 ALL_ONES = 0xFFFFFFFF
 WORDS = (7, 0, 3, 2, 1)

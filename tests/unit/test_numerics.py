@@ -13,7 +13,7 @@ import numpy.typing as npt
 import pytest
 
 from holdfast import numerics
-from holdfast.problems.problem import FloatArray
+from holdfast.arrays import FloatArray
 from holdfast.randomness import Purpose, stream
 
 STREAM = stream(5, 0, 0, Purpose.PREDICTION)

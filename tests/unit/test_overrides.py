@@ -9,16 +9,18 @@ from typing import Any
 import msgspec
 import pytest
 
-from holdfast import configuration
 from holdfast.cli.application import run_application
 from holdfast.cli.overrides import combined, parse_assignment
-from holdfast.configuration import load
+from holdfast.config import loader
+from holdfast.config.loader import load
+from holdfast.config.problem_builder import schemas_of
+from holdfast.config.source import SETTINGS
 from holdfast.errors import HoldfastError
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 
 SECTIONS: dict[str, type[msgspec.Struct]] = {
-    **configuration._SETTINGS,
-    **configuration._schemas_of(PegInHole2D),
+    **SETTINGS,
+    **schemas_of(PegInHole2D),
 }
 KEYS = [
     (section, field.encode_name)
@@ -67,7 +69,7 @@ def another_value(section: str, key: str, value: Any) -> Any:
     return value / 2
 
 
-def plain(loaded: configuration.Configuration) -> dict[str, Any]:
+def plain(loaded: loader.Configuration) -> dict[str, Any]:
     sections = msgspec.json.decode(msgspec.json.encode(loaded.plain()["configuration"]))
     assert isinstance(sections, dict)
     return sections

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 from msgspec import structs
 
-from holdfast.cli import _tell_defect, main
-from holdfast.cli.terminal import PlainProgress, print_summary
+from holdfast.cli import _print_defect, main
+from holdfast.cli.terminal import print_summary, progress_line
 from holdfast.printable import printable
 from holdfast.recording.tables import SummaryBuilder
 from holdfast.runtime.logs import EventLog
@@ -128,12 +128,12 @@ def test_a_command_line(arguments: list[str], said: Run) -> None:
 
 def test_a_defect_s_traceback(capsys: pytest.CaptureFixture[str]) -> None:
     error = ValueError(HOSTILE)
-    _tell_defect(type(error), error, None)
+    _print_defect(type(error), error, None)
     assert capsys.readouterr().err == f"ValueError: {SEEN}\n"
 
 
 def test_progress(capsys: pytest.CaptureFixture[str]) -> None:
-    PlainProgress(3, "trial").say(HOSTILE)
+    progress_line(3, quiet=False).say(HOSTILE)
     assert capsys.readouterr().err == f"{SEEN}\n"
 
 

@@ -13,11 +13,11 @@ from pathlib import Path
 import pytest
 
 from holdfast.errors import TransportError
-from holdfast.transport.endpoints import PrivateSocket
+from holdfast.transport.private_socket import PrivateSocket
 
 MAKES_ONE_AND_WAITS = """
 import sys
-from holdfast.transport.endpoints import PrivateSocket
+from holdfast.transport.private_socket import PrivateSocket
 local = PrivateSocket()
 print(local.endpoint, flush=True)
 sys.stdin.read()

@@ -9,11 +9,11 @@ from typing import Literal, get_args, get_origin, get_type_hints
 import msgspec
 import pytest
 
-from holdfast.simulation.schedule import Fault, RunSettings, line_of, parse_schedule
+from holdfast.lab.simulation.schedule import RunSettings, SimulatedFault, line_of, parse_schedule
 
 PAGE = (Path(__file__).parents[2] / "docs" / "reliability.md").read_text(encoding="utf-8")
 SECTION = PAGE.partition("## The lines of a schedule\n")[2].partition("\n## ")[0]
-FAULTS = get_args(Fault)
+FAULTS = get_args(SimulatedFault)
 
 
 def keys_of(kind: type[msgspec.Struct]) -> list[str]:

@@ -16,10 +16,10 @@ from cryptography.hazmat.primitives.serialization import Encoding
 from cryptography.x509.oid import NameOID
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests.unit.test_credentials import run_keys
+from tests.unit.test_key_ring import run_keys
 
-from holdfast.errors import TransportError
-from holdfast.transport.credentials import CredentialsError, Role, load_credentials
+from holdfast.errors import CredentialsError, TransportError
+from holdfast.transport.credentials import Role, load_credentials
 from holdfast.transport.key_ring import list_credentials, make_credentials, revoke_credentials
 from holdfast.transport.revocation import REVOKED_FILE, refuse_revoked, revoked_serials
 
@@ -423,7 +423,7 @@ class TestCommand:
         ("arguments", "says"),
         [
             (["--revoke", "clara"], "name 'clara': has no certificate of"),
-            (["--revoke-serial", "xyz"], "'xyz' is no hexadecimal number"),
+            (["--revoke-serial", "xyz"], "'xyz'; allowed are hexadecimal numbers"),
             (["--renew", "--rotate"], "choose one"),
         ],
     )

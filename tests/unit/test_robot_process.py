@@ -13,26 +13,36 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from tests.recordings import robot_configuration
 
-from holdfast.configuration import Configuration, load
-from holdfast.errors import ProblemError, TrialError
+from holdfast.config.loader import Configuration
+from holdfast.errors import HeldError, ProblemError, TrialError
 from holdfast.outcome import SensingDecision, TrialResult
 from holdfast.planning import Planner, PlanningState
+from holdfast.protocol.events import (
+    Act,
+    Acted,
+    LogEvent,
+    Paused,
+    Plan,
+    Planned,
+    RobotEffect,
+    Sense,
+    Timing,
+    TransportEvent,
+)
+from holdfast.protocol.records import PausedRecord
+from holdfast.protocol.status import Status
 from holdfast.recording.run_directory import RunDirectory
-from holdfast.robot.own_planning import OwnPlanning
-from holdfast.runtime import own_planner, robot_process
-from holdfast.runtime.environment import EnvironmentMaker, load_environment
-from holdfast.runtime.links import Links, make_links
-from holdfast.runtime.logs import NullEventLog
-from holdfast.runtime.own_planner import OwnPlanner
-from holdfast.runtime.recovery_launcher import RecoveryExited
-from holdfast.runtime.robot_process import RobotProcess
-from holdfast.runtime.trial import run_trial
-from holdfast.session.effects import Act, Effect, Paused, Plan, Report, Sense, Timing
-from holdfast.session.events import Acted, Planned, TransportEvent
-from holdfast.session.records import PausedRecord
-from holdfast.session.robot import HeldError
-from holdfast.session.status import Status
+from holdfast.robot import in_process_planner
+from holdfast.robot import process as robot_process
+from holdfast.robot.environment import EnvironmentMaker, load_environment
+from holdfast.robot.in_process_planner import InProcessSource
+from holdfast.robot.links import Links, make_links
+from holdfast.robot.process import RobotProcess
+from holdfast.robot.recovery_launcher import RecoveryExited
+from holdfast.robot.trial import run_trial
+from holdfast.runtime.events import NullEventLog
 
 PATIENCE_S = 30.0
 """Longest wait for what is sure to come; nothing is measured by it."""
@@ -40,13 +50,7 @@ PATIENCE_S = 30.0
 
 @pytest.fixture
 def configuration(tmp_path: Path) -> Configuration:
-    path = tmp_path / "robot.yaml"
-    path.write_text(
-        "problem: peg_in_hole_2d\n"
-        "particle_filter: {num_particles: 50}\n"
-        "simulator: {num_trials: 2, max_steps: 60, sensing_intervals: 8, seed: 3}\n"
-    )
-    return load(path)
+    return robot_configuration(tmp_path, num_trials=2)
 
 
 class Robots:
@@ -116,7 +120,10 @@ def plain_digests(configuration: Configuration) -> list[str]:
     """Return what a loop without journal, wire and service decides."""
     return [
         run_trial(
-            configuration.problem, configuration.planning, configuration.simulator, trial
+            Planner(configuration.problem, configuration.planning),
+            configuration.simulator.seed,
+            trial,
+            max_steps=configuration.simulator.max_steps,
         ).digest
         for trial in range(configuration.simulator.num_trials)
     ]
@@ -132,33 +139,33 @@ class Machine:
         self.trace: list[str] = []
         self.deaf_s: list[float] = []
         self.wakeups: list[float] = []
-        self.answers: list[list[Effect]] = []
+        self.answers: list[list[RobotEffect]] = []
 
-    def start(self, now: float) -> list[Effect]:
+    def start(self, now: float) -> list[RobotEffect]:
         return []
 
-    def handle(self, event: object, now: float) -> list[Effect]:
+    def handle(self, event: object, now: float) -> list[RobotEffect]:
         self.trace.append(f"handle {type(event).__name__}")
         return self.answers.pop(0) if self.answers else []
 
-    def recovery_exited(self, launch: int, reason: str, now: float) -> list[Effect]:
+    def recovery_exited(self, launch: int, reason: str, now: float) -> list[RobotEffect]:
         return self.handle(RecoveryExited(launch, reason), now)
 
-    def wake(self, now: float) -> list[Effect]:
+    def wake(self, now: float) -> list[RobotEffect]:
         assert now >= self.wakeups.pop(0)
         self.trace.append("wake")
         return self.answers.pop(0) if self.answers else []
 
-    def was_deaf(self, seconds: float) -> None:
+    def event_loop_stalled(self, seconds: float) -> None:
         self.deaf_s.append(seconds)
 
-    def pause(self, now: float) -> list[Effect]:
+    def pause(self, now: float) -> list[RobotEffect]:
         return [Paused()]
 
     def next_wakeup(self) -> float | None:
         return self.wakeups[0] if self.wakeups else None
 
-    def salvage(self) -> list[Effect]:
+    def salvage(self) -> list[RobotEffect]:
         return []
 
 
@@ -224,7 +231,7 @@ def test_what_comes_from_inside_an_effect_is_handled_after_the_effects_at_hand(
 
     robots.event = world_answers  # type: ignore[method-assign, assignment]
     robot, machine = scripted(robots, lambda: robot._happens(RecoveryExited(1, "begin")))
-    machine.answers = [[Report("first", {}), Report("second", {})], [Paused()]]
+    machine.answers = [[LogEvent("first", {}), LogEvent("second", {})], [Paused()]]
     robot.run(())
     assert machine.trace == ["handle RecoveryExited", "first", "second", "handle Acted"]
 
@@ -245,7 +252,7 @@ def test_the_loop_looks_at_the_wire_before_it_handles_more_than_some_events(
 
     robots.event = event  # type: ignore[method-assign, assignment]
     robot, machine = scripted(robots, lambda: robot._happens(RecoveryExited(1, "begin")))
-    machine.answers = [[Report("first", {})], [], [Paused()]]
+    machine.answers = [[LogEvent("first", {})], [], [Paused()]]
     robot.run(())
     assert machine.trace == [
         *("handle RecoveryExited", "first", "the wire", "handle Acted", "handle Acted")
@@ -299,7 +306,7 @@ def test_an_earlier_time_replaces_a_later_one(robots: Robots) -> None:
     )
     machine.wakeups = [time.monotonic() + 10.0 * PATIENCE_S]
 
-    def handle(event: object, now: float) -> list[Effect]:
+    def handle(event: object, now: float) -> list[RobotEffect]:
         machine.trace.append("handle")
         machine.wakeups = [now + 0.01]
         return []
@@ -321,7 +328,7 @@ def test_nobody_is_blamed_for_the_time_in_which_the_loop_did_not_listen(
 
     robots.event = event  # type: ignore[method-assign, assignment]
     robot, machine = scripted(robots, lambda: robot._happens(RecoveryExited(1, "begin")))
-    machine.answers = [[Report("an event that is written to a slow disk", {})], [Paused()]]
+    machine.answers = [[LogEvent("an event that is written to a slow disk", {})], [Paused()]]
     machine.wakeups = [time.monotonic() + 0.1]
     robot.run(())
     assert machine.trace == ["handle RecoveryExited", "wake"]
@@ -376,14 +383,14 @@ def test_a_defect_of_its_own_planner_ends_the_run(
     robots: Robots, monkeypatch: pytest.MonkeyPatch, part: str
 ) -> None:
     """It would wait for ever: nothing else can decide."""
-    answer = own_planner._answer
+    answer = in_process_planner._answer
 
     def fail(planner: Planner, plan: Plan) -> Planned:
         if plan.sensing == (part == "sensing"):
             raise ZeroDivisionError("a defect")
         return answer(planner, plan)
 
-    monkeypatch.setattr(own_planner, "_answer", fail)
+    monkeypatch.setattr(in_process_planner, "_answer", fail)
     with pytest.raises(TrialError, match=r"(?s)trial 0 .*ZeroDivisionError: a defect"):
         robots.run()
 
@@ -394,7 +401,7 @@ def test_what_its_own_planner_refuses_is_said_and_ends_the_run(
     def refuse(planner: Planner, plan: Plan) -> Planned:
         raise ProblemError("policy gives nan")
 
-    monkeypatch.setattr(own_planner, "_answer", refuse)
+    monkeypatch.setattr(in_process_planner, "_answer", refuse)
     with pytest.raises(ProblemError, match="policy gives nan"):
         robots.run()
     assert ("stopped", {"reason": "policy gives nan"}) in robots.told
@@ -473,74 +480,25 @@ def test_what_takes_long_is_computed_on_a_thread_while_the_robot_goes_on(
     """What is brief is not, but for the first of its kind: nobody knows how long that takes."""
     computed_on: list[str] = []
     told_on: set[str] = set()
-    answer, handle = own_planner._answer, OwnPlanning.handle
+    answer, handle = in_process_planner._answer, InProcessSource.handle
 
     def noted(planner: Planner, plan: Plan) -> Planned:
         computed_on.append(threading.current_thread().name)
         return answer(planner, plan)
 
-    def told(self: OwnPlanning, event: TransportEvent | Planned, now: float) -> None:
+    def told(self: InProcessSource, event: TransportEvent | Planned, now: float) -> None:
         told_on.add(threading.current_thread().name)
         handle(self, event, now)
 
-    monkeypatch.setattr(own_planner, "_BRIEF_S", PATIENCE_S if brief else 0.0)
-    monkeypatch.setattr(own_planner, "_answer", noted)
-    monkeypatch.setattr(OwnPlanning, "handle", told)
+    monkeypatch.setattr(in_process_planner, "_BRIEF_S", PATIENCE_S if brief else 0.0)
+    monkeypatch.setattr(in_process_planner, "_answer", noted)
+    monkeypatch.setattr(InProcessSource, "handle", told)
     robots.run()
-    here, thread = threading.current_thread().name, "holdfast-own-planner-0"
+    here, thread = threading.current_thread().name, "holdfast-in-process-planner-0"
     assert told_on == {here}
     assert set(computed_on[:1]) == {thread}
     assert set(computed_on[4:]) == ({here} if brief else {thread})
     assert robots.digests == plain_digests(robots.configuration)
-
-
-def _fail(error: BaseException) -> None:
-    raise error
-
-
-class TestOwnPlanner:
-    @pytest.mark.parametrize("may_be_brief", [True, False])
-    def test_code_of_other_people_is_always_computed_on_a_thread(
-        self, configuration: Configuration, *, may_be_brief: bool
-    ) -> None:
-        """It may take any time at any call."""
-        planner = Planner(configuration.problem, configuration.planning)
-        state = planner.initial_state(3, 0)
-
-        async def ask() -> list[bool]:
-            come: asyncio.Queue[Planned] = asyncio.Queue()
-            own = OwnPlanner(lambda: planner, come.put_nowait, _fail, may_be_brief=may_be_brief)
-            on_loop = []
-            for number in range(3):
-                own.ask(Plan(number, state, sensing=True))
-                on_loop.append(own.compute_brief())
-                assert (await asyncio.wait_for(come.get(), PATIENCE_S)).number == number
-            own.close()
-            return on_loop
-
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(own_planner, "_BRIEF_S", PATIENCE_S)
-            assert asyncio.run(ask()) == [False, may_be_brief, may_be_brief]
-
-    def test_what_was_asked_before_and_not_begun_is_not_computed(
-        self, configuration: Configuration, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        monkeypatch.setattr(own_planner, "_BRIEF_S", PATIENCE_S)
-        planner = Planner(configuration.problem, configuration.planning)
-        state = planner.initial_state(3, 0)
-        come: list[int] = []
-        own = OwnPlanner(
-            lambda: planner,
-            lambda planned: come.append(planned.number),
-            _fail,
-            may_be_brief=True,
-        )
-        own._usual[True].learn(0.0)
-        own.ask(Plan(1, state, sensing=True))
-        own.ask(Plan(2, state, sensing=True))
-        assert own.compute_brief()
-        assert not own.compute_brief()
-        assert come == [2]
 
 
 class TestPause:

@@ -12,15 +12,8 @@ from typing import Any
 import pytest
 from tests.ports import free_port
 
-from holdfast.transport.ros1_calls import (
-    CALLER,
-    CallError,
-    Connection,
-    GoneError,
-    SilentError,
-    call,
-    offers_service,
-)
+from holdfast.errors import CallError, GoneError, SilentError
+from holdfast.transport.ros1_calls import CALLER, Connection, call, offers_service
 
 PATIENCE_S = 20.0
 SHORT_S = 0.05

@@ -18,10 +18,10 @@ from tests.ports import free_port
 
 from holdfast.transport import ros1_node
 from holdfast.transport.endpoints import Endpoint
-from holdfast.transport.ros1 import look_up
+from holdfast.transport.ros1 import RosScheme
 from holdfast.transport.ros1_calls import Connection, HttpHead
 from holdfast.transport.ros1_node import RosNode
-from holdfast.transport.tcpros import ServiceType, Surroundings, encode_header
+from holdfast.transport.tcpros import RosEnvironment, ServiceType, encode_header
 
 PATIENCE_S = 30.0
 TYPE = ServiceType("std_srvs/Trigger", "937c9679a518e3a18d831e57125ea522")
@@ -127,8 +127,8 @@ def master() -> Iterator[Master]:
         gc.collect()
 
 
-def around(master: Master) -> Surroundings:
-    return Surroundings(f"http://127.0.0.1:{master.port}", "127.0.0.1", "127.0.0.1", "/")
+def around(master: Master) -> RosEnvironment:
+    return RosEnvironment(f"http://127.0.0.1:{master.port}", "127.0.0.1", "127.0.0.1", "/")
 
 
 async def until(true: Callable[[], object]) -> None:
@@ -185,7 +185,7 @@ class TestTheMasterLies:
             return await call(self, *arguments, **more)
 
         monkeypatch.setattr(Connection, "call", failing)
-        monkeypatch.setattr(ros1_node, "_LOOK_EVERY_S", 0.01)
+        monkeypatch.setattr(ros1_node, "_CHECK_INTERVAL_S", 0.01)
         await node.start(0.1)
         fails = False
         await until(lambda: "/cloud" in master.services)
@@ -203,7 +203,7 @@ class TestTheMasterLies:
         master.says = lambda _: said
         with pytest.raises(TransportError, match="does not say where it is"):
             await asyncio.get_running_loop().run_in_executor(
-                None, look_up, Endpoint("ros1", "cloud", 0)
+                None, RosScheme().look_up, Endpoint("ros1", "cloud", 0)
             )
 
 
@@ -283,7 +283,7 @@ class TestAnotherHasTheName:
     async def test_who_lives_is_left_alone(
         self, master: Master, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr(ros1_node, "_LOOK_EVERY_S", 0.01)
+        monkeypatch.setattr(ros1_node, "_CHECK_INTERVAL_S", 0.01)
         nodes = [RosNode(name, around(master)) for name in ("first", "second")]
         for node in nodes:
             node.offer("cloud", TYPE, echo)

@@ -6,10 +6,10 @@ from typing import Any, cast
 
 import pytest
 
-from holdfast.ros.ros2.diagnostics import Diagnostics, Level, Told
-from holdfast.ros.ros2.part import Ending, Part
-from holdfast.runtime.robot_watch import Condition
-from holdfast.settings import RecoverySettings
+from holdfast.config.settings import RecoverySettings
+from holdfast.robot.health import Condition
+from holdfast.ros.ros2.diagnostics import Diagnostics, Level, RobotDiagnosis
+from holdfast.ros.ros2.run_segment import Ending, SegmentResult
 
 
 class Running:
@@ -41,12 +41,12 @@ class Said:
         self.now = 100.0
         self.diagnostics = Diagnostics(RecoverySettings(**settings), lambda: self.now)
 
-    def tell(self, part: Running | None, last: Part | None = None) -> Told:
+    def tell(self, part: Running | None, last: SegmentResult | None = None) -> RobotDiagnosis:
         return self.diagnostics.tell(cast(Any, part), last, cast(Any, Deciders()))
 
 
-def part(ending: Ending, **fields: Any) -> Part:
-    return Part(ending, "why", (), **fields)
+def part(ending: Ending, **fields: Any) -> SegmentResult:
+    return SegmentResult(ending, "why", (), **fields)
 
 
 def test_to_hold_while_the_local_service_starts_is_a_warning() -> None:

@@ -12,7 +12,7 @@ from holdfast.errors import HoldfastError
 from holdfast.ros.ros2.main import main
 from holdfast.ros.ros2.parameters import (
     OWN,
-    Parameters,
+    NodeParameters,
     in_parameters,
     known_parameters,
     read_parameters,
@@ -21,7 +21,7 @@ from holdfast.ros.ros2.parameters import (
 CONFIGURATION = Path(__file__).parents[2] / "examples" / "peg_in_hole_2d.yaml"
 
 
-def read(**values: Any) -> Parameters:
+def read(**values: Any) -> NodeParameters:
     given = {key.replace("__", "."): value for key, value in values.items()}
     return read_parameters({"configuration": str(CONFIGURATION), **given})
 

@@ -8,13 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from holdfast import planning
-from holdfast.configuration import Configuration, load
-from holdfast.planning import PlanningState
+from holdfast.config.loader import Configuration, load
+from holdfast.planning import Planner, PlanningState
+from holdfast.protocol.events import Act, Sense, Timing
+from holdfast.robot.links import RECOVERY_SERVICE
 from holdfast.ros.ros2 import telemetry as module
-from holdfast.ros.ros2.telemetry import Shown, Telemetry
-from holdfast.runtime.links import RECOVERY_SERVICE
-from holdfast.session.effects import Act, Sense, Timing
+from holdfast.ros.ros2.telemetry import PublishedDecision, Telemetry
 
 CONFIGURATION = Path(__file__).parents[2] / "examples" / "peg_in_hole_2d.yaml"
 LONG_S = 60.0
@@ -24,7 +23,7 @@ class Audience:
     """Keeps what it is shown; may be slow."""
 
     def __init__(self, configuration: Configuration, *, entropies: bool = True) -> None:
-        self.orders: list[Shown] = []
+        self.orders: list[PublishedDecision] = []
         self.beliefs: list[PlanningState] = []
         self.errors: list[Exception] = []
         self.noticed = threading.Event()
@@ -40,7 +39,7 @@ class Audience:
             wants_entropies=lambda: entropies,
         )
 
-    def order(self, shown: Shown) -> None:
+    def order(self, shown: PublishedDecision) -> None:
         self.may_go_on.wait(LONG_S)
         if shown.decided_by == "nobody":
             raise ValueError("nobody")
@@ -49,14 +48,14 @@ class Audience:
 
 def beginning() -> tuple[Configuration, PlanningState]:
     configuration = load(CONFIGURATION)
-    state = planning.initial_state(configuration.problem, configuration.planning, 0, 0)
+    state = Planner(configuration.problem, configuration.planning).init(0, 0)
     return configuration, state
 
 
 def test_an_order_is_shown_with_entropies_and_belief() -> None:
     configuration, state = beginning()
-    chosen, info = planning.choose_sensing_action(
-        configuration.problem, configuration.planning, state
+    chosen, info = Planner(configuration.problem, configuration.planning).choose_sensing_action(
+        state
     )
     audience = Audience(configuration)
     audience.telemetry.time(Timing(0, 0, "sensing", "cloud", "standard", 0.0, 0.0, 0.0))

@@ -20,7 +20,7 @@ from holdfast.belief import Belief
 from holdfast.errors import CheckpointError, HoldfastError, InvalidValueError
 from holdfast.planning import PlanningState
 from holdfast.ros import messages
-from holdfast.ros.active_sensing import Answer, ErrorCode, Kind, Request
+from holdfast.ros.active_sensing import DecisionAnswer, DecisionRequest, ErrorCode, RequestKind
 from holdfast.ros.messages import (
     SERVICE,
     Serialization,
@@ -47,14 +47,16 @@ STATE = PlanningState(
     Belief(np.array([[0.5, -1.25, 3e-300], [4.0, 5.5, -0.0]]), np.array([0.25, 0.75])),
 )
 REQUESTS = {
-    "empty_request": Request(Kind.INITIALIZE),
-    "initialize_request": Request(Kind.INITIALIZE, CONFIGURATION, 5, 6),
-    "request": Request(Kind.CHOOSE_TASK_ACTIONS, "ü", -1, 3, STATE, 4, np.array([1.5, 2.5, -3.5])),
+    "empty_request": DecisionRequest(RequestKind.INITIALIZE),
+    "initialize_request": DecisionRequest(RequestKind.INITIALIZE, CONFIGURATION, 5, 6),
+    "request": DecisionRequest(
+        RequestKind.CHOOSE_TASK_ACTIONS, "ü", -1, 3, STATE, 4, np.array([1.5, 2.5, -3.5])
+    ),
 }
 ANSWERS = {
-    "empty_answer": Answer(ErrorCode.OK, "", ""),
-    "refusal": Answer(ErrorCode.BUSY, "später", CONFIGURATION),
-    "answer": Answer(
+    "empty_answer": DecisionAnswer(ErrorCode.OK, "", ""),
+    "refusal": DecisionAnswer(ErrorCode.BUSY, "später", CONFIGURATION),
+    "answer": DecisionAnswer(
         ErrorCode.OK,
         "",
         CONFIGURATION,
@@ -158,15 +160,15 @@ class TestBothWays:
 @pytest.mark.parametrize(
     ("request_", "text"),
     [
-        (Request(256), "kind 256: it must be from 0 to 255"),
-        (Request(0, seed=2**63), "seed 9223372036854775808"),
-        (Request(0, trial=-1), "trial -1"),
-        (Request(0, state=STATE._replace(step=2**32)), "state.step 4294967296"),
-        (Request(0, configuration="\ud800"), "text"),
-        (Request(0, observation=np.zeros(2_000_001)), "at most 16000000"),
+        (DecisionRequest(256), "kind 256: it must be from 0 to 255"),
+        (DecisionRequest(0, seed=2**63), "seed 9223372036854775808"),
+        (DecisionRequest(0, trial=-1), "trial -1"),
+        (DecisionRequest(0, state=STATE._replace(step=2**32)), "state.step 4294967296"),
+        (DecisionRequest(0, configuration="\ud800"), "text"),
+        (DecisionRequest(0, observation=np.zeros(2_000_001)), "at most 16000000"),
     ],
 )
-def test_what_does_not_fit_is_refused(request_: Request, text: str) -> None:
+def test_what_does_not_fit_is_refused(request_: DecisionRequest, text: str) -> None:
     with pytest.raises(InvalidValueError, match=text):
         encode_request(request_)
 
@@ -197,4 +199,4 @@ def test_answers_that_contradict_themselves(fields: dict[str, object], text: str
 def test_a_state_that_is_none() -> None:
     broken = STATE._replace(belief=Belief(STATE.belief.states, np.array([0.5, 0.75])))
     with pytest.raises(CheckpointError, match="1"):
-        decode_request(encode_request(Request(1, state=broken)))
+        decode_request(encode_request(DecisionRequest(1, state=broken)))

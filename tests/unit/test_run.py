@@ -195,7 +195,7 @@ def test_a_robot_without_services_tells_of_none(workplace: Workplace) -> None:
 
 
 MY_WORLD = """
-from holdfast.runtime.environment import SimulatedEnvironment
+from holdfast.robot.environment import SimulatedEnvironment
 
 
 class MyWorld:
@@ -346,7 +346,7 @@ def test_a_service_in_the_file_that_cannot_be_one_is_named_with_its_key(
         ),
         (["run", "peg.yaml"], "--log json needs --service, --environment or --rate"),
         (["serve", "--listen", "tcp/nowhere"], "--listen: endpoint 'tcp/nowhere'"),
-        (["serve", "--lease-ms", "1"], "--lease-ms: '1' is not a number from 50"),
+        (["serve", "--lease-ms", "1"], "--lease-ms is '1'; allowed are numbers from 50"),
     ],
 )
 @pytest.mark.parametrize("log", [("--log", "json"), ("--log=json",)])

@@ -10,12 +10,13 @@ import numpy.typing as npt
 import pytest
 from scipy import stats
 
+from holdfast.arrays import FloatArray, IntArray
 from holdfast.belief import Belief
+from holdfast.config.settings import ActiveSensingSettings, PlanningSettings, SelectorSettings
 from holdfast.errors import InvalidValueError, ProblemError
-from holdfast.problems.problem import FloatArray, IntArray, Problem, ProblemBase
+from holdfast.problems.problem import Problem, ProblemBase
 from holdfast.randomness import Purpose, Stream, stream
 from holdfast.sensing import SensingInfo, choose_sensing_action
-from holdfast.settings import ActiveSensingSettings, PlanningSettings, SelectorSettings
 
 HYPOTHESES = stream(41, 0, 0, Purpose.HYPOTHESES)
 SELECTION = stream(41, 0, 0, Purpose.SELECTION)

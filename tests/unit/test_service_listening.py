@@ -70,7 +70,7 @@ def test_a_port_stays_ours_while_no_process_listens() -> None:
         (endpoint,) = sockets.endpoints
         sockets.of(0)
         with connect(endpoint) as waiting:
-            sockets.give_up(0)
+            sockets.release(0)
             with contextlib.suppress(ConnectionResetError):
                 assert waiting.recv(1) == b""
         with pytest.raises(ConnectionRefusedError):
@@ -113,7 +113,7 @@ def test_a_local_socket_is_shared_and_removed(tmp_path: Path) -> None:
         killed.bind(str(path))  # what a service has left that was killed
     with shared(f"unix/{path}") as sockets:
         assert sockets.of(0) == sockets.of(1)
-        sockets.give_up(0)  # the other process still listens
+        sockets.release(0)  # the other process still listens
         with socket.socket(socket.AF_UNIX) as client:
             client.connect(str(path))
             assert accepted(sockets.of(1)) == 1

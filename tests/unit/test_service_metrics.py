@@ -11,14 +11,14 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from holdfast import __version__
-from holdfast.service.metrics import BUCKETS_S, DecisionTimes, Exposition, Report, added
-from holdfast.session.messages import PROTOCOL_VERSION
-from holdfast.session.service_limits import ServiceStatistics
+from holdfast.protocol.messages import PROTOCOL_VERSION
+from holdfast.protocol.service_statistics import ServiceStatistics
+from holdfast.service.metrics import BUCKETS_S, DecisionTimes, Exposition, ServiceReport, summed
 
 Samples = dict[tuple[str, tuple[tuple[str, str], ...]], float]
 
 
-def told(report: Report, exposition: Exposition | None = None) -> Samples:
+def told(report: ServiceReport, exposition: Exposition | None = None) -> Samples:
     text = (exposition or Exposition("cloud_active_sensing")).text(report).decode()
     return {
         (sample.name, tuple(sorted(sample.labels.items()))): sample.value
@@ -34,7 +34,7 @@ class TestWhatIsTold:
         counted.busy, counted.cache_hits = 7, 11
         counted.task_parts, counted.sensing_parts, counted.state_bytes = 13, 17, 19
         counted.refusals = {"version": 1, "stale_epoch": 4}
-        samples = told(Report(counted))
+        samples = told(ServiceReport(counted))
         assert samples["holdfast_sessions", ()] == 3
         assert samples["holdfast_waiting_requests", ()] == 2
         assert samples["holdfast_restores_total", ()] == 5
@@ -50,7 +50,11 @@ class TestWhatIsTold:
         for field in ServiceStatistics.__struct_fields__:
             value = {"version": 12345} if field == "refusals" else 12345
             statistics = msgspec.structs.replace(ServiceStatistics(), **{field: value})
-            ours = [each for (name, _), each in told(Report(statistics)).items() if "fast" in name]
+            ours = [
+                each
+                for (name, _), each in told(ServiceReport(statistics)).items()
+                if "fast" in name
+            ]
             assert ours.count(12345) == 1, field
 
     def test_decisions_are_timed_by_kind(self) -> None:
@@ -59,7 +63,7 @@ class TestWhatIsTold:
         times.add("sensing", 0.003, 0.0002)
         times.add("sensing", 0.005, 0.0002)  # a bucket's upper end belongs to it
         times.add("sensing", 120.0, 0.5)
-        samples = told(Report(times=times))
+        samples = told(ServiceReport(times=times))
         task, sensing = (("kind", "task"),), (("kind", "sensing"),)
         assert samples["holdfast_decision_seconds_count", task] == 1
         assert samples["holdfast_decision_seconds_count", sensing] == 3
@@ -76,7 +80,7 @@ class TestWhatIsTold:
         assert samples["holdfast_wait_seconds_count", ()] == 4
 
     def test_all_is_there_before_anything_has_happened(self) -> None:
-        samples = told(Report())
+        samples = told(ServiceReport())
         for kind in ("task", "sensing"):
             assert samples["holdfast_decisions_total", (("kind", kind),)] == 0
             assert samples["holdfast_decision_seconds_count", (("kind", kind),)] == 0
@@ -90,11 +94,11 @@ class TestWhatIsTold:
 
     @pytest.mark.skipif(sys.platform != "linux", reason="the system tells it there")
     def test_processes_are_told_as_one(self) -> None:
-        one = told(Report())
+        one = told(ServiceReport())
         child = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
         try:
             ids = [os.getpid(), child.pid]
-            both = told(Report(), Exposition("cloud", lambda: ids))
+            both = told(ServiceReport(), Exposition("cloud", lambda: ids))
         finally:
             child.communicate(b"\n", timeout=30)
         assert one["process_resident_memory_bytes", ()] > 1e6
@@ -102,7 +106,7 @@ class TestWhatIsTold:
         assert both["process_start_time_seconds", ()] == one["process_start_time_seconds", ()]
         assert both["process_max_fds", ()] == one["process_max_fds", ()]
         # What has ended still counts.
-        after = told(Report(), Exposition("cloud", lambda: [os.getpid()]))
+        after = told(ServiceReport(), Exposition("cloud", lambda: [os.getpid()]))
         assert after["process_cpu_seconds_total", ()] >= both["process_cpu_seconds_total", ()]
 
 
@@ -114,8 +118,8 @@ class TestAddingUp:
             times.add("task", 0.001 * index, 0.5)
             statistics = ServiceStatistics(task_parts=index, sessions=10 * index)
             statistics.refusals = {"version": 1, f"only_{index}": index}
-            reports.append(Report(statistics, times))
-        total = added(reports)
+            reports.append(ServiceReport(statistics, times))
+        total = summed(reports)
         assert total.statistics.task_parts == 3
         assert total.statistics.sessions == 30
         assert total.statistics.refusals == {"version": 2, "only_1": 1, "only_2": 2}
@@ -129,7 +133,7 @@ class TestAddingUp:
 
     def test_a_process_that_has_ended_holds_nothing_but_counts(self) -> None:
         statistics = ServiceStatistics(task_parts=5, busy=2, sessions=3, state_bytes=7, waiting=1)
-        left = Report(statistics).without_gauges().statistics
+        left = ServiceReport(statistics).without_gauges().statistics
         assert (left.task_parts, left.busy) == (5, 2)
         assert (left.sessions, left.state_bytes, left.waiting, left.running, left.calls) == (0,) * 5
         assert statistics.sessions == 3
@@ -137,8 +141,8 @@ class TestAddingUp:
     def test_over_a_wire(self) -> None:
         times = DecisionTimes()
         times.add("sensing", 0.1, 0.2)
-        report = Report(ServiceStatistics(refusals={"version": 3}), times)
-        again = msgspec.msgpack.decode(msgspec.msgpack.encode(report), type=Report)
+        report = ServiceReport(ServiceStatistics(refusals={"version": 3}), times)
+        again = msgspec.msgpack.decode(msgspec.msgpack.encode(report), type=ServiceReport)
         assert again == report
 
 

@@ -14,32 +14,37 @@ from collections.abc import AsyncIterator, Awaitable, Callable
 from typing import Any, cast
 
 import pytest
-from tests.unit.test_session_service import Robot, content, planning_of
+from tests.unit.test_protocol_service import Robot, content, planning_of
 
+from holdfast.errors import MessageError, ServiceBrokenError
 from holdfast.problems.capsule_robot import CapsuleRobot
 from holdfast.problems.problem import Problem
-from holdfast.service import shell
-from holdfast.service.known_problems import KnownProblems
-from holdfast.service.shell import ServiceBrokenError, ServiceShell
-from holdfast.session.events import Appeared, Ended, Replied, TransportEvent, Vanished
-from holdfast.session.messages import (
+from holdfast.protocol.events import (
+    CallEnded,
+    ReplyReceived,
+    ServiceAppeared,
+    ServiceVanished,
+    TransportEvent,
+)
+from holdfast.protocol.messages import (
     Busy,
-    MessageError,
-    Opening,
     Progress,
     Refused,
     Reply,
     Request,
     SensingAnswer,
+    SessionConfiguration,
     decode_reply,
     decode_request,
     encode,
-    sealed,
+    with_checksum,
 )
-from holdfast.session.service import Service
-from holdfast.session.service_effects import Answer, Effect, Run
-from holdfast.session.service_jobs import Job, Outcome
-from holdfast.session.service_limits import ServiceLimits
+from holdfast.protocol.service import Service
+from holdfast.protocol.service_jobs import Job, JobResult, SendReply, ServiceEffect, StartJob
+from holdfast.protocol.service_limits import ServiceLimits
+from holdfast.service import shell
+from holdfast.service.problem_factory import ProblemFactory
+from holdfast.service.shell import ServiceShell
 from holdfast.transport.in_process import InProcessNetwork
 
 PATIENCE_S = 30.0
@@ -79,12 +84,12 @@ class Patient:
         open_calls = set(calls)
         while open_calls:
             event = await self.events.get()
-            if isinstance(event, Replied):
+            if isinstance(event, ReplyReceived):
                 assert event.call in open_calls
                 reply = decode_reply(event.payload)
                 if not isinstance(reply, Progress):
                     replies[event.call].append(reply)
-            elif isinstance(event, Ended):
+            elif isinstance(event, CallEnded):
                 open_calls.remove(event.call)
         return replies
 
@@ -134,10 +139,14 @@ class Joined:
 
     def __init__(self, workers: int, shell: dict[str, Any], limits: dict[str, Any]) -> None:
         self.held = Held()
-        known = KnownProblems()
+        known = ProblemFactory()
 
-        def make_problem(opening: Opening) -> Problem:
-            return self.held if opening.problem == "held" else known(opening)
+        def make_problem(session_configuration: SessionConfiguration) -> Problem:
+            return (
+                self.held
+                if session_configuration.problem == "held"
+                else known(session_configuration)
+            )
 
         self.network = InProcessNetwork()
         self.timed: list[tuple[str, float, float]] = []
@@ -175,7 +184,7 @@ async def joined(
 
 def held_robot(key: int) -> Robot:
     robot = Robot(key=key)
-    robot.opening = Opening("held", {}, {}, planning_of(), 5)
+    robot.session_configuration = SessionConfiguration("held", {}, {}, planning_of(), 5)
     return robot
 
 
@@ -207,7 +216,7 @@ async def test_first_jobs_and_other_peoples_code_run_on_threads() -> None:
 
 @pytest.mark.parametrize(
     "payload",
-    [b"damaged", sealed(b"no request"), sealed(b"\x9b\x7f"), LARGE],
+    [b"damaged", with_checksum(b"no request"), with_checksum(b"\x9b\x7f"), LARGE],
     ids=["checksum", "form", "version", "large"],
 )
 @on_a_loop
@@ -234,9 +243,9 @@ async def test_signs_of_progress_while_a_worker_computes() -> None:
         patient, call, _ = await both.robot_in_work(1)
         for _ in range(3):
             event = await patient.events.get()
-            while isinstance(event, Appeared):
+            while isinstance(event, ServiceAppeared):
                 event = await patient.events.get()
-            assert isinstance(event, Replied)
+            assert isinstance(event, ReplyReceived)
             assert isinstance(decode_reply(event.payload), Progress)
         both.held.let_go.set()
         replies = (await patient.collect({call}))[call]
@@ -402,9 +411,9 @@ async def test_close_does_not_wait_for_a_computation() -> None:
         await both.shell.close()
         assert both.shell.is_computing  # until the test lets it go
         events: list[TransportEvent] = []
-        while Ended(call) not in events:
+        while CallEnded(call) not in events:
             events.append(await patient.events.get())
-        assert Vanished("service", "boot") in events
+        assert ServiceVanished("service", "boot") in events
 
 
 @on_a_loop
@@ -435,24 +444,24 @@ async def test_draining_ends_at_its_bound() -> None:
 class Script(Service):
     """A machine that hands out the jobs that a test has made."""
 
-    def __init__(self, *runs: Run) -> None:
-        super().__init__(KnownProblems(), 2)
+    def __init__(self, *runs: StartJob) -> None:
+        super().__init__(ProblemFactory(), 2)
         self.runs = list(runs)
         self.begun_at = 0.0
         self.trace: list[str] = []
         self.times: list[float] = []
 
-    def receive_request(self, call: int, *arguments: Any) -> list[Effect]:
+    def receive_request(self, call: int, *arguments: Any) -> list[ServiceEffect]:
         self.trace.append(f"call {call} of {arguments[-1]}")
         runs, self.runs = self.runs, []
-        return [Answer(call, b"first"), *runs]
+        return [SendReply(call, b"first"), *runs]
 
-    def begun(self, job: Job, now: float) -> None:
+    def started(self, job: Job, now: float) -> None:
         self.trace.append(f"begun {job.kind}")
         self.begun_at = now
         self.times.append(now)
 
-    def finished(self, job: Job, outcome: Outcome, now: float) -> list[Effect]:
+    def finished(self, job: Job, outcome: JobResult, now: float) -> list[ServiceEffect]:
         self.trace.append(f"finished {job.kind}")
         self.times.append(now)
         return []
@@ -483,7 +492,7 @@ class Call:
 
 
 def scripted(*jobs: tuple[str, float, Callable[[], object]]) -> tuple[Script, ServiceShell]:
-    machine = Script(*(Run(cast(Job, Scripted(kind, run)), s) for kind, s, run in jobs))
+    machine = Script(*(StartJob(cast(Job, Scripted(kind, run)), s) for kind, s, run in jobs))
     return machine, ServiceShell(machine, InProcessNetwork().service("service", "boot"), 2)
 
 
@@ -609,4 +618,4 @@ async def test_a_machine_with_a_defect_ends_the_service_and_robots_see_it(
         with pytest.raises(ServiceBrokenError, match="a defect"):
             await both.shell.wait()
         events = [await patient.events.get() for _ in range(3)]
-        assert set(events[1:]) == {Vanished("service", "boot"), Ended(call)}
+        assert set(events[1:]) == {ServiceVanished("service", "boot"), CallEnded(call)}

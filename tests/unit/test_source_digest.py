@@ -127,8 +127,8 @@ class TestProblem:
             assert problem_sources(registry.problem_class(name)) == {}
 
     def test_problems_of_the_studies_are_not(self) -> None:
-        name = "holdfast.experiments.busy_room:BusyRoom"
-        assert "holdfast.experiments.busy_room" in problem_sources(registry.problem_class(name))
+        name = "holdfast.lab.studies.busy_room:BusyRoom"
+        assert "holdfast.lab.studies.busy_room" in problem_sources(registry.problem_class(name))
 
     def test_source_that_is_no_python_any_more(self, folder: Path) -> None:
         arm = arm_of(folder)
@@ -219,12 +219,12 @@ class TestCore:
             path = place / "__init__.py" if place.is_dir() else place.with_suffix(".py")
             return path if name.startswith("holdfast") and path.is_file() else None
 
-        problems = [place.partition(":")[0] for place in registry.BUILT_IN.values()]
+        problems = [own.place.partition(":")[0] for own in registry.BUILT_IN.values()]
         deciding = ["holdfast.planning", *problems]
         found = follow_imports(deciding, locate)
         assert len(found) > 15
         folders = {path.parent for path in found.values()}
-        assert folders == {PACKAGE, PACKAGE / "problems"}
+        assert folders == {PACKAGE, PACKAGE / "config", PACKAGE / "problems"}
 
     @pytest.mark.parametrize("changed", ["sensing.py", "problems/peg_in_hole_2d.py", None])
     def test_a_changed_source(self, changed: str | None, tmp_path: Path) -> None:

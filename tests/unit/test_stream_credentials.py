@@ -14,7 +14,13 @@ import pytest
 from tests.processes.faults import PATIENT
 
 from holdfast.errors import TransportError
-from holdfast.session.events import Appeared, Ended, Replied, TransportEvent, Vanished
+from holdfast.protocol.events import (
+    CallEnded,
+    ReplyReceived,
+    ServiceAppeared,
+    ServiceVanished,
+    TransportEvent,
+)
 from holdfast.transport.contract import IncomingCall
 from holdfast.transport.credentials import load_credentials
 from holdfast.transport.endpoints import ServiceAddress, TlsFiles
@@ -34,7 +40,7 @@ from holdfast.transport.tls import TlsStream, client_context
 PATIENCE_S = 60.0
 LEASE_MS = PATIENT["lease_ms"]
 REVOKED = "has a certificate that has been revoked"
-FOREIGN = "has a certificate of an authority that is not believed any more"
+FOREIGN = "has a certificate of an authority that is no longer trusted"
 
 
 async def until(condition: Callable[[], bool], what: object = None) -> None:
@@ -61,15 +67,15 @@ class Robot:
 
     @property
     def boots(self) -> list[str]:
-        return [each.boot for each in self.events if isinstance(each, Appeared)]
+        return [each.incarnation for each in self.events if isinstance(each, ServiceAppeared)]
 
     @property
     def vanished(self) -> list[str]:
-        return [each.boot for each in self.events if isinstance(each, Vanished)]
+        return [each.incarnation for each in self.events if isinstance(each, ServiceVanished)]
 
     @property
     def ended(self) -> list[int]:
-        return [each.call for each in self.events if isinstance(each, Ended)]
+        return [each.call for each in self.events if isinstance(each, CallEnded)]
 
     async def connected(self) -> None:
         await until(lambda: bool(self.boots), (self.events, self.refusals))
@@ -77,7 +83,7 @@ class Robot:
     async def ask(self, call: int) -> list[bytes]:
         self.transport.call("cloud", call, b"?")
         await until(lambda: call in self.ended, self.events)
-        return [each.payload for each in self.events if isinstance(each, Replied)]
+        return [each.payload for each in self.events if isinstance(each, ReplyReceived)]
 
 
 class Cloud:
@@ -89,7 +95,7 @@ class Cloud:
         self.holds = False
         self.transport = StreamServiceTransport(
             "cloud",
-            boot="b1",
+            incarnation="b1",
             listen=[f"{protocol}/127.0.0.1:0"],
             lease_ms=LEASE_MS,
             tls=TlsFiles.of(directory),
@@ -142,7 +148,7 @@ def test_a_revoked_robots_link_ends_and_no_other(tmp_path: Path) -> None:
         await until(lambda: 2 in berta.ended)
         assert berta.boots == ["b1"]
         assert berta.refusals == []
-        assert [each.payload for each in berta.events if isinstance(each, Replied)] == [
+        assert [each.payload for each in berta.events if isinstance(each, ReplyReceived)] == [
             b"berta"
         ] * 2
         told = [fields for name, fields in cloud.told if name == "robot_disconnected"]

@@ -8,7 +8,7 @@ from typing import cast
 
 import pytest
 
-from holdfast.service.metrics import Report
+from holdfast.service.metrics import ServiceReport
 from holdfast.service.supervisor import _SILENT_S, _START_S, _Child
 
 
@@ -22,7 +22,7 @@ def test_one_that_says_nothing_is_stuck_after_a_while(*, serves: bool) -> None:
     with ours, theirs:
         child = _Child(cast("subprocess.Popen[bytes]", Started()), ours)
     if serves:
-        child.report = Report()
+        child.report = ServiceReport()
     bound_s = _SILENT_S if serves else _START_S
     assert child.trouble(child.heard_at + bound_s) is None
     told = child.trouble(child.heard_at + bound_s + 0.1)

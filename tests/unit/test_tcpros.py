@@ -8,7 +8,7 @@ import pytest
 
 from holdfast.errors import TransportError
 from holdfast.transport.tcpros import (
-    Surroundings,
+    RosEnvironment,
     decode_header,
     encode_answer,
     encode_header,
@@ -17,7 +17,7 @@ from holdfast.transport.tcpros import (
     place_of_service,
 )
 
-HERE = Surroundings("http://localhost:11311", "localhost", "127.0.0.1", "/")
+HERE = RosEnvironment("http://localhost:11311", "localhost", "127.0.0.1", "/")
 
 
 def test_a_header_is_read_as_it_was_written() -> None:
@@ -73,13 +73,13 @@ def test_what_is_no_place_is_refused(uri: object) -> None:
     ],
 )
 def test_surroundings(variables: dict[str, str], expected: tuple[str, ...]) -> None:
-    assert tuple(Surroundings.of(variables)) == expected
+    assert tuple(RosEnvironment.of(variables)) == expected
 
 
 @pytest.mark.parametrize("uri", ["localhost:11311", "https://a:1", "http://a", "http://:1", "x"])
 def test_a_master_s_uri_that_is_none_is_refused(uri: str) -> None:
     with pytest.raises(TransportError, match=r"ROS_MASTER_URI is .* expected http://HOST:PORT"):
-        Surroundings.of({"ROS_MASTER_URI": uri})
+        RosEnvironment.of({"ROS_MASTER_URI": uri})
 
 
 def test_names() -> None:

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from holdfast.chaos.processes import DecisionTable, time_of
-from holdfast.files import OutputError
+from holdfast.errors import OutputError
+from holdfast.lab.testbed.records import DecisionTable, time_of
+from holdfast.protocol.events import Timing
 from holdfast.recording.timings import TIMING_COLUMNS, AnswerCounts, TimingTable, count_answers
-from holdfast.session.effects import Timing
 
 MOMENT_NS = 1_700_000_000_123_456_789
 

@@ -1,59 +1,22 @@
-"""The loop of a trial, and many trials in one process and in several."""
+"""Many trials, in one process and in several."""
 
 from __future__ import annotations
 
-import hashlib
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
+from tests.unit.test_trial import configuration_of, failing_configuration, one
 
-from holdfast.configuration import Configuration, load
-from holdfast.errors import EnvironmentFailedError, InvalidValueError, ProblemError
-from holdfast.outcome import Decisions, SensingDecision, TaskDecision, TrialResult
-from holdfast.problems.problem import FloatArray
-from holdfast.recording.recorder import Recorder
-from holdfast.runtime import trials
-from holdfast.runtime.environment import SimulatedEnvironment
-from holdfast.runtime.trial import run_trial
-from holdfast.runtime.trials import TrialCrashError, TrialError, run_trials
-
-FAILING_PROBLEM = """
-import numpy as np
-
-from holdfast.errors import ProblemError
-from holdfast.problems.peg_in_hole_2d import PegInHole2D
-
-
-class Failing(PegInHole2D):
-    \"\"\"Fails in every trial once its initial states are asked for.\"\"\"
-
-    name = "failing"
-
-    def initial_states(self, stream, count):
-        raise {error}
-"""
-
-
-def configuration_of(tmp_path: Path, *, num_trials: int = 4, seed: int = 3) -> Configuration:
-    path = tmp_path / "run.yaml"
-    path.write_text(
-        "problem: peg_in_hole_2d\n"
-        "particle_filter: {num_particles: 40}\n"
-        "active_sensing: {num_observation_samples: 3, num_cores: 1}\n"
-        f"simulator: {{num_trials: {num_trials}, max_steps: 60, seed: {seed}}}\n"
-    )
-    return load(path)
-
-
-def failing_configuration(tmp_path: Path, error: str) -> Configuration:
-    # A name of its own for each error: Python imports a module of one name only once.
-    name = f"failing_{''.join(filter(str.isalpha, error)).lower()}"
-    (tmp_path / f"{name}.py").write_text(FAILING_PROBLEM.format(error=error))
-    path = tmp_path / "failing.yaml"
-    path.write_text(f"problem: {name}:Failing\nsimulator: {{num_trials: 4, seed: 3}}\n")
-    return load(path)
+from holdfast.arrays import FloatArray
+from holdfast.config.loader import Configuration, load
+from holdfast.errors import InvalidValueError, ProblemError, TrialCrashError
+from holdfast.outcome import TrialResult
+from holdfast.planning import Planner
+from holdfast.robot import trials
+from holdfast.robot.environment import SimulatedEnvironment
+from holdfast.robot.trial import run_trial
+from holdfast.robot.trials import TrialError, run_trials
 
 
 def defective_configuration(tmp_path: Path) -> Configuration:
@@ -68,10 +31,6 @@ def defective_configuration(tmp_path: Path) -> Configuration:
     return load(path)
 
 
-def one(configuration: Configuration, trial: int = 0) -> TrialResult:
-    return run_trial(configuration.problem, configuration.planning, configuration.simulator, trial)
-
-
 def decided(results: list[TrialResult]) -> list[tuple[int, str, float | None, int]]:
     """Everything of a result but its times."""
     ordered = sorted(results, key=lambda result: result.trial)
@@ -84,118 +43,6 @@ def run_all(
     results: list[TrialResult] = []
     run_trials(configuration, jobs, finished, results.append)
     return results
-
-
-class TestOneTrial:
-    def test_same_trial_decides_the_same(self, tmp_path: Path) -> None:
-        configuration = configuration_of(tmp_path)
-        first, second = one(configuration), one(configuration)
-        assert first.decisions == second.decisions
-        assert first.digest == second.digest
-
-    def test_an_environment_may_say_that_the_task_failed(self, tmp_path: Path) -> None:
-        configuration = configuration_of(tmp_path)
-        problem, simulator = configuration.problem, configuration.simulator
-
-        class Failing(SimulatedEnvironment):
-            says: Any = "failed"
-
-            def is_done(self) -> Any:
-                return self.says if self.step == 7 else super().is_done()
-
-        world = Failing(problem, simulator.seed, 0)
-        result = run_trial(problem, configuration.planning, simulator, 0, world)
-        assert (result.outcome, result.success, result.failed) == ("failed", False, True)
-        assert result.steps == 7
-        for wrong, says in (("crashed", "'crashed'"), (1, "1"), (None, "None")):
-            world = Failing(problem, simulator.seed, 0)
-            world.says = wrong
-            message = f'Failing: is_done returned {says}; it must return True, False or "failed"'
-            with pytest.raises(EnvironmentFailedError, match=f"^{message}$"):
-                run_trial(problem, configuration.planning, simulator, 0, world)
-
-    def test_other_trials_and_seeds_decide_otherwise(self, tmp_path: Path) -> None:
-        configuration = configuration_of(tmp_path)
-        digests = {
-            one(configuration, 0).digest,
-            one(configuration, 1).digest,
-            one(configuration_of(tmp_path, seed=4), 0).digest,
-        }
-        assert len(digests) == 3
-
-    def test_digest_is_the_hash_of_the_decisions(self, tmp_path: Path) -> None:
-        result = one(configuration_of(tmp_path))
-        assert result.decisions is not None
-        expected = hashlib.blake2b(result.decisions.log, digest_size=32).hexdigest()
-        assert result.digest == expected
-
-    def test_decisions_come_in_the_order_of_the_loop(self, tmp_path: Path) -> None:
-        result = one(configuration_of(tmp_path))
-        assert result.decisions is not None
-        decisions = list(result.decisions)
-        task = [item for item in decisions if isinstance(item, TaskDecision)]
-        sensing = [item for item in decisions if isinstance(item, SensingDecision)]
-        assert [item.step for item in task] == list(range(result.steps))
-        assert [item.step for item in sensing] == list(range(0, result.steps, 9))
-        assert len(sensing) == result.sensing_decisions == len(result.sensing_ms)
-        # At a step of both kinds, the robot senses first.
-        steps = [(item.step, isinstance(item, TaskDecision)) for item in decisions]
-        assert steps == sorted(steps)
-
-    def test_decisions_hold_what_the_environment_was_told(self, tmp_path: Path) -> None:
-        configuration = configuration_of(tmp_path)
-
-        class Noting(SimulatedEnvironment):
-            sensed: list[int]
-            performed: list[tuple[float, ...]]
-
-            def perform_sensing(self, sensing_action: int) -> FloatArray:
-                self.sensed.append(sensing_action)
-                return super().perform_sensing(sensing_action)
-
-            def perform(self, task_action: FloatArray) -> float | None:
-                self.performed.append(tuple(task_action.tolist()))
-                return super().perform(task_action)
-
-        environment = Noting(configuration.problem, configuration.simulator.seed, 0)
-        environment.sensed, environment.performed = [], []
-        result = run_trial(
-            configuration.problem, configuration.planning, configuration.simulator, 0, environment
-        )
-        assert result.decisions is not None
-        decisions = list(result.decisions)
-        assert environment.sensed == [
-            item.sensing_action for item in decisions if isinstance(item, SensingDecision)
-        ]
-        assert environment.performed == [
-            item.action for item in decisions if isinstance(item, TaskDecision)
-        ]
-        assert result.digest == one(configuration).digest
-
-    def test_an_observer_changes_nothing(self, tmp_path: Path) -> None:
-        configuration = configuration_of(tmp_path)
-        recorder = Recorder(trial=0)
-        watched = run_trial(
-            configuration.problem,
-            configuration.planning,
-            configuration.simulator,
-            0,
-            observer=recorder,
-        )
-        assert watched.digest == one(configuration).digest
-        assert recorder.record.result is watched
-
-    def test_it_stops_at_the_goal_or_at_max_steps(self, tmp_path: Path) -> None:
-        configuration = configuration_of(tmp_path)
-        results = [one(configuration, trial) for trial in range(40)]
-        for result in results:
-            assert result.steps == 60 or (result.success and result.steps < 60)
-        assert {result.success for result in results} == {True, False}
-
-    @pytest.mark.parametrize("log", [b"X", b"A\0\0", b"S" + bytes(20), b"E", b"A" + bytes(9)])
-    def test_a_damaged_log_is_refused(self, log: bytes) -> None:
-        with pytest.raises(InvalidValueError, match="decision log"):
-            list(Decisions(3, log))
 
 
 class TestManyTrials:
@@ -266,14 +113,26 @@ class TestManyTrials:
         for rewarded, reward in (((), None), ((2, 5), -4.0)):
             environment = Sparing(problem, simulator.seed, 0)
             environment.rewarded = rewarded
-            result = run_trial(problem, configuration.planning, simulator, 0, environment)
+            result = run_trial(
+                Planner(problem, configuration.planning),
+                simulator.seed,
+                0,
+                max_steps=simulator.max_steps,
+                environment=environment,
+            )
             assert result.reward == reward
             # It decides nothing.
             assert result.digest == one(configuration).digest
         # A trial without a step has earned nothing, which is a sum.
         begun_in_the_goal = Sparing(problem, simulator.seed, 0)
         begun_in_the_goal.state = np.zeros(3)
-        result = run_trial(problem, configuration.planning, simulator, 0, begun_in_the_goal)
+        result = run_trial(
+            Planner(problem, configuration.planning),
+            simulator.seed,
+            0,
+            max_steps=simulator.max_steps,
+            environment=begun_in_the_goal,
+        )
         assert (result.steps, result.reward) == (0, 0.0)
 
     def test_a_problem_without_rewards_has_none(self) -> None:
@@ -292,11 +151,11 @@ class TestManyTrials:
         environment = Rewarding(configuration.problem, configuration.simulator.seed, 0)
         with pytest.raises(ProblemError, match=rf"the reward of step 2 is {reward}; it must be"):
             run_trial(
-                configuration.problem,
-                configuration.planning,
-                configuration.simulator,
+                Planner(configuration.problem, configuration.planning),
+                configuration.simulator.seed,
                 0,
-                environment,
+                max_steps=configuration.simulator.max_steps,
+                environment=environment,
             )
 
     @pytest.mark.parametrize(

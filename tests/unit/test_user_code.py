@@ -10,12 +10,12 @@ import pytest
 
 from holdfast import planning
 from holdfast.cli import main
-from holdfast.configuration import load
-from holdfast.runtime.trials import run_trials
-from holdfast.user_code import is_users_file
+from holdfast.config.loader import load
+from holdfast.config.user_code import is_users_file
+from holdfast.robot.trials import run_trials
 
 
-@pytest.mark.parametrize("name", [planning.__file__, "holdfast/session/robot.py", "<string>"])
+@pytest.mark.parametrize("name", [planning.__file__, "holdfast/protocol/robot.py", "<string>"])
 def test_ours(name: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Also as compiled modules name themselves, wherever the process is."""
     monkeypatch.chdir(tmp_path)

@@ -7,21 +7,28 @@ from collections.abc import Callable
 import msgspec
 import numpy as np
 import pytest
-from tests.unit.test_session_robot import LOCAL, PROBLEM, World
+from tests.robot_world import LOCAL, PROBLEM, World
 
+from holdfast.errors import OwnDecisionError, ServiceRefusedError
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
-from holdfast.protocol.verification import MAX_OPEN_CHECKS, OwnDecisionError, Verification
-from holdfast.session.dispatcher import ServiceRefusedError
-from holdfast.session.effects import Act, Decide, Effect, Stop, Verified
-from holdfast.session.events import Decided
-from holdfast.session.messages import (
+from holdfast.protocol.events import (
+    Act,
+    ComputeOwnAnswer,
+    Effects,
+    Halt,
+    OwnAnswer,
+    RobotEffect,
+    VerificationNoted,
+)
+from holdfast.protocol.messages import (
     Reply,
     SensingAnswer,
     TaskAnswer,
-    numbers_from,
-    numbers_to,
+    decode_floats,
+    encode_floats,
 )
-from holdfast.session.question import Question
+from holdfast.protocol.question import AnswerPart, Provenance, Question
+from holdfast.protocol.verification import MAX_OPEN_CHECKS, Verification
 
 
 def lie(world: World, name: str, change: Callable[[Reply], Reply], after: int = 0) -> None:
@@ -45,8 +52,8 @@ def other_actions(factor: float) -> Callable[[Reply], Reply]:
     def change(reply: Reply) -> Reply:
         if not isinstance(reply, TaskAnswer):
             return reply
-        numbers = factor * numbers_from(reply.actions, len(reply.actions) // 8)
-        return msgspec.structs.replace(reply, actions=numbers_to(numbers))
+        numbers = factor * decode_floats(reply.actions, len(reply.actions) // 8)
+        return msgspec.structs.replace(reply, actions=encode_floats(numbers))
 
     return change
 
@@ -83,7 +90,7 @@ def test_an_action_outside_the_limits_is_never_performed() -> None:
     assert world.statuses() == ["local_recovery"]
     assert verdicts(world) == [("cloud", "task", "different"), ("cloud", "sensing", "same")]
     # Impossible as it is, the planner need not be asked twice.
-    assert len([e for _, e in world.trace if isinstance(e, Decide)]) == 1
+    assert len([e for _, e in world.trace if isinstance(e, ComputeOwnAnswer)]) == 1
 
 
 def test_where_two_answers_differ_the_robot_decides() -> None:
@@ -129,7 +136,7 @@ def test_a_share_of_the_answers_is_computed_again(
     assert {verdict for _, _, verdict in verdicts(world)} == {"same", "different"}
 
 
-def is_report(effect: Effect, name: str) -> bool:
+def is_report(effect: RobotEffect, name: str) -> bool:
     return getattr(effect, "name", None) == name
 
 
@@ -150,17 +157,18 @@ def test_honest_answers_are_all_the_same_and_cost_no_time() -> None:
 def test_the_share_is_kept_and_no_service_can_tell_which() -> None:
     drawn: dict[bytes, list[bool]] = {}
     for secret in (b"one", b"other"):
-        effects: list[Effect] = []
-        verification = Verification(0.25, secret, None, PROBLEM.execute, effects)
+        effects: Effects[RobotEffect] = Effects()
+        verification = Verification(0.25, secret, None, PROBLEM, effects)
         drawn[secret] = []
         for number in range(2000):
             question = question_of(number)
             before = len(effects)
-            verification.answered(question, "cloud")
+            answer(verification, question)
             drawn[secret].append(len(effects) > before)
             for effect in effects[before:]:
-                if isinstance(effect, Decide):
-                    verification.decided(Decided(effect.number), None, 0)
+                if isinstance(effect, ComputeOwnAnswer):
+                    own = OwnAnswer(effect.number, (), 0, question.digest)
+                    verification.decided(own, None, 0)
     # Binomial: four standard deviations of 2,000 draws at 1/4 are 78 (false alarms: 6e-5 each).
     assert all(abs(sum(each) - 500) <= 78 for each in drawn.values())
     both = sum(a and b for a, b in zip(drawn[b"one"], drawn[b"other"], strict=True))
@@ -169,17 +177,23 @@ def test_the_share_is_kept_and_no_service_can_tell_which() -> None:
 
 def question_of(number: int) -> Question:
     world = World()
-    state = world.planner.initial_state(number, 0)
+    state = world.planner.init(number, 0)
     return Question(world.planner.settings, state, number.to_bytes(16, "big"), (), 0)
 
 
+def answer(verification: Verification, question: Question) -> None:
+    """Let a service choose the first sensing action."""
+    reply = SensingAnswer(1, question.state.step, 0, question.digest, 0)
+    verification.take(question, AnswerPart("cloud", None, reply), Provenance("cloud", 0.0, 0.0))
+
+
 def test_what_a_robot_cannot_keep_up_with_is_left_out_and_counted() -> None:
-    effects: list[Effect] = []
-    verification = Verification(1.0, b"secret", None, PROBLEM.execute, effects)
+    effects: Effects[RobotEffect] = Effects()
+    verification = Verification(1.0, b"secret", None, PROBLEM, effects)
     for number in range(MAX_OPEN_CHECKS + 7):
-        verification.answered(question_of(number), "cloud")
+        answer(verification, question_of(number))
     assert len(verification) == MAX_OPEN_CHECKS
-    rows = [effect.verdict for effect in effects if isinstance(effect, Verified)]
+    rows = [effect.verdict for effect in effects if isinstance(effect, VerificationNoted)]
     assert (rows.count("asked"), rows.count("left_out")) == (MAX_OPEN_CHECKS, 7)
 
 
@@ -207,7 +221,7 @@ def test_a_problem_that_is_not_deterministic_is_blamed_itself() -> None:
     calls = 0
     honest = world.own
 
-    def own(effect: Decide) -> Decided:
+    def own(effect: ComputeOwnAnswer) -> OwnAnswer:
         nonlocal calls
         calls += 1
         decided = honest(effect)
@@ -248,10 +262,10 @@ def test_where_limits_tell_nothing_each_action_is_compared_before_it_is_performe
 def test_the_robot_holds_still_if_its_own_planner_cannot_settle_it() -> None:
     world = World(verify_share=0.0)
     lie(world, "cloud", other_actions(77.7), after=1)
-    world.own = lambda effect: Decided(effect.number, failure="ValueError: no such state")
+    world.own = lambda effect: OwnAnswer(effect.number, failure="ValueError: no such state")
     world.start()
     world.run()
-    assert isinstance(world.stopped, Stop)
+    assert isinstance(world.stopped, Halt)
     assert isinstance(world.stopped.error, OwnDecisionError)
     assert "no such state" in str(world.stopped.error)
     assert all(
@@ -267,7 +281,7 @@ def test_a_planner_that_hangs_is_waited_for_no_longer_than_a_decision() -> None:
     world.own_s = 1e6
     world.start()
     world.run(until_s=200.0)
-    assert isinstance(world.stopped, Stop)
+    assert isinstance(world.stopped, Halt)
     assert isinstance(world.stopped.error, OwnDecisionError)
     assert "offload.decision_timeout_ms" in str(world.stopped.error)
     assert 59.0 < world.now < 62.0
@@ -280,8 +294,8 @@ def test_a_planner_that_fails_the_second_time_acquits_nobody() -> None:
     lie(world, "cloud", other_actions(0.5), after=1)
     honest = world.own
 
-    def own(effect: Decide) -> Decided:
-        return Decided(effect.number, failure="gone") if effect.again else honest(effect)
+    def own(effect: ComputeOwnAnswer) -> OwnAnswer:
+        return OwnAnswer(effect.number, failure="gone") if effect.again else honest(effect)
 
     world.own = own
     world.start()
@@ -297,9 +311,9 @@ def test_zeros_of_other_sign_are_another_answer() -> None:
     def negative_zeros(reply: Reply) -> Reply:
         if not isinstance(reply, TaskAnswer):
             return reply
-        numbers = numbers_from(reply.actions, len(reply.actions) // 8)
+        numbers = decode_floats(reply.actions, len(reply.actions) // 8)
         return msgspec.structs.replace(
-            reply, actions=numbers_to(np.where(numbers == 0.0, -0.0, numbers))
+            reply, actions=encode_floats(np.where(numbers == 0.0, -0.0, numbers))
         )
 
     lie(world, "cloud", negative_zeros)
@@ -325,7 +339,7 @@ def test_until_the_planner_has_decided_twice_the_suspect_is_not_followed_blindly
     honest = world.own
     seconds: list[float] = []
 
-    def own(effect: Decide) -> Decided:
+    def own(effect: ComputeOwnAnswer) -> OwnAnswer:
         if effect.again:
             seconds.append(world.now)
             world.own_s = 0.2
@@ -348,7 +362,7 @@ def test_until_the_planner_has_decided_twice_the_suspect_is_not_followed_blindly
 
 def test_a_failed_verification_is_told_and_stops_nobody() -> None:
     world = World(verify_share=1.0)
-    world.own = lambda effect: Decided(effect.number, failure="MemoryError")
+    world.own = lambda effect: OwnAnswer(effect.number, failure="MemoryError")
     world.start()
     world.run()
     world.assert_same_as_without_faults()
@@ -372,6 +386,6 @@ def test_without_a_local_service_the_robot_stops_when_all_have_lied() -> None:
     lie(world, "cloud", other_actions(77.7), after=1)
     world.start()
     world.run()
-    assert isinstance(world.stopped, Stop)
+    assert isinstance(world.stopped, Halt)
     assert isinstance(world.stopped.error, ServiceRefusedError)
     assert "the robot's own planner" in str(world.stopped.error)

@@ -9,8 +9,8 @@ import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from holdfast.config.yaml_document import dotted, read, write
 from holdfast.errors import ConfigurationError
-from holdfast.yaml_document import dotted, read, write
 
 TEXT = st.one_of(
     st.text(st.characters(exclude_categories=["Cs"]), max_size=30),

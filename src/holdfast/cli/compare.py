@@ -1,55 +1,86 @@
-"""``holdfast compare``: whether two runs decided the same."""
+"""``holdfast compare``: whether two runs decided the same, or which of several runs is better."""
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import ClassVar
 
-import typer
-
-from holdfast.cli.endings import EXIT_DIFFERENT
-from holdfast.cli.options import location
+from holdfast.cli.exit_codes import EXIT_DIFFERENT
+from holdfast.errors import OptionError
 from holdfast.printable import printable
+from holdfast.runtime.command_line import Options, argument, flag, location
 
-__all__ = ["compare"]
+__all__ = ["main"]
 
 
-def compare(
-    first: Annotated[
-        Path,
-        typer.Argument(
-            metavar="RUN",
-            parser=location("RUN"),
-            show_default=False,
-            help="Directory of a run, or its journal.",
-        ),
-    ],
-    second: Annotated[
-        Path,
-        typer.Argument(
-            metavar="RUN",
-            parser=location("RUN"),
-            show_default=False,
-            help="The other one, likewise.",
-        ),
-    ],
-    json: Annotated[
-        bool, typer.Option("--json", help="Print the finding as a JSON object.")
-    ] = False,
-) -> None:
-    """Tell whether two runs decided the same, and where they first differ.
+class CompareOptions(Options):
+    """Compare two runs, and show where they first differ.
 
     All trials are compared: each sensing action, each task action bit for bit, and the digests of
-    the states. Exit code 0: they decided the same. 1: they did not, or a trial of one is missing or
-    unfinished in the other. 2: one of them cannot be read.
+    the states.
+
+    With --outcomes: show which run is better. Trials of one number are compared as pairs, because
+    with the same problem and seed they are in the same world. The exit code is 0 whichever it is.
     """
+
+    exit_codes: ClassVar = {
+        0: "the decisions are the same",
+        1: "they differ, or a trial of one run is missing or unfinished in the other",
+    }
+    needs_arguments = True
+
+    runs: tuple[Path, ...] = argument(
+        "RUN",
+        "Directories of runs, or their journals. With --outcomes two or more: the first is the "
+        "baseline.",
+        location,
+        many=True,
+    )
+    outcomes: bool = flag(
+        "--outcomes",
+        help="Show which run is better: success, steps, rewards and decision times against the "
+        "first run's, with intervals (extra lab).",
+    )
+    unpaired: bool = flag(
+        "--unpaired",
+        help="With --outcomes: take the runs as independent samples, as of other seeds.",
+    )
+    json: bool = flag("--json", help="Print the finding as a JSON object.")
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Compare runs and return the exit code."""
+    options = CompareOptions.parse("compare", arguments)
+    runs = options.runs
+    if len(runs) < 2 or (len(runs) > 2 and not options.outcomes):
+        wanted = "two or more runs" if options.outcomes else "two runs (more with --outcomes)"
+        raise OptionError(f"compare takes {wanted}, not {len(runs)}")
+    if options.unpaired and not options.outcomes:
+        raise OptionError("--unpaired says how to compare outcomes; give --outcomes as well")
+    if options.outcomes:
+        _compare_outcomes(runs, paired=not options.unpaired, json=options.json)
+        return 0
     from holdfast.recording.compare import compare_runs
 
-    found = compare_runs(first, second)
+    found = compare_runs(*runs)
+    sys.stdout.write(found.to_json() if options.json else f"{printable(found.describe())}\n")
+    if not options.json:
+        _print_notes(found.notes)
+    return 0 if found.identical else EXIT_DIFFERENT
+
+
+def _compare_outcomes(runs: Sequence[Path], *, paired: bool, json: bool) -> None:
+    from holdfast.recording.outcome_comparison import compare_outcomes
+
+    found = compare_outcomes(runs, paired=paired)
     sys.stdout.write(found.to_json() if json else f"{printable(found.describe())}\n")
     if not json:
-        for note in found.notes:
-            sys.stderr.write(f"note: {printable(note)}\n")
-    if not found.identical:
-        raise typer.Exit(EXIT_DIFFERENT)
+        for run in found.runs:
+            _print_notes(run.notes)
+
+
+def _print_notes(notes: Iterable[str]) -> None:
+    for note in notes:
+        sys.stderr.write(f"note: {printable(note)}\n")

@@ -5,108 +5,105 @@ from __future__ import annotations
 import shutil
 import sys
 import textwrap
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, ClassVar
 
-import typer
-
-from holdfast.cli.endings import EXIT_DIFFERENT
-from holdfast.cli.options import location
+from holdfast.cli.exit_codes import EXIT_DIFFERENT
 from holdfast.errors import HoldfastError
+from holdfast.runtime.command_line import Options, argument, flag, location, option
 
 if TYPE_CHECKING:
-    from holdfast.runtime.doctor import Finding
+    from holdfast.robot.doctor import LayerFinding
 
-__all__ = ["doctor"]
+__all__ = ["main"]
 
-_COLORS = {"ok": "green", "warns": "yellow", "fails": "red"}
+_COLORS = {"ok": 32, "warns": 33, "fails": 31}
+"""Of a terminal: green, yellow, red."""
+
 _INDENT = 22
 _WIDEST = 110
 
 
-def doctor(
-    configuration_path: Annotated[
-        Path | None,
-        typer.Argument(
-            metavar="CONFIG",
-            parser=location("CONFIG"),
-            show_default=False,
-            help="Configuration of a run: its decisions are compared with the service's.",
-        ),
-    ] = None,
-    service: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--service",
-            "-s",
-            metavar="ENDPOINT",
-            help="The service (tls/cloud.example.org:7447), instead of CONFIG's; may be repeated.",
-            show_default=False,
-        ),
-    ] = None,
-    tls: Annotated[
-        Path | None,
-        typer.Option(
-            "--tls",
-            metavar="DIR",
-            parser=location("--tls"),
-            help="This robot's credentials, instead of CONFIG's.",
-            show_default=False,
-        ),
-    ] = None,
-    json: Annotated[
-        bool, typer.Option("--json", help="Print each finding as a JSON object, one a line.")
-    ] = False,
-) -> None:
-    """Say layer by layer what works between this robot and a service, and what to do.
+class DoctorOptions(Options):
+    """Check layer by layer what works between this robot and a service, and what to do.
 
-    Name, route, port, TLS, certificate, protocol, datagrams (over udp), clock, problem (with
-    CONFIG) and round trip: what is above the first layer that fails is not reached. It takes ten
-    seconds for each service at most. Exit code 0: all layers work, perhaps with a warning. 1: one
-    fails. 2: an option or CONFIG cannot be used.
+    The layers: name, route, port, TLS, certificate, protocol, datagrams (over udp), clock, problem
+    (with CONFIG) and round trip. Layers above the first one that fails are not reached. It takes at
+    most ten seconds for each service.
     """
+
+    exit_codes: ClassVar = {0: "all layers work, perhaps with a warning", 1: "a layer fails"}
+    needs_arguments = True
+
+    configuration: Path | None = argument(
+        "CONFIG",
+        "Configuration of a run: its decisions are compared with the service's.",
+        location,
+        required=False,
+    )
+    service: tuple[str, ...] = option(
+        "--service",
+        "-s",
+        metavar="ENDPOINT",
+        many=True,
+        help="The service (tls/cloud.example.org:7447), instead of CONFIG's.",
+    )
+    tls: Path | None = option(
+        "--tls",
+        metavar="DIR",
+        read=location,
+        help="This robot's credentials, instead of CONFIG's.",
+    )
+    json: bool = flag("--json", help="Print each finding as a JSON object, one a line.")
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Check the layers and return the exit code."""
+    options = DoctorOptions.parse("doctor", arguments)
     import asyncio
     import functools
 
     import msgspec
 
-    from holdfast.configuration import load
-    from holdfast.runtime.doctor import OwnDecisions, RobotSetup, check, examine
-    from holdfast.runtime.probe import in_thread
-    from holdfast.settings import OffloadSettings
+    from holdfast.config.loader import load
+    from holdfast.config.settings import OffloadSettings
+    from holdfast.robot.doctor import RobotSetup, check, examine
+    from holdfast.robot.probe import in_thread
+    from holdfast.robot.reference_decisions import ReferenceDecisions
 
-    configuration = None if configuration_path is None else load(configuration_path)
+    configuration = None if options.configuration is None else load(options.configuration)
+    tls = options.tls
     offload = OffloadSettings() if configuration is None else configuration.offload
     if tls is None and offload.tls is not None:
         tls = Path(offload.tls)
-    endpoints = [check(each, tls) for each in service or offload.services]
+    endpoints = [check(each, tls) for each in options.service or offload.services]
     if not endpoints:
         raise HoldfastError("no service is named: give --service ENDPOINT, or CONFIG one")
     decisions = None
     if configuration is not None:
-        decisions = in_thread(functools.partial(OwnDecisions.of, configuration))
+        decisions = in_thread(functools.partial(ReferenceDecisions.of, configuration))
     robot = RobotSetup(offload.name or ("" if tls else "doctor"), tls, offload, decisions)
     fails = False
     for endpoint in endpoints:
 
-        def tell(finding: Finding, service: str = str(endpoint)) -> None:
+        def show(finding: LayerFinding, service: str = str(endpoint)) -> None:
             nonlocal fails
             fails = fails or finding.state == "fails"
-            if json:
+            if options.json:
                 line = {"service": service, **finding._asdict()}
                 sys.stdout.write(msgspec.json.encode(line).decode() + "\n")
             else:
-                typer.echo(_as_text(finding))
+                sys.stdout.write(f"{_as_text(finding)}\n")
             sys.stdout.flush()
 
-        if not json:
-            typer.echo(str(endpoint))
-        asyncio.run(examine(endpoint, robot, tell))
-    if fails:
-        raise typer.Exit(EXIT_DIFFERENT)
+        if not options.json:
+            sys.stdout.write(f"{endpoint}\n")
+        asyncio.run(examine(endpoint, robot, show))
+    return EXIT_DIFFERENT if fails else 0
 
 
-def _as_text(finding: Finding) -> str:
+def _as_text(finding: LayerFinding) -> str:
     """Return the lines of a finding."""
     width = min(shutil.get_terminal_size().columns, _WIDEST)
     begins = f"  {finding.layer:<12} {finding.state:<6} "
@@ -121,6 +118,8 @@ def _as_text(finding: Finding) -> str:
             initial_indent=f"{' ' * (_INDENT - 3)}-> ",
             subsequent_indent=" " * _INDENT,
         )
-    state = typer.style(f" {finding.state:<6} ", fg=_COLORS.get(finding.state))
-    lines[0] = lines[0].replace(f" {finding.state:<6} ", state, 1)
+    if sys.stdout.isatty():
+        state = f" {finding.state:<6} "
+        colored = f"\x1b[{_COLORS[finding.state]}m{state}\x1b[0m"
+        lines[0] = lines[0].replace(state, colored, 1)
     return "\n".join(lines)

@@ -7,106 +7,104 @@ import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
-import typer
-
-from holdfast.cli.endings import ended_by_signals
-from holdfast.cli.options import MAX_TRIALS, OptionError, location, number
+from holdfast.cli.exit_codes import ended_by_signals
 from holdfast.cli.terminal import counted, progress_line
-from holdfast.errors import HoldfastError
-from holdfast.files import OutputError, directory_beside, move_into_place, require_free
+from holdfast.config.user_code import account_of_user_error
+from holdfast.errors import HoldfastError, OptionError, OutputError
+from holdfast.files import directory_beside, move_into_place, require_free
 from holdfast.printable import printable
-from holdfast.user_code import account_of_user_error
+from holdfast.runtime.command_line import (
+    MAX_TRIALS,
+    Options,
+    argument,
+    bad_value,
+    flag,
+    location,
+    number,
+    option,
+)
 
 if TYPE_CHECKING:
-    from holdfast.recording.export import FactSink, RecordedRun
+    from holdfast.recording.facts import FactSink
+    from holdfast.recording.replay import RecordedRun
 
-__all__ = ["export"]
+__all__ = ["main"]
 
 _MIN_RATE_HZ, _MAX_RATE_HZ = 0.001, 10_000.0
 _NOTE = "decided as recorded"
-"""What is to be said of the trials that are written."""
+"""The note of the progress bar."""
 
 _RANGE = re.compile(r"(\d{1,9}):(\d{1,9})")
 
 
-def export(
-    run: Annotated[
-        Path,
-        typer.Argument(
-            metavar="RUN",
-            parser=location("RUN"),
-            show_default=False,
-            help="Directory of a run, or its journal.",
-        ),
-    ],
-    mcap: Annotated[
-        Path | None,
-        typer.Option(
-            "--mcap",
-            metavar="FILE",
-            parser=location("--mcap"),
-            help="Write FILE: standard ROS 2 messages, for RViz, Foxglove, PlotJuggler and "
-            "ros2 bag (extra ros).",
-        ),
-    ] = None,
-    tables: Annotated[
-        Path | None,
-        typer.Option(
-            "--csv",
-            metavar="DIR",
-            parser=location("--csv"),
-            help="Write DIR: trials.csv, steps.csv, beliefs.csv and events.csv.",
-        ),
-    ] = None,
-    trials: Annotated[
-        str | None,
-        typer.Option(
-            "--trials",
-            metavar="A:B",
-            help="Only the trials from A up to, but without, B (default: all).",
-        ),
-    ] = None,
-    rate: Annotated[
-        float,
-        typer.Option(
-            "--rate",
-            metavar="HZ",
-            parser=number("--rate", _MIN_RATE_HZ, _MAX_RATE_HZ, "Hz"),
-            help="Steps a second, for a run that was recorded without times.",
-        ),
-    ] = 10.0,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Show no progress.")] = False,
-) -> None:
-    """Write a recorded run as other programs read it; the run is not changed.
-
-    Beliefs are not recorded, but computed again from the recorded seed and observations; every
-    decision on the way must be the recorded one, bit for bit, else nothing is written.
-
-    Times are the robot's own where the run has them (timings.csv), else steps of 1/HZ.
-    """
-    wanted = None if trials is None else _range_of(trials)
-    if mcap is None and tables is None:
-        raise HoldfastError("nothing to write: give --mcap FILE or --csv DIR, or both")
-    with ended_by_signals():
-        _export(run, mcap, tables, wanted, rate, quiet=quiet)
-
-
-def _range_of(text: str) -> range:
+def _range(text: str) -> range:
     match = _RANGE.fullmatch(text)
     if match is None or int(match[2]) > MAX_TRIALS:
-        raise OptionError(
-            f"--trials is {text!r:.80}; allowed are two whole numbers A:B from 0 to {MAX_TRIALS}, "
-            "such as 0:5"
-        )
+        raise bad_value(text, f"two whole numbers A:B from 0 to {MAX_TRIALS}, such as 0:5")
     begin, end = map(int, match.groups())
     if begin >= end:
-        raise OptionError(
-            f"--trials is {text!r:.80}; the second number must be above the first: 0:5 are the "
-            "first five trials"
-        )
+        raise bad_value(text, "A:B with B above A: 0:5 are the first five trials")
     return range(begin, end)
+
+
+class ExportOptions(Options):
+    """Write a recorded run as other programs read it; the run is not changed.
+
+    Beliefs are not recorded, but computed again from the recorded seed and observations. Every
+    decision on the way must be the recorded one, bit for bit; otherwise nothing is written.
+
+    Times are the robot's own where the run has them (timings.csv), otherwise steps of 1/HZ.
+    """
+
+    needs_arguments = True
+
+    run: Path = argument("RUN", "Directory of a run, or its journal.", location)
+    mcap: Path | None = option(
+        "--mcap",
+        metavar="FILE",
+        read=location,
+        help="Write FILE: standard ROS 2 messages, for RViz, Foxglove, PlotJuggler and ros2 bag "
+        "(extra ros).",
+    )
+    tables: Path | None = option(
+        "--csv",
+        metavar="DIR",
+        read=location,
+        help="Write DIR: trials.csv, steps.csv, beliefs.csv and events.csv.",
+    )
+    trials: range | None = option(
+        "--trials",
+        metavar="A:B",
+        read=_range,
+        help="Only the trials from A up to, but without, B (default: all).",
+    )
+    rate: float = option(
+        "--rate",
+        metavar="HZ",
+        read=number(_MIN_RATE_HZ, _MAX_RATE_HZ, "Hz"),
+        default=10.0,
+        help="Steps a second, for a run that was recorded without times.",
+    )
+    quiet: bool = flag("--quiet", "-q", help="Show no progress.")
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Write what the options ask for and return the exit code."""
+    options = ExportOptions.parse("export", arguments)
+    if options.mcap is None and options.tables is None:
+        raise OptionError("nothing to write: give --mcap FILE or --csv DIR, or both")
+    with ended_by_signals():
+        _export(
+            options.run,
+            options.mcap,
+            options.tables,
+            options.trials,
+            options.rate,
+            quiet=options.quiet,
+        )
+    return 0
 
 
 def _export(
@@ -127,7 +125,7 @@ def _export(
         require_free(tables, "--csv", directory=True)
         if mcap is not None and mcap.absolute() == tables.absolute():
             raise OptionError(f"--mcap and --csv are both {mcap}; give two places")
-    from holdfast.recording.export import RecordedRun
+    from holdfast.recording.replay import RecordedRun
 
     with RecordedRun(path) as recorded:
         trials = [trial for trial in recorded.trials if wanted is None or trial in wanted]
@@ -164,7 +162,6 @@ def _write(
 ) -> list[str]:
     """Write all of it beside its places, and move it there when all is whole; return notes."""
     from holdfast.recording.csv_export import CsvSink
-    from holdfast.recording.export import Facts
 
     notes = _notes(recorded, trials, rate_hz)
     line = progress_line(len(trials), quiet=quiet)
@@ -196,8 +193,8 @@ def _write(
                 made.append((directory, tables))
             line.start(f"{counted(len(trials), 'trial')} of {recorded.path}", 0, _NOTE)
             try:
-                told = recorded.tell(trials, Facts(sinks), rate_hz)
-                for finished, _ in enumerate(told, start=1):
+                replayed = recorded.replay(trials, sinks, rate_hz)
+                for finished, _ in enumerate(replayed, start=1):
                     line.show(finished, _NOTE)
             except (HoldfastError, KeyboardInterrupt):
                 raise
@@ -216,7 +213,7 @@ def _write(
 
 
 def _notes(recorded: RecordedRun, trials: Sequence[int], rate_hz: float) -> list[str]:
-    """Return what a person should know of what is exported."""
+    """Return notes about the exported trials."""
     from holdfast.recording.run_directory import TIMINGS_NAME
 
     notes = []
@@ -242,7 +239,7 @@ def _notes(recorded: RecordedRun, trials: Sequence[int], rate_hz: float) -> list
 
 
 def _about(recorded: RecordedRun, rate_hz: float) -> dict[str, str]:
-    """Return what the metadata of a file says of its run."""
+    """Return the metadata of a file about its run."""
     from holdfast.source_digest import core_version
 
     configuration = recorded.configuration

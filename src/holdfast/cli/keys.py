@@ -5,94 +5,90 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
-import typer
-
-from holdfast.cli.options import location, whole_number
-from holdfast.errors import InvalidValueError
 from holdfast.printable import printable
+from holdfast.runtime.command_line import (
+    Options,
+    argument,
+    bad_value,
+    flag,
+    location,
+    option,
+    whole_number,
+)
 
 if TYPE_CHECKING:
     from holdfast.transport.key_ring import Issued, KeyRing, Revocation
 
-__all__ = ["keys"]
+__all__ = ["main"]
 
 # Those of holdfast.transport.key_ring, which need not be imported for a --help.
 _DEFAULT_DAYS = 365
 _MAX_DAYS = 3650
 
 
-def keys(
-    directory: Annotated[
-        Path,
-        typer.Argument(
-            metavar="DIR",
-            parser=location("DIR"),
-            show_default=False,
-            help="Where they go; made if it is not there.",
-        ),
-    ],
-    robot: Annotated[
-        list[str] | None,
-        typer.Option(metavar="NAME", help="A robot that gets a key; may be repeated."),
-    ] = None,
-    service: Annotated[
-        list[str] | None,
-        typer.Option(metavar="NAME", help="A service that gets a key; may be repeated."),
-    ] = None,
-    host: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="NAME_OR_IP",
-            help="Where robots reach the services, besides this machine; may be repeated.",
-        ),
-    ] = None,
-    days: Annotated[
-        int,
-        typer.Option(
-            metavar="N",
-            parser=whole_number("--days", 1, _MAX_DAYS),
-            help="How long they are valid.",
-        ),
-    ] = _DEFAULT_DAYS,
-    renew: Annotated[
-        bool,
-        typer.Option("--renew", help="New certificates for keys that are there already."),
-    ] = False,
-    rotate: Annotated[
-        bool,
-        typer.Option("--rotate", help="New keys and certificates for those that have some."),
-    ] = False,
-    revoke: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="NAME",
-            help="A robot or service whose certificates are valid no more; may be repeated.",
-        ),
-    ] = None,
-    revoke_serial: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="HEX",
-            help="The number of one certificate that is valid no more; may be repeated.",
-        ),
-    ] = None,
-    list_: Annotated[
-        bool,
-        typer.Option("--list", help="Say what was ever made, and what is revoked."),
-    ] = False,
-) -> None:
+def _serial(text: str) -> int:
+    try:
+        return int(text.replace(":", ""), 16)
+    except ValueError:
+        raise bad_value(text, "hexadecimal numbers; --list shows them") from None
+
+
+class KeysOptions(Options):
     """Make keys by which robots and services know each other, and revoke them.
 
     Without names: one robot and one service. Again with other names: more of the same authority.
-    What is there already stays as it is, unless --renew or --rotate is said; then its certificate
-    is replaced, and its key stays or is replaced, too.
+    What exists stays as it is. --renew replaces its certificate, --rotate its key as well.
 
     --revoke writes revoked.pem into each directory. Copied to a service it takes effect within
     seconds (with the signal SIGHUP at once), copied to a robot with its next connection. Together
-    with --rotate, what is revoked are the certificates of before.
+    with --rotate it revokes the certificates of before.
     """
+
+    needs_arguments = True
+
+    directory: Path = argument("DIR", "Where they go; made if it is missing.", location)
+    robot: tuple[str, ...] = option(
+        "--robot", metavar="NAME", many=True, help="A robot that gets a key."
+    )
+    service: tuple[str, ...] = option(
+        "--service", metavar="NAME", many=True, help="A service that gets a key."
+    )
+    host: tuple[str, ...] = option(
+        "--host",
+        metavar="NAME_OR_IP",
+        many=True,
+        help="Where robots reach the services, besides this machine.",
+    )
+    days: int = option(
+        "--days",
+        metavar="N",
+        read=whole_number(1, _MAX_DAYS),
+        default=_DEFAULT_DAYS,
+        help="How long they are valid.",
+    )
+    renew: bool = flag("--renew", help="New certificates for existing keys.")
+    rotate: bool = flag("--rotate", help="New keys and certificates for those that have some.")
+    revoke: tuple[str, ...] = option(
+        "--revoke",
+        metavar="NAME",
+        many=True,
+        help="A robot or service whose certificates are no longer valid.",
+    )
+    revoke_serial: tuple[int, ...] = option(
+        "--revoke-serial",
+        metavar="HEX",
+        read=_serial,
+        many=True,
+        help="The number of one certificate that is no longer valid.",
+    )
+    list: bool = flag("--list", help="List what was ever made, and what is revoked.")
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Make, revoke or list credentials, and return the exit code."""
+    options = KeysOptions.parse("keys", arguments)
     from holdfast.transport.key_ring import (
         alone_in,
         list_credentials,
@@ -101,46 +97,37 @@ def keys(
     )
 
     def warn(text: str) -> None:
-        typer.echo(f"warning: {printable(text)}", err=True)
+        sys.stderr.write(f"warning: {printable(text)}\n")
 
-    revokes = bool(revoke or revoke_serial)
+    directory = options.directory
+    revokes = bool(options.revoke or options.revoke_serial)
+    makes = options.robot or options.service or options.renew or options.rotate
     with alone_in(directory, warn=warn):
         if revokes:
             done = revoke_credentials(
-                directory, names=revoke or (), serials=_numbers(revoke_serial or ()), warn=warn
+                directory, names=options.revoke, serials=options.revoke_serial, warn=warn
             )
             sys.stdout.write(_account_of_revocation(directory, done))
-        if robot or service or renew or rotate or not (revokes or list_):
+        if makes or not (revokes or options.list):
             ring = make_credentials(
                 directory,
-                robots=robot or (),
-                services=service or (),
-                hosts=host or (),
-                days=days,
-                renew=renew,
-                rotate=rotate,
+                robots=options.robot,
+                services=options.service,
+                hosts=options.host,
+                days=options.days,
+                renew=options.renew,
+                rotate=options.rotate,
                 warn=warn,
             )
             sys.stdout.write(_account(ring))
-        if list_:
+        if options.list:
             listed = list_credentials(directory)
             sys.stdout.write("".join(f"{_line_of(each)}\n" for each in listed))
-
-
-def _numbers(texts: Sequence[str]) -> list[int]:
-    numbers = []
-    for text in texts:
-        try:
-            numbers.append(int(text.replace(":", ""), 16))
-        except ValueError:
-            raise InvalidValueError(
-                f"--revoke-serial: {text!r} is no hexadecimal number; --list shows them"
-            ) from None
-    return numbers
+    return 0
 
 
 def _account_of_revocation(directory: Path, done: Revocation) -> str:
-    """Say what was revoked, and what is to be done with the list."""
+    """Return what was revoked, and where to copy the list."""
     lines = [f"revoked: {_line_of(each)}" for each in done.revoked]
     if not lines:
         return "All of these were revoked already; nothing was changed.\n"
@@ -155,7 +142,7 @@ def _account_of_revocation(directory: Path, done: Revocation) -> str:
 
 
 def _line_of(issued: Issued) -> str:
-    """Say what is known of a certificate, on one line."""
+    """Describe a certificate on one line."""
     parts = [f"{issued.serial:040x}"]
     if issued.role is not None:
         parts.append(f"{issued.role} {issued.name!r}")
@@ -167,7 +154,7 @@ def _line_of(issued: Issued) -> str:
 
 
 def _account(ring: KeyRing) -> str:
-    """Say what was made, and where it belongs."""
+    """Return what was made, and where it belongs."""
     lines = []
     for made in ring.made:
         path = made.directory / "certificate.pem" if made.renewed else f"{made.directory}/"
@@ -196,6 +183,6 @@ def _account(ring: KeyRing) -> str:
     until = ring.authority_expires.strftime("%Y-%m-%d")
     lines += [
         "",
-        f"{ring.authority_key} stays here (valid until {until}): whoever has it can make more.",
+        f"{ring.authority_key} stays here (valid until {until}): it makes keys for anyone.",
     ]
     return "\n".join(lines) + "\n"

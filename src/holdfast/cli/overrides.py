@@ -1,8 +1,7 @@
-"""What a command line says instead of the configuration file, by key.
+"""Values of the command line that replace those of the configuration file, by key.
 
-A key can be given twice: by ``--set SECTION.KEY=VALUE``, and by the option that is there for it.
-Whoever does that and means two things shall hear of it, whichever of both would win. An option that
-was not given says nothing, so that it can take nothing away.
+A key can be given twice: by ``--set SECTION.KEY=VALUE``, and by an option of its own. Two different
+values are an error. An option that was not given replaces nothing.
 """
 
 from __future__ import annotations
@@ -16,12 +15,12 @@ __all__ = ["Override", "combined", "parse_assignment"]
 
 
 class Override(NamedTuple):
-    """A value that is given instead of the file's.
+    """A value that replaces the file's.
 
     Attributes
     ----------
     words : str
-        What stands on the command line.
+        As on the command line.
     key : str
         ``section.key``.
     value : object
@@ -39,16 +38,16 @@ def parse_assignment(assignment: str) -> Override:
     Parameters
     ----------
     assignment : str
-        The value is YAML; ``null`` is one, too.
+        The value is YAML; ``null`` is a value.
 
     Raises
     ------
     InvalidValueError
-        If it is not of that form, names a key below a key, or no value stands there.
+        If it is not of that form, names a key below a key, or has no value.
     ConfigurationError
-        If the value is no YAML.
+        If the value is not YAML.
     """
-    from holdfast.yaml_document import read
+    from holdfast.config.yaml_document import read
 
     name, equals, text = assignment.partition("=")
     section, dot, key = name.strip().partition(".")

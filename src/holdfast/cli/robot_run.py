@@ -7,11 +7,12 @@ from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
-    from holdfast.configuration import Configuration
+    from holdfast.config.loader import Configuration
     from holdfast.outcome import TrialResult
     from holdfast.recording.run_directory import RunDirectory
-    from holdfast.runtime.environment import EnvironmentMaker
-    from holdfast.runtime.logs import EventSink, LogFormat
+    from holdfast.robot.environment import EnvironmentMaker
+    from holdfast.runtime.events import EventSink
+    from holdfast.runtime.logs import LogFormat
     from holdfast.runtime.service_manager import ServiceManager
     from holdfast.service.health import HttpAddress
 
@@ -19,16 +20,16 @@ __all__ = ["RobotRun", "is_robot_run", "run_as_robot"]
 
 
 class RobotRun(NamedTuple):
-    """What there is to say of a run besides its results.
+    """Findings of a robot's run besides its results.
 
     Attributes
     ----------
     missed_ticks : int
-        Of the rate.
+        Ticks of ``--rate`` that came late.
     refusals : dict of str
-        Why a service was asked no more, by its name.
+        Why a service was given up, by its name.
     unreachable : dict of str
-        Why a service could not be reached when it was missed last, by its name.
+        Why a service could not be reached the last time, by its name.
     """
 
     missed_ticks: int = 0
@@ -51,15 +52,14 @@ class _Reasons:
             self.unreachable[str(fields["service"])] = str(fields["reason"])
 
     def close(self) -> None:
-        """Take no more."""
+        """Do nothing."""
 
 
 def is_robot_run(configuration: Configuration, rate_hz: float | None) -> bool:
-    """Tell whether a run needs more than a batch of simulated trials does.
+    """Return whether a run needs more than a batch of simulated trials does.
 
     Parameters
     ----------
-    configuration : Configuration
     rate_hz : float or None
         Task actions a second.
     """
@@ -86,22 +86,20 @@ def run_as_robot(
 
     Parameters
     ----------
-    configuration : Configuration
     directory : RunDirectory
         Its journal keeps each step.
     maker : EnvironmentMaker
         Makes what the robot acts on.
     on_result : callable
         Gets each trial's result, and keeps it.
-    rate_hz : float or None
     log_format : {"text", "json"}
         Of the events on the standard error.
     quiet : bool
         Whether events go to the file alone.
     manager : ServiceManager
-        Is told how the robot is doing.
+        Gets the state of the robot.
     health : HttpAddress or None
-        Where whoever asks is told the same.
+        Where HTTP requests get the same.
 
     Raises
     ------
@@ -109,8 +107,8 @@ def run_as_robot(
         If the robot holds still and cannot go on.
     """
     from holdfast.recording.robot_run import perform_trials
+    from holdfast.robot.health import RobotWatch
     from holdfast.runtime.logs import EventLog
-    from holdfast.runtime.robot_watch import RobotWatch
 
     reasons = _Reasons()
     sinks: list[EventSink] = [reasons]

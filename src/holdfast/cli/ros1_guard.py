@@ -5,85 +5,97 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
-from enum import StrEnum
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, ClassVar, Literal
 
-import typer
-
-from holdfast.cli.options import location, number, whole_number
 from holdfast.printable import printable
+from holdfast.runtime.command_line import (
+    Options,
+    flag,
+    location,
+    number,
+    one_of,
+    option,
+    whole_number,
+)
 
 if TYPE_CHECKING:
     from holdfast.ros.master.settings import GuardSettings
+    from holdfast.runtime.logs import LogFormat
 
-__all__ = ["ros1_guard"]
+__all__ = ["main"]
 
 
 _COMPONENT = "ros1-guard"
 
 
-class _Log(StrEnum):
-    text = "text"
-    json = "json"
-
-
-def ros1_guard(
-    port: Annotated[
-        int | None,
-        typer.Option(
-            metavar="N",
-            parser=whole_number("--port", 1, 65_535),
-            show_default=False,
-            help="The master's port. [default: that of ROS_MASTER_URI, or 11311]",
-        ),
-    ] = None,
-    silent_s: Annotated[
-        float,
-        typer.Option(
-            "--silent-s",
-            metavar="S",
-            parser=number("--silent-s", 0.5, 3600.0, "s"),
-            help="A master that has not answered for so long is killed and replaced.",
-        ),
-    ] = 3.0,
-    rosout: Annotated[bool, typer.Option(help="Have /rosout run, too, as roscore does.")] = True,
-    python: Annotated[
-        str, typer.Option(metavar="FILE", help="ROS's Python, which has rosmaster.")
-    ] = "/usr/bin/python3",
-    directory: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="DIR",
-            parser=location("--directory"),
-            show_default=False,
-            help="Where what the master knows is written down. [default: one of this user that "
-            "goes when the machine is started anew]",
-        ),
-    ] = None,
-    log: Annotated[
-        _Log, typer.Option(help="Form of the ready line and of the log on standard error.")
-    ] = _Log.text,
-) -> None:
+class GuardOptions(Options):
     """Guard the ROS 1 master: when it dies, the next one knows all that it knew.
 
-    Start it instead of roscore. It starts a master, or guards the one that is there, on this
-    machine, and /rosout. When the master is killed or hangs, a new one takes its place, with all
-    services, publishers, subscribers and parameters, whoever's they are; no node is started again,
-    and connections between nodes go on meanwhile. Ctrl-C or SIGTERM ends the guard and the master
-    that it started.
+    Start it instead of roscore. It starts a master, or guards the one that runs on this machine,
+    and /rosout. When the master is killed or hangs, a new one takes its place, with all services,
+    publishers, subscribers and parameters. No node is started again, and connections between nodes
+    go on meanwhile. Ctrl-C or SIGTERM ends the guard and the master that it started.
 
-    If the guard is killed, the master lives on: start another guard. If both are, it goes on where
-    they stopped, if a node of theirs is still there.
+    If the guard is killed, the master lives on: start another guard. If both are killed, the next
+    guard goes on where they stopped, if a node of theirs still runs.
     """
+
+    exit_codes: ClassVar = {0: "after SIGTERM"}
+
+    port: int | None = option(
+        "--port",
+        metavar="N",
+        read=whole_number(1, 65_535),
+        help="The master's port (default: that of ROS_MASTER_URI, or 11311).",
+    )
+    silent_s: float = option(
+        "--silent-s",
+        metavar="S",
+        read=number(0.5, 3600.0, "s"),
+        default=3.0,
+        help="A master that has not answered for this long is killed and replaced.",
+    )
+    rosout: bool = flag("--rosout", default=True, help="Run /rosout, too, as roscore does.")
+    python: str = option(
+        "--python",
+        metavar="FILE",
+        default="/usr/bin/python3",
+        help="ROS's Python, which has rosmaster.",
+    )
+    directory: Path | None = option(
+        "--directory",
+        metavar="DIR",
+        read=location,
+        help="Where the master's registrations are written (default: a directory of this user that "
+        "is gone after a restart of the machine).",
+    )
+    log: Literal["text", "json"] = option(
+        "--log",
+        metavar="FORMAT",
+        read=one_of("text", "json"),
+        default="text",
+        help="Form of the ready line and of the log on standard error: text or json.",
+    )
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Guard until a signal comes, and return the exit code."""
+    options = GuardOptions.parse("ros1-guard", arguments)
     from holdfast.ros.master.settings import GuardSettings, MasterAddress
 
-    address = MasterAddress.of(os.environ, port)
-    raise typer.Exit(_guard(GuardSettings(address, python, directory, silent_s, rosout), log))
+    settings = GuardSettings(
+        MasterAddress.of(os.environ, options.port),
+        options.python,
+        options.directory,
+        options.silent_s,
+        options.rosout,
+    )
+    return _guard(settings, options.log)
 
 
-def _guard(settings: GuardSettings, log: _Log) -> int:
-    """Guard until a signal comes, and return the exit status."""
+def _guard(settings: GuardSettings, log: LogFormat) -> int:
     import asyncio
     import signal
 
@@ -92,7 +104,7 @@ def _guard(settings: GuardSettings, log: _Log) -> int:
     from holdfast.runtime.service_manager import ServiceManager
 
     manager = ServiceManager()
-    events = EventLog(sys.stderr, format=log.value, component=_COMPONENT)
+    events = EventLog(sys.stderr, format=log, component=_COMPONENT)
 
     def ready(how: str) -> None:
         _say_ready(settings, log, how)
@@ -100,26 +112,26 @@ def _guard(settings: GuardSettings, log: _Log) -> int:
 
     async def run() -> signal.Signals:
         loop = asyncio.get_running_loop()
-        told: asyncio.Future[signal.Signals] = loop.create_future()
+        ended: asyncio.Future[signal.Signals] = loop.create_future()
 
-        def tell(number: signal.Signals) -> None:
-            if not told.done():
-                told.set_result(number)
+        def end(number: signal.Signals) -> None:
+            if not ended.done():
+                ended.set_result(number)
 
         for number in (signal.SIGINT, signal.SIGTERM):
             if signal.getsignal(number) is not signal.SIG_IGN:
-                loop.add_signal_handler(number, tell, number)
+                loop.add_signal_handler(number, end, number)
         manager.watch(loop, lambda: f"guards {settings.address.uri}")
         guarding = asyncio.create_task(MasterGuard(settings, events).run(ready))
-        await asyncio.wait((told, guarding), return_when=asyncio.FIRST_COMPLETED)
+        await asyncio.wait((ended, guarding), return_when=asyncio.FIRST_COMPLETED)
         if guarding.done():
             await guarding
-        events.event("stopping", reason=told.result().name)
+        events.event("stopping", reason=ended.result().name)
         manager.stopping()
         guarding.cancel()
         with contextlib.suppress(asyncio.CancelledError):
             await guarding
-        return told.result()
+        return ended.result()
 
     try:
         number = asyncio.run(run())
@@ -129,15 +141,15 @@ def _guard(settings: GuardSettings, log: _Log) -> int:
         events.close()
 
 
-def _say_ready(settings: GuardSettings, log: _Log, how: str) -> None:
+def _say_ready(settings: GuardSettings, log: LogFormat, how: str) -> None:
     uri = settings.address.uri
-    if log is _Log.json:
+    if log == "json":
         from holdfast.runtime.logs import EventLog
 
         with EventLog(sys.stdout, format="json", component=_COMPONENT) as line:
             line.event("ready", service=uri, pid=os.getpid(), master=how)
         return
-    # Nobody may be reading: that is no reason not to guard.
+    # A closed standard output is no reason not to guard.
     with contextlib.suppress(OSError, ValueError):
         sys.stdout.write(printable(f"guards the master at {uri}, which was {how}\n"))
         sys.stdout.flush()

@@ -1,4 +1,4 @@
-"""What ``holdfast serve`` offers to ROS besides its own service; nothing is imported unless asked.
+"""The services in ROS that ``holdfast serve`` offers besides its own.
 
 The service's own package knows nothing of ROS, so the command line brings the two together.
 """
@@ -13,17 +13,17 @@ from typing import TYPE_CHECKING, ClassVar
 from holdfast.errors import InvalidValueError, TransportError
 
 if TYPE_CHECKING:
-    from holdfast.configuration import Configuration
+    from holdfast.config.loader import Configuration
     from holdfast.ros.active_sensing import ActiveSensing
     from holdfast.ros.ros1_service import Ros1Server
-    from holdfast.ros.ros2_wire import Ros2Server
-    from holdfast.service.beside import Beside
-    from holdfast.service.options import Options
+    from holdfast.ros.ros2_service import Ros2Server
+    from holdfast.service.extensions import Extension
+    from holdfast.service.options import ServeOptions
 
 __all__ = ["make_ros_services"]
 
 
-def make_ros_services(options: Options) -> Sequence[Beside]:
+def make_ros_services(options: ServeOptions) -> Sequence[Extension]:
     """Return the services in ROS that the options of ``holdfast serve`` ask for.
 
     Raises
@@ -31,12 +31,12 @@ def make_ros_services(options: Options) -> Sequence[Beside]:
     HoldfastError
         If the configuration or an option cannot be used, or a library is missing.
     """
-    from holdfast.configuration import load
+    from holdfast.config.loader import load
     from holdfast.ros.active_sensing import ActiveSensing
 
     assert options.configuration is not None
     configuration = load(options.configuration)
-    services: list[Beside] = []
+    services: list[Extension] = []
     if options.ros2_domain is not None:
         services.append(_Ros2(ActiveSensing(configuration), options))
     if options.ros1:
@@ -77,8 +77,10 @@ class _Ros2(_OfRos):
 
     _wire = "ros2"
 
-    def __init__(self, service: ActiveSensing, options: Options) -> None:
-        from holdfast.ros.ros2_wire import Ros2Server, check_service_name, zenoh_module
+    def __init__(self, service: ActiveSensing, options: ServeOptions) -> None:
+        from holdfast.ros.ros2_keys import check_service_name
+        from holdfast.ros.ros2_service import Ros2Server
+        from holdfast.ros.zenoh_session import zenoh_module
 
         endpoint = options.ros2_listen or options.ros2_router
         assert options.ros2_domain is not None and endpoint is not None
@@ -104,29 +106,28 @@ class _Ros1(_OfRos):
 
     _wire = "ros1"
 
-    def __init__(self, configuration: Configuration, options: Options) -> None:
-        from holdfast.ros.ros1_service import Ros1ActiveSensing, Ros1Server
-        from holdfast.transport.tcpros import Surroundings
+    def __init__(self, configuration: Configuration, options: ServeOptions) -> None:
+        from holdfast.ros.ros1_service import Ros1Server
+        from holdfast.transport.tcpros import RosEnvironment
 
-        surroundings = Surroundings.of()
-        if surroundings.bind != "127.0.0.1" and not options.insecure:
+        ros_environment = RosEnvironment.of()
+        if ros_environment.bind != "127.0.0.1" and not options.insecure:
             raise InvalidValueError(
-                "--ros1: other machines can reach this service, and in ROS 1 nobody has to prove "
-                "who he is; set ROS_HOSTNAME=127.0.0.1 for nodes of this machine alone, or say "
+                "--ros1: other machines can reach this service, and in ROS 1 no peer proves "
+                "its identity; set ROS_HOSTNAME=127.0.0.1 for nodes of this machine alone, or say "
                 "--insecure"
             )
         try:
-            service = Ros1ActiveSensing(
+            self._server = Ros1Server(
                 configuration,
                 options.ros1_name,
-                surroundings,
+                ros_environment,
                 on_shutdown=self._end,
                 on_event=self._tell,
             )
         except TransportError as error:
             raise TransportError(f"--ros1-name: {error}") from None
-        self._server = Ros1Server(service)
-        self._where = f"{self._server.name} (master {surroundings.master})"
+        self._where = f"{self._server.name} (master {ros_environment.master})"
 
     def _end(self, reason: str) -> None:
         """End this process, as ROS asks a node to; it has the time that SIGTERM leaves."""

@@ -1,15 +1,25 @@
-"""``holdfast serve``, so that the list of commands has it; :func:`holdfast.cli.main` runs it."""
+"""``holdfast serve``: brings the service and what it may offer to ROS together."""
 
 from __future__ import annotations
 
-import typer
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
-__all__ = ["serve"]
+from holdfast.service import process
+
+if TYPE_CHECKING:
+    from holdfast.service.extensions import Extension
+    from holdfast.service.options import ServeOptions
+
+__all__ = ["main"]
 
 
-def serve(context: typer.Context) -> None:
-    """Decide for robots, as a service; see holdfast serve --help."""
+def main(arguments: Sequence[str]) -> int:
+    """Serve until a signal ends it, and return the exit code."""
+    return process.main(arguments, _make_extensions)
+
+
+def _make_extensions(options: ServeOptions) -> Sequence[Extension]:
     from holdfast.cli.ros_services import make_ros_services
-    from holdfast.service.process import main
 
-    raise typer.Exit(main(context.args, make_ros_services))
+    return make_ros_services(options)

@@ -1,8 +1,8 @@
-"""The standard streams of the command, which may be closed, full, or read by nobody any more.
+"""The standard streams of the command, which may be closed, full, or without a reader.
 
-What is said on the standard error is for whoever looks on. Nobody looking on is no reason to end a
-run. What is written to the standard output was asked for: a command whose reader has had enough
-(``holdfast simulate --story | head``) ends as the system's own tools do, without a word.
+A standard error that cannot be written is no reason to end a run. The standard output holds
+results: a command whose reader has ended (``holdfast simulate --story | head``) ends quietly, as
+the system's own tools do.
 """
 
 from __future__ import annotations
@@ -13,25 +13,20 @@ import signal
 import sys
 from typing import TYPE_CHECKING, TextIO
 
-from holdfast.errors import HoldfastError
+from holdfast.errors import UnwritableOutputError
 
 if TYPE_CHECKING:
     from _typeshed import ReadableBuffer
 
 __all__ = [
     "EXIT_UNREAD",
-    "UnwritableOutputError",
-    "end_with_the_reader",
-    "forgive_unwritable_errors",
+    "end_with_reader",
+    "ignore_unwritable_stderr",
     "replace_closed_streams",
 ]
 
 EXIT_UNREAD = 128 + signal.SIGPIPE
-"""Nobody reads the standard output any more: 141, as of a program that SIGPIPE has ended."""
-
-
-class UnwritableOutputError(HoldfastError):
-    """The standard output cannot be written, for another reason than that nobody reads it."""
+"""The standard output has no reader any more: 141, as after SIGPIPE."""
 
 
 def replace_closed_streams() -> None:
@@ -48,26 +43,26 @@ def replace_closed_streams() -> None:
             setattr(sys, name, stream)
 
 
-def forgive_unwritable_errors() -> None:
-    """Let what cannot be written to the standard error be lost, and nothing else.
+def ignore_unwritable_stderr() -> None:
+    """Drop output that cannot be written to the standard error, and go on.
 
     A full disk, a terminal that is gone or a pipe whose reader has ended would otherwise raise
     wherever something is said, and once more at the end of the process.
     """
     before = sys.stderr
-    # Else it is somebody else's.
+    # Otherwise it was replaced, by a test for instance.
     if before is sys.__stderr__ and isinstance(before, io.TextIOWrapper):
-        sys.stderr = _over(before, _ForgivingFile, line_buffering=True)
+        sys.stderr = _over(before, _LossyFile, line_buffering=True)
 
 
-def end_with_the_reader() -> None:
-    """Let what cannot be written to the standard output end the command.
+def end_with_reader() -> None:
+    """End the command when the standard output cannot be written.
 
-    Quietly with :data:`EXIT_UNREAD` if nobody reads it, else by an :class:`UnwritableOutputError`;
-    what comes after that, such as what is still buffered, is lost.
+    Quietly with :data:`EXIT_UNREAD` if it has no reader, otherwise by an
+    :class:`UnwritableOutputError`. Later output, such as the rest of a buffer, is lost.
     """
     before = sys.stdout
-    # Else it is somebody else's.
+    # Otherwise it was replaced, by a test for instance.
     if before is sys.__stdout__ and isinstance(before, io.TextIOWrapper):
         sys.stdout = _over(before, _EndingFile)
 
@@ -108,13 +103,13 @@ class _EndingFile(io.FileIO):
             ) from error
 
 
-class _ForgivingFile(io.FileIO):
-    """A file of which whatever cannot be written counts as written."""
+class _LossyFile(io.FileIO):
+    """A file that drops what it cannot write."""
 
     def write(self, data: ReadableBuffer, /) -> int:
         try:
             written: int | None = super().write(data)
         except OSError:
             written = None
-        # None also if it would block: an unread pipe that somebody else has set so.
+        # None also if it would block: an unread pipe that is set to non-blocking.
         return memoryview(data).nbytes if written is None else written

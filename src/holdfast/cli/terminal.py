@@ -1,4 +1,4 @@
-"""What a person at a terminal sees of a run: how far it is, what it came to, where its files are.
+"""What a person at a terminal sees of a run: its progress, its summary and its files.
 
 Progress goes to the standard error, so that the standard output holds results alone.
 """
@@ -16,23 +16,19 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.progress import Progress
 
-    from holdfast.configuration import Configuration
+    from holdfast.config.loader import Configuration
     from holdfast.outcome import TrialResult
-    from holdfast.recording.journal import Tally
+    from holdfast.recording.journal_reader import Tally
     from holdfast.recording.tables import RunSummary
 
 __all__ = [
-    "LiveProgress",
-    "PlainProgress",
     "ProgressLine",
-    "QuietProgress",
     "RunDisplay",
     "counted",
     "duration",
     "print_files",
     "print_summary",
     "progress_line",
-    "run_display",
 ]
 
 _PLAIN_INTERVAL_S = 5.0
@@ -47,7 +43,7 @@ class ProgressLine(Protocol):
         ...
 
     def show(self, finished: int, note: str) -> None:
-        """Show how many are finished now, and what is to be said of them."""
+        """Show how many are finished now, with a note."""
         ...
 
     def say(self, text: str) -> None:
@@ -65,35 +61,29 @@ def progress_line(total: int, *, quiet: bool, noun: str = "trial") -> ProgressLi
     Parameters
     ----------
     total : int
-        Trials.
-    quiet : bool
-        Whether to show nothing.
+        Number of trials.
     noun : str
-        What the trials are called.
+        Name of a trial.
     """
     if quiet:
-        return QuietProgress()
+        return _Quiet()
     if sys.stderr.isatty():
         from rich.console import Console
 
-        return LiveProgress(total, Console(stderr=True), noun)
-    return PlainProgress(total, noun)
+        return _Live(total, Console(stderr=True), noun)
+    return _Plain(total, noun)
 
 
-class QuietProgress:
+class _Quiet:
     """Shows nothing."""
 
-    def start(self, title: str, finished: int, note: str) -> None:
-        """Do nothing."""
+    def start(self, title: str, finished: int, note: str) -> None: ...
 
-    def show(self, finished: int, note: str) -> None:
-        """Do nothing."""
+    def show(self, finished: int, note: str) -> None: ...
 
-    def say(self, text: str) -> None:
-        """Do nothing."""
+    def say(self, text: str) -> None: ...
 
-    def stop(self) -> None:
-        """Do nothing."""
+    def stop(self) -> None: ...
 
 
 class _Speed:
@@ -114,14 +104,8 @@ class _Speed:
         return "-" if rate is None else f"{rate:.3g} {self._noun}s/s"
 
 
-class PlainProgress:
-    """A line now and then, for logs.
-
-    Parameters
-    ----------
-    total : int
-    noun : str
-    """
+class _Plain:
+    """A line now and then, for logs."""
 
     def __init__(self, total: int, noun: str) -> None:
         self._total = total
@@ -130,14 +114,12 @@ class PlainProgress:
         self._last = 0.0
 
     def start(self, title: str, finished: int, note: str) -> None:
-        """Begin, with what an earlier part has finished."""
         del note
         self._speed = _Speed(finished, self._noun)
         self._last = perf_counter()
         self.say(title)
 
     def show(self, finished: int, note: str) -> None:
-        """Write a line, if it is time to."""
         now = perf_counter()
         if now - self._last < _PLAIN_INTERVAL_S or finished == self._total:
             return
@@ -148,24 +130,14 @@ class PlainProgress:
         self.say(f"{finished}/{self._total} {self._noun}s, {note}, {speed}{left} left")
 
     def say(self, text: str) -> None:
-        """Write a line."""
         sys.stderr.write(f"{printable(text)}\n")
         sys.stderr.flush()
 
-    def stop(self) -> None:
-        """Do nothing."""
+    def stop(self) -> None: ...
 
 
-class LiveProgress:
-    """A line that moves, for people.
-
-    Parameters
-    ----------
-    total : int
-    console : Console
-        Of rich, on a terminal.
-    noun : str
-    """
+class _Live:
+    """A line that moves, for people; the console is one of rich on a terminal."""
 
     def __init__(self, total: int, console: Console, noun: str) -> None:
         self._total = total
@@ -175,7 +147,6 @@ class LiveProgress:
         self._progress: Progress | None = None
 
     def start(self, title: str, finished: int, note: str) -> None:
-        """Begin, with what an earlier part has finished."""
         from rich.progress import (
             BarColumn,
             MofNCompleteColumn,
@@ -206,34 +177,24 @@ class LiveProgress:
         self._progress.start()
 
     def show(self, finished: int, note: str) -> None:
-        """Move the line."""
         if self._progress is not None:
             rate = self._speed.text(finished)
             self._progress.update(self._task, completed=finished, note=note, rate=rate)
 
     def say(self, text: str) -> None:
-        """Print a line above it."""
         self._console.print(printable(text), highlight=False, markup=False, soft_wrap=True)
 
     def stop(self) -> None:
-        """Take the line away."""
         if self._progress is not None:
             self._progress.stop()
 
 
 class RunDisplay:
-    """Shows how far a run is.
+    """Shows how far a run is."""
 
-    Parameters
-    ----------
-    configuration : Configuration
-        Of the run.
-    line : ProgressLine
-    """
-
-    def __init__(self, configuration: Configuration, line: ProgressLine) -> None:
+    def __init__(self, configuration: Configuration, *, quiet: bool) -> None:
         self._configuration = configuration
-        self._line = line
+        self._line = progress_line(configuration.simulator.num_trials, quiet=quiet)
         self._finished = 0
         self._successes = 0
         self._failures = 0
@@ -267,22 +228,8 @@ class RunDisplay:
         return f"success {share}" + (f", {self._failures:,} failed" if self._failures else "")
 
 
-def run_display(configuration: Configuration, *, quiet: bool) -> RunDisplay:
-    """Return what shows how far a run is.
-
-    Parameters
-    ----------
-    configuration : Configuration
-        Of the run.
-    quiet : bool
-        Whether to show nothing.
-    """
-    line = progress_line(configuration.simulator.num_trials, quiet=quiet)
-    return RunDisplay(configuration, line)
-
-
 def print_summary(summary: RunSummary) -> None:
-    """Print what a run came to."""
+    """Print the summary of a run."""
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
@@ -313,7 +260,7 @@ def _verified_text(summary: RunSummary) -> str:
 
 
 def _summary_rows(summary: RunSummary) -> list[tuple[str, str]]:
-    from holdfast.belief import UNEXPLAINED_DEVIATIONS_SQUARED
+    from holdfast.belief import VALIDATION_GATE_SQUARED
     from holdfast.protocol.verification import OWN_PLANNER
 
     rows = []
@@ -344,7 +291,7 @@ def _summary_rows(summary: RunSummary) -> list[tuple[str, str]]:
             )
         )
     if summary.unexplained_observations:
-        deviations = f"{UNEXPLAINED_DEVIATIONS_SQUARED**0.5:g}"
+        deviations = f"{VALIDATION_GATE_SQUARED**0.5:g}"
         rows.append(
             (
                 "unexplained",
@@ -369,13 +316,7 @@ def _summary_rows(summary: RunSummary) -> list[tuple[str, str]]:
 
 
 def print_files(directory: Path) -> None:
-    """Print which files a run has left.
-
-    Parameters
-    ----------
-    directory : Path
-        Of the run.
-    """
+    """Print which files a run has left in its directory."""
     from holdfast.recording.run_directory import output_names
 
     names = [name for name in output_names() if (directory / name).exists()]

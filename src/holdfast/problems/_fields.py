@@ -21,7 +21,7 @@ __all__ = [
     "Step",
     "Tolerance",
     "Variance",
-    "checked",
+    "validated",
 ]
 
 Coordinate = Annotated[float, msgspec.Meta(ge=-1e5, le=1e5)]
@@ -37,7 +37,7 @@ Seed = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
 StructT = TypeVar("StructT", bound=msgspec.Struct)
 
 
-def checked(section: str, settings: StructT) -> StructT:
+def validated(section: str, settings: StructT) -> StructT:
     """Return settings whose fields have the declared types and bounds.
 
     msgspec checks what it decodes, not what a constructor is given.
@@ -46,7 +46,6 @@ def checked(section: str, settings: StructT) -> StructT:
     ----------
     section : str
         Name of the section in the configuration, for the message.
-    settings : msgspec.Struct
 
     Raises
     ------

@@ -11,9 +11,9 @@ from typing import Annotated, ClassVar, Literal
 
 import msgspec
 import numpy as np
-import numpy.typing as npt
 
 from holdfast import _kernel
+from holdfast.arrays import BoolArray, FloatArray, IntArray
 from holdfast.errors import InvalidValueError
 from holdfast.geometry import DiscWorld
 from holdfast.problems._fields import (
@@ -25,9 +25,9 @@ from holdfast.problems._fields import (
     Step,
     Tolerance,
     Variance,
-    checked,
+    validated,
 )
-from holdfast.problems.problem import FloatArray, IntArray, Scene
+from holdfast.problems.problem import Scene
 from holdfast.problems.rigid_body import RigidBodyProblem, constant
 
 __all__ = ["CapsuleRobot", "CapsuleRobotModel", "CapsuleRobotPlanner", "Target", "Wall"]
@@ -157,11 +157,6 @@ class CapsuleRobot(RigidBodyProblem):
     the last one comes the goal. Every sensing action observes both coordinates, with variances
     of its own.
 
-    Parameters
-    ----------
-    model : CapsuleRobotModel
-    state_space_planner : CapsuleRobotPlanner
-
     Raises
     ------
     InvalidValueError
@@ -182,8 +177,8 @@ class CapsuleRobot(RigidBodyProblem):
         model: CapsuleRobotModel | None = None,
         state_space_planner: CapsuleRobotPlanner | None = None,
     ) -> None:
-        model = checked("model", model or CapsuleRobotModel())
-        planner = checked("state_space_planner", state_space_planner or CapsuleRobotPlanner())
+        model = validated("model", model or CapsuleRobotModel())
+        planner = validated("state_space_planner", state_space_planner or CapsuleRobotPlanner())
         _check_count("model.num_walls", model.num_walls, "walls", len(model.walls))
         _check_count(
             "state_space_planner.num_via_points",
@@ -259,7 +254,7 @@ class CapsuleRobot(RigidBodyProblem):
             self._path_policy, states, stage, offsets, self._collision_tolerance, threads
         )
 
-    def is_goal(self, states: FloatArray) -> npt.NDArray[np.bool_]:
+    def is_goal(self, states: FloatArray) -> BoolArray:
         """Tell where the centre is within the goal's radius."""
         return np.asarray(_squared_distance(states, self._centers[-1]) < self._squared_radii[-1])
 

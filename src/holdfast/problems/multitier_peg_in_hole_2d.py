@@ -11,9 +11,9 @@ from typing import Annotated, ClassVar
 
 import msgspec
 import numpy as np
-import numpy.typing as npt
 
 from holdfast import _kernel
+from holdfast.arrays import BoolArray, FloatArray, IntArray
 from holdfast.errors import InvalidValueError
 from holdfast.geometry import FAR, RectangleWorld
 from holdfast.problems._fields import (
@@ -25,9 +25,9 @@ from holdfast.problems._fields import (
     Step,
     Tolerance,
     Variance,
-    checked,
+    validated,
 )
-from holdfast.problems.problem import FloatArray, IntArray, Scene
+from holdfast.problems.problem import Scene
 from holdfast.problems.rigid_body import PegProblem, constant, upright_limit
 
 __all__ = [
@@ -125,11 +125,6 @@ class MultitierPegInHole2D(PegProblem):
     when the peg's centre is below the last hole's centre and within its tolerance of its axis.
     The policy turns the peg once its centre is within half its width of the hole's axis.
 
-    Parameters
-    ----------
-    model : MultitierPegInHole2DModel
-    state_space_planner : MultitierPegInHole2DPlanner
-
     Raises
     ------
     InvalidValueError
@@ -152,8 +147,8 @@ class MultitierPegInHole2D(PegProblem):
         model: MultitierPegInHole2DModel | None = None,
         state_space_planner: MultitierPegInHole2DPlanner | None = None,
     ) -> None:
-        model = checked("model", model or MultitierPegInHole2DModel())
-        planner = checked(
+        model = validated("model", model or MultitierPegInHole2DModel())
+        planner = validated(
             "state_space_planner", state_space_planner or MultitierPegInHole2DPlanner()
         )
         width, height = model.peg_dim
@@ -214,7 +209,7 @@ class MultitierPegInHole2D(PegProblem):
             self._path_policy, states, stage, offsets, self._collision_tolerance, threads
         )
 
-    def is_goal(self, states: FloatArray) -> npt.NDArray[np.bool_]:
+    def is_goal(self, states: FloatArray) -> BoolArray:
         """Tell where the peg's centre is below that of the last hole, near its axis."""
         last = self.model.holes[-1]
         return np.asarray(

@@ -12,9 +12,9 @@ from typing import ClassVar, Literal
 
 import msgspec
 import numpy as np
-import numpy.typing as npt
 
 from holdfast import _kernel
+from holdfast.arrays import BoolArray, FloatArray, IntArray
 from holdfast.geometry import FAR, RectangleWorld
 from holdfast.problems._fields import (
     Coordinate,
@@ -23,9 +23,9 @@ from holdfast.problems._fields import (
     Step,
     Tolerance,
     Variance,
-    checked,
+    validated,
 )
-from holdfast.problems.problem import FloatArray, IntArray, Scene
+from holdfast.problems.problem import Scene
 from holdfast.problems.rigid_body import PegProblem, upright_limit
 
 __all__ = ["PegInHole2D", "PegInHole2DModel", "PegInHole2DPlanner"]
@@ -86,11 +86,6 @@ class PegInHole2D(PegProblem):
     height. The goal is reached when the peg is half-way in: x and y are below the tolerance in
     size. The policy turns the peg once its centre is within half its width of the hole's axis.
 
-    Parameters
-    ----------
-    model : PegInHole2DModel
-    state_space_planner : PegInHole2DPlanner
-
     Raises
     ------
     InvalidValueError
@@ -113,8 +108,8 @@ class PegInHole2D(PegProblem):
         model: PegInHole2DModel | None = None,
         state_space_planner: PegInHole2DPlanner | None = None,
     ) -> None:
-        model = checked("model", model or PegInHole2DModel())
-        planner = checked("state_space_planner", state_space_planner or PegInHole2DPlanner())
+        model = validated("model", model or PegInHole2DModel())
+        planner = validated("state_space_planner", state_space_planner or PegInHole2DPlanner())
         half_hole = 0.5 * model.peg_width + model.hole_tolerance
         floor = -0.5 * model.peg_height - model.hole_tolerance
         super().__init__(
@@ -167,7 +162,7 @@ class PegInHole2D(PegProblem):
             self._path_policy, states, stage, offsets, self._collision_tolerance, threads
         )
 
-    def is_goal(self, states: FloatArray) -> npt.NDArray[np.bool_]:
+    def is_goal(self, states: FloatArray) -> BoolArray:
         """Tell where the peg is half-way in the hole."""
         tolerance = self._tolerance
         return np.asarray(

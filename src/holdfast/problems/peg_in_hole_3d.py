@@ -11,9 +11,9 @@ from typing import ClassVar
 
 import msgspec
 import numpy as np
-import numpy.typing as npt
 
 from holdfast import _kernel
+from holdfast.arrays import BoolArray, FloatArray, IntArray
 from holdfast.errors import InvalidValueError
 from holdfast.geometry import FAR, BoxWorld
 from holdfast.problems._fields import (
@@ -23,9 +23,9 @@ from holdfast.problems._fields import (
     Step,
     Tolerance,
     Variance,
-    checked,
+    validated,
 )
-from holdfast.problems.problem import FloatArray, IntArray, Scene
+from holdfast.problems.problem import Scene
 from holdfast.problems.rigid_body import PegProblem, upright_limit
 
 __all__ = ["PegInHole3D", "PegInHole3DModel", "PegInHole3DPlanner"]
@@ -104,11 +104,6 @@ class PegInHole3D(PegProblem):
     The resolution of each coordinate is what the motion noise blurs in a step, 0.071 m and
     0.032 rad: metres and radians are not added as if they were the same.
 
-    Parameters
-    ----------
-    model : PegInHole3DModel
-    state_space_planner : PegInHole3DPlanner
-
     Raises
     ------
     InvalidValueError
@@ -137,8 +132,8 @@ class PegInHole3D(PegProblem):
         model: PegInHole3DModel | None = None,
         state_space_planner: PegInHole3DPlanner | None = None,
     ) -> None:
-        model = checked("model", model or PegInHole3DModel())
-        planner = checked("state_space_planner", state_space_planner or PegInHole3DPlanner())
+        model = validated("model", model or PegInHole3DModel())
+        planner = validated("state_space_planner", state_space_planner or PegInHole3DPlanner())
         super().__init__(
             BoxWorld(model.peg_dim, _plate_and_walls(model)),
             init_mean=model.init_mean,
@@ -185,7 +180,7 @@ class PegInHole3D(PegProblem):
             self._path_policy, states, stage, offsets, self._collision_tolerance, threads
         )
 
-    def is_goal(self, states: FloatArray) -> npt.NDArray[np.bool_]:
+    def is_goal(self, states: FloatArray) -> BoolArray:
         """Tell where the peg is half-way in the hole."""
         near = np.abs(states[..., 0:3]) < self._tolerance
         return np.asarray(near.all(axis=-1))

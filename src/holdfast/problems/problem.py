@@ -1,4 +1,4 @@
-"""What a problem is: a plain object of NumPy functions.
+"""The contract of a problem: a plain object of NumPy functions.
 
 A problem says how the world moves, what a sensing action would show, what the task planner does in
 a known state, and when the task is done. Everything else (the belief, the entropies, the choice)
@@ -11,8 +11,8 @@ A function is called with any of these and returns the same leading shape, as fl
 that it is given are read-only: make a new one instead of changing them.
 
 Two threads never use one instance at the same time, but a run has several instances, and each may
-be asked anything in any order. So what an instance keeps from one call to the next (a buffer, a
-cache) must not show in what it returns.
+be called with anything in any order. So what an instance keeps from one call to the next (a buffer,
+a cache) must not change what it returns.
 
 Observations are Gaussian, by :meth:`Problem.observation_mean` and
 :meth:`Problem.observation_variance`, unless the problem has the two methods of
@@ -25,8 +25,8 @@ it is asked; for further ones ask ``stream.substream(1)``, ``stream.substream(2)
 
 To have the same decisions, bit for bit, on every machine, a problem uses only operations that IEEE
 754 defines exactly (``+ - * /``, ``np.sqrt``, comparisons, ``np.where``) and takes ``exp``,
-``sin``, sums and the like from :mod:`holdfast.numerics`. One that does not still works: then only
-the checkpoint, not a recomputation, carries a state from one machine to another.
+``sin``, sums and the like from :mod:`holdfast.numerics`. A problem with other operations works,
+too, but then another machine needs the checkpoint of a state and cannot compute the state again.
 """
 
 from __future__ import annotations
@@ -37,27 +37,23 @@ from typing import Any, Protocol, Self, runtime_checkable
 import numpy as np
 import numpy.typing as npt
 
+from holdfast.arrays import BoolArray, FloatArray, IntArray
 from holdfast.errors import ProblemError
 from holdfast.randomness import Stream
 
 __all__ = [
     "BatchedMotionProblem",
     "ExpectedMotionProblem",
-    "FloatArray",
     "GeneralObservationProblem",
-    "IntArray",
     "KnownStateReturnProblem",
     "Problem",
     "ProblemBase",
     "Scene",
 ]
 
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
-
 
 class Scene:
-    """What of a problem can be drawn: the plane of two coordinates, its obstacles and the body.
+    """The drawing of a problem: the plane of two coordinates, its obstacles and the body.
 
     Parameters
     ----------
@@ -186,7 +182,7 @@ class Problem(Protocol):
         """Return the reward of executed ``actions`` that led to ``states``, leading shape."""
         ...
 
-    def is_goal(self, states: FloatArray) -> npt.NDArray[np.bool_]:
+    def is_goal(self, states: FloatArray) -> BoolArray:
         """Tell which states end the task with success, of the leading shape."""
         ...
 

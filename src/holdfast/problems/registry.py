@@ -1,37 +1,99 @@
-"""Problems by name.
+"""Problems by name: holdfast's own, those of installed packages, and single files.
 
-A package registers its problems as entry points of the group ``holdfast.problems``; a single file
-needs no registration and is named ``module:Class``. holdfast's own problems are registered as well,
-but they are found without a search through everything that is installed: that takes longer than
-all else that a service does before it can decide.
+The table below is the only place that names holdfast's own problems. They are found without a
+search through everything installed, which takes longer than all else that a service does before it
+can decide. Another package registers its problems as entry points of the group
+``holdfast.problems``. A single file needs no registration: its problem is ``module:Class``.
 """
 
 from __future__ import annotations
 
 import importlib
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from holdfast.errors import UnknownProblemError
+import msgspec
 
-__all__ = ["BUILT_IN", "names", "problem_class", "problem_module"]
+from holdfast.errors import InvalidValueError, UnknownProblemError
+from holdfast.problems.problem import Problem
+
+__all__ = ["BUILT_IN", "BuiltIn", "make", "names", "problem_class", "problem_module"]
 
 GROUP = "holdfast.problems"
 
+
+class BuiltIn(NamedTuple):
+    """One of holdfast's own problems.
+
+    Attributes
+    ----------
+    place : str
+        Module and class.
+    signature_keys : frozenset of str
+        Keys of the section ``model`` that only this problem has together. The thesis's files do
+        not name their problem; these keys tell it.
+    """
+
+    place: str
+    signature_keys: frozenset[str]
+
+
 BUILT_IN = {
-    "peg_in_hole_2d": "holdfast.problems.peg_in_hole_2d:PegInHole2D",
-    "multitier_peg_in_hole_2d": "holdfast.problems.multitier_peg_in_hole_2d:MultitierPegInHole2D",
-    "capsule_robot": "holdfast.problems.capsule_robot:CapsuleRobot",
-    "peg_in_hole_3d": "holdfast.problems.peg_in_hole_3d:PegInHole3D",
+    "peg_in_hole_2d": BuiltIn(
+        "holdfast.problems.peg_in_hole_2d:PegInHole2D", frozenset({"peg_width"})
+    ),
+    "multitier_peg_in_hole_2d": BuiltIn(
+        "holdfast.problems.multitier_peg_in_hole_2d:MultitierPegInHole2D", frozenset({"holes"})
+    ),
+    "capsule_robot": BuiltIn(
+        "holdfast.problems.capsule_robot:CapsuleRobot", frozenset({"robot_radius"})
+    ),
+    "peg_in_hole_3d": BuiltIn(
+        "holdfast.problems.peg_in_hole_3d:PegInHole3D", frozenset({"peg_dim", "hole_tolerance"})
+    ),
 }
-"""holdfast's own problems; the same as their entry points."""
+"""holdfast's own problems by name."""
 
 
 def names() -> list[str]:
-    """Return the registered names, sorted."""
-    from holdfast.user_code import registered_names
+    """Return all names, built in and registered, sorted."""
+    from holdfast.config.user_code import registered_names
 
-    return registered_names(GROUP)
+    return sorted({*BUILT_IN, *registered_names(GROUP)})
+
+
+def make(name: str, **settings: Any) -> Problem:
+    """Build a problem.
+
+    Parameters
+    ----------
+    name : str
+        A registered name, or ``module:Class``.
+    **settings
+        Keys of the sections ``model`` and ``state_space_planner`` of a configuration
+        (docs/problems.md); those left out have their defaults.
+
+    Raises
+    ------
+    UnknownProblemError
+        If there is no such problem.
+    InvalidValueError, ProblemError
+        If the problem does not take these settings.
+    """
+    kind = problem_class(name)
+    planner_keys = getattr(getattr(kind, "StateSpacePlanner", None), "__struct_fields__", ())
+    planner = {key: settings.pop(key) for key in planner_keys if key in settings}
+    model_keys = getattr(getattr(kind, "Model", None), "__struct_fields__", None)
+    if model_keys is not None:
+        for key in settings:
+            if key not in model_keys:
+                allowed = ", ".join([*model_keys, *planner_keys])
+                raise InvalidValueError(f"{name} has no setting {key!r}; allowed: {allowed}")
+    try:
+        problem: Problem = kind.from_settings(settings, planner)
+    except msgspec.ValidationError as error:
+        raise InvalidValueError(f"{name}: {error}") from error
+    return problem
 
 
 def problem_class(name: str, search_directory: Path | None = None) -> type[Any]:
@@ -56,35 +118,33 @@ def problem_class(name: str, search_directory: Path | None = None) -> type[Any]:
         If the name is not registered, or the module or its class cannot be imported.
     """
     if name in BUILT_IN:
-        module_name, _, class_name = BUILT_IN[name].partition(":")
+        module_name, _, class_name = BUILT_IN[name].place.partition(":")
         built_in: type[Any] = getattr(importlib.import_module(module_name), class_name)
         return built_in
-    from holdfast.user_code import find_class
+    from holdfast.config.user_code import find_class
 
     return find_class(
         name,
         what="problem",
         group=GROUP,
+        built_in=BUILT_IN,
         search_directory=search_directory,
         error_type=UnknownProblemError,
     )
 
 
 def problem_module(name: str) -> str | None:
-    """Return the name of the module in which a problem's class is looked up.
+    """Return the module of a problem's class; None for a name that is not registered.
 
     Parameters
     ----------
     name : str
         A registered name, or ``module:Class``.
-
-    Returns
-    -------
-    str or None
-        None for a name that is not registered.
     """
-    place = name if ":" in name else BUILT_IN.get(name)
-    if place is None and name:
+    place = name if ":" in name else None
+    if name in BUILT_IN:
+        place = BUILT_IN[name].place
+    elif place is None and name:
         import importlib.metadata
 
         found = importlib.metadata.entry_points(group=GROUP, name=name)

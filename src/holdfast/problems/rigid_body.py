@@ -15,9 +15,10 @@ import msgspec
 import numpy as np
 
 from holdfast import numerics
+from holdfast.arrays import FloatArray
 from holdfast.errors import InvalidValueError
 from holdfast.geometry import MAX_NOISE_ATTEMPTS, BoxWorld, DiscWorld, RectangleWorld
-from holdfast.problems.problem import FloatArray, ProblemBase
+from holdfast.problems.problem import ProblemBase
 from holdfast.randomness import NOISE_FREE, Stream
 
 __all__ = ["PegProblem", "RigidBodyProblem", "constant", "upright_limit"]

@@ -1,58 +1,60 @@
-"""What services answer is not taken on trust: the robot computes some of it again.
+"""Services are not trusted blindly: the robot's own planner recomputes some of their answers.
 
-A service is a calculator, and a calculator can be faulty, out of date or in the wrong hands. The
-robot holds the truth and has a planner of its own, so it can tell. Three things make it look:
+A service can be faulty, outdated or in the wrong hands. The robot holds the true state and has a
+planner, so it can check. It does so in three cases:
 
-- an action that the problem's own ``execute`` would not let through;
-- two answers to one question that are not the same;
-- chance: a share of the questions, drawn with a secret of the robot, so no service knows which.
+- an action that the problem's ``execute`` would change (it is outside the limits);
+- two answers to one question that differ;
+- a random share of the questions, selected with the robot's secret, so no service can predict it.
 
-In the first two cases the robot waits for its own planner and does what that says. In the third it
-goes on, and its planner computes while the robot moves. Whoever answered otherwise than the robot's
-own planner is not asked again in this run.
+In the first two cases the robot waits for its own planner and follows that. In the third it follows
+the service, and the planner computes while the robot moves. A service whose answer differs from the
+own planner's is not asked again in this run.
 
-Before a service is blamed for an action that was possible, the planner decides a second time, with
-an instance of the problem made anew. If it comes to something else than the first time, the problem
-itself is not deterministic, and nobody is to blame. Until then nothing that the service says is
-followed without asking the planner.
+Before a service is blamed for an action within the limits, the planner decides a second time, with
+a new instance of the problem. If it disagrees with itself, the problem is not deterministic and no
+service is blamed. Until that is known, every answer of the service is disputed.
 """
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-from holdfast.errors import HoldfastError
-from holdfast.session.effects import Decide, Effect, Report, Verified
-from holdfast.session.events import Decided
-from holdfast.session.messages import DIGEST_SIZE, SensingAnswer
-from holdfast.session.question import Given, Provenance, Question, same_actions
+from holdfast import checked
+from holdfast.arrays import FloatArray
+from holdfast.errors import OwnDecisionError
+from holdfast.problems.problem import Problem
+from holdfast.protocol.events import (
+    ComputeOwnAnswer,
+    Effects,
+    OwnAnswer,
+    RobotEffect,
+    VerificationNoted,
+)
+from holdfast.protocol.messages import DIGEST_SIZE, SensingAnswer
+from holdfast.protocol.question import AnswerPart, Provenance, Question, same_actions
 
-__all__ = ["OWN_PLANNER", "OwnDecisionError", "Verification", "WrongAnswer"]
+__all__ = ["OWN_PLANNER", "Verification", "WrongAnswer"]
 
-FloatArray = npt.NDArray[np.float64]
 
 OWN_PLANNER = "in_process"
-"""What the planner in the robot's own process is called where services have names."""
+"""Name of the planner in the robot's own process, where services have names."""
+
+_MAX_PARTS = 64
+"""Bound on the parts of one question's answer that are kept to be compared."""
 
 MAX_OPEN_CHECKS = 64
-"""Bound on the questions that wait for the robot's own planner; more are left out, and counted."""
-
-
-class OwnDecisionError(HoldfastError):
-    """Answers disagree, and the robot's own planner cannot say which is right."""
+"""Bound on the questions that wait for the own planner; further ones are left out and counted."""
 
 
 class WrongAnswer(NamedTuple):
-    """A service answered otherwise than the robot's own planner.
+    """A service's answer that differs from the own planner's.
 
     Attributes
     ----------
-    service : str
     step : int
         Of the question.
     kind : {"task", "sensing"}
@@ -64,26 +66,26 @@ class WrongAnswer(NamedTuple):
 
 
 class Verification:
-    """Decides what is computed again, and who was wrong.
+    """Takes the parts of answers, has some recomputed and finds the service that was wrong.
+
+    It alone writes into the answer of a question that services answer.
 
     Parameters
     ----------
     share : float
         Of the questions that services answer, from 0 to 1.
     secret : bytes
-        Of the robot: with it, and the question's digest, it is drawn which ones.
+        Of the robot; selects the questions, together with their digests.
     exempt : str or None
-        A service that is not drawn: the local one, which is the same code on the same machine.
-    limited : callable
-        What the problem's ``execute`` makes of actions, shape ``(count, action_size)`` in and out.
-    effects : list of Effect
-        What is to be computed and told is added to it.
+        A service that is not sampled: the local one, which runs the same code on the same machine.
+    effects : Effects
+        Receives what is to be computed and logged.
 
     Attributes
     ----------
-    limits_tell : bool
-        Whether an action that ``execute`` would change is a wrong one. False once a right one was
-        changed: the robot has to compare each action with its own planner's then.
+    limits_are_reliable : bool
+        Whether an action that ``execute`` would change must be wrong. False once ``execute`` has
+        changed a correct one; then the robot compares each action with its own planner's.
     """
 
     def __init__(
@@ -91,33 +93,33 @@ class Verification:
         share: float,
         secret: bytes,
         exempt: str | None,
-        limited: Callable[[FloatArray], FloatArray],
-        effects: list[Effect],
+        problem: Problem,
+        effects: Effects[RobotEffect],
     ) -> None:
         self._share = share
         self._secret = secret[:64]
         self._exempt = exempt
-        self._limited = limited
+        self._problem = problem
         self._effects = effects
         self._asked: dict[int, Question] = {}
         self._number = 0
         # By the question in which they differed from the robot's own planner.
         self._suspects: dict[str, Question] = {}
         self._wrong: list[WrongAnswer] = []
-        self.limits_tell = True
+        self.limits_are_reliable = True
 
     def __len__(self) -> int:
         return len(self._asked)
 
     def take_wrong(self) -> list[WrongAnswer]:
-        """Return the wrong answers found since the last time."""
+        """Return the wrong answers found since the last call."""
         wrong, self._wrong = self._wrong, []
         return wrong
 
     # -- answers ---------------------------------------------------------------------------------
 
     def outside_limits(self, actions: FloatArray) -> str | None:
-        """Say what is wrong with task actions that the problem's ``execute`` would change.
+        """Describe task actions that the problem's ``execute`` would change.
 
         Parameters
         ----------
@@ -126,11 +128,11 @@ class Verification:
         Returns
         -------
         str or None
-            None if they are within the limits.
+            None if all are within the limits.
         """
-        if not self.limits_tell:
+        if not self.limits_are_reliable:
             return None
-        limited = self._limited(actions)
+        limited = checked.executed_action(self._problem, actions)
         # An action on a limit may be moved by a rounding error.
         slack = 1e-9 * np.maximum(1.0, np.abs(limited))
         outside = (np.abs(actions - limited) > slack).any(axis=-1)
@@ -142,8 +144,31 @@ class Verification:
             f"execute, which makes {_written(limited[first])} of it"
         )
 
-    def answered(self, question: Question, service: str) -> None:
-        """Take note that a service has given a part of the answer to a question."""
+    def take(self, question: Question, part: AnswerPart, provenance: Provenance) -> None:
+        """Take a part of the answer to a question.
+
+        The robot follows the first part within the limits. A part that is outside the limits, or
+        differs from another, disputes the question.
+        """
+        outside = (
+            None if part.task_actions is None else self.outside_limits(np.array(part.task_actions))
+        )
+        part.outside_limits = outside is not None
+        agrees = _keep_and_follow_first(question, part, provenance)
+        if not agrees:
+            if not question.disputed and question.own is None:
+                why = outside or "two answers to one question differ"
+                self._effects.report(
+                    "disagreement",
+                    service=part.service,
+                    step=question.state.step,
+                    kind=part.kind,
+                    reason=f"{why}; the robot's own planner decides",
+                )
+            self.dispute(question, part.service)
+        self._answered(question, part.service)
+
+    def _answered(self, question: Question, service: str) -> None:
         if question.own is not None:
             if self._judge(question):
                 _use(question, question.own)
@@ -153,31 +178,32 @@ class Verification:
             self.check(question, service)
 
     def check(self, question: Question, service: str) -> None:
-        """Let the robot's own planner answer a question when it has time.
+        """Have the own planner answer a question when it has time.
 
         Parameters
         ----------
-        question : Question
         service : str
-            Whose answer it is to be compared with.
+            Whose answer is to be compared.
         """
-        if question.checked:
+        if question.check_decided:
             return
-        question.checked = True
+        question.check_decided = True
         if len(self._asked) < MAX_OPEN_CHECKS:
             self._ask(question, service)
         else:
             self._note(question, service, "question", "left_out")
 
     def dispute(self, question: Question, service: str) -> None:
-        """Let the robot's own planner answer a question before anything is done about it."""
+        """Have the own planner answer a question before the robot acts on it."""
         if question.disputed or question.own is not None:
             return
-        question.disputed = question.checked = True
+        question.disputed = question.check_decided = True
         for number, asked in self._asked.items():
             if asked is question:
                 # It waits for the planner already, perhaps behind others.
-                self._effects.append(Decide(number, question.state, urgent=True, again=False))
+                self._effects.append(
+                    ComputeOwnAnswer(number, question.state, urgent=True, again=False)
+                )
                 return
         self._ask(question, service, urgent=True)
 
@@ -195,31 +221,30 @@ class Verification:
         if not again:
             # Before the answer is there: it may never come, and that is to be known.
             self._note(question, service, "question", "asked")
-        self._effects.append(Decide(self._number, question.state, urgent, again))
+        self._effects.append(ComputeOwnAnswer(self._number, question.state, urgent, again))
 
     # -- the robot's own decisions ---------------------------------------------------------------
 
-    def decided(self, event: Decided, current: Question | None, performed: int) -> bool:
+    def decided(self, event: OwnAnswer, current: Question | None, performed: int) -> bool:
         """Take the own planner's answer.
 
         Parameters
         ----------
-        event : Decided
         current : Question or None
-            The one that the robot is at; this answer may be to an earlier one.
+            The robot's current question; this answer may belong to an earlier one.
         performed : int
-            Task actions of the current question that are performed, or ordered.
+            Task actions of the current question that are performed or ordered.
 
         Returns
         -------
         bool
-            Whether the current question can be gone on with; False if what was performed differs
-            from what should have been, so that its answer leads nowhere any more.
+            Whether the current question remains usable: False if the performed actions differ from
+            the correct ones.
 
         Raises
         ------
         OwnDecisionError
-            If the robot waits for it, and the planner failed.
+            If the robot waits for the planner and it failed.
         """
         question = self._asked.pop(event.number, None)
         if question is None:
@@ -233,17 +258,19 @@ class Verification:
             if question is not current or not (differs or question.disputed):
                 return True
             question.disputed = False
-            tasks = question.tasks or []
-            if not same_actions(tasks[:performed], event.actions[:performed]):
+            task_actions = question.task_actions or []
+            if not same_actions(task_actions[:performed], event.actions[:performed]):
                 return False
             _use(question, event)
             if not performed:
-                question.task_source = Provenance(OWN_PLANNER, event.computed_s, event.computed_s)
+                question.task_provenance = Provenance(
+                    OWN_PLANNER, event.computed_s, event.computed_s
+                )
             return True
         # It was asked again. If that failed, what it said first is all that there is.
         question.own_is_certain = event.failure is not None or _same(question.own, event)
         if not question.own_is_certain:
-            self._report(
+            self._effects.report(
                 "not_deterministic",
                 step=question.state.step,
                 reason="the robot's own planner came to two decisions in one state, so the "
@@ -253,28 +280,28 @@ class Verification:
         return True
 
     def _judge(self, question: Question) -> bool:
-        """Compare what services gave with the robot's own answer; tell whether any differs."""
+        """Compare the services' parts with the own answer; return whether any differs."""
         own = question.own
         assert own is not None
         any_differs = False
-        for given in question.given:
-            if given.judged:
+        for part in question.parts:
+            if part.judged:
                 continue
-            same = _agrees(given, own)
+            same = _agrees(part, own)
             any_differs = any_differs or not same
-            if same and given.outside_limits:
+            if same and part.outside_limits:
                 self._note_limits(question)
-            certain = True if given.outside_limits else question.own_is_certain
+            certain = True if part.outside_limits else question.own_is_certain
             if not same and certain is None:
-                self._suspects[given.service] = question
+                self._suspects[part.service] = question
                 if question not in self._asked.values():
-                    self._ask(question, given.service, again=True)
+                    self._ask(question, part.service, again=True)
                 continue
-            given.judged = True
+            part.judged = True
             verdict = "same" if same else "different" if certain else "not_deterministic"
-            self._note(question, given.service, given.kind, verdict)
+            self._note(question, part.service, part.kind, verdict)
             if verdict == "different":
-                self._wrong.append(WrongAnswer(given.service, question.state.step, given.kind))
+                self._wrong.append(WrongAnswer(part.service, question.state.step, part.kind))
         if question.own_is_certain is not None:
             self._suspects = {
                 service: about for service, about in self._suspects.items() if about is not question
@@ -282,9 +309,9 @@ class Verification:
         return any_differs
 
     def _note_limits(self, question: Question) -> None:
-        if self.limits_tell:
-            self.limits_tell = False
-            self._report(
+        if self.limits_are_reliable:
+            self.limits_are_reliable = False
+            self._effects.report(
                 "limits_unknown",
                 step=question.state.step,
                 reason="the problem's execute changes what it has let through, so it does not say "
@@ -299,41 +326,58 @@ class Verification:
                 f"trial {state.trial}, step {state.step}: services answer differently, or outside "
                 f"the problem's limits, and the robot's own planner cannot decide: {text}"
             )
-        self._report("verification_failed", step=state.step, reason=text)
-        for given in question.given:
-            if not given.judged:
-                given.judged = True
-                self._note(question, given.service, given.kind, "failed")
+        self._effects.report("verification_failed", step=state.step, reason=text)
+        for part in question.parts:
+            if not part.judged:
+                part.judged = True
+                self._note(question, part.service, part.kind, "failed")
 
     def _note(self, question: Question, service: str, kind: str, verdict: str) -> None:
         state = question.state
-        self._effects.append(Verified(state.trial, state.step, service, kind, verdict))
-
-    def _report(self, name: str, **fields: object) -> None:
-        self._effects.append(Report(name, fields))
+        self._effects.append(VerificationNoted(state.trial, state.step, service, kind, verdict))
 
 
-def _use(question: Question, own: Decided) -> None:
-    """Give a question the robot's own answer."""
+def _keep_and_follow_first(question: Question, part: AnswerPart, provenance: Provenance) -> bool:
+    """Keep a part of the answer, and follow it if it is the first; return whether all parts agree.
+
+    A part outside the limits is only kept for comparison.
+    """
+    others = [each for each in question.parts if each.kind == part.kind]
+    known = any(each.service == part.service and each.agrees_with(part) for each in others)
+    if not known and len(question.parts) < _MAX_PARTS:
+        question.parts.append(part)
+    if part.outside_limits:
+        return False
+    if part.task_actions is not None and question.task_actions is None:
+        question.task_actions = part.task_actions
+        question.task_provenance = provenance
+    elif part.sensing is not None and question.sensing is None:
+        question.sensing = part.sensing
+        question.sensing_provenance = provenance
+    return all(part.agrees_with(each) for each in others)
+
+
+def _use(question: Question, own: OwnAnswer) -> None:
+    """Make the own planner's answer the one that the robot follows."""
     if question.task_count:
-        question.tasks = list(own.actions)
+        question.task_actions = list(own.actions)
     if question.sensing_step is not None and own.sensing_action is not None:
         digest = own.ahead_digest[:DIGEST_SIZE]
         question.sensing = SensingAnswer(0, question.sensing_step, own.sensing_action, digest, 0)
-        question.sensing_source = Provenance(OWN_PLANNER, own.computed_s, own.computed_s)
+        question.sensing_provenance = Provenance(OWN_PLANNER, own.computed_s, own.computed_s)
 
 
-def _agrees(given: Given, own: Decided) -> bool:
-    if given.tasks is not None:
-        return same_actions(given.tasks, own.actions)
-    sensing = given.sensing
+def _agrees(part: AnswerPart, own: OwnAnswer) -> bool:
+    if part.task_actions is not None:
+        return same_actions(part.task_actions, own.actions)
+    sensing = part.sensing
     assert sensing is not None
     # Chosen in another state than the one in which the robot arrives, it would be of no use.
     arrives = sensing.digest == own.ahead_digest[:DIGEST_SIZE]
     return arrives and sensing.sensing_action == own.sensing_action
 
 
-def _same(first: Decided, second: Decided) -> bool:
+def _same(first: OwnAnswer, second: OwnAnswer) -> bool:
     return (
         same_actions(first.actions, second.actions)
         and first.sensing_action == second.sensing_action

@@ -1,10 +1,9 @@
-"""Whether two runs decided the same, and if not, where they first went apart.
+"""Whether two runs decided the same, and if not, where they first differ.
 
-This is how the promise is checked: a run whose services were killed must have decided what an
-undisturbed one decides, so the decisions that both journals hold are compared bit for bit, trial by
-trial, in order. Times, recoveries and who decided may differ; a sensing action, a coordinate of a
-task action or the digest of a state may not. What is not there cannot be compared, so a trial that
-one run has not finished is a difference as well.
+A run whose services were killed must have decided what an undisturbed one decides. So the decisions
+of both journals are compared bit for bit, trial by trial, in order. Times, recoveries and services
+may differ; a sensing action, a coordinate of a task action or the digest of a state may not. A
+trial that one run has not finished is a difference as well.
 """
 
 from __future__ import annotations
@@ -18,18 +17,16 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from holdfast.files import OutputError
 from holdfast.outcome import Decisions, SensingDecision, TaskDecision, TrialResult
-from holdfast.recording.journal import Journal
-from holdfast.recording.run_directory import JOURNAL_NAME, configuration_difference
-from holdfast.session.records import ActingRecord
+from holdfast.protocol.records import ActingRecord
+from holdfast.recording.journal_file import find_journal
+from holdfast.recording.journal_reader import JournalReader
+from holdfast.recording.run_directory import configuration_difference
 
 __all__ = ["Comparison", "Difference", "compare_runs"]
 
 _ABSENT = "not given"
 _ENDING = struct.Struct("<cQ32s")
-_DATABASE = b"SQLite format 3\0"
-"""What a file of SQLite begins with."""
 
 
 class Difference(msgspec.Struct, frozen=True, kw_only=True):
@@ -53,20 +50,19 @@ class Difference(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Comparison(msgspec.Struct, frozen=True, kw_only=True):
-    """What comparing two runs found.
+    """The result of comparing the decisions of two runs.
 
     Attributes
     ----------
     identical : bool
-        Whether they decided the same in all trials.
     first_run, second_run : str
-        The runs, as they were named.
+        As they were named.
     trials, sensing_actions, task_actions : int
-        How much was found to be the same.
+        How many were found to be the same.
     difference : Difference or None
         The first one.
     notes : tuple of str
-        What else a person should know: other versions, other settings, other rewards.
+        Other versions, other settings, other rewards.
     """
 
     identical: bool
@@ -124,7 +120,8 @@ def compare_runs(first: Path, second: Path) -> Comparison:
     """
     with ExitStack() as stack:
         journals = [
-            stack.enter_context(Journal.read(_journal_path(run))) for run in (first, second)
+            stack.enter_context(JournalReader.read(find_journal(run, "compare")))
+            for run in (first, second)
         ]
         found = _Found()
         _compare(journals[0], journals[1], found)
@@ -161,33 +158,7 @@ class _Trial(NamedTuple):
     state: str
 
 
-def _journal_path(run: Path) -> Path:
-    if run.is_dir():
-        if not (run / JOURNAL_NAME).is_file():
-            raise OutputError(f"{run}: holds no {JOURNAL_NAME}, so no run to compare")
-        return run / JOURNAL_NAME
-    if not run.exists():
-        raise OutputError(f"{run}: there is no such directory or journal, so no run to compare")
-    if not run.is_file():
-        raise OutputError(f"{run}: is a pipe or device, not a journal")
-    _require_database(run)
-    return run
-
-
-def _require_database(path: Path) -> None:
-    """Refuse what was mistaken for a journal: a table of the run, say."""
-    try:
-        with path.open("rb") as file:
-            start = file.read(len(_DATABASE))
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be read: {error.strerror}") from error
-    if start and start != _DATABASE:
-        raise OutputError(
-            f"{path}: is not a journal; name the directory of a run, or its {JOURNAL_NAME}"
-        )
-
-
-def _compare(first: Journal, second: Journal, found: _Found) -> None:
+def _compare(first: JournalReader, second: JournalReader, found: _Found) -> None:
     found.difference = _difference_of_runs(first.meta(), second.meta(), found)
     if found.difference is not None:
         return
@@ -220,7 +191,7 @@ def _compare(first: Journal, second: Journal, found: _Found) -> None:
 def _difference_of_runs(
     first: Mapping[str, str], second: Mapping[str, str], found: _Found
 ) -> Difference | None:
-    """Return in what the runs differ as wholes; what need not matter is noted."""
+    """Return how the runs differ as wholes; what changes no decision is only noted."""
     import yaml
 
     texts = [meta.get("configuration", "") for meta in (first, second)]
@@ -249,7 +220,7 @@ def _value(configuration: Any, keys: tuple[str, ...]) -> Any:
     return configuration
 
 
-def _trials(journal: Journal) -> Iterator[_Trial]:
+def _trials(journal: JournalReader) -> Iterator[_Trial]:
     """Yield the trials of a run in order, the unfinished one in its place."""
     unfinished = journal.unfinished()
     begun = None

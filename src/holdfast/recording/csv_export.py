@@ -9,15 +9,16 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self, TextIO
 
+from holdfast.arrays import FloatArray
 from holdfast.belief import Belief
-from holdfast.problems.problem import FloatArray, Problem
-from holdfast.recording.export import (
+from holdfast.problems.problem import Problem
+from holdfast.recording.facts import (
     Decider,
     EventFact,
     SensingFact,
@@ -30,8 +31,6 @@ __all__ = ["TABLES", "CsvSink"]
 
 TABLES = ("trials.csv", "steps.csv", "beliefs.csv", "events.csv")
 """One row a trial; a step; a particle of a belief; an event of the services."""
-
-_DECIDER = ("service", "status", "waited_ms", "round_trip_ms", "computed_ms")
 
 
 class CsvSink:
@@ -47,22 +46,21 @@ class CsvSink:
 
     def __init__(self, directory: Path, problem: Problem) -> None:
         self._actions = [str(label) for label in problem.sensing_actions]
-        self._state_size = problem.state_size
-        self._action_size = problem.action_size
         self._began_ns = 0
         self._sensing: SensingFact | None = None
-        labels = state_labels(problem)
+        self._labels = state_labels(problem)
         with ExitStack() as stack:
             self._files = [
                 stack.enter_context((directory / name).open("w", encoding="utf-8", newline=""))
                 for name in TABLES
             ]
-            self._trials, self._steps, self._beliefs, self._events = map(_writer, self._files)
+            self._trials, _, self._beliefs, self._events = map(_writer, self._files)
             self._close = stack.pop_all()
         self._trials.writerow(
             ["trial", "began", "ended", "seed", "outcome", "success", "steps", "reward", "digest"]
         )
-        self._steps.writerow(
+        self._steps = csv.DictWriter(
+            self._files[1],
             [
                 "trial",
                 "step",
@@ -76,18 +74,20 @@ class CsvSink:
                 "effective_sample_size",
                 "resampled",
                 "state_digest",
-                *(f"estimate {label}" for label in labels),
-                *(f"true {label}" for label in labels),
-                *(f"action_{index}" for index in range(self._action_size)),
+                *(f"estimate {label}" for label in self._labels),
+                *(f"true {label}" for label in self._labels),
+                *(f"action_{index}" for index in range(problem.action_size)),
                 "reward",
                 "sensing_time",
                 "observation_time",
                 "action_time",
-                *(f"sensing_{name}" for name in _DECIDER),
-                *(f"action_{name}" for name in _DECIDER),
-            ]
+                *(f"sensing_{name}" for name in Decider._fields),
+                *(f"action_{name}" for name in Decider._fields),
+            ],
+            lineterminator="\n",
         )
-        self._beliefs.writerow(["trial", "step", "when", "particle", *labels, "weight"])
+        self._steps.writeheader()
+        self._beliefs.writerow(["trial", "step", "when", "particle", *self._labels, "weight"])
         self._events.writerow(["time", "event", "trial", "fields"])
 
     def __enter__(self) -> Self:
@@ -154,34 +154,34 @@ class CsvSink:
 
     def _write_step(self, trial: int, step: int, fact: TaskFact | None) -> None:
         sensing, self._sensing = self._sensing, None
-        row: list[Any] = [trial, step]
-        row.append(fact.stage if fact is not None else None if sensing is None else sensing.stage)
-        if sensing is None:
-            row += [None] * (8 + len(self._actions))
-        else:
-            observation = sensing.observation
-            row += [
-                sensing.sensing_action,
-                self._actions[sensing.sensing_action],
-                None if observation is None else " ".join(map(repr, observation.tolist())),
-                *_cells(sensing.entropies, len(self._actions)),
-                None if sensing.explained is None else int(sensing.explained),
-                sensing.mahalanobis_distance,
-                sensing.effective_sample_size,
-                None if sensing.resampled is None else int(sensing.resampled),
-                sensing.state_digest.hex(),
-            ]
-        row += _cells(None if fact is None else fact.estimate, self._state_size)
-        row += _cells(None if fact is None else fact.true_state, self._state_size)
-        row += _cells(None if fact is None else fact.action, self._action_size)
-        row.append(None if fact is None else fact.reward)
-        row += [
-            None if sensing is None else _seconds(sensing.decided_ns),
-            None if sensing is None else _seconds(sensing.observed_ns),
-            None if fact is None else _seconds(fact.time_ns),
-        ]
-        row += _decider_cells(None if sensing is None else sensing.decider)
-        row += _decider_cells(None if fact is None else fact.decider)
+        row: dict[str, Any] = {"trial": trial, "step": step}
+        if sensing is not None:
+            row |= {
+                "stage": sensing.stage,
+                "sensing_action": sensing.sensing_action,
+                "sensing_action_label": self._actions[sensing.sensing_action],
+                "explained": None if sensing.explained is None else int(sensing.explained),
+                "mahalanobis_distance": sensing.mahalanobis_distance,
+                "effective_sample_size": sensing.effective_sample_size,
+                "resampled": None if sensing.resampled is None else int(sensing.resampled),
+                "state_digest": sensing.state_digest.hex(),
+                "sensing_time": _seconds(sensing.decided_ns),
+                "observation_time": _seconds(sensing.observed_ns),
+                **_cells("entropy_{}", sensing.entropies),
+                **_decider_cells("sensing", sensing.decider),
+            }
+            if sensing.observation is not None:
+                row["observation"] = " ".join(map(repr, sensing.observation.tolist()))
+        if fact is not None:
+            row |= {
+                "stage": fact.stage,
+                "reward": fact.reward,
+                "action_time": _seconds(fact.time_ns),
+                **_cells("estimate {}", fact.estimate, self._labels),
+                **_cells("true {}", fact.true_state, self._labels),
+                **_cells("action_{}", fact.action),
+                **_decider_cells("action", fact.decider),
+            }
         self._steps.writerow(row)
 
     def _write_belief(self, trial: int, step: int, when: str, belief: Belief | None) -> None:
@@ -195,9 +195,9 @@ class CsvSink:
 
 
 def state_labels(problem: Problem) -> list[str]:
-    """Return a name for each coordinate of a state, with its unit where the problem says it."""
+    """Return a name for each coordinate of a state: the problem's label, if all have one."""
     labels = list(map(str, problem.state_labels))
-    if len(labels) == problem.state_size:
+    if len(set(labels)) == problem.state_size:
         return labels
     return [f"state_{index}" for index in range(problem.state_size)]
 
@@ -206,12 +206,20 @@ def _writer(file: io.TextIOBase) -> Any:
     return csv.writer(file, lineterminator="\n")
 
 
-def _cells(values: FloatArray | None, count: int) -> Iterable[float | None]:
-    return [None] * count if values is None else values.tolist()
+def _cells(
+    name: str, values: FloatArray | None, labels: Sequence[object] | None = None
+) -> dict[str, float]:
+    """Return a column for each value, named by its label or else its index."""
+    if values is None:
+        return {}
+    names = range(len(values)) if labels is None else labels
+    return {name.format(each): value for each, value in zip(names, values.tolist(), strict=True)}
 
 
-def _decider_cells(decider: Decider | None) -> Sequence[Any]:
-    return [None] * len(_DECIDER) if decider is None else list(decider)
+def _decider_cells(kind: str, decider: Decider | None) -> dict[str, Any]:
+    if decider is None:
+        return {}
+    return {f"{kind}_{name}": value for name, value in decider._asdict().items()}
 
 
 def _seconds(time_ns: int) -> str:

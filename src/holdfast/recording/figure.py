@@ -1,10 +1,9 @@
 """One trial in one picture: where the robot was, what it believed, and what it chose to sense.
 
-On the left is the workspace, with the way that was gone, the way that was believed, and the
-belief's particles at some of the sensing steps. On the right each coordinate of the state runs over
-the steps, above a strip that shows what was sensed when, and how much the alternatives differed in
-what is minimised.
-Every sensing action has a colour and a marker of its own, so that a print in grey reads as well.
+On the left is the workspace, with the true and the estimated path, and the belief's particles at
+some of the sensing steps. On the right is each coordinate of the state over the steps; below them,
+which sensing action was chosen when, and the score of each alternative. Every sensing action has
+its own colour and marker, so that a print in grey is legible as well.
 
 This module imports matplotlib; import it only where a figure is wanted.
 """
@@ -29,10 +28,11 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
-from holdfast.configuration import Configuration
+from holdfast.arrays import FloatArray
+from holdfast.config.loader import Configuration
 from holdfast.files import write_atomically
 from holdfast.outcome import Outcome
-from holdfast.problems.problem import FloatArray, Problem, Scene
+from holdfast.problems.problem import Problem, Scene
 from holdfast.recording.recorder import SensingRecord, TrialRecord
 
 __all__ = ["STYLE", "trial_figure"]
@@ -66,7 +66,11 @@ _MAX_MARKS = 120
 """With more sensing steps than this, marks on the paths would hide them; the strip has them all."""
 
 _LABEL_WIDTH = 14
+_SHORT_LABEL = 8
 _DOTS_PER_INCH = 150
+_WIDTH = 11.0
+_SMALLEST = 8.0
+"""In points: 9 pixels high where the picture is 900 pixels wide."""
 
 # Typed loosely: matplotlib's releases differ in how they type these keys.
 STYLE: Any = {
@@ -94,11 +98,9 @@ def trial_figure(configuration: Configuration, record: TrialRecord, path: Path) 
     Parameters
     ----------
     configuration : Configuration
-        Of the run that the trial is one of.
+        Of the run.
     record : TrialRecord
-        What happened in it.
     path : Path
-        Where to write the picture.
 
     Raises
     ------
@@ -110,7 +112,7 @@ def trial_figure(configuration: Configuration, record: TrialRecord, path: Path) 
     num_panels = problem.state_size + 2
     height = max(6.2, 1.12 * num_panels + 1.6)
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(13.0 if scene else 8.0, height), layout="constrained")
+        figure = Figure(figsize=(_WIDTH if scene else 8.0, height), layout="constrained")
         FigureCanvasAgg(figure)
         figure.suptitle(_title(configuration, record), x=0.012, ha="left", fontsize=12.0)
         if scene:
@@ -165,10 +167,27 @@ def _labels(problem: Problem) -> Sequence[str]:
     return [f"state[{index}]" for index in range(problem.state_size)]
 
 
-def _look(sensing_action: int) -> tuple[str, str]:
+def _style_of(sensing_action: int) -> tuple[str, str]:
     return (
         _ACTION_COLORS[sensing_action % len(_ACTION_COLORS)],
         _ACTION_MARKERS[(sensing_action + sensing_action // 6) % len(_ACTION_MARKERS)],
+    )
+
+
+def _scatter_chosen(
+    panel: Axes, x: npt.ArrayLike, y: npt.ArrayLike, sensing_action: int, record: TrialRecord
+) -> None:
+    """Mark where a sensing action was chosen."""
+    color, marker = _style_of(sensing_action)
+    panel.scatter(
+        x,
+        y,
+        s=_marker_size(record),
+        color=color,
+        marker=marker,
+        edgecolor="white",
+        linewidth=0.4,
+        zorder=4,
     )
 
 
@@ -206,47 +225,17 @@ def _draw_workspace(panel: Axes, problem: Problem, scene: Scene, record: TrialRe
     if len(truth):
         panel.plot(*truth[:, axes].T, color=_TRUE, linewidth=1.3)
     for sensing in record.sensing if len(record.sensing) <= _MAX_MARKS else ():
-        color, marker = _look(sensing.sensing_action)
-        panel.scatter(
-            way[sensing.step, axes[0]],
-            way[sensing.step, axes[1]],
-            s=_marker_size(record),
-            color=color,
-            marker=marker,
-            edgecolor="white",
-            linewidth=0.4,
-            zorder=4,
-        )
+        place = way[sensing.step]
+        _scatter_chosen(panel, place[axes[0]], place[axes[1]], sensing.sensing_action, record)
     if scene.points is not None:
-        panel.scatter(
-            scene.points[:, 0],
-            scene.points[:, 1],
-            s=42,
-            marker="o",
-            facecolor="white",
-            edgecolor=_GOAL,
-            zorder=3,
-        )
+        x, y = scene.points.T
+        panel.scatter(x, y, s=42, facecolor="white", edgecolor=_GOAL, zorder=3)
     if len(way):
-        panel.scatter(
-            way[0, axes[0]],
-            way[0, axes[1]],
-            s=70,
-            marker="o",
-            facecolor="white",
-            edgecolor=_TRUE,
-            zorder=5,
-        )
+        x, y = way[0, axes]
+        panel.scatter(x, y, s=70, facecolor="white", edgecolor=_TRUE, zorder=5)
     if scene.goal is not None:
-        panel.scatter(
-            scene.goal[0],
-            scene.goal[1],
-            s=150,
-            marker="*",
-            color=_GOAL,
-            edgecolor="white",
-            zorder=5,
-        )
+        x, y = scene.goal
+        panel.scatter(x, y, s=150, marker="*", color=_GOAL, edgecolor="white", zorder=5)
 
 
 def _shown_part(scene: Scene, points: Sequence[FloatArray]) -> FloatArray:
@@ -377,30 +366,12 @@ def _draw_workspace_legend(
     handles += [
         Line2D([], [], color=_BELIEF, linestyle=(0, (4, 1.5)), label="estimated path"),
         _dot(_BELIEF, "o", "particles, older ones paler", size=3.5),
-        Line2D(
-            [],
-            [],
-            marker="o",
-            linestyle="",
-            markerfacecolor="white",
-            color=_TRUE,
-            label=f"start{of_estimate}",
-        ),
+        _dot(_TRUE, "o", f"start{of_estimate}", hollow=1.0),
     ]
     if scene.goal is not None:
         handles.append(_dot(_GOAL, "*", "goal", size=11.0))
     if scene.points is not None:
-        handles.append(
-            Line2D(
-                [],
-                [],
-                marker="o",
-                linestyle="",
-                markerfacecolor="white",
-                color=_GOAL,
-                label="landmark",
-            )
-        )
+        handles.append(_dot(_GOAL, "o", "landmark", hollow=1.0))
     if scene.body is not None:
         handles.append(Line2D([], [], color=_BODY, linewidth=0.9, label=f"body{of_estimate}"))
     if len(scene.obstacles):
@@ -410,7 +381,7 @@ def _draw_workspace_legend(
     figure.legend(
         handles=handles,
         loc="outside lower center",
-        ncols=4 if max(map(len, problem.sensing_actions), default=0) <= _LABEL_WIDTH else 3,
+        ncols=4 if max(map(len, problem.sensing_actions), default=0) <= _SHORT_LABEL else 3,
         columnspacing=1.6,
         handletextpad=0.6,
     )
@@ -423,16 +394,15 @@ def _action_handles(problem: Problem, record: TrialRecord) -> list[Line2D]:
     handles = []
     for action, name in enumerate(problem.sensing_actions):
         if action in chosen:
-            handles.append(_dot(*_look(action), fill(f"sensed {name}", 30), size=5.5))
+            handles.append(_dot(*_style_of(action), fill(f"sensed {name}", 30), size=5.5))
         elif compared:
-            handle = _dot(*_look(action), fill(f"{name}, never sensed", 30), size=4.5)
-            handle.set_markerfacecolor("white")
-            handle.set_markeredgewidth(0.9)
-            handles.append(handle)
+            label = fill(f"{name}, never sensed", 30)
+            handles.append(_dot(*_style_of(action), label, size=4.5, hollow=0.9))
     return handles
 
 
-def _dot(color: str, marker: str, label: str, *, size: float) -> Line2D:
+def _dot(color: str, marker: str, label: str, *, size: float = 6.0, hollow: float = 0.0) -> Line2D:
+    """Return a legend's entry for a marker; a hollow one has an edge of this width."""
     return Line2D(
         [],
         [],
@@ -440,7 +410,8 @@ def _dot(color: str, marker: str, label: str, *, size: float) -> Line2D:
         marker=marker,
         linestyle="",
         markersize=size,
-        markeredgewidth=0.0,
+        markerfacecolor="white" if hollow else color,
+        markeredgewidth=hollow,
         label=label,
     )
 
@@ -481,17 +452,7 @@ def _draw_coordinates(
         Patch(facecolor=_BELIEF, alpha=0.22, label="± 2 standard deviations"),
     ]
     if not all(sensing.explained for sensing in record.sensing):
-        handles.append(
-            Line2D(
-                [],
-                [],
-                marker="x",
-                linestyle="",
-                markersize=7.0,
-                color=_TRUE,
-                label="far from every particle",
-            )
-        )
+        handles.append(_dot(_TRUE, "x", "far from every particle", size=7.0, hollow=1.0))
     panels[0].legend(
         handles=handles,
         loc="lower center",
@@ -508,18 +469,8 @@ def _scatter_sensing(panel: Axes, record: TrialRecord, heights: Sequence[float])
     actions = np.array([sensing.sensing_action for sensing in record.sensing], dtype=int)
     steps = np.array([sensing.step for sensing in record.sensing], dtype=int)
     for action in np.unique(actions):
-        color, marker = _look(int(action))
         chosen = actions == action
-        panel.scatter(
-            steps[chosen],
-            heights_array[chosen],
-            s=_marker_size(record),
-            color=color,
-            marker=marker,
-            edgecolor="white",
-            linewidth=0.4,
-            zorder=4,
-        )
+        _scatter_chosen(panel, steps[chosen], heights_array[chosen], int(action), record)
 
 
 def _draw_choices(panel: Axes, problem: Problem, record: TrialRecord) -> None:
@@ -538,7 +489,7 @@ def _draw_choices(panel: Axes, problem: Problem, record: TrialRecord) -> None:
             zorder=5,
         )
     labels = [fill(str(label), _LABEL_WIDTH) for label in problem.sensing_actions]
-    size = 9.0 if max(map(len, labels), default=0) <= _LABEL_WIDTH else 7.0
+    size = 9.0 if max(map(len, labels), default=0) <= _LABEL_WIDTH else _SMALLEST
     panel.set_yticks(range(count), labels, fontsize=size)
     panel.set_ylim(count - 0.4, -0.6)
     panel.set_ylabel("sensed")
@@ -557,7 +508,7 @@ _SCORES = {
 def _draw_entropies(panel: Axes, configuration: Configuration, record: TrialRecord) -> None:
     """Draw every sensing action's score at each sensing step; the lowest was chosen."""
     problem = configuration.problem
-    panel.set_ylabel(_SCORES.get(configuration.planning.selector.method, ""), fontsize=7.0)
+    panel.set_ylabel(_SCORES.get(configuration.planning.selector.method, ""), fontsize=_SMALLEST)
     panel.yaxis.set_major_locator(MaxNLocator(nbins=4))
     known = [sensing for sensing in record.sensing if sensing.entropies is not None]
     if not known:
@@ -573,52 +524,32 @@ def _draw_entropies(panel: Axes, configuration: Configuration, record: TrialReco
     panel.vlines(
         steps, entropies.min(axis=1), entropies.max(axis=1), color="#B4B9C0", linewidth=0.8
     )
-    size = _marker_size(record)
     panel.legend(
         handles=[
-            Line2D([], [], marker="o", linestyle="", markersize=4.5, color=_BODY, label="chosen"),
-            Line2D(
-                [],
-                [],
-                marker="o",
-                linestyle="",
-                markersize=3.5,
-                markerfacecolor="white",
-                markeredgecolor=_BODY,
-                markeredgewidth=0.7,
-                label="not chosen (hollow)",
-            ),
+            _dot(_BODY, "o", "chosen", size=4.5),
+            _dot(_BODY, "o", "not chosen (hollow)", size=3.5, hollow=0.7),
         ],
         loc="lower right",
         bbox_to_anchor=(1.0, 1.0),
         ncols=2,
-        fontsize=7.5,
+        fontsize=_SMALLEST,
         borderpad=0.1,
         borderaxespad=0.1,
         columnspacing=1.2,
         handletextpad=0.3,
     )
     for action in range(len(problem.sensing_actions)):
-        color, marker = _look(action)
+        color, marker = _style_of(action)
         won = chosen == action
         # The alternatives are hollow, so that the choice stands out.
         panel.scatter(
             steps[~won],
             entropies[~won, action],
-            s=0.6 * size,
+            s=0.6 * _marker_size(record),
             facecolor="white",
             edgecolor=color,
             marker=marker,
             linewidth=0.7,
             zorder=3,
         )
-        panel.scatter(
-            steps[won],
-            entropies[won, action],
-            s=size,
-            color=color,
-            marker=marker,
-            edgecolor="white",
-            linewidth=0.4,
-            zorder=4,
-        )
+        _scatter_chosen(panel, steps[won], entropies[won, action], action, record)

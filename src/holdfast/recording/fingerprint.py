@@ -1,7 +1,7 @@
-"""Which code made a run: a trial can only stand beside others that the same code decided.
+"""Which code made a run: only trials that the same code decided can be compared.
 
-The version of holdfast and the digest of what decides in it tell its own code, the digests of its
-sources that of a problem (:mod:`holdfast.source_digest`).
+holdfast is identified by its version and the digest of its deciding modules, a problem by the
+digests of its sources (:mod:`holdfast.source_digest`).
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import json
 from collections.abc import Mapping
 
 from holdfast import __version__
-from holdfast.configuration import Configuration
+from holdfast.config.loader import Configuration
 from holdfast.problems.registry import problem_module
 from holdfast.source_digest import core_version, problem_sources
 
@@ -22,18 +22,13 @@ _SOURCES = "problem_sources"
 
 
 def fingerprint(configuration: Configuration) -> dict[str, str]:
-    """Return what tells the code of a run, for its journal.
-
-    Parameters
-    ----------
-    configuration : Configuration
-        Of the run; its problem is looked at.
+    """Return the identity of a run's code, for its journal.
 
     Returns
     -------
     dict of str
-        holdfast's version, without and with the digest of its core, and the digests of a problem's
-        sources, as JSON.
+        holdfast's version, without and with the digest of its core, and the digests of the
+        problem's sources, as JSON.
     """
     return {
         _VERSION: __version__,

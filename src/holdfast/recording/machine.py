@@ -1,7 +1,4 @@
-"""What numbers were measured on: the machine and the software, by name.
-
-A time says something only together with this.
-"""
+"""The machine and the software of a measurement, by name: a time means something only with them."""
 
 from __future__ import annotations
 
@@ -19,7 +16,7 @@ import numpy as np
 
 import holdfast
 from holdfast import _kernel
-from holdfast.runtime.trials import available_cores
+from holdfast.robot.trials import available_cores
 
 __all__ = ["commit", "describe", "kernel_hash", "machines"]
 
@@ -52,7 +49,7 @@ def kernel_hash() -> str:
 
 def machines() -> str:
     """Return whether the state machines of sessions are ``compiled`` or ``interpreted``."""
-    found = importlib.util.find_spec("holdfast.session.robot")
+    found = importlib.util.find_spec("holdfast.protocol.robot")
     origin = (found and found.origin) or ""
     return "compiled" if origin.endswith(tuple(EXTENSION_SUFFIXES)) else "interpreted"
 

@@ -1,35 +1,19 @@
-"""Looks on at one trial and keeps what a figure of it needs.
-
-A robot's own world cannot be run again for a figure. But all that the planner had of it is in the
-journal: the same observations, given to the same planner, lead to the same
-beliefs. What the world's true state was nobody knows.
-"""
+"""An observer that records one trial for its figure."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
+from holdfast.arrays import FloatArray
 from holdfast.belief import Belief, estimate, standard_deviation
-from holdfast.outcome import Done, TrialResult
+from holdfast.outcome import TrialResult
 from holdfast.planning import PlanningState
-from holdfast.problems.problem import FloatArray
-from holdfast.runtime.environment import Environment
-from holdfast.runtime.trial import SensingStep, TaskStep
-from holdfast.session.messages import numbers_from, numbers_to
-from holdfast.session.records import (
-    ActingRecord,
-    ObservedRecord,
-    PerformedRecord,
-    Record,
-    RecordError,
-)
+from holdfast.robot.environment import Environment
+from holdfast.robot.trial import SensingStep, TaskStep
 
 __all__ = [
-    "DecidedOtherwiseError",
-    "RecordedEnvironment",
     "Recorder",
     "SensingRecord",
     "TrialRecord",
@@ -42,33 +26,12 @@ MAX_STEPS_KEPT = 100_000
 """Steps kept of a trial, so that a recorder's memory is bounded."""
 
 
-class DecidedOtherwiseError(RecordError):
-    """A trial is decided otherwise when it is computed again.
-
-    Attributes
-    ----------
-    step : int
-    kind : {"sensing", "task"} or None
-        Of the decision in the records; None where they end.
-    """
-
-    def __init__(self, trial: int, step: int, kind: str | None) -> None:
-        super().__init__(
-            f"trial {trial} is decided otherwise at step {step} when it is computed again: the "
-            "problem is not deterministic, or a service has decided otherwise"
-        )
-        self.step = step
-        self.kind = kind
-
-
 @dataclass(frozen=True)
 class SensingRecord:
-    """What happened at one sensing step.
+    """One sensing step.
 
     Attributes
     ----------
-    step : int
-    sensing_action : int
     observation : array
     entropies : array of shape (num_sensing_actions,) or None
         What was minimised; None if nothing was.
@@ -89,7 +52,7 @@ class SensingRecord:
 
 @dataclass
 class TrialRecord:
-    """What happened in one trial, step by step.
+    """One trial, step by step.
 
     Attributes
     ----------
@@ -101,7 +64,6 @@ class TrialRecord:
         Executed task actions.
     rewards : list of float
         The rewards of the steps, NaN where the environment reported none.
-    sensing : list of SensingRecord
     result : TrialResult or None
         The outcome; None while the trial runs.
     """
@@ -116,7 +78,7 @@ class TrialRecord:
 
 
 class Recorder:
-    """An observer that records one trial, and looks away from all others.
+    """An observer that records one trial and ignores all others.
 
     Parameters
     ----------
@@ -126,7 +88,7 @@ class Recorder:
     Attributes
     ----------
     record : TrialRecord
-        What was seen; complete when ``record.result`` is not None.
+        Complete when ``record.result`` is not None.
     """
 
     def __init__(self, trial: int) -> None:
@@ -184,78 +146,6 @@ class Recorder:
         state = getattr(environment, "state", None)
         if state is not None:
             self.record.true_states.append(np.array(state, dtype=np.float64))
-
-
-class RecordedEnvironment:
-    """The world of a trial that has ended: it answers what its records say that it answered.
-
-    Parameters
-    ----------
-    records : sequence of Record
-        Of the trial, in the order in which they were written; the one of the last performance may
-        be missing.
-    result : TrialResult
-        What it came to.
-    """
-
-    def __init__(self, records: Sequence[Record], result: TrialResult) -> None:
-        self.result = result
-        self._records = [
-            record
-            for record in records
-            if isinstance(record, ObservedRecord | ActingRecord | PerformedRecord)
-        ]
-        self._next = 0
-        self._step = 0
-
-    def from_the_beginning(self) -> RecordedEnvironment:
-        """Return the same world before the trial."""
-        return RecordedEnvironment(self._records, self.result)
-
-    def perform_sensing(self, sensing_action: int) -> FloatArray:
-        """Return the observation that was made.
-
-        Raises
-        ------
-        DecidedOtherwiseError
-            If another sensing action was performed, or none.
-        """
-        record = self._take()
-        if not isinstance(record, ObservedRecord) or record.sensing_action != sensing_action:
-            raise self._otherwise(record)
-        return numbers_from(record.observation, len(record.observation) // 8)
-
-    def perform(self, task_action: FloatArray) -> float | None:
-        """Return the reward; None where there was none, or it is not in the records.
-
-        Raises
-        ------
-        DecidedOtherwiseError
-            If another task action was performed, or none.
-        """
-        record = self._take()
-        if not isinstance(record, ActingRecord) or record.action != numbers_to(task_action):
-            raise self._otherwise(record)
-        self._step += 1
-        performed = self._take()
-        return performed.reward if isinstance(performed, PerformedRecord) else None
-
-    def is_done(self) -> Done:
-        """Tell whether the task was done, or had failed."""
-        if self._step < self.result.steps:
-            return False
-        return "failed" if self.result.failed else self.result.success
-
-    def _take(self) -> ObservedRecord | ActingRecord | PerformedRecord | None:
-        if self._next == len(self._records):
-            return None
-        self._next += 1
-        return self._records[self._next - 1]
-
-    def _otherwise(self, record: Record | None) -> DecidedOtherwiseError:
-        kinds = {ObservedRecord: "sensing", ActingRecord: "task"}
-        kind = None if record is None else kinds.get(type(record))
-        return DecidedOtherwiseError(self.result.trial, self._step, kind)
 
 
 def _some_particles(belief: Belief) -> FloatArray:

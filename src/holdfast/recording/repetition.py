@@ -1,8 +1,8 @@
-"""Who was wrong if a trial comes out otherwise when it is run again.
+"""Running a trial again, and which service was wrong if it is decided otherwise.
 
-A planner that decides twice alike, and not as the services did, is believed: the problem has just
-shown that it is deterministic, and the services have the same code. If it decides otherwise each
-time, nothing can be said of anybody but the problem.
+If this process decides the same twice, and not what the service decided, the problem is
+deterministic and the service was wrong, because it has the same code. If this process decides
+otherwise each time, the problem is not deterministic, and nothing is known about the service.
 """
 
 from __future__ import annotations
@@ -12,25 +12,25 @@ from itertools import zip_longest
 from pathlib import Path
 from typing import NamedTuple
 
-from holdfast.configuration import Configuration
+from holdfast.config.loader import Configuration
+from holdfast.errors import DecidedOtherwiseError
 from holdfast.outcome import Decisions, SensingDecision, TrialResult
+from holdfast.planning import Planner
 from holdfast.protocol.verification import OWN_PLANNER
-from holdfast.recording.recorder import DecidedOtherwiseError, RecordedEnvironment
+from holdfast.recording.recorded_environment import RecordedEnvironment
 from holdfast.recording.timings import deciders
-from holdfast.runtime.trial import NULL_OBSERVER, TrialObserver, run_trial
+from holdfast.robot.trial import NULL_OBSERVER, TrialObserver, run_trial
 
 __all__ = ["Deviation", "Repetition", "repeat", "wrong_service"]
 
 
 class Deviation(NamedTuple):
-    """Where a trial that is run again is first decided otherwise.
+    """The first decision of a repeated trial that differs.
 
     Attributes
     ----------
-    step : int
     kind : {"sensing", "task"} or None
-        Of the decision; None if no decision differs but what the robot made of its observation,
-        or where the trial ended.
+        Of the decision; None if only the state after an observation differs, or the trial's end.
     """
 
     step: int
@@ -38,16 +38,16 @@ class Deviation(NamedTuple):
 
 
 class Repetition(NamedTuple):
-    """What a trial came to when it was run again.
+    """The result of running a trial again.
 
     Attributes
     ----------
     decisions : Decisions or None
-        None if its recorded world could not answer any more.
+        None if another action was performed than its world has recorded.
     deviation : Deviation or None
         From the trial as it was; None if there is none.
     error : DecidedOtherwiseError or None
-        What the recorded world had to say.
+        Raised by the recorded world.
     """
 
     decisions: Decisions | None
@@ -68,22 +68,24 @@ def repeat(
 
     Parameters
     ----------
-    configuration : Configuration
     kept : Decisions
         Of the trial as it was.
-    trial : int
     recorded : RecordedEnvironment or None
         Its world, from the beginning; None for a simulated one.
     anew : bool
         Whether to build the problem anew, as a service does.
-    observer : TrialObserver
     """
     problem = configuration.problem
     if anew:
         problem = Configuration.from_plain(configuration.plain()).problem
     try:
         result: TrialResult = run_trial(
-            problem, configuration.planning, configuration.simulator, trial, recorded, observer
+            Planner(problem, configuration.planning),
+            configuration.simulator.seed,
+            trial,
+            max_steps=configuration.simulator.max_steps,
+            environment=recorded,
+            observer=observer,
         )
     except DecidedOtherwiseError as error:
         return Repetition(None, Deviation(error.step, error.kind), error)
@@ -122,7 +124,6 @@ def wrong_service(
         Runs the trial once more; it is not called where no service decided.
     timings : Path
         The run's ``timings.csv``.
-    trial : int
 
     Returns
     -------

@@ -1,7 +1,7 @@
 """The trials of a run as a robot performs them, step by step and journalled.
 
-Whoever starts a robot, the command or a node of ROS, calls this one function. It joins the run's
-directory, the links to the services and the robot's process, and closes all of them again.
+The command and the node of ROS both call :func:`perform_trials`. It opens the links to the services
+and the run's logs, runs the robot's process, and closes all of them again.
 """
 
 from __future__ import annotations
@@ -12,27 +12,28 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from holdfast.recording.run_directory import EVENTS_NAME, TIMINGS_NAME, VERIFICATION_NAME
 from holdfast.recording.timings import TimingTable, VerificationTable, count_verified
-from holdfast.runtime.links import make_links
-from holdfast.runtime.logs import BoundedEventLog, EventLog, TeeEventLog
-from holdfast.runtime.robot_process import RobotProcess
+from holdfast.robot.links import make_links
+from holdfast.robot.process import RobotProcess
+from holdfast.runtime.events import BoundedEventLog, TeeEventLog
+from holdfast.runtime.logs import EventLog
 
 if TYPE_CHECKING:
-    from holdfast.configuration import Configuration
+    from holdfast.config.loader import Configuration
     from holdfast.outcome import TrialResult
     from holdfast.planning import PlanningState
+    from holdfast.protocol.events import Act, Sense, Timing, VerificationNoted
     from holdfast.recording.run_directory import RunDirectory
-    from holdfast.runtime.environment import EnvironmentMaker
-    from holdfast.runtime.logs import EventSink
-    from holdfast.runtime.robot_watch import RobotWatch
-    from holdfast.session.effects import Act, Sense, Timing, Verified
+    from holdfast.robot.environment import EnvironmentMaker
+    from holdfast.robot.health import RobotWatch
+    from holdfast.runtime.events import EventSink
 
-__all__ = ["RECOVERY_LOG_NAME", "Onlooker", "perform_trials"]
+__all__ = ["RECOVERY_LOG_NAME", "RobotObserver", "perform_trials"]
 
 RECOVERY_LOG_NAME = "recovery.log"
 
 
-class Onlooker(NamedTuple):
-    """Who looks on while a robot runs; on its event loop, so each must return at once.
+class RobotObserver(NamedTuple):
+    """Callbacks on the robot's event loop, so each must return at once.
 
     Attributes
     ----------
@@ -58,13 +59,12 @@ def perform_trials(
     rate_hz: float | None,
     sinks: Sequence[EventSink],
     watch: Callable[[EventSink], RobotWatch] | None = None,
-    onlooker: Onlooker | None = None,
+    observer: RobotObserver | None = None,
 ) -> int:
     """Run the missing trials one after another.
 
     Parameters
     ----------
-    configuration : Configuration
     directory : RunDirectory
         Its journal keeps each step.
     maker : EnvironmentMaker
@@ -74,10 +74,9 @@ def perform_trials(
     rate_hz : float or None
         Task actions a second; None acts as soon as possible.
     sinks : sequence of EventSink
-        Are told what happens, besides the run's own log; they are closed at the end.
+        Get the events, besides the run's own log; they are closed at the end.
     watch : callable or None
-        Makes what tells others how the robot is doing, given where to tell of it.
-    onlooker : Onlooker or None
+        Makes the watch that publishes the robot's state, given the log of events.
 
     Returns
     -------
@@ -90,7 +89,6 @@ def perform_trials(
         If the robot holds still and cannot go on.
     """
     with contextlib.ExitStack() as stack:
-        # What is only for people on a terminal is kept in the file all the same.
         log = EventLog(directory.path / EVENTS_NAME, format="json", component="robot")
         events = BoundedEventLog(TeeEventLog(log, *sinks))
         stack.callback(events.close)
@@ -98,7 +96,7 @@ def perform_trials(
         stack.callback(links.close)
         timings = TimingTable(directory.path / TIMINGS_NAME)
         stack.callback(timings.close)
-        on_verified: Callable[[Verified], None] = _ignore
+        on_verified: Callable[[VerificationNoted], None] = _ignore
         distrusted: Collection[str] = ()
         if configuration.offload.services:
             earlier = count_verified(directory.path / VERIFICATION_NAME)
@@ -109,8 +107,8 @@ def perform_trials(
 
         def on_timing(timing: Timing) -> None:
             timings.add(timing)
-            if onlooker is not None:
-                onlooker.timing(timing)
+            if observer is not None:
+                observer.timing(timing)
 
         robot = RobotProcess(
             configuration,
@@ -128,14 +126,14 @@ def perform_trials(
             distrusted,
             make_planner=links.make_planner,
             watch=None if watch is None else watch(events),
-            on_order=None if onlooker is None else onlooker.order,
+            on_order=None if observer is None else observer.order,
         )
-        if onlooker is not None:
-            onlooker.process(robot)
+        if observer is not None:
+            observer.process(robot)
         launcher = None if links.launcher is None else links.launcher(robot.deliver)
         robot.run(directory.journal.finished(), launcher)
         return robot.missed_ticks
 
 
-def _ignore(verified: Verified) -> None:
-    """Do nothing: a robot that asks no service has nothing to verify."""
+def _ignore(verified: VerificationNoted) -> None:
+    """Do nothing: without services there is nothing to verify."""

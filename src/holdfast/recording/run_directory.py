@@ -1,10 +1,10 @@
 """The directory of a run: what is in it, and whether it may be written to.
 
 A run's directory is claimed before its first trial, so that a wrong path costs no computing. The
-journal is the truth; ``trials.csv`` and ``summary.json`` are made from it, and are made again when
-a run is resumed. Only the same configuration and the same code go on with a run, because a table
-of trials that were decided in two ways would say nothing about either. Where decisions are made and
-what they act on may differ, though: that changes time, never a decision.
+journal is the source of ``trials.csv`` and ``summary.json``, which are made again when a run is
+resumed. A run is resumed only with the same configuration and code, because a table of trials that
+were decided in two ways would say nothing about either. Services and links may differ: they change
+times, never a decision.
 """
 
 from __future__ import annotations
@@ -19,14 +19,17 @@ from typing import Any, Self
 import msgspec
 
 from holdfast import __version__
-from holdfast.configuration import Configuration
-from holdfast.files import OutputError, write_atomically
+from holdfast.config.loader import Configuration
+from holdfast.config.settings import SelectorSettings
+from holdfast.errors import OutputError
+from holdfast.files import write_atomically
 from holdfast.outcome import TrialResult
 from holdfast.recording.fingerprint import difference, fingerprint
-from holdfast.recording.journal import Journal, Survives, require_writable
+from holdfast.recording.journal import Journal
+from holdfast.recording.journal_file import JOURNAL_NAME, Survives, require_writable
+from holdfast.recording.journal_reader import JournalReader
 from holdfast.recording.tables import RunSummary, SummaryBuilder, csv_lines
 from holdfast.recording.timings import count_answers, count_verified
-from holdfast.settings import SelectorSettings
 
 __all__ = [
     "CONFIGURATION_NAME",
@@ -40,6 +43,7 @@ __all__ = [
     "RunDirectory",
     "claim_default_directory",
     "configuration_difference",
+    "first_difference",
     "latest_default_directory",
     "output_names",
 ]
@@ -47,13 +51,11 @@ __all__ = [
 CONFIGURATION_NAME = "config.yaml"
 EVENTS_NAME = "events.jsonl"
 FIGURE_NAME = "trial.png"
-JOURNAL_NAME = "journal.sqlite"
 SUMMARY_NAME = "summary.json"
 TIMINGS_NAME = "timings.csv"
 VERIFICATION_NAME = "verification.csv"
 TRIALS_NAME = "trials.csv"
 
-# Which service decides, and how soon it is given up, changes no decision.
 _SECTIONS_WITHOUT_DECISIONS = ("offload", "recovery")
 
 _MAX_SUFFIX = 10_000
@@ -70,11 +72,10 @@ class RunDirectory:
     path : Path
         The directory.
     configuration : Configuration
-        What the run is.
     journal : Journal
-        Its open journal.
+        Open.
     services_before : tuple of str or None
-        Those of the part before, if the run goes on.
+        Those of the earlier part, if the run was resumed.
     """
 
     def __init__(
@@ -156,8 +157,8 @@ class RunDirectory:
             _require_writable_directory(path)
             require_writable(path / JOURNAL_NAME)
         except OutputError as error:
-            # Whether something is the matter with the journal as well, its reader says.
-            Journal.read(path / JOURNAL_NAME).close()
+            # If the journal is damaged as well, its reader raises first.
+            JournalReader.read(path / JOURNAL_NAME).close()
             raise OutputError(
                 f"{error}; its journal is whole: go on when it can be written, or with a copy of "
                 "the directory (--out)"
@@ -184,8 +185,8 @@ class RunDirectory:
     def resume_if_begun(cls, path: Path, configuration: Configuration) -> Self:
         """Open the directory of a run that has begun, else claim it for a new one.
 
-        A process that was killed while it claimed the directory leaves a journal without a trial or
-        none at all, which counts as not begun; so does whatever else lies there.
+        A process that was killed while it claimed the directory leaves a journal without a trial,
+        or none: that counts as not begun, and so does any other content.
 
         Raises
         ------
@@ -193,7 +194,7 @@ class RunDirectory:
             As :meth:`resume` and :meth:`create` do.
         """
         is_there = False
-        with contextlib.suppress(OSError):  # what is the matter there, the other one says
+        with contextlib.suppress(OSError):  # create() reports it
             is_there = (path / JOURNAL_NAME).exists()
         if is_there:
             unused = _unused_journal(path, configuration.recovery.journal_survives)
@@ -202,10 +203,10 @@ class RunDirectory:
             unused.close()
         return cls.create(path, configuration)
 
-    def told_summary(self) -> RunSummary | None:
-        """Return what ``summary.json`` says if all trials are finished and it tells of all.
+    def complete_summary(self) -> RunSummary | None:
+        """Return ``summary.json`` if all trials are finished and it covers them all, else None.
 
-        A process that was killed after the last trial has left none, perhaps, or an old one.
+        A process that was killed after the last trial may have left none, or an old one.
         """
         trials = self.configuration.simulator.num_trials
         if self.journal.tally().finished < trials:
@@ -217,7 +218,7 @@ class RunDirectory:
         return summary if summary.finished == summary.trials == trials else None
 
     def add(self, result: TrialResult) -> None:
-        """Keep a finished trial, with its observations unless they can be simulated again."""
+        """Write a finished trial, with its observations unless they can be simulated again."""
         self.journal.add(result, keep_steps=self.configuration.environment.object is not None)
 
     def write_tables(self, wall_time_s: float) -> RunSummary:
@@ -226,7 +227,7 @@ class RunDirectory:
         Parameters
         ----------
         wall_time_s : float
-            Time that this part of the run took; what earlier parts took is added.
+            Of this part of the run; that of earlier parts is added.
 
         Returns
         -------
@@ -272,15 +273,7 @@ class RunDirectory:
 
 
 def output_names() -> tuple[str, ...]:
-    """Return the names of the files that a run leaves in its directory, the last three not always.
-
-    Returns
-    -------
-    tuple of str
-        ``events.jsonl`` (changes of status), ``timings.csv`` (a row for each decision) and
-        ``verification.csv`` (a row for each answer that was computed again) are there only if
-        services decided.
-    """
+    """Return the names of a run's files; the last three are there only if services decided."""
     return (
         TRIALS_NAME,
         SUMMARY_NAME,
@@ -298,7 +291,6 @@ def claim_default_directory(configuration: Configuration, parent: Path) -> Path:
 
     Parameters
     ----------
-    configuration : Configuration
     parent : Path
         Where it is made if it is not there; this one is made too.
 
@@ -358,8 +350,8 @@ def _default_directories(configuration: Configuration, parent: Path) -> Iterator
 
 
 def _unused_journal(path: Path, survives: Survives) -> Journal | None:
-    """Return the open journal of a run that has done nothing yet, None if there is no such."""
-    # Absent, in use, damaged or no journal of ours: then nothing there is free to be used.
+    """Return the open journal of a run that has done nothing yet, None if there is none."""
+    # One that is absent, in use, damaged or not ours cannot be used.
     with contextlib.suppress(OutputError):
         # Checked only if it is to be used, for then it is small.
         journal = Journal.open(path / JOURNAL_NAME, survives=survives, check=False)
@@ -375,7 +367,7 @@ def _unused_journal(path: Path, survives: Survives) -> Journal | None:
 
 
 def _require_writable_directory(path: Path) -> None:
-    """Find out by an ordinary file: SQLite's own errors do not say why."""
+    """Raise OutputError unless a file can be made there; SQLite's errors do not say why not."""
     try:
         with tempfile.TemporaryFile(dir=path):
             pass
@@ -408,7 +400,7 @@ def configuration_difference(first: str, second: str) -> tuple[str, str, str] | 
     Parameters
     ----------
     first, second : str
-        Two resolved configurations (:meth:`holdfast.configuration.Configuration.to_yaml`).
+        Two resolved configurations (:meth:`holdfast.config.loader.Configuration.to_yaml`).
 
     Returns
     -------
@@ -418,11 +410,11 @@ def configuration_difference(first: str, second: str) -> tuple[str, str, str] | 
     import yaml
 
     # Both were written by us, so the same plain loader reads both in the same way.
-    return _difference_in(_compared(yaml.safe_load(first)), _compared(yaml.safe_load(second)), "")
+    return first_difference(_compared(yaml.safe_load(first)), _compared(yaml.safe_load(second)))
 
 
 def _compared(configuration: Any) -> Any:
-    """Leave out what changes no decision: how many trials, who decides, where files lie."""
+    """Leave out what changes no decision: number of trials, services, directories."""
     if not isinstance(configuration, Mapping):
         return configuration
     left_out = ("problem_directory", *_SECTIONS_WITHOUT_DECISIONS)
@@ -431,8 +423,7 @@ def _compared(configuration: Any) -> Any:
         kept["simulator"] = {
             key: value for key, value in kept["simulator"].items() if key != "num_trials"
         }
-    # A run that was begun before there was a key has none; whatever the key says, its method does
-    # not ask for it.
+    # A run from before a key existed lacks it, and its method does not use it.
     if isinstance(kept.get("selector"), Mapping):
         defaults = msgspec.json.decode(msgspec.json.encode(SelectorSettings()))
         kept["selector"] = {**defaults, **kept["selector"]}
@@ -465,17 +456,18 @@ def _require_enough_trials(path: Path, journal: Journal, num_trials: int) -> Non
         )
 
 
-def _difference_in(there: Any, here: Any, key: str) -> tuple[str, str, str] | None:
+def first_difference(there: Any, here: Any, key: str = "") -> tuple[str, str, str] | None:
+    """Return the first key whose value differs, and both values, None if there is none."""
     if isinstance(there, Mapping) and isinstance(here, Mapping):
         for name in [*here, *(name for name in there if name not in here)]:
             inner = f"{key}.{name}" if key else str(name)
-            found = _difference_in(there.get(name), here.get(name), inner)
+            found = first_difference(there.get(name), here.get(name), inner)
             if found:
                 return found
         return None
     if isinstance(there, list) and isinstance(here, list) and len(there) == len(here):
         for index, (old, new) in enumerate(zip(there, here, strict=True)):
-            found = _difference_in(old, new, f"{key}[{index}]")
+            found = first_difference(old, new, f"{key}[{index}]")
             if found:
                 return found
         return None

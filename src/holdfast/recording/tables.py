@@ -1,7 +1,7 @@
-"""What a run comes to: one row for each trial, and one page about all of them.
+"""``trials.csv``, a row for each trial, and ``summary.json``, one page about all of them.
 
-The tables are made from results in the order of their trials, one at a time, so that a run of
-millions of trials needs no more memory than its sensing times take.
+Results are added one at a time, in the order of their trials, so that a run of millions of trials
+needs no more memory than its sensing times.
 """
 
 from __future__ import annotations
@@ -13,32 +13,16 @@ from collections.abc import Iterable, Iterator
 import msgspec
 import numpy as np
 
-from holdfast.outcome import TrialResult
+from holdfast.outcome import TRIAL_COLUMNS, TrialResult
 from holdfast.recording.timings import AnswerCounts, VerificationCounts
 
 __all__ = [
-    "CSV_COLUMNS",
     "RunSummary",
     "SummaryBuilder",
     "csv_lines",
     "csv_row",
     "wilson_interval",
 ]
-
-CSV_COLUMNS = (
-    "trial",
-    "seed",
-    "success",
-    "steps",
-    "reward",
-    "sensing_decisions",
-    "mean_sensing_ms",
-    "recoveries",
-    "unexplained_observations",
-    "digest",
-    "outcome",
-)
-"""Columns of ``trials.csv``."""
 
 _NORMAL_QUANTILE_975 = 1.959963984540054
 
@@ -48,59 +32,44 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes
     ----------
-    problem : str
-        Name of the problem.
-    seed : int
-        Seed of the run.
     holdfast_version : str
-        Version that made the run (or its last part, if it was resumed).
+        Of the last part, if the run was resumed.
     trials : int
         Trials that the configuration asks for.
     finished : int
-        Trials that are finished; all other figures are about these.
-    successes : int
-        Trials that reached the goal.
-    failures : int
-        Trials that ended in failure, as an environment says; the rest ran out of steps.
-    success_rate : float or None
-        Successes over finished trials.
+        Trials that are finished; all other numbers are about these.
+    successes, failures : int
+        Trials that reached the goal, and that the environment ended as failed; the rest ran out of
+        steps.
     success_rate_interval_95 : tuple of float, or None
-        Wilson's interval for it.
+        Wilson's interval.
     mean_reward : float or None
-        Mean of the rewards of all finished trials; None if one of them has none.
+        None if a finished trial has no reward.
     mean_reward_of_successes : float or None
-        The same of the successful ones alone, as earlier work reports it.
-    mean_steps : float or None
-        Mean number of steps.
-    sensing_decisions : int
-        Sensing actions chosen in all trials.
+        Earlier work reports this one.
     unexplained_observations : int
-        Observations that no particle explained: they lay outside the validation gate of all.
+        Observations outside the validation gate of every particle.
     recoveries : int
         Times that the local service took over, in all processes of the run.
     sensing_decisions_by_service, task_answers_by_service : dict of str to int, or None
-        Which service made how many of these, and gave how many answers with task actions (one holds
-        those up to the next sensing step); None where ``timings.csv`` is not kept.
+        Sensing decisions of each service, and its answers with task actions (one holds those up to
+        the next sensing step); None where ``timings.csv`` is not kept.
     longest_wait_ms : float or None
         The longest time that the robot stood still for a decision.
     verified_answers : int or None
         Answers of services that the robot's own planner computed again; None where no service
-        decided.
+        decided. For the next three see :class:`holdfast.recording.timings.VerificationCounts`.
     wrong_answers : dict of str to int, or None
-        By service: those that were not what the robot's own planner decides.
-    not_deterministic : int or None
-        Those of which nothing can be said: the robot's own planner came to two decisions.
-    unverified_answers : int or None
-        Questions that the robot's own planner was to answer as well and did not: it failed, too
-        many waited, or the process ended before.
+        By service.
+    not_deterministic, unverified_answers : int or None
     sensing_ms_median, sensing_ms_p99 : float or None
         Wall time of choosing a sensing action. Each decision counts once, as it was carried out,
         also those of earlier processes of a run that was resumed.
     wall_time_s : float
-        Time that the run took, over all its parts; of a part that was killed it is not known.
+        Over all parts of the run, without those that were killed.
     digest : str
-        BLAKE2b-256 over the digests of the trials in order: equal if, and only if, all decisions
-        of two runs are.
+        BLAKE2b-256 over the digests of the trials in order: equal exactly if all decisions of two
+        runs are.
     """
 
     problem: str
@@ -138,17 +107,17 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
 def csv_row(result: TrialResult) -> list[str]:
     """Return one row of ``trials.csv``; reading a number back gives the same number.
 
-    What there is none of, such as the reward of a trial without one, is an empty cell.
+    A value that is None, such as the reward of a trial without one, is an empty cell.
     """
     return [
         "" if value is None else str(int(value)) if isinstance(value, bool) else str(value)
-        for value in (getattr(result, column) for column in CSV_COLUMNS)
+        for value in (getattr(result, column) for column in TRIAL_COLUMNS)
     ]
 
 
 def csv_lines(results: Iterable[TrialResult]) -> Iterator[str]:
     """Yield the lines of ``trials.csv``, the head first; no value needs quotes."""
-    yield ",".join(CSV_COLUMNS) + "\n"
+    yield ",".join(TRIAL_COLUMNS) + "\n"
     for result in results:
         yield ",".join(csv_row(result)) + "\n"
 
@@ -156,17 +125,12 @@ def csv_lines(results: Iterable[TrialResult]) -> Iterator[str]:
 def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
     """Return the 95 % interval for a rate, by Wilson's score.
 
-    Unlike the usual plus-minus interval it is right near 0 and 1 and never leaves them.
+    It is right near 0 and 1, too, and never leaves them.
 
     Parameters
     ----------
     successes, trials : int
         Counts; ``trials`` is at least 1.
-
-    Returns
-    -------
-    tuple of float
-        Lower and upper end.
     """
     z_squared = _NORMAL_QUANTILE_975**2
     rate = successes / trials
@@ -190,7 +154,7 @@ def _mean(total: float | None, count: int) -> float | None:
 
 
 class SummaryBuilder:
-    """Adds up results, in the order of their trials, to a summary."""
+    """Adds up results, in the order of their trials."""
 
     def __init__(self) -> None:
         self._finished = 0
@@ -231,20 +195,16 @@ class SummaryBuilder:
         answers: AnswerCounts | None = None,
         verified: VerificationCounts | None = None,
     ) -> RunSummary:
-        """Return the summary of what was added.
+        """Return the summary.
 
         Parameters
         ----------
-        problem : str
-        seed : int
-        version : str
         trials : int
             Trials that the configuration asks for.
-        wall_time_s : float
         answers : AnswerCounts or None
-            Who decided, where that is known.
+            Who decided, if known.
         verified : VerificationCounts or None
-            What was computed again, where services decided.
+            If services decided.
         """
         count = self._finished
         median = p99 = None

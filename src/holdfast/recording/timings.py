@@ -1,32 +1,39 @@
-"""How long each decision of a run took, who made it, and whether it was right: rows as they come.
+"""How long each decision of a run took, who made it, and whether it was right: ``timings.csv``.
 
-These tables are for people and figures; nothing is decided by them. So a row is handed to the
-operating system at once but not forced to the disk, and what a crash cuts off is cut off here too
-when the run goes on. (The times in the tables of the trials come from the journal.)
+These tables are for people and figures; no decision depends on them. So a row is handed to the
+operating system at once but not forced to the disk, and a row that a crash cut short is removed
+when the run goes on. (The times in ``trials.csv`` come from the journal.)
 """
 
 from __future__ import annotations
 
+import contextlib
 import csv
+import math
 import time
 from collections import Counter
 from collections.abc import Callable, Container, Iterator, Sequence
+from datetime import datetime
 from pathlib import Path
 from typing import NamedTuple
 
-from holdfast.files import OutputError
-from holdfast.session.effects import Timing, Verified
+from holdfast.errors import OutputError
+from holdfast.protocol.events import Timing, VerificationNoted
 
 __all__ = [
     "TIMING_COLUMNS",
     "VERIFICATION_COLUMNS",
     "AnswerCounts",
+    "TimingRow",
     "TimingTable",
     "VerificationCounts",
     "VerificationTable",
     "count_answers",
     "count_verified",
     "deciders",
+    "nanoseconds",
+    "read_timings",
+    "rows_by_trial",
 ]
 
 TIMING_COLUMNS = (
@@ -52,7 +59,6 @@ class _Table:
     ----------
     path : Path
         Appended to if it is there.
-    columns : sequence of str
     clock : callable
         Returns nanoseconds since the epoch.
 
@@ -93,11 +99,6 @@ class _Table:
 class TimingTable(_Table):
     """The file ``timings.csv`` of a run: a row for each answer that was used.
 
-    Parameters
-    ----------
-    path : Path
-    clock : callable
-
     Raises
     ------
     OutputError
@@ -130,11 +131,6 @@ class TimingTable(_Table):
 class VerificationTable(_Table):
     """The file ``verification.csv`` of a run: a row for each answer that was computed again.
 
-    Parameters
-    ----------
-    path : Path
-    clock : callable
-
     Raises
     ------
     OutputError
@@ -144,7 +140,7 @@ class VerificationTable(_Table):
     def __init__(self, path: Path, *, clock: Callable[[], int] = time.time_ns) -> None:
         super().__init__(path, VERIFICATION_COLUMNS, clock)
 
-    def add(self, verified: Verified) -> None:
+    def add(self, verified: VerificationNoted) -> None:
         """Add a row.
 
         Raises
@@ -162,19 +158,19 @@ class VerificationTable(_Table):
 
 
 class VerificationCounts(NamedTuple):
-    """How many answers of a run's services were computed again.
+    """How many answers of services were computed again.
 
     Attributes
     ----------
     verified : int
-        Parts of answers that were compared.
+        Decisions that were compared.
     wrong : dict of str to int
-        By service: those that are not what the robot's own planner decides.
+        By service: those that differ from the decision of the robot's own planner.
     not_deterministic : int
-        Those of which nothing can be said, because the robot's own planner came to two decisions.
+        Those for which the robot's own planner came to two decisions.
     unverified : int
-        Questions that were to be answered by the robot's own planner and were not: it failed, too
-        many waited, or the process ended before.
+        Requests that the robot's own planner was to compute as well and did not: it failed, too
+        many were waiting, or the process ended before.
     """
 
     verified: int
@@ -185,10 +181,6 @@ class VerificationCounts(NamedTuple):
 
 def count_verified(path: Path) -> VerificationCounts | None:
     """Count the rows of a run's ``verification.csv``.
-
-    Parameters
-    ----------
-    path : Path
 
     Returns
     -------
@@ -236,16 +228,14 @@ def count_answers(path: Path, trials: Container[int]) -> AnswerCounts | None:
 
     Parameters
     ----------
-    path : Path
     trials : container of int
         Those that count.
 
     Returns
     -------
     AnswerCounts or None
-        None if there is no such table. A row that is damaged does not count. A decision that was
-        asked for again, because the robot was killed before it could use it, counts once: as what
-        it came to at last.
+        None if there is no such table. A decision that was requested again, because the robot was
+        killed before it could use it, counts once: as the answer that was used.
     """
     sensing: Counter[str] = Counter()
     task: Counter[str] = Counter()
@@ -253,56 +243,111 @@ def count_answers(path: Path, trials: Container[int]) -> AnswerCounts | None:
     current: int | None = None
     decided: dict[tuple[int, str], str] = {}  # of one trial: they are run one after another
 
-    def settle() -> None:
+    def count() -> None:
         for (_, kind), service in decided.items():
             (sensing if kind == "sensing" else task)[service] += 1
         decided.clear()
 
     try:
-        for row in _rows(path, 6):
-            try:
-                trial, step, kind, service, _, waited_ms = row[:6]
-                number, key, wait_ms = int(trial), (int(step), kind), float(waited_ms)
-            except ValueError:
-                continue  # the head, or a row that a power cut has spoilt
-            if number not in trials:
+        for row in read_timings(path):
+            if row.trial not in trials:
                 continue
-            if number != current:
-                settle()
-                current = number
-            decided[key] = service
-            longest_ms = wait_ms if longest_ms is None else max(longest_ms, wait_ms)
+            if row.trial != current:
+                count()
+                current = row.trial
+            decided[row.step, row.kind] = row.service
+            longest_ms = row.waited_ms if longest_ms is None else max(longest_ms, row.waited_ms)
     except (OSError, csv.Error):
         return None
-    settle()
+    count()
     return AnswerCounts(dict(sensing.most_common()), dict(task.most_common()), longest_ms)
 
 
 def deciders(path: Path, trial: int) -> dict[tuple[int, str], str]:
-    """Return who made the decisions of a trial, by step and kind, from ``timings.csv``.
-
-    Parameters
-    ----------
-    path : Path
-    trial : int
-
-    Returns
-    -------
-    dict
-        Empty if there is no such table; of a decision that was asked for again, whose was used.
-    """
-    decided: dict[tuple[int, str], str] = {}
+    """Return which service made each decision of a trial, by step and kind; empty if unknown."""
     try:
-        for number, step, kind, service, *_ in _rows(path, 6):
-            if number == str(trial) and step.isdigit():
-                decided[int(step), kind] = service
+        # Of a decision that was requested again, the last row is the one that was used.
+        return {
+            (row.step, row.kind): row.service for row in read_timings(path) if row.trial == trial
+        }
     except (OSError, csv.Error):
         return {}
-    return decided
+
+
+def rows_by_trial(path: Path) -> dict[int, dict[tuple[int, str], TimingRow]]:
+    """Return the rows that have a time, by trial, step and kind; empty if there is no table.
+
+    Raises
+    ------
+    OutputError
+        If the table cannot be read.
+    """
+    rows: dict[int, dict[tuple[int, str], TimingRow]] = {}
+    try:
+        for row in read_timings(path):
+            if row.is_whole:
+                rows.setdefault(row.trial, {})[row.step, row.kind] = row
+    except FileNotFoundError:
+        return {}
+    except (OSError, csv.Error) as error:
+        raise OutputError(f"{path}: cannot be read: {error}") from error
+    return rows
+
+
+class TimingRow(NamedTuple):
+    """A row of ``timings.csv``; one that is cut short has no times but the first."""
+
+    trial: int
+    step: int
+    kind: str
+    service: str
+    status: str
+    waited_ms: float
+    round_trip_ms: float = math.nan
+    computed_ms: float = math.nan
+    time_ns: int = 0
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether no column is missing."""
+        return self.time_ns > 0
+
+
+def read_timings(path: Path) -> Iterator[TimingRow]:
+    """Yield the rows of a run's ``timings.csv``, without the head and damaged rows."""
+    for row in _rows(path, 6):
+        try:
+            trial, step, kind, service, status, waited_ms = row[:6]
+            read = TimingRow(int(trial), int(step), kind, service, status, float(waited_ms))
+        except ValueError:
+            continue
+        if len(row) == len(TIMING_COLUMNS):
+            with contextlib.suppress(ValueError):
+                read = read._replace(
+                    round_trip_ms=float(row[6]),
+                    computed_ms=float(row[7]),
+                    time_ns=nanoseconds(row[8]),
+                )
+        yield read
+
+
+def nanoseconds(moment: str) -> int:
+    """Return nanoseconds since 1970 of a time in one of our files.
+
+    Raises
+    ------
+    ValueError
+        If it is none, or has no time zone.
+    """
+    parsed = datetime.fromisoformat(moment)
+    if parsed.tzinfo is None:
+        raise ValueError(moment)
+    seconds = int(parsed.replace(microsecond=0).timestamp())
+    return 1_000_000_000 * seconds + 1000 * parsed.microsecond
 
 
 def _rows(path: Path, least: int) -> Iterator[list[str]]:
-    """Yield the rows of a table, as far as they have enough columns."""
+    """Yield the rows of a table that have enough columns."""
     with path.open(encoding="utf-8", errors="replace", newline="") as file:
         for row in csv.reader(line.replace("\0", "") for line in file):
             if len(row) >= least:

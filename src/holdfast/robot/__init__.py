@@ -1,1 +1,1 @@
-"""The robot's shell: what its state machine asks for is done here, with threads and clocks."""
+"""The robot's shell: carries out its state machine's effects, with threads, sockets and clocks."""

@@ -1,12 +1,12 @@
-"""Active sensing as one typed service: three requests, and a state that goes with each.
+"""Active sensing as one stateless, typed service with three kinds of request.
 
 The first implementation had a service ``cloud_active_sensing`` in the cloud and another one,
-``cloud_active_sensing_recovery``, on the robot. Each kept the belief to itself, so a robot that
-went from one to the other lost it. Here a request brings the state and the answer takes it back:
-the services keep nothing, and it does not matter which of them answers.
+``cloud_active_sensing_recovery``, on the robot. Each kept the belief, so a robot that changed the
+service lost it. Here each request brings the planning state and each answer returns it, so any
+service can answer any request.
 
-This module is the service without any wire: requests and answers as Python objects. How they look
-as messages, ``interfaces/srv/ActiveSensing.srv`` says, field by field.
+This module has the service without a wire: requests and answers as Python objects.
+``interfaces/srv/ActiveSensing.srv`` defines them as messages, field by field.
 """
 
 from __future__ import annotations
@@ -17,42 +17,42 @@ from typing import NamedTuple
 
 import msgspec
 import numpy as np
-import numpy.typing as npt
 
 from holdfast import planning
+from holdfast.arrays import FloatArray
 from holdfast.belief import Belief
-from holdfast.configuration import Configuration
+from holdfast.config.loader import Configuration
+from holdfast.config.user_code import account_of_user_error
 from holdfast.errors import CheckpointError, HoldfastError, ProblemError
 from holdfast.planning import Planner, PlanningState
-from holdfast.runtime.robot_process import opening_of
-from holdfast.user_code import account_of_user_error
+from holdfast.robot.session_configuration import session_configuration_of
 
 __all__ = [
+    "ANOTHER_MAY_ANSWER",
     "ActiveSensing",
-    "Answer",
+    "DecisionAnswer",
+    "DecisionRequest",
     "ErrorCode",
-    "Kind",
-    "Request",
+    "RequestKind",
     "checked_state",
     "configuration_digest",
     "no_state",
 ]
 
-FloatArray = npt.NDArray[np.float64]
 
 _MAX_MESSAGE = 2000
 _NO_ENTROPIES = np.empty(0)
 
 
-class Kind(enum.IntEnum):
-    """What is asked."""
+class RequestKind(enum.IntEnum):
+    """The kind of a request."""
 
     INITIALIZE = 0
-    """The belief that a trial begins with."""
+    """Return the state that a trial begins with."""
     CHOOSE_SENSING_ACTION = 1
-    """What to sense."""
+    """Choose what to sense."""
     CHOOSE_TASK_ACTIONS = 2
-    """What to do once this was observed."""
+    """Choose the task actions after an observation."""
 
 
 class ErrorCode(enum.IntEnum):
@@ -60,32 +60,36 @@ class ErrorCode(enum.IntEnum):
 
     OK = 0
     BAD_REQUEST = 1
-    """Nobody can answer this request."""
+    """The request is invalid for every service."""
     OTHER_CONFIGURATION = 2
     """This service plans with another configuration or other code."""
     PROBLEM_FAILED = 3
     """The problem's own code has raised an error."""
     BUSY = 4
-    """Too much to do: somebody else may have time, and so may this service, later."""
+    """Too many requests: another service may answer now, or this one later."""
 
 
-class Request(NamedTuple):
-    """A request; what its kind does not need is left as it is.
+ANOTHER_MAY_ANSWER = (ErrorCode.OTHER_CONFIGURATION, ErrorCode.BUSY)
+"""Refusals of one service; every other error is the request's or the problem's own."""
+
+
+class DecisionRequest(NamedTuple):
+    """A request; fields that its kind does not need keep their defaults.
 
     Attributes
     ----------
     kind : int
-        One of :class:`Kind`.
+        One of :class:`RequestKind`.
     configuration : str
-        Digest of the configuration that is meant; empty means the service's own.
+        Digest of the required configuration; empty accepts the service's.
     seed, trial : int
-        Of the trial that is to begin.
+        Of the trial that begins.
     state : PlanningState or None
         None only for INITIALIZE.
     sensing_action : int
-        What was sensed.
+        The sensing action that was performed.
     observation : array of shape (observation_size,)
-        What it showed.
+        Its result.
     """
 
     kind: int
@@ -97,23 +101,21 @@ class Request(NamedTuple):
     observation: FloatArray = _NO_ENTROPIES
 
 
-class Answer(NamedTuple):
-    """An answer; what its request did not ask for is empty.
+class DecisionAnswer(NamedTuple):
+    """An answer; fields that its request did not ask for are empty.
 
     Attributes
     ----------
-    error : ErrorCode
     message : str
         Why there is no answer, in words.
     configuration : str
         Digest of the service's configuration.
     state : PlanningState or None
         For the next request; None if there is no answer.
-    sensing_action : int
     entropies : array of shape (J,)
         Expected entropy after each sensing action, in nats; empty if the selector has none.
     task_actions : array of shape (n, action_size)
-        What to do until the next sensing step, in order.
+        Up to the next sensing step, in order.
     """
 
     error: ErrorCode
@@ -126,28 +128,23 @@ class Answer(NamedTuple):
 
 
 def no_state() -> PlanningState:
-    """Return a state of no particles, for messages that must have one and mean none."""
+    """Return a state without particles, which messages use for none."""
     return PlanningState(0, 0, 0, 0, False, Belief(np.empty((0, 0)), np.empty(0)))
 
 
 def configuration_digest(configuration: Configuration) -> str:
-    """Return 16 digits that stand for all that decides but seed, trial and state.
+    """Return 16 digits of a digest over the problem, its code, the settings and the version.
 
-    That is the problem and its code, the settings of the planning, and holdfast's own version.
+    Everything that decides is in it, except seed, trial and state.
     """
-    opening = msgspec.structs.replace(opening_of(configuration), seed=0)
+    session_configuration = msgspec.structs.replace(session_configuration_of(configuration), seed=0)
     return hashlib.blake2b(
-        msgspec.msgpack.encode(opening, order="sorted"), digest_size=8
+        msgspec.msgpack.encode(session_configuration, order="sorted"), digest_size=8
     ).hexdigest()
 
 
 class ActiveSensing:
-    """Answers requests by one configuration; one thread at a time.
-
-    Parameters
-    ----------
-    configuration : Configuration
-    """
+    """Answers the requests of one configuration; for one thread at a time."""
 
     def __init__(self, configuration: Configuration) -> None:
         self._problem_name = configuration.problem_name
@@ -165,12 +162,12 @@ class ActiveSensing:
         """Coordinates of a state."""
         return self._planner.problem.state_size
 
-    def refusal(self, error: ErrorCode, message: str) -> Answer:
-        """Return the answer that there is none."""
-        return Answer(error, message[:_MAX_MESSAGE], self.configuration)
+    def refusal(self, error: ErrorCode, message: str) -> DecisionAnswer:
+        """Return an answer with an error."""
+        return DecisionAnswer(error, message[:_MAX_MESSAGE], self.configuration)
 
-    def answer(self, request: Request) -> Answer:
-        """Answer a request, or say in the answer why there is none."""
+    def answer(self, request: DecisionRequest) -> DecisionAnswer:
+        """Answer a request; errors are answers, too."""
         if request.configuration not in ("", self.configuration):
             return self.refusal(
                 ErrorCode.OTHER_CONFIGURATION,
@@ -180,7 +177,7 @@ class ActiveSensing:
         try:
             return self._answer(request)
         except HoldfastError as error:
-            # Only its author can mend a problem that breaks its contract.
+            # Only the author can fix a problem that breaks its contract.
             code = ErrorCode.PROBLEM_FAILED if isinstance(error, ProblemError) else None
             return self.refusal(code or ErrorCode.BAD_REQUEST, str(error))
         except Exception as error:
@@ -189,30 +186,31 @@ class ActiveSensing:
                 raise
             return self.refusal(ErrorCode.PROBLEM_FAILED, account)
 
-    def _answer(self, request: Request) -> Answer:
+    def _answer(self, request: DecisionRequest) -> DecisionAnswer:
         planner = self._planner
-        if request.kind == Kind.INITIALIZE:
-            state = planner.initial_state(request.seed, request.trial)
-            return Answer(ErrorCode.OK, "", self.configuration, state)
-        if request.kind not in (Kind.CHOOSE_SENSING_ACTION, Kind.CHOOSE_TASK_ACTIONS):
+        if request.kind == RequestKind.INITIALIZE:
+            state = planner.init(request.seed, request.trial)
+            return DecisionAnswer(ErrorCode.OK, "", self.configuration, state)
+        if request.kind not in (RequestKind.CHOOSE_SENSING_ACTION, RequestKind.CHOOSE_TASK_ACTIONS):
             return self.refusal(
                 ErrorCode.BAD_REQUEST,
-                f"kind {request.kind}: there are {', '.join(f'{k.value} {k.name}' for k in Kind)}",
+                f"kind {request.kind}: there are "
+                + ", ".join(f"{kind.value} {kind.name}" for kind in RequestKind),
             )
         if request.state is None:
             return self.refusal(ErrorCode.BAD_REQUEST, "state: there are no particles in it")
         state = request.state
-        planning.check_state(planner.problem, planner.settings, state)
+        planner.check(state)
         needs_sensing = planner.needs_sensing(state)
-        if request.kind == Kind.CHOOSE_SENSING_ACTION:
+        if request.kind == RequestKind.CHOOSE_SENSING_ACTION:
             if not needs_sensing:
                 return self.refusal(
                     ErrorCode.BAD_REQUEST,
                     f"step {state.step} needs no sensing action; ask for CHOOSE_TASK_ACTIONS",
                 )
-            chosen, info = planning.choose_sensing_action(planner.problem, planner.settings, state)
+            chosen, info = planner.choose_sensing_action(state)
             entropies = _NO_ENTROPIES if info.entropies is None else info.entropies
-            return Answer(ErrorCode.OK, "", self.configuration, state, chosen, entropies)
+            return DecisionAnswer(ErrorCode.OK, "", self.configuration, state, chosen, entropies)
         if needs_sensing:
             state, _ = planner.observe(state, request.sensing_action, request.observation)
         elif request.observation.size:
@@ -221,7 +219,7 @@ class ActiveSensing:
                 f"observation of {request.observation.size} values: step {state.step} needs none",
             )
         actions, ahead = planner.plan_until_sensing(state, self._max_actions)
-        return Answer(
+        return DecisionAnswer(
             ErrorCode.OK,
             "",
             self.configuration,
@@ -244,8 +242,6 @@ def checked_state(
 
     Parameters
     ----------
-    seed, trial, step, stage : int
-    sensed : bool
     state_size : int
         Coordinates of a state.
     states : array of shape (num_particles * state_size,)
@@ -266,7 +262,7 @@ def checked_state(
             f"state_size {state_size} need {weights.size * state_size}"
         )
     belief = Belief(states.reshape(weights.size, state_size), weights)
-    # What a checkpoint is checked for is what a state from outside must be checked for.
+    # A state from outside must pass the checks of a checkpoint.
     return planning.decode_checkpoint(
         planning.encode_checkpoint(PlanningState(seed, trial, step, stage, sensed, belief))
     )

@@ -1,14 +1,13 @@
-"""The robot's side of the typed service: the thesis's algorithm, without its losses.
+"""The robot's side of the typed service: the thesis's algorithm, without losing the belief.
 
-The cloud decides. If it does not answer in time, the recovery service on the robot does (*local
-recovery*), and the cloud is asked the same in the background at every turn; its first answer makes
-it the one that decides again, while the recovery service stays ready (*keep alive*). If neither
-answers, the robot holds still and both are asked again and again. The state goes with every
-request, so nothing is lost on the way from one to the other.
+The cloud decides. If it does not answer in time, the recovery service on the robot decides (*local
+recovery*), and each request also goes to the cloud in the background. The cloud's first answer in
+time makes it decide again, while the recovery service stays ready (*keep alive*). If neither
+answers, the robot holds still and both are asked repeatedly. The state is in every request, so a
+change of the service loses nothing.
 
-Each service has a thread of its own that asks it, one request at a time. Whoever waits for a
-decision waits for these threads and never for a socket, so no call holds a robot for longer than
-its deadline.
+One thread for each service sends the requests, one at a time. A decision waits for these threads
+and never for a socket, so no call exceeds its deadline.
 """
 
 from __future__ import annotations
@@ -21,68 +20,68 @@ from time import monotonic
 from typing import NamedTuple, Protocol, Self
 
 from holdfast.errors import HoldfastError, InvalidValueError, TransportError
-from holdfast.ros.active_sensing import Answer, ErrorCode, Request
-from holdfast.session.status import Cause, Status, next_status
+from holdfast.protocol.status import Cause, Status, next_status
+from holdfast.ros.active_sensing import (
+    ANOTHER_MAY_ANSWER,
+    DecisionAnswer,
+    DecisionRequest,
+    ErrorCode,
+)
 
-__all__ = ["ActiveSensingClient", "Service"]
+__all__ = ["ActiveSensingClient", "DecisionService"]
 
 _AGAIN_S = 0.05
 """A service that failed at once is not asked again before this time has passed."""
 
 _MAX_DEADLINE_S = 3600.0
 
-_ELSEWHERE = (ErrorCode.OTHER_CONFIGURATION, ErrorCode.BUSY)
-"""What another service may answer; all other errors are the request's or the problem's own."""
 
-
-class Service(Protocol):
-    """A way to one service."""
+class DecisionService(Protocol):
+    """A client of one service."""
 
     @property
     def name(self) -> str:
-        """Its name, for people."""
+        """Name of the service, for messages."""
         ...
 
-    def ask(self, request: Request, deadline_s: float) -> Answer:
-        """Ask, and wait for the answer for so long at most.
+    def ask(self, request: DecisionRequest, deadline_s: float) -> DecisionAnswer:
+        """Ask, and wait at most ``deadline_s`` for the answer.
 
         Raises
         ------
         TransportError
-            If there is no answer; the message says why.
+            If there is no answer; the message gives the reason.
         """
         ...
 
     def close(self) -> None:
-        """End what is being asked; may be called from another thread, and repeated."""
+        """End all requests; may be called from another thread, and repeated."""
         ...
 
 
 class _Outcome(NamedTuple):
     asker: _Asker
     number: int
-    answer: Answer | None
+    answer: DecisionAnswer | None
     reason: str
     took_s: float
 
 
 class _Asker:
-    """Asks one service, on a thread of its own, one request at a time.
+    """Asks one service on its own thread, one request at a time.
 
     Parameters
     ----------
-    service : Service
-    deadline_s : float
     outcomes : SimpleQueue
-        Gets what came of each request; None says that there is nothing more.
+        Gets the outcome of each request.
     is_last_resort : bool
-        Whether nobody else is left to answer: then a service that is slower than its deadline
-        gets twice the time with each request, since to ask it anew would take longer still.
+        Whether no other service is left. Then the deadline doubles with each request that misses
+        it, since asking anew would take even longer.
     """
 
     def __init__(
         self,
-        service: Service,
+        service: DecisionService,
         deadline_s: float,
         outcomes: queue.SimpleQueue[_Outcome | None],
         *,
@@ -92,7 +91,7 @@ class _Asker:
         self._deadline_s = deadline_s
         self._is_last_resort = is_last_resort
         self._outcomes = outcomes
-        self._requests: queue.SimpleQueue[tuple[int, Request] | None] = queue.SimpleQueue()
+        self._requests: queue.SimpleQueue[tuple[int, DecisionRequest] | None] = queue.SimpleQueue()
         self.asked = 0
         self.busy = False
         self.reason = ""
@@ -100,15 +99,15 @@ class _Asker:
         self._thread = threading.Thread(target=self._work, name=service.name, daemon=True)
         self._thread.start()
 
-    def ask(self, number: int, request: Request) -> None:
-        """Ask, unless an earlier request is still out or the last one has just failed."""
+    def ask(self, number: int, request: DecisionRequest) -> None:
+        """Ask, unless an earlier request is open or the last one has just failed."""
         if not self.busy and monotonic() >= self.not_before:
             self.busy = True
             self.asked = number
             self._requests.put((number, request))
 
     def take(self, outcome: _Outcome) -> bool:
-        """Note an outcome of this service and tell whether it was an answer."""
+        """Note an outcome of this service; return whether it was an answer."""
         self.busy = False
         self.reason = outcome.reason
         self.not_before = 0.0 if outcome.answer is not None else monotonic() + _AGAIN_S
@@ -124,7 +123,7 @@ class _Asker:
         while (asked := self._requests.get()) is not None:
             number, request = asked
             began = monotonic()
-            answer: Answer | None = None
+            answer: DecisionAnswer | None = None
             reason = ""
             try:
                 answer = self.service.ask(request, self._deadline_s)
@@ -132,7 +131,7 @@ class _Asker:
                 reason = str(error)
             except Exception as error:  # noqa: BLE001 - a thread that ends would never answer
                 reason = f"{type(error).__name__}: {error}"
-            if answer is not None and answer.error in _ELSEWHERE:
+            if answer is not None and answer.error in ANOTHER_MAY_ANSWER:
                 reason = f"{answer.error.name}: {answer.message}"
                 answer = None
             took_s = monotonic() - began
@@ -149,17 +148,15 @@ class ActiveSensingClient:
     cloud, recovery : Service
         They are closed with the client.
     deadline_s : float
-        A cloud that has not answered by then is given up for this decision, and is used again when
-        it has answered within this time. The recovery service, after which there is nobody, gets
-        more with each request that takes longer.
+        The cloud's time for an answer. After a miss it decides again once it answers within this
+        time. The recovery service, the last resort, gets more with each request that takes longer.
     on_event : callable or None
-        Is told of each change as ``on_event(name, **fields)``: ``status`` (``status``, ``reason``)
-        and ``holding`` (``reason``) when nobody answers. By default they are logged, as warnings
+        Gets each change as ``on_event(name, **fields)``: ``status`` (``status``, ``reason``) and
+        ``holding`` (``reason``) while no service answers. By default they are logged as warnings
         of ``holdfast.ros``.
 
     Attributes
     ----------
-    status : Status
     decided_by : str
         Name of the service whose answer was returned last.
 
@@ -171,8 +168,8 @@ class ActiveSensingClient:
 
     def __init__(
         self,
-        cloud: Service,
-        recovery: Service,
+        cloud: DecisionService,
+        recovery: DecisionService,
         deadline_s: float = 0.5,
         on_event: Callable[..., None] | None = None,
     ) -> None:
@@ -197,27 +194,26 @@ class ActiveSensingClient:
         self.close()
 
     def close(self) -> None:
-        """Ask nobody any more; who waits for a decision gets a TransportError. May be repeated."""
+        """End all requests; an open :meth:`decide` raises TransportError. May be repeated."""
         self._closed = True
         self._outcomes.put(None)
         self._cloud.close()
         self._recovery.close()
 
-    def decide(self, request: Request, give_up_s: float | None = None) -> Answer:
-        """Return what a service answers; while none does, wait.
+    def decide(self, request: DecisionRequest, give_up_s: float | None = None) -> DecisionAnswer:
+        """Return a service's answer; while none answers, wait.
 
         Parameters
         ----------
-        request : Request
         give_up_s : float or None
-            Stop waiting after this time; None waits until somebody answers.
+            Longest wait; None waits until a service answers.
 
         Raises
         ------
         InvalidValueError
-            If the services say that nobody can answer this, and why.
+            If the request is invalid or the problem failed; the message gives the reason.
         TransportError
-            If nobody has answered in time, or this is closed.
+            If no service has answered in time, or this is closed.
         """
         self._number += 1
         began = monotonic()
@@ -245,12 +241,12 @@ class ActiveSensingClient:
         return self.status is not Status.LOCAL_RECOVERY
 
     def _wait_s(self, until: float) -> float:
-        """Return how long nothing but an outcome can change anything."""
+        """Return how long to wait for an outcome before time itself matters."""
         left = until - monotonic()
         return min(_AGAIN_S, left) if left > 0 else _AGAIN_S
 
-    def _hear(self, timeout_s: float) -> Answer | None:
-        """Take all outcomes that are there, after waiting for one, up to the one asked for."""
+    def _hear(self, timeout_s: float) -> DecisionAnswer | None:
+        """Take the available outcomes, after waiting for one; stop at the wanted answer."""
         block = timeout_s > 0
         while True:
             try:
@@ -259,7 +255,7 @@ class ActiveSensingClient:
                 return None
             block = False
             if outcome is None or self._closed:
-                self._outcomes.put(None)  # for the next one who asks
+                self._outcomes.put(None)  # for the next caller
                 raise TransportError("this client is closed")
             answered = outcome.asker.take(outcome)
             if outcome.asker is self._cloud:
@@ -292,6 +288,6 @@ class ActiveSensingClient:
 
 
 def _log(name: str, **fields: object) -> None:
-    """Log an event, which without any settings is a line on the standard error."""
+    """Log an event, by default as a line on the standard error."""
     words = " ".join(f"{key}={value}" for key, value in fields.items() if value)
     logging.getLogger("holdfast.ros").warning("%s: %s", name, words)

@@ -1,14 +1,12 @@
-"""A world that somebody else's executive stands for: it asks for decisions, one after another.
+"""An environment for robots with an executive: a program that drives the robot and asks to decide.
 
-Many robots have a program already that drives them. It does not want to be called; it calls. So
-here a robot's run meets an environment whose ``perform_sensing`` and ``perform`` hand the decision
-to whoever calls :meth:`Executive.call`, and wait for the call that says what came of it. The run
-itself is like any other: journalled, with services that may die, to be resumed.
+Such a program calls; it does not want to be called. So this environment's ``perform_sensing`` and
+``perform`` publish the decision, and wait until a call of :meth:`DecisionHandover.call` reports its
+outcome. The run is like any other: journalled, resumable, with services that may die.
 
-A call may be repeated, because the one who makes it may not have heard the answer, or because a
-process died. So each decision has a number that follows from where in the trial it stands, not from
-who counts: the observation of step t is number 2 t + 1, its task action is 2 t + 2. A run that goes
-on after a crash gives the same decisions the same numbers.
+Calls may be repeated after a lost reply or a crash. So a decision's number follows from its place
+in the trial: the sensing action of step t is number 2 t + 1, the task action is 2 t + 2. A resumed
+run gives the same decisions the same numbers.
 """
 
 from __future__ import annotations
@@ -19,43 +17,49 @@ from time import monotonic
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from holdfast.arrays import FloatArray
 from holdfast.errors import EnvironmentFailedError, InvalidValueError
 from holdfast.outcome import Done
 from holdfast.problems.problem import Problem
-from holdfast.runtime.environment import EnvironmentMaker, observation_size
+from holdfast.robot.environment import EnvironmentMaker, ObservationSizes
 
-__all__ = ["Call", "Code", "DueDecision", "Executive", "ExecutiveEnvironment", "ExecutiveMaker"]
+__all__ = [
+    "DecideCode",
+    "DecideRequest",
+    "DecisionHandover",
+    "DueDecision",
+    "ExecutiveEnvironment",
+    "ExecutiveMaker",
+]
 
-FloatArray = npt.NDArray[np.float64]
 
 _NO_NUMBERS: FloatArray = np.empty(0)
 
 
-class Code(enum.IntEnum):
-    """How a call ends."""
+class DecideCode(enum.IntEnum):
+    """The result of a call."""
 
     OK = 0
     HOLDING = 1
-    """Nothing is decided yet: make the same call again."""
+    """There is no decision yet: repeat the call."""
     FINISHED = 2
-    """All trials are."""
+    """All trials are finished."""
     BAD_REQUEST = 3
-    """The call's answer was not taken; the decision is still due."""
+    """The reported outcome was refused; the decision is still due."""
     INACTIVE = 4
-    """Nobody runs here."""
+    """No run is active."""
     ENDED = 5
     """The run has ended early."""
 
 
 class DueDecision(NamedTuple):
-    """A decision that waits for what comes of it.
+    """A decision whose outcome is awaited.
 
     Attributes
     ----------
     trial, number : int
-        Name it.
+        Identify it.
     step : int
         Task actions before it.
     sensing_action : int or None
@@ -71,16 +75,14 @@ class DueDecision(NamedTuple):
     task_action: FloatArray = _NO_NUMBERS
 
 
-class Call(NamedTuple):
-    """What came of a decision.
+class DecideRequest(NamedTuple):
+    """The outcome of a decision.
 
     Attributes
     ----------
     trial, number : int
-        Of the decision; number 0 answers none.
+        Of the decision; number 0 reports no outcome.
     observation : array of shape (n,)
-    reward : float or None
-    done : bool or "failed"
     """
 
     trial: int = 0
@@ -90,31 +92,29 @@ class Call(NamedTuple):
     done: Done = False
 
 
-class Reply(NamedTuple):
-    """What a call gets.
+class DecideReply(NamedTuple):
+    """The reply to a call.
 
     Attributes
     ----------
-    code : Code
     message : str
         Why there is no decision.
-    due : DueDecision or None
     """
 
-    code: Code
+    code: DecideCode
     message: str = ""
     due: DueDecision | None = None
 
 
-class Executive:
-    """Where a robot's run and whoever performs its decisions meet; for any number of threads.
+class DecisionHandover:
+    """Hands a run's decisions to an executive and its outcomes back; usable from any thread.
 
-    It is for one run, until that ends or is held.
+    It serves one run, until that ends or is held.
 
     Parameters
     ----------
     problem : Problem
-        Its own instance: it is called by the threads of callers.
+        An instance that only callers' threads use.
     sensing_interval : int
         Task actions between two sensing steps.
     """
@@ -122,30 +122,27 @@ class Executive:
     def __init__(self, problem: Problem, sensing_interval: int) -> None:
         self._problem = problem
         self._interval = sensing_interval
-        self._sizes: dict[int, int | None] = {}
+        self._sizes = ObservationSizes(problem)
         self._changed = threading.Condition()
         self._due: DueDecision | None = None
-        self._answer: Call | None = None
+        self._answer: DecideRequest | None = None
         self._answered: tuple[int, int] | None = None
-        self._end: Reply | None = None
+        self._end: DecideReply | None = None
 
-    def end(self, code: Code, message: str) -> None:
-        """Take note that the run has ended, or is to end: nobody waits any longer.
-
-        What came first counts.
-        """
+    def end(self, code: DecideCode, message: str) -> None:
+        """End all waits, because the run has ended or will end. The first call counts."""
         with self._changed:
-            self._end = self._end or Reply(code, message)
+            self._end = self._end or DecideReply(code, message)
             self._due = None
             self._changed.notify_all()
 
-    def perform(self, due: DueDecision) -> Call:
-        """Hand a decision to whoever calls, and wait for what comes of it.
+    def perform(self, due: DueDecision) -> DecideRequest:
+        """Publish a decision and wait for its outcome.
 
         Raises
         ------
         EnvironmentFailedError
-            If the run is to end.
+            If the run ends first.
         """
         with self._changed:
             self._answer = None
@@ -153,19 +150,18 @@ class Executive:
                 self._due = due
                 self._changed.notify_all()
             self._changed.wait_for(lambda: self._answer or self._end)
-            answer: Call | None = self._answer
+            answer: DecideRequest | None = self._answer
             if answer is None:
                 raise EnvironmentFailedError("" if self._end is None else self._end.message)
             return answer
 
-    def call(self, call: Call, within_s: float) -> Reply:
-        """Take what came of a decision, and return the next one.
+    def call(self, call: DecideRequest, within_s: float) -> DecideReply:
+        """Take the outcome of a decision, and return the next decision.
 
         Parameters
         ----------
-        call : Call
         within_s : float
-            If there is none by then, the reply says so.
+            Longest wait; the reply is ``HOLDING`` after it.
         """
         deadline = monotonic() + within_s
         named = call.trial, call.number
@@ -174,21 +170,25 @@ class Executive:
                 due = self._due
                 if due is not None:
                     if not call.number or self._precedes(named, due):
-                        return Reply(Code.OK, due=due)
+                        return DecideReply(DecideCode.OK, due=due)
                     try:
                         self._check(call, due)
                     except InvalidValueError as error:
-                        return Reply(Code.BAD_REQUEST, str(error), due)
+                        return DecideReply(DecideCode.BAD_REQUEST, str(error), due)
                     self._answer, self._answered, self._due = call, named, None
                     self._changed.notify_all()
                 elif call.number and self._answered not in (None, named):
-                    return Reply(Code.BAD_REQUEST, self._wrong_number(named, self._answered))
+                    return DecideReply(
+                        DecideCode.BAD_REQUEST, self._wrong_number(named, self._answered)
+                    )
                 if not self._changed.wait(deadline - monotonic()) and monotonic() >= deadline:
-                    return Reply(Code.HOLDING, "nothing is decided yet; make the same call again")
+                    return DecideReply(
+                        DecideCode.HOLDING, "nothing is decided yet; make the same call again"
+                    )
             return self._end
 
     def _precedes(self, named: tuple[int, int], due: DueDecision) -> bool:
-        """Tell whether a decision is the one before the one that is due."""
+        """Return whether a decision directly precedes the due one."""
         if due.number <= 1 or (due.number == 2 and not self._senses_at(0)):
             return named[0] == due.trial - 1
         by_sensing = due.sensing_action is None and self._senses_at(due.step)
@@ -205,7 +205,7 @@ class Executive:
             "answered, or was last; number 0 asks what is due"
         )
 
-    def _check(self, call: Call, due: DueDecision) -> None:
+    def _check(self, call: DecideRequest, due: DueDecision) -> None:
         if (call.trial, call.number) != (due.trial, due.number):
             raise InvalidValueError(
                 self._wrong_number((call.trial, call.number), (due.trial, due.number))
@@ -225,7 +225,7 @@ class Executive:
                 f"done says {said}: number {due.number} is a sensing action, after which the task "
                 "goes on; say so with the task action that it ended with"
             )
-        size = self._observation_size(due.sensing_action)
+        size = self._sizes[due.sensing_action]
         if call.observation.size < 1 or size not in (None, call.observation.size):
             raise InvalidValueError(
                 f"observation of {call.observation.size} values: sensing action "
@@ -237,24 +237,19 @@ class Executive:
                 f"observation[{place}] is {call.observation[place]}: must be a finite number"
             )
 
-    def _observation_size(self, sensing_action: int) -> int | None:
-        if sensing_action not in self._sizes:
-            self._sizes[sensing_action] = observation_size(self._problem, sensing_action)
-        return self._sizes[sensing_action]
-
 
 class ExecutiveEnvironment:
-    """One trial of a world that an executive stands for.
+    """One trial that an executive performs.
 
     Parameters
     ----------
-    executive : Executive
-    trial : int
     step : int
-        Task actions that are known to have been performed in it.
+        Task actions that the journal knows to be performed in it.
     """
 
-    def __init__(self, executive: Executive | None = None, trial: int = 0, step: int = 0) -> None:
+    def __init__(
+        self, executive: DecisionHandover | None = None, trial: int = 0, step: int = 0
+    ) -> None:
         if executive is None:
             raise EnvironmentFailedError(
                 "this run is driven by an executive that asks the node's service decide; go on "
@@ -287,8 +282,8 @@ class ExecutiveEnvironment:
     def steps_performed(self) -> int:
         """Return how many task actions the journal knows to be performed.
 
-        The one that it may have begun is handed out again, with its number: the executive knows
-        whether it has performed that, and answers without doing it twice.
+        One that may have begun is handed out again with its number. The executive knows whether it
+        has performed it, and answers without performing it twice.
         """
         return self._step
 
@@ -298,13 +293,11 @@ class ExecutiveMaker(EnvironmentMaker):
 
     Parameters
     ----------
-    executive : Executive
-    problem : Problem
     timeout_ms : float
         Longest time that the executive may take for one decision.
     """
 
-    def __init__(self, executive: Executive, problem: Problem, timeout_ms: float) -> None:
+    def __init__(self, executive: DecisionHandover, problem: Problem, timeout_ms: float) -> None:
         super().__init__("the executive", problem, 0, timeout_ms)
         self.simulated = False
         self._executive = executive

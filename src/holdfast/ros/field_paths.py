@@ -1,8 +1,8 @@
 """Fields of a ROS message by their path, such as ``pose.position.x`` or ``wrench[2].force.z``.
 
-A robot's services have fields of their own. So which field takes what is said in parameters, as
-text, and read here. Nothing in this module imports ROS: a message is an object that tells its
-fields with ``get_fields_and_field_types()``, as every generated one does.
+Robots' services differ in their fields, so parameters name the fields as text, which is parsed
+here. Nothing in this module imports ROS: a message is an object that lists its fields with
+``get_fields_and_field_types()``, as every generated one does.
 """
 
 from __future__ import annotations
@@ -132,8 +132,6 @@ def write(message: Any, path: Path, value: Any) -> None:
 
     Parameters
     ----------
-    message : message
-    path : tuple
     value : number, str, or list of either
         It is converted to the type of the field.
 
@@ -246,7 +244,7 @@ def _element(declared: str | None) -> str | None:
 
 
 def _grow(holder: Any, size: int, declared: str | None) -> bool:
-    """Make an array as long as it must be; tell whether it could be done."""
+    """Extend an array to a size; return whether that is possible."""
     element = _element(declared)
     if isinstance(holder, np.ndarray) or element is None or "[" in (declared or ""):
         return False

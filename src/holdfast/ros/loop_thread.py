@@ -1,4 +1,4 @@
-"""An asyncio loop on a thread of its own, for what must go on while others wait or compute."""
+"""An asyncio loop on its own thread, which runs while other threads wait or compute."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class LoopThread:
         self._thread.start()
 
     def run(self, coroutine: Coroutine[Any, Any, _T], within_s: float) -> _T:
-        """Run a coroutine there, and wait for its result for so long.
+        """Run a coroutine there, and wait at most ``within_s`` for its result.
 
         Raises
         ------
@@ -45,7 +45,7 @@ class LoopThread:
             raise TransportError(f"it took longer than {within_s:g} s") from None
 
     def call(self, function: Callable[..., object], *arguments: object) -> None:
-        """Have something called there; nothing happens once it is closed."""
+        """Call a function there; after the end nothing happens."""
         with contextlib.suppress(RuntimeError):
             self._loop.call_soon_threadsafe(function, *arguments)
 
@@ -58,7 +58,7 @@ class LoopThread:
         asyncio.set_event_loop(self._loop)
         try:
             self._loop.run_forever()
-            # What was cancelled just now still hears of it.
+            # Tasks that were just cancelled get their exception.
             self._loop.run_until_complete(asyncio.sleep(0))
         finally:
             self._loop.close()

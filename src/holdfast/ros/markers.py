@@ -1,8 +1,8 @@
-"""What of a problem RViz and Foxglove can show: obstacles, the goal, the body, what is sensed.
+"""A problem as shapes for RViz and Foxglove: obstacles, goal, body and sensing action.
 
 A marker here is plain data; :mod:`holdfast.ros.mcap_export` makes ``visualization_msgs`` of it. The
-body stands in the frame that is the estimate (or the true pose) and moves with it, so it is said
-once. What a problem does not say is left out.
+body's frame is the estimate (or the true pose), which moves, so the body is written once. What a
+problem does not define is left out.
 """
 
 from __future__ import annotations
@@ -11,9 +11,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from holdfast.arrays import FloatArray
 from holdfast.belief import Belief, estimate
 from holdfast.geometry import BoxWorld
-from holdfast.problems.problem import FloatArray, Problem, Scene
+from holdfast.problems.problem import Problem, Scene
 from holdfast.ros.poses import POSE_COORDINATES, PoseLayout
 
 __all__ = ["Marker", "scene_markers", "sensing_markers"]
@@ -37,13 +38,12 @@ _DISC_POINTS = 49
 
 
 class Marker(NamedTuple):
-    """A shape to be shown.
+    """A shape.
 
     Attributes
     ----------
     kind : str
         A constant of ``visualization_msgs/Marker``: ``CUBE``, ``LINE_STRIP``, ...
-    frame, namespace : str
     pose : tuple of float
         Position and quaternion (x, y, z, w).
     scale : tuple of float
@@ -51,9 +51,8 @@ class Marker(NamedTuple):
     color : tuple of float
         Red, green, blue and opacity, 0 to 1.
     points : sequence of (x, y, z)
-    text : str
     moves_with_frame : bool
-        Whether it stays where it is in the frame when that moves.
+        Whether it follows its frame.
     """
 
     kind: str
@@ -78,8 +77,6 @@ def scene_markers(
 
     Parameters
     ----------
-    problem : Problem
-    layout : PoseLayout
     frame : str
         In which its poses are.
     estimate_frame, truth_frame : str or None

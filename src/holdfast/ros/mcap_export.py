@@ -17,12 +17,13 @@ from typing import TYPE_CHECKING, Any, Final, Self
 
 import numpy as np
 
+from holdfast.arrays import FloatArray
 from holdfast.belief import Belief
-from holdfast.configuration import Configuration
-from holdfast.errors import HoldfastError
-from holdfast.problems.problem import FloatArray
+from holdfast.config.loader import Configuration
+from holdfast.errors import MissingRosbagsError
+from holdfast.protocol.status import Status
 from holdfast.recording.csv_export import state_labels
-from holdfast.recording.export import (
+from holdfast.recording.facts import (
     Decider,
     EventFact,
     SensingFact,
@@ -36,7 +37,7 @@ from holdfast.ros.poses import pose_layout
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
 
-__all__ = ["MAP_FRAME", "TASK_FRAME", "McapSink", "MissingRosbagsError", "require_rosbags"]
+__all__ = ["MAP_FRAME", "TASK_FRAME", "McapSink", "require_rosbags"]
 
 MAP_FRAME = "map"
 TASK_FRAME = "task"
@@ -73,10 +74,6 @@ _WARNINGS = frozenset(
     ]
 )
 _ERRORS = frozenset(("wrong_answer", "not_deterministic", "state_diverged", "stopped", "error"))
-
-
-class MissingRosbagsError(HoldfastError):
-    """The library rosbags is not installed."""
 
 
 def require_rosbags() -> None:
@@ -249,7 +246,7 @@ class McapSink:
         name, fields = fact.name, dict(fact.fields)
         if name == "trial":
             return  # its beginning and its end are there
-        worse = name == "status" and fields.get("to") == "local_recovery"
+        worse = name == "status" and fields.get("to") == Status.LOCAL_RECOVERY.value
         level = "ERROR" if name in _ERRORS else "WARN" if worse or name in _WARNINGS else "INFO"
         component = str(fields.pop("component", "robot"))
         text = ", ".join(f"{key} {value}" for key, value in fields.items())
@@ -415,7 +412,7 @@ class McapSink:
         if decider is not None:
             entries |= decider._asdict()
         level, message = 0, status
-        if decider is not None and decider.status == "local_recovery":
+        if decider is not None and decider.status == Status.LOCAL_RECOVERY.value:
             level = 1
         if explained is False:
             level, message = 1, f"{status}; no particle explains the observation"

@@ -1,37 +1,47 @@
 """The typed service as ROS messages: in CDR for ROS 2, and in ROS 1's own serialisation.
 
-ROS knows a type by a digest of its definition, and two ends with different digests do not talk to
-each other. So the definitions stand in one place, ``interfaces``, where colcon and catkin read them
-as well, and everything here is made of them: the serialisation and both kinds of digest, RIHS01
-of ROS 2 (REP 2016) and the MD5 sum of ROS 1.
+ROS identifies a type by a digest of its definition, and two ends with different digests do not
+connect. So the definitions are in one place, ``interfaces``, which colcon and catkin read, too. The
+serialisation and both digests are made from them: RIHS01 of ROS 2 (REP 2016) and the MD5 sum of
+ROS 1.
 
-rosbags does all of this for messages. A service is, to RIHS01, one more message with three fields:
-its request, its response, and an event that has both.
+rosbags does this for messages. For RIHS01 a service is a message with three fields: its request,
+its response, and an event that contains both.
 """
 
 from __future__ import annotations
 
 import functools
 import hashlib
+from collections.abc import Callable
 from importlib.resources import files
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
+from holdfast.arrays import FloatArray
 from holdfast.errors import HoldfastError, InvalidValueError
-from holdfast.ros.active_sensing import Answer, ErrorCode, Request, checked_state, no_state
+from holdfast.ros.active_sensing import (
+    DecisionAnswer,
+    DecisionRequest,
+    ErrorCode,
+    checked_state,
+    no_state,
+)
 
 if TYPE_CHECKING:
     from rosbags.interfaces.typing import Typesdict
     from rosbags.typesys.store import Typestore
 
     from holdfast.planning import PlanningState
+    from holdfast.ros.active_sensing import ActiveSensing
 
 __all__ = [
     "MAX_BYTES",
     "SERVICE",
     "Serialization",
+    "answer_message",
     "decode_answer",
     "decode_request",
     "encode_answer",
@@ -69,7 +79,7 @@ def typestore() -> Typestore:
     Raises
     ------
     InvalidValueError
-        If rosbags is not installed; the message says what mends it.
+        If rosbags is not installed.
     """
     try:
         from rosbags.typesys import Stores, get_types_from_msg, get_typestore
@@ -159,7 +169,7 @@ def _hashed_text(store: Typestore, name: str) -> str:
     return "\n".join(lines)
 
 
-def encode_request(request: Request, serialization: Serialization = "cdr") -> bytes:
+def encode_request(request: DecisionRequest, serialization: Serialization = "cdr") -> bytes:
     """Return a request as a message.
 
     Raises
@@ -180,7 +190,9 @@ def encode_request(request: Request, serialization: Serialization = "cdr") -> by
     return _encode(message, "Request", serialization)
 
 
-def decode_request(data: bytes | memoryview, serialization: Serialization = "cdr") -> Request:
+def decode_request(
+    data: bytes | memoryview, serialization: Serialization = "cdr"
+) -> DecisionRequest:
     """Return the request that a message has.
 
     Raises
@@ -191,7 +203,7 @@ def decode_request(data: bytes | memoryview, serialization: Serialization = "cdr
         If its state is none.
     """
     message = _decode(data, "Request", serialization)
-    return Request(
+    return DecisionRequest(
         kind=message.kind,
         configuration=message.configuration,
         seed=message.seed,
@@ -202,7 +214,7 @@ def decode_request(data: bytes | memoryview, serialization: Serialization = "cdr
     )
 
 
-def encode_answer(answer: Answer, serialization: Serialization = "cdr") -> bytes:
+def encode_answer(answer: DecisionAnswer, serialization: Serialization = "cdr") -> bytes:
     """Return an answer as a message.
 
     Raises
@@ -225,7 +237,7 @@ def encode_answer(answer: Answer, serialization: Serialization = "cdr") -> bytes
     return _encode(message, "Response", serialization)
 
 
-def decode_answer(data: bytes | memoryview, serialization: Serialization = "cdr") -> Answer:
+def decode_answer(data: bytes | memoryview, serialization: Serialization = "cdr") -> DecisionAnswer:
     """Return the answer that a message has.
 
     Raises
@@ -247,7 +259,7 @@ def decode_answer(data: bytes | memoryview, serialization: Serialization = "cdr"
         raise InvalidValueError(
             f"task_actions has {actions.size} numbers: they must be actions of action_size {size}"
         )
-    return Answer(
+    return DecisionAnswer(
         error=error,
         message=message.message,
         configuration=message.configuration,
@@ -256,6 +268,33 @@ def decode_answer(data: bytes | memoryview, serialization: Serialization = "cdr"
         entropies=_array(message.entropies),
         task_actions=actions.reshape(-1, size) if actions.size else np.empty((0, size)),
     )
+
+
+def answer_message(
+    service: ActiveSensing,
+    request: bytes,
+    serialization: Serialization = "cdr",
+    on_refused: Callable[[str], None] = lambda _: None,
+) -> bytes:
+    """Have a service answer a request, both as messages; every failure is an answer, too.
+
+    Parameters
+    ----------
+    on_refused : callable
+        Gets the reason if the bytes are no request.
+    """
+    try:
+        decoded = decode_request(request, serialization)
+    except HoldfastError as error:
+        on_refused(str(error))
+        answer = service.refusal(ErrorCode.BAD_REQUEST, str(error))
+    else:
+        answer = service.answer(decoded)
+    try:
+        return encode_answer(answer, serialization)
+    except HoldfastError as error:
+        refusal = service.refusal(ErrorCode.PROBLEM_FAILED, str(error))
+        return encode_answer(refusal, serialization)
 
 
 def _state_message(state: PlanningState | None) -> Any:
@@ -309,7 +348,7 @@ def _decode(data: bytes | memoryview, part: str, serialization: Serialization) -
     except HoldfastError:
         raise
     except Exception as error:
-        # What was generated for the type checks nothing; on other bytes it fails in many ways.
+        # The generated code checks nothing; invalid bytes raise many kinds of errors.
         raise InvalidValueError(
             f"{len(data)} bytes are no {SERVICE}_{part} in {serialization}: "
             f"{type(error).__name__} {error}".rstrip()
@@ -324,10 +363,10 @@ def _whole(name: str, value: int, negative_bits: int, bits: int) -> int:
     return int(value)
 
 
-def _flat(array: npt.ArrayLike) -> npt.NDArray[np.float64]:
+def _flat(array: npt.ArrayLike) -> FloatArray:
     return np.ascontiguousarray(array, dtype=np.float64).ravel()
 
 
-def _array(array: npt.ArrayLike) -> npt.NDArray[np.float64]:
-    """Return an array of one's own; a message's lies in its bytes, as they were sent."""
+def _array(array: npt.ArrayLike) -> FloatArray:
+    """Return a copy; a message's array is a view of its bytes."""
     return np.array(array, dtype=np.float64)

@@ -22,12 +22,12 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from holdfast.arrays import FloatArray
 from holdfast.belief import Belief, estimate
 from holdfast.errors import ProblemError
 
 __all__ = ["POSE_COORDINATES", "PoseLayout", "pose_layout"]
 
-FloatArray = npt.NDArray[np.float64]
 
 POSE_COORDINATES = ("x", "y", "z", "roll", "pitch", "yaw")
 """In the order of the covariance of ``geometry_msgs/PoseWithCovariance``: rotations are about the
@@ -114,7 +114,7 @@ def pose_layout(problem: Any) -> PoseLayout | None:
     Raises
     ------
     ProblemError
-        If what it says cannot be.
+        If these attributes are invalid.
     """
     words = getattr(problem, "pose", None)
     if words is None or (isinstance(words, tuple | list) and not words):

@@ -1,18 +1,18 @@
-"""What a robot offers in ROS, as parameters say it: names, types, and which field takes what.
+"""A robot's interface in ROS, by parameters: names and types of its calls, and their fields.
 
-Somebody who has a robot has services and actions for it already. The parameters map them to what
-holdfast asks of a robot; each of the five is called a role here:
+Existing robots have their own services and actions. The parameters map them to the five calls that
+holdfast needs, the roles:
 
 - ``sense``: perform a sensing action;
 - ``act``: perform a task action;
-- ``done``: tell whether the task is done;
-- ``steps``: tell how many task actions were performed in this trial;
-- ``reset``: bring the robot to where trials begin.
+- ``done``: report whether the task is done;
+- ``steps``: report how many task actions were performed in this trial;
+- ``reset``: bring the robot to the start of a trial.
 
 A robot that offers the ready-made ``robot/sense`` (``holdfast_interfaces/srv/Sense``),
 ``robot/act`` (``holdfast_interfaces/action/Act``) and ``robot/trial``
 (``holdfast_interfaces/srv/Trial``, for the other three) needs no parameters at all. As soon as
-``sense`` or ``act`` has a type of its own, a role without a name is not there: without ``done``
+``sense`` or ``act`` has another type, a role without a name does not exist: without ``done``
 trials end at ``simulator.max_steps``, without ``steps`` a run that was killed in the middle of a
 task action cannot be resumed, without ``reset`` a trial begins where the robot is.
 
@@ -27,9 +27,9 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
+from holdfast.config.yaml_document import read
 from holdfast.errors import ConfigurationError
 from holdfast.ros.field_paths import Path, check_path, find_type, parse_path
-from holdfast.yaml_document import read
 
 __all__ = ["ROBOT_PARAMETERS", "ObservationTopic", "RobotCall", "RobotInterface"]
 
@@ -159,19 +159,16 @@ class RobotCall(NamedTuple):
 
     Attributes
     ----------
-    role, name, type_name : str
     kind : str
         ``srv``, ``action`` or ``msg``.
     type : type
         The generated class.
-    timeout_s : float
     paths : dict of str to list of tuple
         By key (``trial``, ``index``, ``action``, ...) the fields that it names. Those of
         ``observation`` are in ``observation``.
     observation : list of str
         With ``{index}`` and ``{label}`` still in them.
     constants : list of (path, value)
-    scale, values : list of float
     """
 
     role: str
@@ -196,7 +193,7 @@ class RobotCall(NamedTuple):
         return paths[0] if paths else None
 
     def __str__(self) -> str:
-        """Return what it is, for messages."""
+        """Return a description for messages."""
         word = {"srv": "service", "action": "action", "msg": "topic"}[self.kind]
         return f"{word} {self.name} ({self.key('name')})"
 
@@ -229,10 +226,8 @@ class RobotInterface:
     ----------
     calls : dict of str to RobotCall
         By role; those that are not there are missing.
-    observation : ObservationTopic or None
     timeout_s : float
         For an observation that nobody is asked for, and for each call by default.
-    discovery_timeout_s : float
 
     Raises
     ------

@@ -1,1 +1,1 @@
-"""The shells: what touches clocks, processes and the world, so that planning does not have to."""
+"""What robots and services need of the operating system: logs, workers, descriptors, systemd."""

@@ -1,28 +1,380 @@
-"""What has to be known of a command line before it is parsed, and also if it cannot be."""
+"""Command lines: each command declares its options once, as the attributes of a class.
+
+The parser, the help, the messages about bad values and the command line that repeats a call follow
+from that class. ``argparse`` splits the words. A service that replaces a dead one reads its options
+here, too, and its start-up time is recovery time: so nothing that is slow to load is imported.
+"""
 
 from __future__ import annotations
 
+import argparse
+import contextlib
 import itertools
-from collections.abc import Sequence
+import os
+import re
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar, NamedTuple, NoReturn, Self
 
-__all__ = ["MAX_JOBS", "wants_json"]
+from holdfast.errors import OptionError
+
+__all__ = [
+    "MAX_JOBS",
+    "MAX_SEED",
+    "MAX_TRIALS",
+    "Option",
+    "Options",
+    "argument",
+    "bad_value",
+    "close_match",
+    "flag",
+    "location",
+    "number",
+    "one_of",
+    "option",
+    "wants_json",
+    "whole_number",
+]
 
 MAX_JOBS = 1024
 """Largest number of worker processes that a command can be asked for (``--jobs``)."""
 
+MAX_SEED = 2**63 - 1
+"""Largest seed, as in the configuration."""
+
+MAX_TRIALS = 10_000_000
+"""Largest number of trials, as in the configuration."""
+
+_MAX_COLUMNS = 100
+
+_AFTER_DASHES = "\0"
+"""Put before each word after ``--``; no word of a command line has this character."""
+
+_EXIT_CODES = {
+    0: "done",
+    1: "different",
+    2: "an error",
+    3: "a service answered otherwise than the robot's own planner",
+    4: "an error, but the run can go on",
+}
+
+
+class Option(NamedTuple):
+    """An option or a positional argument of a command.
+
+    Attributes
+    ----------
+    names : tuple of str
+        The long name first; empty for a positional argument.
+    read : callable
+        Turns the text into the value; see :func:`bad_value`.
+    many : bool
+        Whether it may be given several times; then the value is a tuple.
+    key : str or None
+        The configuration's ``section.key`` that it replaces.
+    hidden : bool
+        Whether the help leaves it out.
+    """
+
+    names: tuple[str, ...]
+    help: str
+    metavar: str
+    read: Callable[[str], Any]
+    default: Any
+    many: bool = False
+    key: str | None = None
+    hidden: bool = False
+    required: bool = False
+
+    @property
+    def is_flag(self) -> bool:
+        """Whether it takes no value."""
+        return isinstance(self.default, bool)
+
+    def words(self, value: Any) -> list[str]:
+        """Return the words of a command line that give this value."""
+        if self.is_flag:
+            return [self.names[0] if value else f"--no-{self.names[0].removeprefix('--')}"]
+        values = [str(each) for each in (value if self.many else (value,))]
+        if not self.names:
+            return [f"./{each}" if each.startswith("-") else each for each in values]
+        # In two words a value with a dash in front would be taken for an option.
+        return [
+            word
+            for each in values
+            for word in (
+                [f"{self.names[0]}={each}"] if each.startswith("-") else [self.names[0], each]
+            )
+        ]
+
+
+def argument(
+    metavar: str,
+    help: str,  # noqa: A002
+    read: Callable[[str], Any] = str,
+    *,
+    many: bool = False,
+    required: bool = True,
+) -> Any:
+    """Declare a positional argument; see :class:`Option`."""
+    return Option((), help, metavar, read, () if many else None, many, required=required)
+
+
+def option(
+    *names: str,
+    help: str,  # noqa: A002
+    metavar: str,
+    read: Callable[[str], Any] = str,
+    default: Any = None,
+    many: bool = False,
+    key: str | None = None,
+    hidden: bool = False,
+) -> Any:
+    """Declare an option with a value; see :class:`Option`."""
+    return Option(names, help, metavar, read, () if many else default, many, key, hidden)
+
+
+def flag(*names: str, help: str, default: bool = False) -> Any:  # noqa: A002
+    """Declare an option without a value; one that is on by default is switched off by ``--no-``."""
+    return Option(names, help, "", str, default)
+
+
+class Options:
+    """The options of a command, to be derived from: its docstring is the help.
+
+    Attributes
+    ----------
+    exit_codes : mapping of int to str or None
+        The codes with which the command ends besides 0 and 2, and what they mean if that is not
+        what they mean in general.
+    needs_arguments : bool
+        Whether the command without any arguments shows its help.
+    """
+
+    exit_codes: ClassVar[Mapping[int, str | None]] = {}
+    needs_arguments: ClassVar[bool] = False
+
+    def __init__(self, **values: Any) -> None:
+        for name, each in self.table().items():
+            setattr(self, name, values.get(name, each.default))
+
+    @classmethod
+    def table(cls) -> dict[str, Option]:
+        """Return the options by the names of their attributes."""
+        return {name: each for name, each in vars(cls).items() if isinstance(each, Option)}
+
+    @classmethod
+    def parse(cls, command: str, arguments: Sequence[str]) -> Self:
+        """Read the arguments of a command.
+
+        Raises
+        ------
+        OptionError
+            If one of them cannot be used; the message names the option, the value and the limit.
+        SystemExit
+            After the help was shown.
+        """
+        parser = _parser(cls, f"holdfast {command}")
+        if cls.needs_arguments and not arguments:
+            import sys
+
+            parser.print_help(sys.stderr)
+            raise SystemExit(2)
+        try:
+            found, unknown = parser.parse_known_intermixed_args(_marked(arguments))
+        except argparse.ArgumentError as error:
+            raise OptionError(_complaint(error)) from None
+        if unknown:
+            word = unknown[0].partition("=")[0]
+            if not word.startswith("-"):
+                word = word.removeprefix(_AFTER_DASHES)
+                raise OptionError(f"{word!r:.80} is one argument too many")
+            names = [name for each in cls.table().values() for name in each.names]
+            hint = close_match(word, names)
+            raise OptionError(f"{word!r:.80} is no option of holdfast {command}{hint}")
+        table = cls.table()
+        values = {
+            name: tuple(value) if table[name].many else value for name, value in vars(found).items()
+        }
+        for name, each in table.items():
+            if each.required and values[name] in (None, ()):
+                raise OptionError(f"{each.metavar} is missing")
+        return cls(**values)
+
+    def words(self, *without: str) -> list[str]:
+        """Return the command line that gives these options, but for defaults and those named."""
+        given = [
+            each.words(value)
+            for name, each in self.table().items()
+            if name not in without and (value := getattr(self, name)) != each.default
+        ]
+        return list(itertools.chain.from_iterable(given))
+
+
+class _Parser(argparse.ArgumentParser):
+    """Raises what another parser prints."""
+
+    def error(self, message: str) -> NoReturn:
+        raise OptionError(message)
+
+
+class _Help(argparse.HelpFormatter):
+    """Separates paragraphs, and shows the metavar of an option once."""
+
+    def __init__(self, prog: str) -> None:
+        # With its width, because shutil, which would find it, is slow to load.
+        columns = 80
+        with contextlib.suppress(OSError):
+            columns = min(os.get_terminal_size().columns, _MAX_COLUMNS)
+        super().__init__(prog, max_help_position=32, width=columns - 2)
+
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        paragraphs = re.split(r"\n\s*\n", text.strip())
+        return "\n\n".join(
+            super(_Help, self)._fill_text(each, width, indent) for each in paragraphs
+        )
+
+    def _format_action_invocation(self, action: argparse.Action) -> str:
+        names = sorted(action.option_strings, key=len)
+        if not names or action.nargs == 0:
+            return ", ".join(names) or str(action.metavar)
+        return f"{', '.join(names)} {action.metavar}"
+
+
+def _parser(options: type[Options], program: str) -> _Parser:
+    table = options.table()
+    places = [
+        each.metavar if each.required else f"[{each.metavar}{'...' if each.many else ''}]"
+        for each in table.values()
+        if not each.names
+    ]
+    codes = {0: None, 2: None, **options.exit_codes}
+    meanings = [f"{code} {codes[code] or _EXIT_CODES[code]}" for code in sorted(codes)]
+    parser = _Parser(
+        prog=program,
+        usage=" ".join([program, "[OPTIONS]", *places]),
+        description=options.__doc__,
+        epilog=f"Exit codes: {'; '.join(meanings)}; 128 + N ended by the signal N.",
+        formatter_class=_Help,
+        allow_abbrev=False,
+        exit_on_error=False,
+        add_help=False,
+    )
+    parser.add_argument("-h", "--help", action="help", help="Show this help and exit.")
+    # Else "-3:2" is taken for an option.
+    parser._negative_number_matcher = re.compile(r"-\.?\d")
+    for name, each in table.items():
+        given: dict[str, Any] = {"help": argparse.SUPPRESS if each.hidden else _help(each)}
+        if each.is_flag:
+            on = argparse.BooleanOptionalAction
+            given |= {"action": on if each.default else "store_true", "default": each.default}
+        else:
+            given |= {"metavar": each.metavar, "type": each.read, "default": each.default}
+        if each.names:
+            if each.many:
+                given |= {"action": "append", "default": []}
+            parser.add_argument(*each.names, dest=name, **given)
+        else:
+            given["type"] = _unmarked(each.read)
+            parser.add_argument(name, nargs="*" if each.many else "?", **given)
+    return parser
+
+
+def _marked(words: Sequence[str]) -> list[str]:
+    """Return the words without ``--``, and mark those behind it: none of them is an option.
+
+    ``parse_known_intermixed_args`` reads a command line twice, and forgets ``--`` in between.
+    """
+    before = list(itertools.takewhile(lambda word: word != "--", words))
+    return before + [_AFTER_DASHES + word for word in words[len(before) + 1 :]]
+
+
+def _unmarked(read: Callable[[str], Any]) -> Callable[[str], Any]:
+    return lambda text: read(text.removeprefix(_AFTER_DASHES))
+
+
+def _help(each: Option) -> str:
+    text = each.help.replace("%", "%%")
+    if each.many and each.names:
+        text += " May be repeated."
+    if each.is_flag or each.default in (None, ()) or "default" in text:
+        return text
+    default = f"{each.default:g}" if isinstance(each.default, float) else each.default
+    return f"{text} (default: {default})"
+
+
+def _complaint(error: argparse.ArgumentError) -> str:
+    """Return the message about an argument, with its long name."""
+    name = (error.argument_name or "").split("/")[0]
+    if error.message == "expected one argument":
+        return f"{name} needs a value"
+    if error.message.startswith("ignored explicit argument"):
+        return f"{name} takes no value"
+    return f"{name} {error.message}"
+
+
+def bad_value(text: str, allowed: str) -> argparse.ArgumentTypeError:
+    """Return the error of a value; the parser puts the option's name before it."""
+    return argparse.ArgumentTypeError(f"is {text!r:.80}; allowed are {allowed}")
+
+
+def close_match(text: str, allowed: Sequence[str]) -> str:
+    """Return "; did you mean ...?" with the closest allowed word; empty if none is close."""
+    import difflib
+
+    near = difflib.get_close_matches(text.lower(), allowed, n=1)
+    return f"; did you mean {near[0]}?" if near else ""
+
+
+def whole_number(least: int, most: int) -> Callable[[str], int]:
+    """Return a reader of whole numbers from ``least`` to ``most``."""
+
+    def read(text: str) -> int:
+        with contextlib.suppress(ValueError):
+            if least <= (value := int(text)) <= most:
+                return value
+        raise bad_value(text, f"whole numbers from {least} to {most}")
+
+    return read
+
+
+def number(least: float, most: float, unit: str) -> Callable[[str], float]:
+    """Return a reader of numbers from ``least`` to ``most``."""
+
+    def read(text: str) -> float:
+        with contextlib.suppress(ValueError):
+            if least <= (value := float(text)) <= most:
+                return value
+        raise bad_value(text, f"numbers from {least:g} to {most:g} ({unit})")
+
+    return read
+
+
+def one_of(*choices: str) -> Callable[[str], str]:
+    """Return a reader of one of a few words."""
+
+    def read(text: str) -> str:
+        if text not in choices:
+            listed = ", ".join(choices[:-1]) + f" and {choices[-1]}"
+            raise bad_value(text, listed + close_match(text, choices))
+        return text
+
+    return read
+
+
+def location(text: str) -> Path:
+    """Read a path. The empty text, such as an unset variable of a script, is not one."""
+    if not text:
+        raise argparse.ArgumentTypeError("is ''; expected a path (. is the current directory)")
+    return Path(text)
+
 
 def wants_json(arguments: Sequence[str]) -> bool:
-    """Tell whether a command line asks for events as JSON, though it may not be a valid one.
-
-    Parameters
-    ----------
-    arguments : sequence of str
-        With ``--log json`` or ``--log=json`` among them.
-    """
+    """Return whether a command line, which need not be valid, asks for events as JSON."""
     chosen = "text"
-    for option, value in itertools.pairwise([*arguments, ""]):
-        if option == "--log":
+    for name, value in itertools.pairwise([*arguments, ""]):
+        if name == "--log":
             chosen = value
-        elif option.startswith("--log="):
-            chosen = option.removeprefix("--log=")
+        elif name.startswith("--log="):
+            chosen = name.removeprefix("--log=")
     return chosen == "json"

@@ -1,43 +1,30 @@
-"""Files and sockets that this process may have open at a time, and what it needs of them.
+"""The limit on open files and sockets of this process.
 
-With too few, each part fails in its own way: no event loop, a journal that cannot be opened, a
-service to which nobody can connect. So the limit is looked at before anything is opened. What a
-process may allow itself (the hard limit), it takes.
+With too few, each part fails in its own way: no event loop, no journal, no connections. So the
+limit is checked before anything is opened, and raised as far as the hard limit allows.
 """
 
 from __future__ import annotations
 
 import contextlib
 
-from holdfast.errors import HoldfastError
+from holdfast.errors import DescriptorError
 
-__all__ = ["NEEDED", "DescriptorError", "allow_descriptors"]
+__all__ = ["NEEDED", "allow_descriptors"]
 
 NEEDED = 64
 """For any command. A robot was seen to have 21 open at a time, a service 9 without its robots."""
 
 
-class DescriptorError(HoldfastError):
-    """Fewer files and sockets may be open at a time than the process needs."""
-
-
 def allow_descriptors(wanted: int = NEEDED) -> int:
-    """See to it that this process may have enough files and sockets open at a time.
+    """Raise the limit on open files and sockets to ``wanted``, as far as the hard limit allows.
 
-    Parameters
-    ----------
-    wanted : int
-        The limit is raised to so many, as far as the process is allowed to; it is never lowered.
-
-    Returns
-    -------
-    int
-        How many may be open now; ``wanted`` if there is no limit.
+    Returns how many may be open now; ``wanted`` if there is no limit.
 
     Raises
     ------
     DescriptorError
-        If fewer than :data:`NEEDED` are allowed; the message says how the limit is raised.
+        If fewer than :data:`NEEDED` are allowed; the message says how to raise the limit.
     """
     try:
         import resource

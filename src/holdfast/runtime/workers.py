@@ -1,8 +1,8 @@
 """Worker processes, each with a pipe of its own.
 
-Not those of ``concurrent.futures``, for two reasons: when a worker is killed we must say what it
-was computing, and on Ctrl-C the workers must end at once. Here no thread stands between the
-processes: a worker that is not wanted any more is killed, and nothing is left to be waited for.
+They replace ``concurrent.futures`` for two reasons: when a worker is killed, the message must say
+what it was computing, and on Ctrl-C the workers must end at once. No thread stands between the
+processes, so a worker can be killed without waiting.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from typing import Any
 
-from holdfast.runtime.leash import end_with_parent
+from holdfast.runtime.parent_death import end_with_parent
 
 __all__ = ["WorkerProcess", "end_workers"]
 
@@ -30,11 +30,8 @@ _STARTED: weakref.WeakSet[WorkerProcess] = weakref.WeakSet()
 
 
 @atexit.register
-def _end_what_is_left() -> None:
-    """Kill workers that nobody ended.
-
-    The package multiprocessing would ask them to end, which they do not hear, and wait.
-    """
+def _kill_remaining() -> None:
+    """Kill workers at exit: they block the signal with which multiprocessing would end them."""
     for worker in list(_STARTED):
         if worker._process.pid is not None:
             with contextlib.suppress(ValueError):
@@ -44,19 +41,17 @@ def _end_what_is_left() -> None:
 class WorkerProcess:
     """A worker process as its parent sees it.
 
-    It ends with this process, however this one ends (Linux), and hears no signal that a terminal or
-    a batch system sends to all: this process alone answers them. Put it where you will find it,
-    then start it: so no signal can come between its start and your knowing of it.
+    It ends with this process, however this one ends (Linux), and blocks the signals that a terminal
+    or a batch system sends to all processes: only the parent handles them. Store the object before
+    you call :meth:`start`, so that an interrupt cannot lose a started worker.
 
     Parameters
     ----------
-    name : str
     work : callable
-        What it runs: a function of a module, called with its end of the pipe and ``arguments``.
-    arguments : tuple
-        What can be pickled.
+        A module's function, called with its end of the pipe and ``arguments``, which must be
+        picklable.
     threads : int
-        How many it may compute with.
+        Of NumPy's BLAS in the worker.
 
     Attributes
     ----------
@@ -76,7 +71,7 @@ class WorkerProcess:
 
     def start(self) -> None:
         """Start it, once."""
-        # Its start would undo the mask set below, so it must have been started before.
+        # Started first, because its start would undo the mask set below.
         resource_tracker.ensure_running()
         _STARTED.add(self)
         with _inherited_by_children(self._threads):
@@ -85,16 +80,15 @@ class WorkerProcess:
         self._theirs.close()
 
     def send(self, message: bytes) -> None:
-        """Send a message; a dead worker is found out when its pipe is read."""
+        """Send a message; a dead worker shows when its pipe is read."""
         with contextlib.suppress(BrokenPipeError, ConnectionResetError):
             self.connection.send_bytes(message)
 
     def receive(self) -> bytes | None:
-        """Return its next message once it is there; None if it has ended."""
+        """Wait for its next message; return None if it has ended."""
         try:
             return self.connection.recv_bytes()
         except (EOFError, OSError):
-            # It ended before it sent anything, or in the middle of sending.
             return None
 
     def how_it_ended(self) -> tuple[str, bool]:
@@ -107,10 +101,8 @@ class WorkerProcess:
 
 
 def end_workers(workers: Iterable[WorkerProcess]) -> None:
-    """End workers now, whatever they do, and wait until they are gone; may be repeated."""
+    """Kill workers and wait until they are gone; may be repeated."""
     workers = list(workers)
-    # There is nothing to wait for: each result is sent whole or not wanted any more. They block the
-    # gentler signals.
     started = [worker for worker in workers if worker._process.pid is not None]
     with _no_signals():
         for worker in started:
@@ -124,11 +116,10 @@ def end_workers(workers: Iterable[WorkerProcess]) -> None:
 
 @contextlib.contextmanager
 def _inherited_by_children(threads: int) -> Iterator[None]:
-    """Let children start with few threads and with the signals blocked that end a run.
+    """Start children with few threads, and with the signals blocked that end a run.
 
-    Ctrl-C, a terminal that is closed and a batch system's SIGTERM reach every process of the group;
-    the parent alone answers them. Blocking the signals here, not in the child, covers the child's
-    first moments too, and delays them for us only.
+    Ctrl-C, a closed terminal and a batch system's SIGTERM reach every process of the group, and
+    only the parent handles them. Blocking them here also covers the child's first moments.
     """
     variables = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
     saved = {name: os.environ.get(name) for name in variables}
@@ -146,11 +137,11 @@ def _inherited_by_children(threads: int) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _no_signals() -> Iterator[None]:
-    """Do what is inside without being interrupted."""
+    """Block the ending signals inside."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, ())
     late: KeyboardInterrupt | None = None
     try:
-        # Of a signal that has just come, Python tells here, when they are blocked already.
+        # A signal that came just before may be raised here, when they are blocked already.
         try:
             signal.pthread_sigmask(signal.SIG_BLOCK, _ENDING_SIGNALS)
         except KeyboardInterrupt as interruption:
@@ -166,6 +157,6 @@ def _begin(
     parent: int, work: Callable[..., None], connection: Connection, arguments: tuple[Any, ...]
 ) -> None:
     end_with_parent(parent)
-    # The parent may end at any time; then nobody is left to tell.
+    # The parent may end at any time.
     with contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError):
         work(connection, *arguments)

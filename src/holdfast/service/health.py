@@ -1,10 +1,9 @@
-"""Health and metrics over HTTP, answered by the event loop that the service itself runs on.
+"""Health and metrics over HTTP, served by the service's own event loop.
 
-Whatever watches a service asks with a plain GET: ``/livez`` says that the loop moves, which the
-answer itself proves; ``/readyz`` that robots are welcome; ``/metrics`` what has been counted. That
-is little enough to need no web server: a request's head is read and everything after it ignored,
-one answer is sent, and the connection is closed. Heads, connections and time are bounded, so that
-whoever connects costs the robots nothing.
+A monitor sends a plain GET: ``/livez`` shows that the loop runs, which the response itself proves;
+``/readyz`` that robots are accepted; ``/metrics`` the counters. This needs no web server: a
+request's head is read, the rest ignored, one response sent, and the connection closed. Heads,
+connections and time are bounded, so clients cannot slow the robots down.
 """
 
 from __future__ import annotations
@@ -16,23 +15,22 @@ import socket
 from collections.abc import Awaitable, Callable, Mapping
 from typing import NamedTuple, TypeAlias
 
-from holdfast.errors import HoldfastError, TransportError
+from holdfast.errors import HealthError, TransportError
 from holdfast.transport.endpoints import host_and_port, parse_host, why_not_bound
 
 __all__ = [
-    "HealthError",
     "HttpAddress",
     "HttpServer",
+    "MonitoringServers",
     "Page",
     "Pages",
-    "Watched",
     "parse_http_address",
 ]
 
 _MAX_HEAD_BYTES = 8192
 _MAX_CONNECTIONS = 64
-_PATIENCE_S = 5.0
-"""For a connection, from its beginning to its end."""
+_TIMEOUT_S = 5.0
+"""For a whole connection."""
 
 _REASONS = {
     200: "OK",
@@ -45,20 +43,8 @@ _REASONS = {
 _LOOPBACK = "127.0.0.1"
 
 
-class HealthError(HoldfastError):
-    """Health or metrics cannot be offered at an address."""
-
-
 class HttpAddress(NamedTuple):
-    """Where to answer. ``str`` gives ``HOST:PORT``.
-
-    Attributes
-    ----------
-    host : str
-        An IPv6 address without its brackets.
-    port : int
-        0 lets the system choose.
-    """
+    """A host, an IPv6 one without brackets, and a port; 0 is any. ``str`` gives ``HOST:PORT``."""
 
     host: str
     port: int
@@ -68,15 +54,7 @@ class HttpAddress(NamedTuple):
 
 
 class Page(NamedTuple):
-    """An answer.
-
-    Attributes
-    ----------
-    status : int
-        200 or 503.
-    body : bytes
-    content_type : str
-    """
+    """A response."""
 
     status: int
     body: bytes
@@ -84,51 +62,38 @@ class Page(NamedTuple):
 
     @classmethod
     def of(cls, trouble: str | None) -> Page:
-        """Return the page that says "ok", or with status 503 what the trouble is."""
+        """Return the page "ok" or, with status 503, the trouble."""
         return cls(200 if trouble is None else 503, f"{trouble or 'ok'}\n".encode())
 
 
 Pages: TypeAlias = Mapping[str, Callable[[], Awaitable[Page]]]
-"""What is called for each path."""
+"""A function for each path."""
 
 
 def parse_http_address(text: str) -> HttpAddress:
-    """Read ``HOST:PORT``, an IPv6 address in brackets; or ``PORT`` alone, of this machine only.
-
-    Raises
-    ------
-    HealthError
-        If it is neither.
-    """
+    """Read ``HOST:PORT``, or ``PORT`` of the loopback address; raise HealthError for others."""
     host, colon, port = text.rpartition(":")
     try:
         host = parse_host(host) if colon else _LOOPBACK
     except TransportError as error:
-        raise HealthError(f"{text!r} is no HOST:PORT: {error}") from None
+        raise HealthError(f"{text!r:.80}: {error}") from None
     if not re.fullmatch("[0-9]{1,5}", port) or int(port) > 65535:
-        raise HealthError(f"{text!r}: port {port!r} is not a whole number from 0 to 65535")
+        raise HealthError(f"{text!r:.80}: port {port!r:.80} is not a whole number from 0 to 65535")
     return HttpAddress(host, int(port))
 
 
 class HttpServer:
-    """Answers GET and HEAD at one address.
-
-    Parameters
-    ----------
-    address : HttpAddress
-    pages : Pages
-        One that raises has a defect, and ends the connection without an answer.
-    """
+    """Answers GET and HEAD at one address."""
 
     def __init__(self, address: HttpAddress, pages: Pages) -> None:
         self._address = address
         self._pages = pages
         self._server: asyncio.Server | None = None
-        # In the order of their beginning.
+        # The oldest first.
         self._connections: dict[_Connection, None] = {}
 
     async def start(self) -> HttpAddress:
-        """Listen, in the running loop; return where, with the port that was free instead of 0.
+        """Listen, in the running loop; return the address, with the chosen port instead of 0.
 
         Raises
         ------
@@ -153,14 +118,14 @@ class HttpServer:
         return self._address._replace(port=self._server.sockets[0].getsockname()[1])
 
     def close(self) -> None:
-        """Listen no more, and end all connections; may be repeated."""
+        """Stop listening, and end all connections; may be repeated."""
         if self._server is not None:
             self._server.close()
         for connection in list(self._connections):
             connection.abort()
 
     def begun(self, connection: _Connection) -> None:
-        """Take a connection in; where there are too many, the oldest has to go."""
+        """Add a connection; if there are too many, end the oldest."""
         if len(self._connections) >= _MAX_CONNECTIONS:
             next(iter(self._connections)).abort()
         self._connections[connection] = None
@@ -170,7 +135,7 @@ class HttpServer:
         self._connections.pop(connection, None)
 
     async def page(self, method: bytes, target: bytes) -> Page:
-        """Return the answer to a request."""
+        """Return the response to a request."""
         if method not in (b"GET", b"HEAD"):
             return Page(405, b"GET and HEAD are answered\n")
         page = self._pages.get(target.partition(b"?")[0].decode("latin-1"))
@@ -179,21 +144,21 @@ class HttpServer:
         return await page()
 
 
-class Watched:
-    """Pages at several addresses; where two are the same, one server has the pages of both."""
+class MonitoringServers:
+    """Servers at several addresses; pages of the same address share one."""
 
     def __init__(self) -> None:
-        self._wanted: dict[str, HttpAddress] = {}
+        self._addresses: dict[str, HttpAddress] = {}
         self._pages: dict[HttpAddress, dict[str, Callable[[], Awaitable[Page]]]] = {}
         self._servers: list[HttpServer] = []
 
     def add(self, purpose: str, address: HttpAddress, pages: Pages) -> None:
-        """Want pages at an address."""
-        self._wanted[purpose] = address
+        """Add pages at an address, before the start."""
+        self._addresses[purpose] = address
         self._pages.setdefault(address, {}).update(pages)
 
     async def start(self) -> dict[str, str]:
-        """Answer; return where, as ``HOST:PORT`` for each purpose.
+        """Listen; return ``HOST:PORT`` for each purpose.
 
         Raises
         ------
@@ -205,16 +170,16 @@ class Watched:
             server = HttpServer(address, pages)
             found[address] = str(await server.start())
             self._servers.append(server)
-        return {purpose: found[address] for purpose, address in self._wanted.items()}
+        return {purpose: found[address] for purpose, address in self._addresses.items()}
 
     def close(self) -> None:
-        """Answer no more; may be repeated."""
+        """Stop all servers; may be repeated."""
         for server in self._servers:
             server.close()
 
 
 class _Connection(asyncio.Protocol):
-    """One request and its answer."""
+    """One request and its response."""
 
     def __init__(self, server: HttpServer) -> None:
         self._server = server
@@ -224,7 +189,7 @@ class _Connection(asyncio.Protocol):
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         assert isinstance(transport, asyncio.Transport)
         self._transport = transport
-        self._give_up = asyncio.get_running_loop().call_later(_PATIENCE_S, self.abort)
+        self._timeout = asyncio.get_running_loop().call_later(_TIMEOUT_S, self.abort)
         self._server.begun(self)
 
     def data_received(self, data: bytes) -> None:
@@ -238,7 +203,7 @@ class _Connection(asyncio.Protocol):
 
     def connection_lost(self, exc: Exception | None) -> None:
         del exc
-        self._give_up.cancel()
+        self._timeout.cancel()
         self._server.ended(self)
         if self._answering is not None:
             self._answering.cancel()

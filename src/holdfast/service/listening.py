@@ -1,8 +1,8 @@
-"""The sockets of a service of several processes, which outlive each of them.
+"""The listening sockets of a service with several processes; they outlive each process.
 
-Each process has a listening socket of its own at the same TCP port, and the system spreads
-connections over them (``SO_REUSEPORT``). One more socket is bound there that never listens: it
-keeps the port while no process has one. A local socket is one file, so all processes share it.
+Each process has its own listening socket at the same TCP port, and the system spreads connections
+over them (``SO_REUSEPORT``). One more socket is bound but never listens: it reserves the port while
+no process has one. A local socket is one file, so all processes share it.
 """
 
 from __future__ import annotations
@@ -21,10 +21,6 @@ __all__ = ["SharedEndpoints"]
 
 class SharedEndpoints:
     """Endpoints at which several processes listen.
-
-    Parameters
-    ----------
-    endpoints : sequence of Endpoint
 
     Attributes
     ----------
@@ -61,7 +57,7 @@ class SharedEndpoints:
         Raises
         ------
         OSError
-            If they had been given up, and the system allows no more sockets now.
+            If they were released and the system allows no more sockets.
         """
         if index not in self._listening:
             listening = self._listening[index] = []
@@ -71,16 +67,16 @@ class SharedEndpoints:
                 )
         return self._listening[index]
 
-    def give_up(self, index: int) -> None:
-        """Refuse what waits at a process's own sockets, and what would."""
+    def release(self, index: int) -> None:
+        """Close a process's own sockets, and so refuse the connections that wait there."""
         for listening in self._listening.pop(index, ()):
             if listening not in self._bound:
                 listening.close()
 
     def close(self) -> None:
-        """Give up all sockets and addresses; may be repeated."""
+        """Close all sockets; may be repeated."""
         for index in list(self._listening):
-            self.give_up(index)
+            self.release(index)
         while self._files:
             remove_socket_file(*self._files.pop())
         for bound in self._bound:
@@ -97,7 +93,7 @@ class SharedEndpoints:
         bound = socket.socket(family)
         self._bound.append(bound)
         bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        # The port must be ours alone; only then is it shared, with our own processes.
+        # First make sure that no other program has the port, then share it with our processes.
         bound.bind(where)
         bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 0)
         bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)

@@ -1,8 +1,8 @@
-"""How a service is doing, for Prometheus: counted by the service, written when somebody asks.
+"""A service's metrics for Prometheus, formatted when they are read.
 
-The service's machine counts what it does anyway, and two additions for each decision keep the
-distributions of times. A :class:`Report` holds all of that. Reports of several processes are added
-up, and so is what a process had counted that has ended: a counter never goes backwards.
+The service's state machine has counters, and each decision adds to histograms of times. A
+:class:`ServiceReport` holds both. Reports of several processes are summed, with those of ended
+processes, so that no counter decreases.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 import msgspec
 
 from holdfast import __version__
-from holdfast.errors import HoldfastError
-from holdfast.session.messages import PROTOCOL_VERSION
-from holdfast.session.service_limits import ServiceStatistics
+from holdfast.errors import MetricsError
+from holdfast.protocol.messages import PROTOCOL_VERSION
+from holdfast.protocol.service_statistics import ServiceStatistics
 
 if TYPE_CHECKING:
     from prometheus_client.core import Metric
@@ -29,9 +29,8 @@ __all__ = [
     "DecisionTimes",
     "Durations",
     "Exposition",
-    "MetricsError",
-    "Report",
-    "added",
+    "ServiceReport",
+    "summed",
 ]
 
 DecisionKind: TypeAlias = Literal["task", "sensing"]
@@ -41,10 +40,10 @@ BUCKETS_S = (
     *(1e-3, 2.5e-3, 5e-3, 10e-3, 25e-3, 50e-3, 100e-3, 250e-3, 500e-3),
     *(1.0, 2.5, 5.0, 10.0, 30.0, 60.0),
 )
-"""Upper ends of the histograms' buckets: from a task action's arithmetic to a hopeless wait."""
+"""Upper bounds of the histograms' buckets."""
 
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
-"""Of what :class:`Exposition` writes."""
+"""Of :class:`Exposition`."""
 
 _COUNTERS = (
     ("restores", "States taken from a robot's checkpoint."),
@@ -67,30 +66,19 @@ _GAUGES = (
 )
 
 
-class MetricsError(HoldfastError):
-    """Metrics cannot be offered: a package is missing."""
-
-
 class Durations(msgspec.Struct):
-    """A histogram of durations.
-
-    Attributes
-    ----------
-    counts : list of int
-        Those in each bucket of :data:`BUCKETS_S`, and last those beyond.
-    sum_s : float
-    """
+    """A histogram of durations: a count per bucket of :data:`BUCKETS_S`, and one beyond."""
 
     counts: list[int] = msgspec.field(default_factory=lambda: [0] * (len(BUCKETS_S) + 1))
     sum_s: float = 0.0
 
     def add(self, seconds: float) -> None:
-        """Note a duration."""
+        """Count a duration."""
         self.counts[bisect_left(BUCKETS_S, seconds)] += 1
         self.sum_s += seconds
 
     def cumulative(self) -> list[tuple[str, float]]:
-        """Return the buckets as Prometheus counts them: all up to each upper end."""
+        """Return the upper bounds and Prometheus's cumulative counts."""
         buckets, count = [], 0
         for end, own in zip((*map(str, BUCKETS_S), "+Inf"), self.counts, strict=True):
             count += own
@@ -99,29 +87,27 @@ class Durations(msgspec.Struct):
 
 
 class DecisionTimes(msgspec.Struct):
-    """For how long decisions were computed, and for how long they had waited before."""
+    """The computing times of decisions by kind, and their waiting times."""
 
     task: Durations = msgspec.field(default_factory=Durations)
     sensing: Durations = msgspec.field(default_factory=Durations)
     waited: Durations = msgspec.field(default_factory=Durations)
 
     def add(self, kind: DecisionKind, computed_s: float, waited_s: float) -> None:
-        """Note the times of a decision that was computed."""
+        """Count the times of a decision."""
         (self.task if kind == "task" else self.sensing).add(computed_s)
         self.waited.add(waited_s)
 
 
-class Report(msgspec.Struct):
-    """What one process of a service has counted, or several together.
+class ServiceReport(msgspec.Struct):
+    """The counters of one process of a service, or the sum of several.
 
     Attributes
     ----------
-    statistics : ServiceStatistics
-    times : DecisionTimes
     restarts : int
-        Processes that were started again.
+        Of processes.
     certificate_expires_s : float or None
-        When the certificate in use does, of several the first, in seconds since 1970; None without.
+        The earliest end of a certificate in use, in seconds since 1970; None without.
     """
 
     statistics: ServiceStatistics = msgspec.field(default_factory=ServiceStatistics)
@@ -129,15 +115,15 @@ class Report(msgspec.Struct):
     restarts: int = 0
     certificate_expires_s: float | None = None
 
-    def without_gauges(self) -> Report:
-        """Return what is left of a process that has ended: it holds nothing any more."""
+    def without_gauges(self) -> ServiceReport:
+        """Return the report of an ended process: its counters, without what it held."""
         nothing_held = {field: 0 for field, _, _ in _GAUGES}
-        return Report(msgspec.structs.replace(self.statistics, **nothing_held), self.times)
+        return ServiceReport(msgspec.structs.replace(self.statistics, **nothing_held), self.times)
 
 
-def added(reports: Iterable[Report]) -> Report:
-    """Return the sum of reports, which share nothing with it."""
-    total = Report()
+def summed(reports: Iterable[ServiceReport]) -> ServiceReport:
+    """Return the sum of reports, as an independent copy."""
+    total = ServiceReport()
     for report in reports:
         total.restarts += report.restarts
         ends = (total.certificate_expires_s, report.certificate_expires_s)
@@ -166,8 +152,7 @@ class Exposition:
     name : str
         Of the service.
     processes : callable, optional
-        Returns the numbers of the processes whose memory and time are told as one, the first of
-        them the one that answers.
+        Returns the ids of the processes whose memory and time are summed, this process first.
 
     Raises
     ------
@@ -188,16 +173,16 @@ class Exposition:
         self._name = name
         self._processes = processes
 
-    def text(self, report: Report, *, is_ready: bool = True) -> bytes:
+    def text(self, report: ServiceReport, *, is_ready: bool = True) -> bytes:
         """Return the metrics."""
         from prometheus_client import CollectorRegistry, generate_latest
 
         families = [*self._families(report, is_ready), *self._process_families()]
         registry = CollectorRegistry(auto_describe=False)
-        registry.register(_Collected(families))
+        registry.register(_FixedCollector(families))
         return generate_latest(registry)
 
-    def _families(self, report: Report, is_ready: bool) -> Iterator[Metric]:
+    def _families(self, report: ServiceReport, is_ready: bool) -> Iterator[Metric]:
         from prometheus_client.core import (
             CounterMetricFamily,
             GaugeMetricFamily,
@@ -252,13 +237,12 @@ class Exposition:
         )
 
     def _process_families(self) -> Iterator[Metric]:
-        """Yield the standard metrics of a process, of all processes together.
+        """Yield the standard process metrics, summed over all processes.
 
-        Their number of descriptors allowed and the time of their start are the first one's. A
-        process that has been waited for counts as a child of the first one, so that the time
-        computed does not go backwards.
+        The start time and the limit on descriptors are the first process's. Its ended children
+        count too, so that the computing time does not decrease.
         """
-        first, *others = map(_told_by_the_system, self._processes())
+        first, *others = map(_process_metrics, self._processes())
         for family in first:
             (sample,) = family.samples
             value = sample.value
@@ -271,19 +255,19 @@ class Exposition:
                 )
             if family.name == "process_cpu_seconds":
                 ended = os.times()
-                # The system counts in hundredths; a last bit must not make it go backwards.
+                # Rounded, so that floating-point noise cannot make it decrease.
                 value = round(value + ended.children_user + ended.children_system, 6)
             family.samples = [sample._replace(value=value)]
             yield family
 
 
-def _told_by_the_system(process: int) -> list[Metric]:
+def _process_metrics(process: int) -> list[Metric]:
     from prometheus_client import ProcessCollector
 
     return list(ProcessCollector(pid=lambda: process, registry=None).collect())
 
 
-class _Collected:
+class _FixedCollector:
     def __init__(self, families: list[Metric]) -> None:
         self._families = families
 

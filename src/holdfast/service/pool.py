@@ -1,7 +1,7 @@
-"""Threads for what takes longer than an event loop may stand still.
+"""Threads for work that would block the event loop for too long.
 
-They are daemons, and nobody waits for one that computes when the process ends. (Those of
-``concurrent.futures`` are waited for at exit, however long that takes.)
+They are daemons, so the end of the process does not wait for a computation. (It waits for the
+threads of ``concurrent.futures``, however long that takes.)
 """
 
 from __future__ import annotations
@@ -26,16 +26,14 @@ class ThreadPool:
     Parameters
     ----------
     num_threads : int
-        At most; they are started as they are needed.
-    name : str
-        Of the threads.
+        At most; they start when needed.
     failed : callable
-        Is called on the loop with an error that a function has raised.
+        Called on the loop with an exception of a function.
 
     Attributes
     ----------
     num_open : int
-        Functions whose results have not been handed over.
+        Functions whose results have not been delivered.
     """
 
     def __init__(
@@ -63,7 +61,7 @@ class ThreadPool:
         self._queue.put((loop, function, done))
 
     def close(self) -> None:
-        """Let the threads end; one that computes is not waited for."""
+        """End the threads, without waiting for a computation."""
         for _ in self._threads:
             self._queue.put(None)
 
@@ -72,16 +70,16 @@ class ThreadPool:
             loop, function, done = task
             try:
                 result = function()
-            except BaseException as error:  # noqa: BLE001 - the loop's side must hear of any
+            except BaseException as error:  # noqa: BLE001 - the loop handles it
                 function, done, result = _nothing, self._failed, error
             try:
-                loop.call_soon_threadsafe(self._hand_over, done, result)
+                loop.call_soon_threadsafe(self._deliver, done, result)
             except RuntimeError:
-                return  # the loop is closed: nobody waits for it any more
-            # Nothing of it is held while the thread waits for the next.
+                return  # the loop is closed
+            # Release everything before waiting for the next task.
             del task, function, done, result
 
-    def _hand_over(self, done: Callable[[Any], None], result: object) -> None:
+    def _deliver(self, done: Callable[[Any], None], result: object) -> None:
         self.num_open -= 1
         done(result)
 

@@ -1,8 +1,8 @@
 """``holdfast serve``: one service as a process of its own.
 
-A service is often started because another one has died, and a robot waits for it. So it must be
-ready a fraction of a second after its start, and what it does not need by then it does not load:
-this module imports nothing at its top that takes time, and the options are read before NumPy is.
+A service is often started because another one has died, while a robot waits. So it must be ready in
+a fraction of a second: this module imports nothing slow at its top, and reads the options before it
+imports NumPy.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ from typing import TYPE_CHECKING, NoReturn
 
 from holdfast.errors import HoldfastError, InvalidValueError
 from holdfast.printable import printable
-from holdfast.service.options import Options, checked_endpoints, options_of_each, parse_options
+from holdfast.service.options import ServeOptions, checked_endpoints, parse_options
 
 if TYPE_CHECKING:
     import asyncio
 
     from holdfast.runtime.logs import EventLog
     from holdfast.runtime.service_manager import ServiceManager
-    from holdfast.service.beside import Beside, MakeBeside
-    from holdfast.service.metrics import DecisionTimes, Report
-    from holdfast.service.own_credentials import ServiceCredentials
+    from holdfast.service.credentials import ServiceCredentials
+    from holdfast.service.extensions import Extension, MakeExtensions
+    from holdfast.service.metrics import DecisionTimes, ServiceReport
     from holdfast.service.shell import ServiceShell
     from holdfast.service.supervisor import Supervised
     from holdfast.transport.service_end import StreamServiceTransport
@@ -37,32 +37,25 @@ if TYPE_CHECKING:
 __all__ = ["main"]
 
 _SWITCH_INTERVAL_S = 0.0005
-"""How long a thread may hold the interpreter while the one that has the answer waits for it."""
+"""How long a thread may hold the interpreter while another waits for it."""
 
 _BETWEEN_COLLECTIONS = 10_000
 _CLOSE_TIMEOUT_S = 0.7
-_LOOK_S = 0.01
+_CHECK_INTERVAL_S = 0.01
 _STDIN = 0
 
 _OFFERED = ("health", "metrics", "ros2", "ros1")
-"""What the ready line may say that is offered, and where."""
+"""Keys of the ready line for what else is offered, and where."""
 
 
-def main(arguments: Sequence[str], make_beside: MakeBeside | None = None) -> int:
-    """Run ``holdfast serve`` until it is told to stop.
-
-    Parameters
-    ----------
-    arguments : sequence of str
-        What follows ``serve`` on the command line.
-    make_beside : callable or None
-        Makes what the options ask for besides the service.
+def main(arguments: Sequence[str], make_extensions: MakeExtensions | None = None) -> int:
+    """Run ``holdfast serve`` until it has to stop.
 
     Returns
     -------
     int
         0 after SIGTERM or the end of standard input, 130 after SIGINT, 129 after SIGHUP. With
-        credentials it is SIGHUP that has them read again, which their change does as well.
+        credentials, SIGHUP reloads them instead.
 
     Raises
     ------
@@ -70,19 +63,19 @@ def main(arguments: Sequence[str], make_beside: MakeBeside | None = None) -> int
         If an option cannot be used; the message says which and why.
     """
     options = parse_options(arguments)
-    # Nothing is thrown away while modules are loaded, so there is nothing to look for.
+    # Importing modules leaves no garbage to collect.
     gc.disable()
-    # NumPy's BLAS would start threads that nothing here has work for.
+    # Threads of NumPy's BLAS would have no work here.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     if options.processes > 1:
-        return _serve_with_several(options, arguments)
+        return _serve_with_several(options)
     if options.supervised is not None:
         return _serve_supervised(options, *options.supervised)
-    return _serve(options, make_beside=make_beside)
+    return _serve(options, make_extensions=make_extensions)
 
 
-def _serve_with_several(options: Options, arguments: Sequence[str]) -> int:
-    """Watch several processes that serve, each with the same options but for the supervisor's."""
+def _serve_with_several(options: ServeOptions) -> int:
+    """Supervise several processes."""
     _credentials(options)
     listen = checked_endpoints(options)
 
@@ -98,7 +91,8 @@ def _serve_with_several(options: Options, arguments: Sequence[str]) -> int:
     shared = SharedEndpoints(listen)
     events = EventLog(sys.stderr, format=options.log, component=options.name)
     endpoints = [str(endpoint) for endpoint in shared.endpoints]
-    of_each = [*options_of_each(arguments), f"--workers={workers}"]
+    of_each = options.words("listen", "processes", "health", "metrics", "workers")
+    of_each += [f"--workers={workers}"]
     of_each += [f"--listen={endpoint}" for endpoint in endpoints]
 
     async def run() -> int:
@@ -127,9 +121,9 @@ def _serve_with_several(options: Options, arguments: Sequence[str]) -> int:
         events.close()
 
 
-def _serve_supervised(options: Options, parent: int, descriptor: int) -> int:
-    """Be one of several processes, and end with the one that watches them."""
-    from holdfast.runtime.leash import end_with_parent
+def _serve_supervised(options: ServeOptions, parent: int, descriptor: int) -> int:
+    """Serve as one of several processes, and end with the supervisor."""
+    from holdfast.runtime.parent_death import end_with_parent
     from holdfast.service.supervisor import Supervised
 
     end_with_parent(parent)
@@ -139,74 +133,74 @@ def _serve_supervised(options: Options, parent: int, descriptor: int) -> int:
     except HoldfastError as error:
         if supervised.has_served:
             raise
-        # The supervisor says it, once.
+        # The supervisor reports it, once.
         supervised.failed(str(error))
         return 2
 
 
 def _serve(
-    options: Options,
+    options: ServeOptions,
     supervised: Supervised | None = None,
-    make_beside: MakeBeside | None = None,
+    make_extensions: MakeExtensions | None = None,
 ) -> int:
     if options.until_stdin_closes and sys.stdin is None:
         raise InvalidValueError("--until-stdin-closes: this process has no standard input")
-    # In the order in which they are needed, so that a mistake in the options is told at once.
+    # In this order, so that wrong options are reported before anything is loaded.
     credentials = _credentials(options)
     checked_endpoints(options)
 
     if credentials is None:
         _import_without_openssl()
-    others = make_beside(options) if make_beside and options.has_beside else ()
+    extensions = make_extensions(options) if make_extensions and options.has_extensions else ()
 
     from holdfast.runtime.descriptors import NEEDED, allow_descriptors
     from holdfast.transport.service_end import MAX_LINKS, MAX_UNKNOWN, StreamServiceTransport
 
     def end_for_ros(reason: str) -> None:
-        """End as ROS asks a node to, with the time that SIGTERM leaves."""
+        """End because ROS asks for it, as after SIGTERM."""
         shell.note("ros_shutdown", reason=reason)
         os.kill(os.getpid(), signal.SIGTERM)
 
-    beside = NEEDED + MAX_UNKNOWN
-    allowed = allow_descriptors(beside + MAX_LINKS)
-    boot = os.urandom(8).hex()
+    reserved = NEEDED + MAX_UNKNOWN
+    allowed = allow_descriptors(reserved + MAX_LINKS)
+    incarnation = os.urandom(8).hex()
     transport = StreamServiceTransport(
         options.name,
-        boot=boot,
+        incarnation=incarnation,
         listen=options.listen,
         connect=options.connect,
         listening=[socket.socket(fileno=each) for each in options.sockets],
         lease_ms=options.lease_ms,
-        # Else those who have the most links would leave no descriptor for anybody new.
-        max_links=min(MAX_LINKS, max(allowed // 4, allowed - beside)),
+        # Otherwise robots with many links would leave no descriptor for a new one.
+        max_links=min(MAX_LINKS, max(allowed // 4, allowed - reserved)),
         tls=None if credentials is None else credentials.files,
         on_event=lambda event, **fields: shell.note(event, **fields),
         on_shutdown=end_for_ros,
-        needs_endpoint=not others,
+        needs_endpoint=not extensions,
     )
 
     import asyncio
 
     import msgspec
 
-    from holdfast.runtime.allocator import limit_arenas
+    from holdfast.protocol.service import Service
+    from holdfast.protocol.service_limits import ServiceLimits
     from holdfast.runtime.logs import EventLog
     from holdfast.runtime.service_manager import ServiceManager
-    from holdfast.service.known_problems import KnownProblems
+    from holdfast.service.allocator import limit_arenas
     from holdfast.service.metrics import DecisionTimes
+    from holdfast.service.problem_factory import ProblemFactory
     from holdfast.service.shell import ServiceShell
-    from holdfast.session.service import Service
-    from holdfast.session.service_limits import ServiceLimits
 
     limit_arenas()
     limits = ServiceLimits(max_sessions_per_robot=options.max_sessions_per_robot)
     if options.max_sessions is not None:
         limits = msgspec.structs.replace(limits, max_sessions=options.max_sessions)
     workers = options.workers or len(os.sched_getaffinity(0))
-    problems = KnownProblems(options.problem, options.problem_directory or Path.cwd())
+    problems = ProblemFactory(options.problem, options.problem_directory or Path.cwd())
 
     def describe_error(error: BaseException) -> str:
-        from holdfast.user_code import describe_problem_error
+        from holdfast.config.user_code import describe_problem_error
 
         return describe_problem_error("the problem", error)
 
@@ -220,7 +214,7 @@ def _serve(
         status = asyncio.run(
             _run(
                 options,
-                boot,
+                incarnation,
                 transport,
                 credentials,
                 shell,
@@ -228,21 +222,21 @@ def _serve(
                 times,
                 supervised,
                 manager,
-                others,
+                extensions,
             )
         )
     finally:
         events.close()
-    if shell.is_computing or any(each.is_busy for each in others):
-        # A thread that comes back from foreign code while the interpreter goes down would abort
-        # the process.
+    if shell.is_computing or any(each.is_busy for each in extensions):
+        # A thread that returns from native code during interpreter shutdown would abort the
+        # process.
         _end_at_once(status)
     return status
 
 
 async def _run(
-    options: Options,
-    boot: str,
+    options: ServeOptions,
+    incarnation: str,
     transport: StreamServiceTransport,
     credentials: ServiceCredentials | None,
     shell: ServiceShell,
@@ -250,12 +244,12 @@ async def _run(
     times: DecisionTimes,
     supervised: Supervised | None,
     manager: ServiceManager,
-    others: Sequence[Beside],
+    extensions: Sequence[Extension],
 ) -> int:
     """Serve until there is a reason to stop; return the exit status."""
     import asyncio
 
-    from holdfast.service.metrics import Report
+    from holdfast.service.metrics import ServiceReport
 
     loop = asyncio.get_running_loop()
     is_serving = False
@@ -263,11 +257,11 @@ async def _run(
     def why_not_ready() -> str | None:
         return "draining" if shell.is_draining else None if is_serving else "starting"
 
-    def report() -> Report:
+    def report() -> ServiceReport:
         expires_s = None if credentials is None else credentials.expires_s
-        return Report(shell.statistics(), times, certificate_expires_s=expires_s)
+        return ServiceReport(shell.statistics(), times, certificate_expires_s=expires_s)
 
-    async def reported() -> Report:
+    async def reported() -> ServiceReport:
         return report()
 
     def reload() -> None:
@@ -281,16 +275,16 @@ async def _run(
         with contextlib.suppress(RuntimeError):  # the loop is closed
             loop.call_soon_threadsafe(functools.partial(shell.note, event, **fields))
 
-    async def drain_others() -> None:
-        for each in others:
+    async def drain_extensions() -> None:
+        for each in extensions:
             each.take_no_more()
-        while any(each.is_busy for each in others):
-            await asyncio.sleep(_LOOK_S)
+        while any(each.is_busy for each in extensions):
+            await asyncio.sleep(_CHECK_INTERVAL_S)
 
     async def drain() -> None:
         with contextlib.suppress(TimeoutError):
             await asyncio.wait_for(
-                asyncio.gather(shell.drain(options.drain_s), drain_others()), options.drain_s
+                asyncio.gather(shell.drain(options.drain_s), drain_extensions()), options.drain_s
             )
 
     def status() -> str:
@@ -307,20 +301,20 @@ async def _run(
             if credentials is not None:
                 credentials.watch(loop, transport, events)
             offered: dict[str, object] = {}
-            for each in others:
+            for each in extensions:
                 offered |= each.start(note)
             if options.until_stdin_closes:
                 _watch_stdin(loop, shell)
-            # What was loaded stays; the collector need never look at it again.
+            # Loaded modules stay; the collector need not scan them.
             gc.freeze()
             gc.set_threshold(_BETWEEN_COLLECTIONS)
             gc.enable()
             is_serving = True
             if supervised is None:
-                where: dict[str, object] = {"boot": boot, **watched, **offered}
+                where: dict[str, object] = {"boot": incarnation, **watched, **offered}
                 where["listen"] = list(transport.endpoints)
                 if options.connect:
-                    where["connect"] = options.connect
+                    where["connect"] = list(options.connect)
                 _say_ready(options, where)
                 manager.watch(loop, status)
                 manager.ready()
@@ -341,34 +335,34 @@ async def _run(
             try:
                 await shell.close(_CLOSE_TIMEOUT_S)
             finally:
-                for each in others:
+                for each in extensions:
                     each.close(_CLOSE_TIMEOUT_S)
             if supervised is not None:
                 supervised.close()
     return _exit_status(reason)
 
 
-def _credentials(options: Options) -> ServiceCredentials | None:
+def _credentials(options: ServeOptions) -> ServiceCredentials | None:
     if options.tls is None:
         return None
-    from holdfast.service.own_credentials import ServiceCredentials
+    from holdfast.service.credentials import ServiceCredentials
 
     return ServiceCredentials(options.tls, functools.partial(_warn, options))
 
 
 @contextlib.asynccontextmanager
 async def _watched(
-    options: Options,
+    options: ServeOptions,
     why_not_alive: Callable[[], str | None],
     why_not_ready: Callable[[], str | None],
-    report: Callable[[], Awaitable[Report]],
+    report: Callable[[], Awaitable[ServiceReport]],
     processes: Callable[[], Sequence[int]] = lambda: (os.getpid(),),
 ) -> AsyncIterator[dict[str, str]]:
-    """Answer what --health and --metrics ask for; give where."""
+    """Serve health and metrics if the options say so; yield their addresses."""
     if options.health is None and options.metrics is None:
         yield {}
         return
-    from holdfast.service.health import Page, Watched
+    from holdfast.service.health import MonitoringServers, Page
 
     async def alive() -> Page:
         return Page.of(why_not_alive())
@@ -376,7 +370,7 @@ async def _watched(
     async def ready() -> Page:
         return Page.of(why_not_ready())
 
-    watched = Watched()
+    watched = MonitoringServers()
     if options.health is not None:
         watched.add("health", options.health, {"/livez": alive, "/readyz": ready})
     if options.metrics is not None:
@@ -397,10 +391,7 @@ async def _watched(
 
 
 def _import_without_openssl() -> None:
-    """Load asyncio and hashlib as they are where there is no OpenSSL, which takes long to load.
-
-    Neither needs it here: the links do TLS by themselves, and the digests are Python's own.
-    """
+    """Import asyncio and hashlib without OpenSSL, which is slow to load and not needed."""
     hidden = [name for name in ("ssl", "_hashlib") if name not in sys.modules]
     for name in hidden:
         sys.modules[name] = None  # type: ignore[assignment]
@@ -428,7 +419,7 @@ def _watch_stdin(loop: asyncio.AbstractEventLoop, shell: ServiceShell) -> None:
     try:
         loop.add_reader(_STDIN, read)
     except PermissionError:
-        # A file, or the null device: nobody will ever close it.
+        # A file or the null device never reports its end.
         shell.stop("standard input has ended")
 
 
@@ -439,16 +430,16 @@ def _end_at_once(status: int) -> NoReturn:
     os._exit(status)
 
 
-def _warn(options: Options, text: str) -> None:
+def _warn(options: ServeOptions, text: str) -> None:
     if options.log == "json":
-        from holdfast.runtime.logs import tell_event
+        from holdfast.runtime.logs import write_event
 
-        tell_event(options.name, "credentials", reason=text)
+        write_event(options.name, "credentials", reason=text)
     else:
         sys.stderr.write(f"holdfast serve: warning: {printable(text)}\n")
 
 
-def _say_ready(options: Options, where: Mapping[str, object]) -> None:
+def _say_ready(options: ServeOptions, where: Mapping[str, object]) -> None:
     if options.log == "json":
         from holdfast.runtime.logs import EventLog
 
@@ -464,7 +455,7 @@ def _say_ready(options: Options, where: Mapping[str, object]) -> None:
     if "processes" in where:
         parts[-1] += f" with {where['processes']} processes"
     parts += [f"offers {what} at {where[what]}" for what in _OFFERED if what in where]
-    # Nobody may be reading: that is no reason not to serve.
+    # A closed standard output is no reason not to serve.
     with contextlib.suppress(OSError, ValueError):
         sys.stdout.write(printable(f"{options.name} {', '.join(parts)}\n"))
         sys.stdout.flush()

@@ -1,14 +1,13 @@
-"""What surrounds a service's machine: one event loop, and threads for what takes long.
+"""The I/O shell around a service's state machine: an event loop, and threads for long work.
 
-To hand something over to another thread takes longer than many a decision. So all that is short
-happens on the loop: a request is decoded there, the machine is told of it, and if a brief job comes
-of that, the loop computes it in a later turn. By then all that has arrived meanwhile is read, so
-that the machine knows what waits when it chooses who is next, and all that was answered is sent.
-Long jobs, which compute without the interpreter, and large requests go to threads, and their
-results come back to the loop.
+Passing work to another thread takes longer than many decisions. So short work happens on the loop:
+it decodes a request, passes it to the machine, and computes a resulting brief job in a later turn.
+By then it has read all requests that arrived meanwhile, so the machine knows them when it chooses
+the next job, and it has sent all replies. Long jobs, which compute without the interpreter, and
+large requests go to threads; their results return to the loop.
 
 A brief job cannot be interrupted, so a job counts as brief only if those before it of the same
-robot were, and if it is as usual (:class:`~holdfast.session.service_effects.Run`).
+robot were, and if it is as usual (:class:`~holdfast.protocol.service_jobs.StartJob`).
 
 Nothing here needs a socket.
 """
@@ -25,22 +24,29 @@ from typing import Literal, TypeAlias
 
 import msgspec
 
-from holdfast.errors import HoldfastError
-from holdfast.runtime.logs import CountedEvent, EventRates, EventSink, NullEventLog
+from holdfast.errors import MessageError, ServiceBrokenError
+from holdfast.protocol.events import LogEvent
+from holdfast.protocol.messages import Busy, Request, decode_request, encode
+from holdfast.protocol.service import Service
+from holdfast.protocol.service_jobs import (
+    EndCall,
+    Job,
+    JobResult,
+    SendReply,
+    ServiceEffect,
+    StartJob,
+)
+from holdfast.protocol.service_statistics import ServiceStatistics
+from holdfast.runtime.events import EventRates, EventSink, NullEventLog
 from holdfast.service.pool import ThreadPool
-from holdfast.session.messages import Busy, MessageError, Request, decode_request, encode
-from holdfast.session.service import Service
-from holdfast.session.service_effects import Answer, Effect, End, Noted, Run
-from holdfast.session.service_jobs import Job, Outcome
-from holdfast.session.service_limits import ServiceStatistics
 from holdfast.transport.contract import IncomingCall, ServiceTransport
 
-__all__ = ["DecisionHook", "ServiceBrokenError", "ServiceShell"]
+__all__ = ["DecisionHook", "ServiceShell"]
 
 DecisionHook: TypeAlias = Callable[[Literal["task", "sensing"], float, float], None]
 
 _BRIEF_S = 0.001
-"""Jobs that may take longer run on threads: the loop hears nobody meanwhile."""
+"""Longer jobs run on threads, because a job blocks the loop."""
 
 _LARGE_BYTES = 64 << 10
 """Requests that are larger are decoded on a thread."""
@@ -49,15 +55,11 @@ _MAX_UNDECODED = 4096
 """Large requests that wait to be decoded."""
 
 _MAX_UNDECODED_BYTES = 128 << 20
-"""Of these requests: two of the largest. One is let in, however large it is; and where others have
-taken the room, one of each robot's as long as all do not take twice as much."""
+"""Of these requests: two of the largest. One request is always admitted; when other robots have
+used up the bound, each robot may have one more, up to twice the bound in total."""
 
 _UNREAD_BUSY = [encode(Busy(0, retry_after_ms)) for retry_after_ms in range(100, 126)]
-"""Used in turn, so that robots that were turned away together do not come back together."""
-
-
-class ServiceBrokenError(HoldfastError):
-    """The service's own code failed: a defect. A new process is better than half a service."""
+"""Used in rotation, so that robots that were rejected together do not retry together."""
 
 
 class ServiceShell:
@@ -65,23 +67,17 @@ class ServiceShell:
 
     Parameters
     ----------
-    service : Service
     transport : ServiceTransport
         Not started yet.
-    workers : int
-        As the machine was told.
-    events : EventSink
-        Is told what happens.
     on_decision : callable or None
-        Is called with the kind, the time computed and the time waited of each part of an answer.
+        Called with the kind, computing time and waiting time of each decision.
     max_undecoded, max_undecoded_bytes : int
-        Large requests that wait to be decoded, and their size; what is beyond is turned away
-        unread.
+        Bounds on large requests that wait to be decoded; further ones are rejected unread.
 
     Attributes
     ----------
     is_draining : bool
-        Whether no new robots are taken, because the service is about to end.
+        Whether new robots are rejected because the service is about to end.
     """
 
     def __init__(
@@ -117,7 +113,7 @@ class ServiceShell:
         self.is_draining = False
 
     async def start(self) -> None:
-        """Be there for robots.
+        """Start the transport.
 
         Raises
         ------
@@ -129,7 +125,7 @@ class ServiceShell:
         await self._transport.start(self.deliver)
 
     async def wait(self) -> str:
-        """Wait until there is a reason to stop, and return the one that :meth:`stop` was told.
+        """Wait for :meth:`stop`, and return its reason.
 
         Raises
         ------
@@ -144,9 +140,9 @@ class ServiceShell:
             self._stopped.set_result(reason)
 
     async def drain(self, timeout_s: float) -> None:
-        """Take no more links, and wait until all robots have their answers and have left.
+        """Take no new links, and wait until all robots have their replies and have left.
 
-        Until it has found another service a robot goes on asking this one, and is answered.
+        A robot is still answered until it has found another service.
         """
         self.is_draining = True
         awaited = {self._transport.dismiss()}
@@ -156,7 +152,7 @@ class ServiceShell:
         await asyncio.wait(awaited, timeout=timeout_s)
 
     async def close(self, timeout_s: float = 1.0) -> None:
-        """End all calls and links, within this time; a job that runs is not waited for."""
+        """End all calls and links within this time, without waiting for a running job."""
         self._closed = True
         if self._timer is not None:
             self._timer.cancel()
@@ -168,27 +164,24 @@ class ServiceShell:
 
     @property
     def is_computing(self) -> bool:
-        """Whether a thread is at work, which nobody waits for."""
+        """Whether a thread is still computing."""
         return self._jobs.num_open + self._decoder.num_open > 0
 
     def note(self, event: str, /, **fields: object) -> None:
-        """Log an event; of each kind only so often, with the number of those left out.
-
-        What another machine can bring about, it can bring about a thousand times a second.
-        """
-        omitted = self._rates.admit(event, event, fields, self._loop.time())
-        if omitted is not None:
-            self._log(CountedEvent(event, fields, omitted))
+        """Log an event, with a limited rate for each kind."""
+        admitted = self._rates.admit(event, event, fields, self._loop.time())
+        if admitted is not None:
+            admitted.report_to(self._events)
         self._set_timer()
 
     def statistics(self) -> ServiceStatistics:
-        """Return a copy of what the machine counts."""
+        """Return a copy of the machine's counters."""
         statistics = self._service.statistics
         copy = msgspec.structs.replace(statistics, refusals=dict(statistics.refusals))
         copy.busy += self._unread
         return copy
 
-    # -- what happens ----------------------------------------------------------------------------
+    # -- events ----------------------------------------------------------------------------------
 
     def deliver(self, call: IncomingCall) -> None:
         """Take a call from the transport."""
@@ -198,7 +191,7 @@ class ServiceShell:
             self._guarded(self._received, call)
 
     def _guarded(self, handler: Callable[..., None], *arguments: object) -> None:
-        """Call a handler, as long as the service is there; what it raises is a defect of ours."""
+        """Call a handler unless the shell is closed; an exception from it is a defect here."""
         if self._closed:
             return
         try:
@@ -207,7 +200,7 @@ class ServiceShell:
             self._broke(error)
 
     def _broke(self, error: BaseException) -> None:
-        """Let :meth:`wait` raise, and be there for no robot any more."""
+        """Have :meth:`wait` raise, and close the transport."""
         if self._closed:
             return
         self._closed = True
@@ -222,7 +215,7 @@ class ServiceShell:
         if size <= _LARGE_BYTES:
             self._decoded(call, size, _decode(payload))
         elif self._undecoded >= self._max_undecoded or self._takes_too_much(call.robot, size):
-            self._turn_away_unread(call)
+            self._reject_unread(call)
         else:
             self._undecoded += 1
             self._undecoded_of[call.robot] += 1
@@ -231,13 +224,13 @@ class ServiceShell:
             self._decoder.submit(functools.partial(_decode, payload), done)
 
     def _takes_too_much(self, robot: str | None, size: int) -> bool:
-        """Tell whether a large request is one too many."""
+        """Return whether a large request exceeds the bound on bytes."""
         wanted_bytes = self._undecoded_bytes + size
         if self._undecoded_of[robot]:
             return wanted_bytes > self._max_undecoded_bytes
         return self._undecoded > 0 and wanted_bytes > 2 * self._max_undecoded_bytes
 
-    def _turn_away_unread(self, call: IncomingCall) -> None:
+    def _reject_unread(self, call: IncomingCall) -> None:
         self._unread += 1
         call.reply(_UNREAD_BUSY[self._unread % len(_UNREAD_BUSY)])
         call.end()
@@ -266,45 +259,46 @@ class ServiceShell:
         self._finished(job, *self._computed(job))
 
     def _run_brief_job_soon(self) -> None:
-        """Have the next brief job run once all that has arrived by then was handled.
+        """Schedule the next brief job after all input that has arrived by then.
 
-        The loop hears what has arrived after what was to be called soon, and before what is due.
+        In one turn the loop runs ``call_soon`` callbacks of before, then reads sockets, then runs
+        due timers.
         """
         self._loop.call_at(self._loop.time(), self._guarded, self._run_brief_job)
 
-    def _computed(self, job: Job) -> tuple[Outcome, float]:
-        """Return what a job comes to, and how long it took; on any thread."""
+    def _computed(self, job: Job) -> tuple[JobResult, float]:
+        """Run a job on any thread; return its outcome and its duration."""
         began = self._loop.time()
         outcome = job.run()
         return outcome, self._loop.time() - began
 
-    def _finished(self, job: Job, outcome: Outcome, computed_s: float) -> None:
+    def _finished(self, job: Job, outcome: JobResult, computed_s: float) -> None:
         now = self._loop.time()
-        # Without the ways to a thread and back: else a brief job that was once sent there never
-        # counts as brief again.
-        self._service.begun(job, now - computed_s)
+        # Without the time to a thread and back: with it a brief job that once ran there would
+        # never count as brief again.
+        self._service.started(job, now - computed_s)
         self._carry_out(self._service.finished(job, outcome, now))
 
     def _tick(self) -> None:
-        """Let the machine take note of the time, and log what was left out before."""
+        """Advance the machine's clock, and log dropped events that are due."""
         self._timer = None
         now = self._loop.time()
         for event in self._rates.due(now):
-            self._log(event)
+            event.report_to(self._events)
         self._carry_out(self._service.tick(now))
 
-    # -- what comes of it ------------------------------------------------------------------------
+    # -- effects ---------------------------------------------------------------------------------
 
-    def _carry_out(self, effects: list[Effect]) -> None:
+    def _carry_out(self, effects: list[ServiceEffect]) -> None:
         for effect in effects:
-            if isinstance(effect, Answer):
+            if isinstance(effect, SendReply):
                 self._calls[effect.call].reply(effect.payload)
-            elif isinstance(effect, End):
+            elif isinstance(effect, EndCall):
                 self._calls.pop(effect.call).end()
-            elif isinstance(effect, Run):
+            elif isinstance(effect, StartJob):
                 self._run(effect)
-            elif isinstance(effect, Noted):
-                self.note(effect.event, **effect.fields)
+            elif isinstance(effect, LogEvent):
+                self.note(effect.name, **effect.fields)
             elif self._on_decision is not None:
                 self._on_decision(effect.kind, effect.computed_s, effect.waited_s)
         self._set_timer()
@@ -312,7 +306,7 @@ class ServiceShell:
             self._idle.set_result(None)
             self._idle = None
 
-    def _run(self, run: Run) -> None:
+    def _run(self, run: StartJob) -> None:
         job = run.job
         if run.expected_s > _BRIEF_S:
             self._jobs.submit(
@@ -325,19 +319,16 @@ class ServiceShell:
             self._run_brief_job_soon()
 
     def _set_timer(self) -> None:
-        """Be woken when the machine, or the log, is to be told of the time."""
+        """Set the timer for the machine's or the log's next wake-up."""
         dues = (self._service.next_wakeup(), self._rates.next_due())
         due = min((each for each in dues if each is not None), default=None)
         if due is None:
             return
         if self._timer is not None:
             if self._timer.when() <= due:
-                return  # earlier than need be: it is set anew then
+                return  # it fires earlier, and is set again then
             self._timer.cancel()
         self._timer = self._loop.call_at(due, self._guarded, self._tick)
-
-    def _log(self, event: CountedEvent) -> None:
-        self._events.event(event.name, **event.told())
 
 
 def _decode(payload: bytes) -> Request | MessageError:

@@ -1,18 +1,16 @@
-"""``holdfast serve --processes N``: several processes behind one address, and one that watches.
+"""``holdfast serve --processes N``: several processes behind one address, and their supervisor.
 
-One interpreter computes on one core. So N processes serve, each an ordinary ``holdfast serve``, and
-nothing is shared between them but the address: a robot that finds itself at another process than
-before brings its state along, as it does after any lost link. Which process a connection goes to,
-the system decides.
+One interpreter computes on one core. So N processes serve, each an ordinary ``holdfast serve``.
+They share nothing but the address: a robot that reaches another process than before sends its
+state, as after any lost link. The system chooses the process of a connection.
 
-The supervisor binds the addresses and keeps them. It gives every process a listening socket of its
-own, and when a process dies, keeps that socket for the next one: connections wait there meanwhile,
-and are refused only if the process cannot be started again at once. It starts processes afresh,
-never by fork, and they end when it does. It serves no robot itself, so it has next to nothing to
-fail at.
+The supervisor binds the addresses. It gives every process a listening socket, and keeps that socket
+for the next process when one dies: connections wait there, and are refused only if the process
+cannot be restarted at once. Processes are spawned, not forked, and end when the supervisor does. It
+serves no robot itself, so little in it can fail.
 
-Supervisor and process talk over a pair of sockets that keep messages apart: a process tells every
-second, and whenever it is asked, what it has counted. So a message is a heartbeat as well.
+Supervisor and process talk over a pair of SEQPACKET sockets. A process reports its counters every
+second and on request; each report is a heartbeat, too.
 """
 
 from __future__ import annotations
@@ -30,75 +28,65 @@ from typing import Any, Protocol
 
 import msgspec
 
-from holdfast.errors import HoldfastError
-from holdfast.runtime.logs import EventSink
+from holdfast.errors import ServiceProcessError
+from holdfast.runtime.events import EventSink
 from holdfast.runtime.service_manager import ServiceManager
-from holdfast.service.metrics import Report, added
+from holdfast.service.metrics import ServiceReport, summed
 
-__all__ = ["ListeningSockets", "ServiceProcessError", "Supervised", "Supervisor", "supervise"]
+__all__ = ["ListeningSockets", "Supervised", "Supervisor", "supervise"]
 
 _REPORT_EVERY_S = 1.0
 _FRESH_WITHIN_S = 1.0
-"""For how long whoever wants to know the metrics waits for the processes' newest reports."""
+"""A request for metrics waits this long for the processes' newest reports."""
 
 _SILENT_S = 10.0
 _START_S = 60.0
-"""A process that has said nothing for so long, once it served or since its start, is stuck."""
+"""A process that is silent for so long, after its first report or since its start, is stuck."""
 
 _STEADY_S = 10.0
-"""A process that ends earlier than this has failed at its start, and is started again later."""
+"""A process that ends earlier than this has failed at its start; its restart is delayed."""
 
 _END_S = 0.5
 _FIRST_DELAY_S, _LAST_DELAY_S = 0.1, 30.0
 _KEPT_S = 1.0
-"""Connections are not kept waiting for a process that is started later than this."""
+"""With a longer delay, waiting connections are refused."""
 
 _MAX_MESSAGE_BYTES = 65_536
 _MAX_TEXT = 4000
-
-
-class ServiceProcessError(HoldfastError):
-    """A process of a service has ended before it served."""
 
 
 class ListeningSockets(Protocol):
     """The sockets at which processes listen."""
 
     def of(self, index: int) -> Sequence[socket.socket]:
-        """Return those of a process, one for each endpoint; made anew if they were given up."""
+        """Return those of a process, one for each endpoint; opened again if they were released."""
         ...
 
-    def give_up(self, index: int) -> None:
-        """Refuse what waits at a process's own sockets, and what would."""
+    def release(self, index: int) -> None:
+        """Close a process's own sockets, and so refuse the connections that wait there."""
         ...
 
     def close(self) -> None:
-        """Give up all sockets and addresses; may be repeated."""
+        """Close all sockets; may be repeated."""
         ...
 
 
-class _Told(msgspec.Struct, tag="told"):
-    """What a process tells; ``answers`` is the number of the question, 0 if there was none."""
+class _StatusReport(msgspec.Struct, tag="told"):
+    """A process's status; ``answers`` is the number of the request for it, 0 without one."""
 
     ready: bool
-    report: Report
+    report: ServiceReport
     answers: int = 0
 
 
-class _Failed(msgspec.Struct, tag="failed"):
+class _StartFailure(msgspec.Struct, tag="failed"):
     """Why a process cannot serve."""
 
     text: str
 
 
 class Supervised:
-    """A process's end of the pair: tells the supervisor how it is.
-
-    Parameters
-    ----------
-    descriptor : int
-        Of this end, inherited.
-    """
+    """A process's end of the pair: reports to the supervisor over an inherited descriptor."""
 
     def __init__(self, descriptor: int) -> None:
         self._socket = socket.socket(fileno=descriptor)
@@ -112,75 +100,70 @@ class Supervised:
         """Whether this process has said that it serves."""
         return self._timer is not None
 
-    def start(self, report: Callable[[], Report], lost: Callable[[], None]) -> None:
-        """Say in the running loop that this process serves, and report from then on.
+    def start(self, report: Callable[[], ServiceReport], lost: Callable[[], None]) -> None:
+        """Report that this process serves, and its counters regularly, in the running loop.
 
-        Parameters
-        ----------
-        report : callable
-            Returns what has been counted.
-        lost : callable
-            Is called when the supervisor is gone.
+        ``lost`` is called when the supervisor is gone.
         """
         self._loop = asyncio.get_running_loop()
         self._report, self._lost = report, lost
         self._ready = True
-        self._loop.add_reader(self._socket, self._asked)
-        self._regularly()
+        self._loop.add_reader(self._socket, self._on_request)
+        self._report_regularly()
 
     def not_ready(self) -> None:
-        """Say that this process takes no more robots."""
+        """Report that this process takes no more robots."""
         self._ready = False
-        self._tell(0)
+        self._report_status(0)
 
     def failed(self, text: str) -> None:
-        """Say why this process cannot serve."""
-        self._send(_Failed(text[:_MAX_TEXT]))
+        """Report why this process cannot serve."""
+        self._send(_StartFailure(text[:_MAX_TEXT]))
 
     def close(self) -> None:
-        """Say nothing more. The end of the process closes this end, and so tells that it ended."""
+        """Report nothing more. The supervisor sees the socket close when the process ends."""
         if self._timer is not None:
             self._timer.cancel()
             self._loop.remove_reader(self._socket)
         self._socket.detach()
 
-    def _regularly(self) -> None:
-        self._tell(0)
-        self._timer = self._loop.call_later(_REPORT_EVERY_S, self._regularly)
+    def _report_regularly(self) -> None:
+        self._report_status(0)
+        self._timer = self._loop.call_later(_REPORT_EVERY_S, self._report_regularly)
 
-    def _asked(self) -> None:
+    def _on_request(self) -> None:
         with contextlib.suppress(BlockingIOError, ConnectionResetError):
-            question = self._socket.recv(16)
-            if question:
-                self._tell(int.from_bytes(question, "big"))
+            request = self._socket.recv(16)
+            if request:
+                self._report_status(int.from_bytes(request, "big"))
                 return
         self._loop.remove_reader(self._socket)
         self._lost()
 
-    def _tell(self, answers: int) -> None:
-        self._send(_Told(self._ready, self._report(), answers))
+    def _report_status(self, answers: int) -> None:
+        self._send(_StatusReport(self._ready, self._report(), answers))
 
-    def _send(self, message: _Told | _Failed) -> None:
-        # A supervisor that does not listen for a while misses nothing: the next report has it all.
+    def _send(self, message: _StatusReport | _StartFailure) -> None:
+        # A dropped report is no loss: the next one has all counters.
         with contextlib.suppress(BlockingIOError, BrokenPipeError, ConnectionResetError):
             self._socket.send(msgspec.msgpack.encode(message))
 
 
 class _Child:
-    """A process as the supervisor sees it."""
+    """A process, as the supervisor sees it."""
 
     def __init__(self, process: subprocess.Popen[bytes], control: socket.socket) -> None:
         self.process = process
         self.control = control
         self.started_at = self.heard_at = monotonic()
-        self.report: Report | None = None
+        self.report: ServiceReport | None = None
         self.ready = False
         self.reload = False
         self.answered = 0
         self.failure: str | None = None
 
-    def ask(self, number: int) -> None:
-        """Have it report."""
+    def request_report(self, number: int) -> None:
+        """Request a report."""
         with contextlib.suppress(OSError):
             self.control.send(number.to_bytes(8, "big"))
 
@@ -193,7 +176,7 @@ class _Child:
 
 
 class Supervisor:
-    """Starts a service's processes, watches them, starts again what dies, and ends them.
+    """Starts a service's processes, watches them, restarts those that die, and ends them.
 
     Belongs to the event loop that runs when it is made.
 
@@ -201,10 +184,8 @@ class Supervisor:
     ----------
     arguments : sequence of str
         Of ``holdfast serve``, for every process.
-    processes : int
     listening : ListeningSockets
         Closed when the processes are to end.
-    events : EventSink
     """
 
     def __init__(
@@ -214,15 +195,15 @@ class Supervisor:
         listening: ListeningSockets,
         events: EventSink,
     ) -> None:
-        # -P: what lies in the directory that this one was started in is nobody's module.
+        # -P: modules in the current directory are not imported.
         self._command = [sys.executable, "-P", "-m", "holdfast", "serve", *arguments]
         self._listening = listening
         self._events = events
         self._children: list[_Child | None] = [None] * processes
         self._early_ends = [0] * processes
         self._delayed: dict[int, asyncio.TimerHandle] = {}
-        self._past = Report()
-        self._asked = 0
+        self._past = ServiceReport()
+        self._requests = 0
         self._stopping = False
         self._loop = asyncio.get_running_loop()
         self._change: asyncio.Future[None] = self._loop.create_future()
@@ -257,47 +238,37 @@ class Supervisor:
             if child.ready:
                 child.process.send_signal(signal.SIGHUP)
             else:
-                child.reload = True  # it may have read the old ones a moment ago
+                child.reload = True  # it may have read the old ones already
 
     async def stop(self, number: int, timeout_s: float) -> None:
-        """Have all processes end, at the same time; kill those that do not.
-
-        Parameters
-        ----------
-        number : int
-            The signal that they get: at SIGTERM they finish what they owe.
-        timeout_s : float
-            How long they may take.
-        """
-        self._stopping = True
-        for timer in self._delayed.values():
-            timer.cancel()
-        # As long as this end is open, the system would go on accepting for nobody.
-        self._listening.close()
-        for child in self._living():
-            child.process.send_signal(number)
+        """Send this signal to all processes, and kill those that do not end within this time."""
+        self._signal_all(number)
         await self._until(lambda: not self._living(), timeout_s)
         self.kill()
 
     def kill(self) -> None:
         """End all processes now; may be repeated."""
+        self._signal_all(signal.SIGKILL)
+        for index, dead in enumerate(self._children):
+            if dead is not None:
+                self._reap(index, dead)
+        self._changed()
+
+    def _signal_all(self, number: int) -> None:
         self._stopping = True
         for timer in self._delayed.values():
             timer.cancel()
+        # An open listening socket would go on accepting connections.
         self._listening.close()
         for child in self._living():
-            child.process.kill()
-        for index, dead in enumerate(self._children):
-            if dead is not None:
-                self._bury(index, dead)
-        self._changed()
+            child.process.send_signal(number)
 
     def process_ids(self) -> list[int]:
-        """Return this process's number, then those of the processes."""
+        """Return the ids of this process and of the service's processes."""
         return [os.getpid(), *(child.process.pid for child in self._living())]
 
     def why_not_ready(self) -> str | None:
-        """Return why no robot is welcome; None if some process takes robots."""
+        """Return why no process takes robots; None if one does."""
         if self._stopping:
             return "draining"
         if any(child.ready for child in self._living()):
@@ -310,7 +281,7 @@ class Supervisor:
         return next(filter(None, (child.trouble(now) for child in self._living())), None)
 
     def status(self) -> str:
-        """Return how it is, in a few words, as far as the processes have told by themselves."""
+        """Return the status in a few words, from the processes' last reports."""
         living = self._living()
         sessions = sum(each.report.statistics.sessions for each in living if each.report)
         serving = (
@@ -319,17 +290,17 @@ class Supervisor:
         )
         return self.why_not_alive() or self.why_not_ready() or serving
 
-    async def report(self) -> Report:
-        """Return what all processes have counted, those that have ended too."""
-        self._asked = asked = self._asked + 1
+    async def report(self) -> ServiceReport:
+        """Return the sum of all processes' counters, those that have ended included."""
+        self._requests = number = self._requests + 1
         for child in self._living():
-            child.ask(asked)
+            child.request_report(number)
         await self._until(
-            lambda: all(child.answered >= asked for child in self._living() if child.ready),
+            lambda: all(child.answered >= number for child in self._living() if child.ready),
             _FRESH_WITHIN_S,
         )
         reports = (child.report for child in self._living())
-        total = added([self._past, *(report for report in reports if report is not None)])
+        total = summed([self._past, *(report for report in reports if report is not None)])
         total.restarts = self._restarts
         return total
 
@@ -359,9 +330,9 @@ class Supervisor:
                 self._restart(index, f"cannot be started: {error.strerror}", lived_s=0.0)
                 return
         child = self._children[index] = _Child(process, ours)
-        self._loop.add_reader(ours, self._hear, index, child)
+        self._loop.add_reader(ours, self._on_message, index, child)
 
-    def _hear(self, index: int, child: _Child) -> None:
+    def _on_message(self, index: int, child: _Child) -> None:
         try:
             data = child.control.recv(_MAX_MESSAGE_BYTES)
         except BlockingIOError:
@@ -371,9 +342,9 @@ class Supervisor:
         if not data:
             self._ended(index, child)
             return
-        message = msgspec.msgpack.decode(data, type=_Told | _Failed)
+        message = msgspec.msgpack.decode(data, type=_StatusReport | _StartFailure)
         child.heard_at = monotonic()
-        if isinstance(message, _Failed):
+        if isinstance(message, _StartFailure):
             child.failure = message.text
             return
         if message.ready and not child.ready and self._has_served:
@@ -387,12 +358,12 @@ class Supervisor:
         self._changed()
 
     def _ended(self, index: int, child: _Child) -> None:
-        """Take note that a process has closed its end, as the system does when it ends."""
+        """Handle the end of a process, which closes its end of the pair."""
         with contextlib.suppress(subprocess.TimeoutExpired):
-            # The system closes what a process has open a moment before it says how that ended.
+            # The system closes a process's files a moment before its exit status is known.
             child.process.wait(_END_S)
         child.process.kill()
-        code = self._bury(index, child)
+        code = self._reap(index, child)
         if code < 0:
             reason = f"was ended by {signal.Signals(-code).name}"
         else:
@@ -401,19 +372,19 @@ class Supervisor:
             self._restart(index, child.failure or reason, monotonic() - child.started_at, child)
         self._changed()
 
-    def _bury(self, index: int, child: _Child) -> int:
-        """Keep what a process has counted, and wait for it, which has ended or been killed."""
+    def _reap(self, index: int, child: _Child) -> int:
+        """Keep the counters of a process that has ended or been killed; return its exit status."""
         self._loop.remove_reader(child.control)
         child.control.close()
         self._children[index] = None
         if child.report is not None:
-            self._past = added([self._past, child.report.without_gauges()])
+            self._past = summed([self._past, child.report.without_gauges()])
         return child.process.wait()
 
     def _restart(
         self, index: int, reason: str, lived_s: float, child: _Child | None = None
     ) -> None:
-        """Start a process again: at once, or later if it keeps failing at its start."""
+        """Restart a process: at once, or with a delay if it keeps failing at its start."""
         if not self._has_served:
             self._failure = reason
             return
@@ -422,7 +393,7 @@ class Supervisor:
         fields = {} if child is None else {"pid": child.process.pid}
         self._events.event("process_ended", reason=reason, **fields, again_in_s=delay_s)
         if delay_s > _KEPT_S:
-            self._listening.give_up(index)
+            self._listening.release(index)
         self._restarts += 1
         self._delayed[index] = self._loop.call_later(delay_s, self._start, index)
 
@@ -448,25 +419,16 @@ async def supervise(
     ready: Callable[[], None],
     manager: ServiceManager,
 ) -> int:
-    """Run a service's processes until a signal says that they are to end.
+    """Run a service's processes until a signal ends them; return that signal.
 
     Parameters
     ----------
-    supervisor : Supervisor
-    events : EventSink
     ending : iterable of signal.Signals
-        Those that end the service. If SIGHUP is none of them, the processes get it.
+        The signals that end the service. SIGHUP goes to the processes if it is not among them.
     drain_s : float
-        How long the processes may take to end in order. A second signal ends them at once.
+        Time for the processes to end in order. A second signal ends them at once.
     ready : callable
-        Is called once, when all of them serve.
-    manager : ServiceManager
-        Is told so as well, and that all of them live, as long as they do.
-
-    Returns
-    -------
-    int
-        The signal.
+        Called once, when all processes serve.
 
     Raises
     ------

@@ -1,8 +1,7 @@
-"""What all wires' robot ends have in common: the table of calls in flight.
+"""The robot's table of calls in flight, common to all transports.
 
-A call that has ended must stay ended, although its end can come from four sides: the service ends
-it, the service vanishes, the robot abandons it, the transport closes. Whoever takes the call out of
-the table delivers its end, and what comes later finds nothing.
+A call can end for four reasons: the service ends it, the service vanishes, the robot abandons it,
+or the transport closes. It must end only once, so the first of these removes it from the table.
 """
 
 from __future__ import annotations
@@ -10,15 +9,21 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from holdfast.errors import InvalidValueError
-from holdfast.session.events import Appeared, Ended, Replied, TransportEvent, Vanished
+from holdfast.protocol.events import (
+    CallEnded,
+    ReplyReceived,
+    ServiceAppeared,
+    ServiceVanished,
+    TransportEvent,
+)
 
 __all__ = ["CallTable", "PendingCall", "too_large"]
 
 
 def too_large(size_bytes: int, max_message_bytes: int) -> bytes:
-    """Return the reply to a request that is larger than allowed, which therefore nobody reads."""
-    # Imported here because it brings NumPy along, which a transport does not need otherwise.
-    from holdfast.session.messages import Refused, encode
+    """Return the reply to a request that is larger than allowed."""
+    # Imported here because it imports NumPy, which no transport needs.
+    from holdfast.protocol.messages import Refused, encode
 
     return encode(
         Refused(
@@ -30,16 +35,9 @@ def too_large(size_bytes: int, max_message_bytes: int) -> bytes:
 
 
 class PendingCall:
-    """A call in flight.
+    """A call in flight to ``peer``.
 
-    Its number may be used again as soon as it is abandoned, so what comes of it is told apart by
-    this object.
-
-    Attributes
-    ----------
-    number : int
-    peer : object
-        Whoever was asked.
+    Its number may be used again as soon as it is abandoned; this object identifies it.
     """
 
     __slots__ = ("number", "peer")
@@ -61,7 +59,7 @@ class CallTable:
         self._deliver = deliver
 
     def begin(self, number: int, peer: object) -> PendingCall | None:
-        """Enter a call to a peer; return None if the table is closed.
+        """Add a call to a peer; return None if the table is closed.
 
         Raises
         ------
@@ -82,34 +80,34 @@ class CallTable:
     def replied(self, call: PendingCall, payload: bytes) -> None:
         """Deliver a reply, if the call is still in flight."""
         if self._deliver is not None and self.is_pending(call):
-            self._deliver(Replied(call.number, payload))
+            self._deliver(ReplyReceived(call.number, payload))
 
     def ended(self, call: PendingCall) -> None:
         """Deliver the end of a call, if it is still in flight."""
         if self._deliver is not None and self.is_pending(call):
             del self._pending[call.number]
-            self._deliver(Ended(call.number))
+            self._deliver(CallEnded(call.number))
 
     def abandon(self, number: int) -> PendingCall | None:
-        """Take a call out without delivering anything."""
+        """Remove a call without delivering anything."""
         return self._pending.pop(number, None)
 
-    def appeared(self, service: str, boot: str) -> None:
-        """Deliver that a service is there."""
+    def appeared(self, service: str, incarnation: str) -> None:
+        """Deliver that a service has appeared."""
         if self._deliver is not None:
-            self._deliver(Appeared(service, boot))
+            self._deliver(ServiceAppeared(service, incarnation))
 
-    def vanished(self, service: str, boot: str, peer: object) -> None:
-        """Deliver that a service is gone, then the ends of its calls."""
+    def vanished(self, service: str, incarnation: str, peer: object) -> None:
+        """Deliver that a service has vanished, then the ends of its calls."""
         if self._deliver is None:
             return
-        # Those of now: who hears that it is gone may at once use a number again.
+        # Listed first: the receiver of ServiceVanished may reuse their numbers at once.
         calls = [call for call in self._pending.values() if call.peer is peer]
-        self._deliver(Vanished(service, boot))
+        self._deliver(ServiceVanished(service, incarnation))
         for call in calls:
             self.ended(call)
 
-    def lost(self, peer: object) -> None:
+    def peer_lost(self, peer: object) -> None:
         """Deliver the ends of the calls to a peer."""
         for call in [call for call in self._pending.values() if call.peer is peer]:
             self.ended(call)

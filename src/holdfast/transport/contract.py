@@ -1,11 +1,10 @@
-"""What a wire must do, for the robot's end and for the service's.
+"""The contract of transports, for the robot's end and for the service's.
 
-Everything happens on one thread, that of an asyncio event loop: there the methods are called, and
-there what happens is delivered, to one callable. Nothing is delivered from inside a method of the
-wire, so whoever calls one is never entered again on the way; and nothing here ever blocks. What is
-delivered must return soon, too, for while it runs nothing else is heard.
+Everything happens on the thread of an asyncio event loop: methods are called there, and events are
+delivered there, to one callable. No event is delivered from inside a method, so callers need not be
+reentrant. No method blocks, and the callable must return soon, because it blocks the loop.
 
-Every implementation passes ``tests/contracts/test_transport``.
+Every implementation passes ``tests/contracts/test_transport_contract``.
 """
 
 from __future__ import annotations
@@ -14,12 +13,12 @@ import asyncio
 from collections.abc import Callable
 from typing import Protocol
 
-from holdfast.session.events import TransportEvent
+from holdfast.protocol.events import TransportEvent
 
 __all__ = ["DEFAULT_MAX_MESSAGE_BYTES", "IncomingCall", "RobotTransport", "ServiceTransport"]
 
 DEFAULT_MAX_MESSAGE_BYTES = 64 * 1024 * 1024
-"""Bound on a message, unless told otherwise: a state of a million particles fills 56 MB."""
+"""Default bound on a message: a state of a million particles fills 56 MB."""
 
 
 class RobotTransport(Protocol):
@@ -29,9 +28,10 @@ class RobotTransport(Protocol):
         """Begin to connect, in the running loop, and to deliver events.
 
         Events of one call come in the order in which they happened, and after its
-        :class:`~holdfast.session.events.Ended` nothing more comes of it. A service that is there
-        already is delivered as :class:`~holdfast.session.events.Appeared` as well. One that is gone
-        is delivered as :class:`~holdfast.session.events.Vanished`, then the ends of its calls.
+        :class:`~holdfast.protocol.events.CallEnded` nothing more comes of it. A service that is
+        already there is delivered as :class:`~holdfast.protocol.events.ServiceAppeared` as well.
+        One that is gone is delivered as :class:`~holdfast.protocol.events.ServiceVanished`, then
+        the ends of its calls.
 
         Raises
         ------
@@ -41,31 +41,20 @@ class RobotTransport(Protocol):
         ...
 
     def call(self, service: str, call: int, payload: bytes) -> None:
-        """Send a request; never raises for a lost service.
+        """Send a request to a known service; never raises for a lost one.
 
-        Whatever happens is delivered as events, and the last one is always ``Ended``: soon if the
-        service is not there, or is lost before the call has ended.
-
-        Parameters
-        ----------
-        service : str
-            One of those that the transport was made for.
-        call : int
-            Number by which the events name this call; unique while the transport is open.
-        payload : bytes
-            The request.
+        The results are events with the number ``call``, which is unique while the transport is
+        open. The last event is always :class:`~holdfast.protocol.events.CallEnded`, soon if the
+        service is absent or lost.
         """
         ...
 
     def abandon(self, call: int) -> None:
-        """Give a call up: nothing more of it is delivered, not even its end."""
+        """Abandon a call: nothing more of it is delivered, not even its end."""
         ...
 
     async def close(self, timeout_s: float = 1.0) -> None:
-        """Deliver nothing more, send what was to be sent, and close all links.
-
-        It takes this long at most, whatever the other ends do. May be repeated.
-        """
+        """Deliver nothing more, flush, and close all links, within this time. May be repeated."""
         ...
 
 
@@ -79,23 +68,23 @@ class IncomingCall(Protocol):
 
     @property
     def robot(self) -> str | None:
-        """Name in the certificate with which the robot has proved who it is; None if it has not."""
+        """Name in the robot's certificate; None without one."""
         ...
 
     def reply(self, payload: bytes) -> None:
         """Send a reply; may be repeated. A robot that is gone is no error.
 
-        A robot that does not read what it is sent loses its link, and nobody waits for it.
+        A robot that does not read loses its link, and nothing waits for it.
         """
         ...
 
     def end(self) -> None:
-        """End the call; a call that is never ended would hold the robot until it gives up."""
+        """End the call; the robot waits for the end of every call."""
         ...
 
 
 class ServiceTransport(Protocol):
-    """The service's end: it is seen, and is called."""
+    """The service's end: robots find it and call it."""
 
     @property
     def endpoints(self) -> tuple[str, ...]:
@@ -103,7 +92,7 @@ class ServiceTransport(Protocol):
         ...
 
     async def start(self, deliver: Callable[[IncomingCall], None]) -> None:
-        """Listen, be seen, and deliver calls; returns when robots can connect.
+        """Listen and deliver calls; returns when robots can connect.
 
         Raises
         ------
@@ -115,14 +104,11 @@ class ServiceTransport(Protocol):
     def dismiss(self) -> asyncio.Future[None]:
         """Take no new links, and ask the robots to go elsewhere.
 
-        Until they do, calls are delivered and answered as before. What is returned is done when all
-        robots that can be told have gone.
+        Until they do, calls are delivered and answered as before. The future is done when all
+        robots that can be asked have left.
         """
         ...
 
     async def close(self, timeout_s: float = 1.0) -> None:
-        """End all calls, send what was to be sent, and close all links, within this time.
-
-        May be repeated.
-        """
+        """End all calls, flush, and close all links, within this time. May be repeated."""
         ...

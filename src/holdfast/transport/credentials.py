@@ -1,8 +1,8 @@
-"""Will these credentials work? Found out before a link is opened.
+"""Checks credentials before a link is opened.
 
-A TLS library says late, and in few words, that a certificate was refused. So the handshake of both
-ends is played through in memory, with the ``ssl`` module of the standard library, when a robot or a
-service starts: what the other end would refuse is named then, with the file and the reason.
+TLS libraries report late, and in few words, why they refuse a certificate. So when a robot or a
+service starts, it performs the handshake of both ends in memory. If the peer would refuse these
+credentials, the error names the file and the reason.
 
 :mod:`holdfast.transport.key_ring` makes credentials.
 """
@@ -17,7 +17,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias
 
-from holdfast.errors import HoldfastError, TransportError
+from holdfast.errors import CredentialsError, TransportError
 from holdfast.transport.endpoints import AUTHORITY_FILE, TlsFiles
 from holdfast.transport.revocation import REVOKED_FILE, refuse_revoked
 
@@ -26,9 +26,8 @@ if TYPE_CHECKING:
 
 __all__ = [
     "EXPIRES_SOON_DAYS",
-    "CredentialsError",
     "CredentialsWarning",
-    "OwnCredentials",
+    "LoadedCredentials",
     "Role",
     "date_text",
     "file_versions",
@@ -41,31 +40,18 @@ __all__ = [
 Role: TypeAlias = Literal["robot", "service"]
 
 EXPIRES_SOON_DAYS = 14
-"""A certificate with fewer days left is warned of when it is loaded."""
+"""With fewer days left, loading a certificate warns."""
 
 _OPEN_TO_OTHERS = 0o077
 _GROUP_READS = 0o040
 
 
-class CredentialsError(HoldfastError):
-    """Credentials cannot be made or used; the message names the file and the reason."""
-
-
 class CredentialsWarning(UserWarning):
-    """Credentials work, but somebody should look at them."""
+    """Credentials work, but need attention."""
 
 
-class OwnCredentials(NamedTuple):
-    """Credentials that will work.
-
-    Attributes
-    ----------
-    files : TlsFiles
-    name : str
-        In the certificate.
-    expires_s : float
-        When, in seconds since 1970.
-    """
+class LoadedCredentials(NamedTuple):
+    """Checked credentials, the certificate's name, and its end in seconds since 1970."""
 
     files: TlsFiles
     name: str
@@ -75,38 +61,32 @@ class OwnCredentials(NamedTuple):
 def load_credentials(
     directory: Path | str, role: Role, *, warn: Callable[[str], None] | None = None
 ) -> TlsFiles:
-    """Check a robot's or a service's credentials, and return where they are.
+    """Check a robot's or a service's credentials, and return their files.
 
     Parameters
     ----------
     directory : Path or str
         With ``authority.pem``, ``certificate.pem`` and ``key.pem``.
-    role : {"robot", "service"}
-        Whose they must be.
     warn : callable or None
-        Takes texts that somebody should read: a key that others can read, a certificate that
-        expires soon. None gives them to :mod:`warnings`.
-
-    Returns
-    -------
-    TlsFiles
+        Takes warnings as text: others can read the key, or the certificate expires soon. None
+        passes them to :mod:`warnings`.
 
     Raises
     ------
     CredentialsError
-        If the other end would not accept them: a file is missing, unreadable or malformed, the key
-        belongs to another certificate, the certificate is not valid now, was signed by another
-        authority, is for the other role, or has not exactly one common name.
+        If the peer would refuse them: a file is missing, unreadable or malformed, the key belongs
+        to another certificate, the certificate is not valid now, was signed by another authority,
+        is for the other role, or has not exactly one common name.
     """
-    # A warning is about the place from which this function is called.
+    # The warning names the caller of this function.
     warn = warn or partial(give_to_warnings, stacklevel=4)
     return read_credentials(directory, role, warn=warn).files
 
 
 def read_credentials(
     directory: Path | str, role: Role, *, warn: Callable[[str], None]
-) -> OwnCredentials:
-    """Do as :func:`load_credentials`; return also what the certificate says."""
+) -> LoadedCredentials:
+    """Check credentials as :func:`load_credentials` does; return the certificate's data too."""
     directory = Path(directory)
     files = TlsFiles.of(directory)
     for path in (files.authority, files.certificate, files.key):
@@ -116,18 +96,17 @@ def read_credentials(
         except OSError as error:
             raise CredentialsError(_unreadable(directory, path, role, error)) from error
     warn_if_open(files.key, warn)
-    name, expires_s = _rehearse(files, role)
+    name, expires_s = _check_handshake(files, role)
     days_left = (expires_s - datetime.now(UTC).timestamp()) / 86_400.0
     if days_left < EXPIRES_SOON_DAYS:
         warn(f"{files.certificate}: expires in {days_left:.1f} days, on {date_text(expires_s)}")
-    return OwnCredentials(files, name, expires_s)
+    return LoadedCredentials(files, name, expires_s)
 
 
 def file_versions(files: TlsFiles) -> list[tuple[int, int, int] | None]:
-    """Return what is different as soon as one of the files, or the list beside them, is.
+    """Return inode, change time and size of each file and of the revocation list.
 
-    The time is that of the last change of any kind, rights included: what is copied may bring
-    along the time at which it was written.
+    Not the modification time: a copied file may keep that of its original.
     """
     found: list[tuple[int, int, int] | None] = []
     revoked = files.authority.with_name(REVOKED_FILE)
@@ -149,7 +128,6 @@ def give_to_warnings(text: str, stacklevel: int = 3) -> None:
 def _unreadable(directory: Path, path: Path, role: Role, error: OSError) -> str:
     text = f"{path}: cannot be read: {error.strerror}"
     if isinstance(error, PermissionError):
-        # Of this directory nothing else can be found out, either.
         return f"{text}; this process is user {os.geteuid()}"
     if TlsFiles.of(directory / role).certificate.exists():
         return f"{text}; did you mean {directory / role}?"
@@ -163,8 +141,7 @@ def _unreadable(directory: Path, path: Path, role: Role, error: OSError) -> str:
 def warn_if_open(key: Path, warn: Callable[[str], None]) -> None:
     """Warn of a key that others can read.
 
-    If it is not this user's own, its group is how this user may read it: so systemd hands
-    credentials over, and so a cluster does.
+    The group may read a key of another owner: systemd and Kubernetes provide credentials that way.
     """
     status = key.stat()
     mode = status.st_mode
@@ -173,11 +150,11 @@ def warn_if_open(key: Path, warn: Callable[[str], None]) -> None:
         warn(f"{key}: others can read this key (mode {mode & 0o777:03o}); chmod 600 {key}")
 
 
-def _rehearse(files: TlsFiles, role: Role) -> tuple[str, float]:
-    """Let both ends of a link shake hands in memory; return the certificate's name and end."""
+def _check_handshake(files: TlsFiles, role: Role) -> tuple[str, float]:
+    """Perform both ends' handshake in memory; return the certificate's name and end."""
     import ssl
 
-    from holdfast.transport.tls import common_name, fault_of_certificate
+    from holdfast.transport.tls import common_name, describe_certificate_error
 
     authority, certificate, key = files.authority, files.certificate, files.key
     serving = role == "service"
@@ -196,7 +173,7 @@ def _rehearse(files: TlsFiles, role: Role) -> tuple[str, float]:
         refuse_revoked(theirs, authority.parent)
     except TransportError as error:
         raise CredentialsError(str(error)) from error
-    # A server needs a certificate of its own; nobody looks at it here.
+    # A server needs some certificate; it is not checked here.
     for context in (ours,) if serving else (ours, theirs):
         try:
             # Without the empty password, an encrypted key would ask for one on the terminal.
@@ -216,12 +193,12 @@ def _rehearse(files: TlsFiles, role: Role) -> tuple[str, float]:
                     continue
         shown = far.getpeercert() or {}
     except ssl.SSLCertVerificationError as error:
-        if error.verify_code in _LIST_IS_WRONG:
-            reason = _LIST_IS_WRONG[error.verify_code]
+        if error.verify_code in _CRL_ERRORS:
+            reason = _CRL_ERRORS[error.verify_code]
             raise CredentialsError(f"{authority.with_name(REVOKED_FILE)}: {reason}") from error
-        reason = fault_of_certificate(error, role)
+        reason = describe_certificate_error(error, role)
         raise CredentialsError(
-            f"{certificate}: {reason}{_more_of(certificate, role, error.verify_code)}"
+            f"{certificate}: {reason}{_renewal_hint(certificate, role, error.verify_code)}"
         ) from error
     except (ssl.SSLError, ValueError) as error:
         raise CredentialsError(f"{certificate}: does not work for TLS: {error}") from error
@@ -244,17 +221,17 @@ def _unusable_pair(certificate: Path, key: Path, error: ssl.SSLError) -> str:
     return f"{certificate} and {key} cannot be used: {error.reason or error}"
 
 
-_LIST_IS_WRONG = {
+_CRL_ERRORS = {
     3: f"is not of the authority beside it, {AUTHORITY_FILE}",
     8: f"was not signed by the authority beside it, {AUTHORITY_FILE}",
     11: "is not valid yet; is this machine's clock right?",
     12: "has expired",
 }
-"""By OpenSSL's numbers: what can be wrong with a revocation list."""
+"""Faults of a revocation list, by OpenSSL's error numbers."""
 
 
-def _more_of(certificate: Path, role: Role, verify_code: int) -> str:
-    """Return when a certificate is valid that is not so now, or how to get another one."""
+def _renewal_hint(certificate: Path, role: Role, verify_code: int) -> str:
+    """Return the validity of a certificate, or how to get another one."""
     if verify_code == 23:
         return f"; 'holdfast keys DIR --rotate --{role} NAME' makes new ones"
     if verify_code not in (9, 10):
@@ -274,5 +251,5 @@ def _more_of(certificate: Path, role: Role, verify_code: int) -> str:
 
 
 def date_text(time_s: float) -> str:
-    """Return a time, in seconds since 1970, as people read it."""
+    """Return a time, in seconds since 1970, as text."""
     return datetime.fromtimestamp(time_s, UTC).strftime("%Y-%m-%d %H:%M UTC")

@@ -1,20 +1,16 @@
-"""Connects to an endpoint, again and again, until somebody is there.
+"""Connects to an endpoint, and retries until a peer is there.
 
-A service that is started again is to be used at once, however far away it is. So a new attempt
-begins every few hundredths of a second, and none waits for the one before, which may hang on a path
-that is cut or on a process that stands still. The longer nobody is there, the longer the pauses:
-in proportion, so that waiting for the next attempt adds two per cent to any outage.
+A restarted service should be used at once, however far away it is. So a new attempt begins every 20
+ms, in parallel to earlier ones, which may hang on a cut path or a stopped process. The pause grows
+in proportion to the outage, so that waiting for the next attempt adds two per cent to it.
 
-Somebody who takes a connection and ends it soon again, hello or not, is asked less often: the pause
-doubles with each such link, up to a fifth of a second. (It may be a proxy that accepts while its
-service is being started.) A link that has brought an answer, or has lasted, makes it short again:
-so a service that dies and is started again is found as fast as ever.
+A peer that soon ends its connections is tried less often: the pause doubles with each, up to 0.2 s.
+(It may be a proxy that accepts while its service starts.) A link that brought an answer, or lasted,
+resets the pause, so that a service that dies and restarts is found as fast as ever.
 
-A name may stand for several addresses, at each of which there is another process. Each robot tries
-them in an order of its own, so that robots spread over the processes, and one that loses a link
-comes back to the process that knows it. An address that refuses leads to the next one at once.
-
-Why attempts fail is told, for whoever has to mend it.
+A name may have several addresses, each of another process. Each robot tries them in its own order.
+So robots spread over the processes, and a robot that loses a link returns to the process that knows
+it. An address that refuses leads to the next one at once. Failures are reported with their reasons.
 """
 
 from __future__ import annotations
@@ -31,6 +27,7 @@ from typing import Any, Final, TypeAlias
 from holdfast.errors import TransportError
 from holdfast.transport.endpoints import Endpoint, system_words
 from holdfast.transport.links import Link
+from holdfast.transport.schemes import Scheme
 
 __all__ = ["Dialer"]
 
@@ -40,53 +37,45 @@ _SHARE_OF_OUTAGE: Final = 0.02
 
 _LAST_PAUSE_AFTER_NOTHING_S: Final = 0.2
 _LASTING_S: Final = 1.0
-"""A link that ends sooner, and has brought no answer, has come to nothing."""
+"""A link that ends sooner, without an answer, counts as failed."""
 
 _CONNECT_TIMEOUT_S: Final = 2.0
-"""For the answer to an attempt; the next ones have long begun."""
+"""For one attempt; later ones run in parallel."""
 
 _NEXT_LINK_S: Final = 0.25
-"""After a connection has come about, so long no second one is taken beside it."""
+"""After a connection, no second one is made for so long."""
 
 _REFUSED_PAUSE_S: Final = 1.0
-"""After one of the ends did not want the other."""
-
-_RESOLVE_AGAIN_S: Final = 1.0
-"""After the last answer: while nobody is reached, a name may come to stand for somebody else."""
-
-_LOOK_UP_AGAIN_S: Final = 0.1
-"""After a ROS 1 master's last answer."""
+"""After one end has refused the other."""
 
 _Address: TypeAlias = str | tuple[Any, ...]
 
 
 class Dialer:
-    """Makes links to an endpoint while it is wanted to.
+    """Makes links to an endpoint, from :meth:`start` to :meth:`stop`.
 
     Parameters
     ----------
-    endpoint : Endpoint
-    make_link : callable
-        Makes the link of a new connection.
     on_failed : callable
-        Is told why no connection comes about, each time that an attempt has failed and all of the
-        endpoint's addresses have.
+        Called with the reasons when an attempt has failed at each of the endpoint's addresses.
     identity : str
-        Of this end: by it the addresses of a name are put into an order.
+        Of this end; it determines the order of a name's addresses.
     """
 
     def __init__(
         self,
         endpoint: Endpoint,
+        scheme: Scheme,
         make_link: Callable[[], Link],
         on_failed: Callable[[str], None] = lambda _: None,
         identity: str = "",
     ) -> None:
         self._endpoint = endpoint
+        self._scheme = scheme
         self._identity = identity
         self._make_link = make_link
         self._on_failed = on_failed
-        # Since somebody was there, why the last attempt at each address came to nothing.
+        # Why the last attempt at each address failed, since the last success.
         self._failures: dict[_Address, str] = {}
         self._loop = asyncio.get_running_loop()
         self._attempts: dict[socket.socket, tuple[_Address, asyncio.TimerHandle]] = {}
@@ -96,13 +85,11 @@ class Dialer:
         self._next: asyncio.TimerHandle | None = None
         self._absent_since: float | None = None
         self._attempted_at = self._connected_at = float("-inf")
-        self._turn = 0
+        self._next_address = 0
         self._resolve_at = float("-inf")
         self._addresses: list[tuple[socket.AddressFamily, _Address]] = []
         if endpoint.is_local_socket:
             self._addresses = [(socket.AF_UNIX, endpoint.host)]
-        elif endpoint.is_ros1:
-            pass  # the master knows it
         elif "%" not in endpoint.host:  # the interface that it names may come later
             with contextlib.suppress(ValueError):
                 version = ipaddress.ip_address(endpoint.host).version
@@ -111,7 +98,7 @@ class Dialer:
         self._is_name = not self._addresses
 
     def start(self, *, refused: bool = False) -> None:
-        """Begin to connect, or go on; after a refusal only after a while."""
+        """Begin to connect, or go on; after a refusal with a pause."""
         now = self._loop.time()
         if self._absent_since is None:
             self._absent_since = now
@@ -120,14 +107,14 @@ class Dialer:
                 return
             self._next.cancel()
         self._connected_at = float("-inf")
-        # A service that comes and goes is not reached more often than one that is not there.
+        # A flapping service is not tried more often than an absent one.
         at = max(
             now + (_REFUSED_PAUSE_S if refused else 0.0), self._attempted_at + self._least_pause_s
         )
         self._next = self._loop.call_at(at, self._attempt)
 
-    def won(self, winner: Link) -> None:
-        """Connect no more, and end all links that were made but this one."""
+    def selected(self, winner: Link) -> None:
+        """Stop connecting, and end all other links that were made."""
         self.stop()
         for link in list(self._links):
             if link is not winner:
@@ -136,7 +123,7 @@ class Dialer:
         self._winner = winner
 
     def stop(self) -> None:
-        """Connect no more; the links that were made go on."""
+        """Stop connecting; existing links go on."""
         if self._next is not None:
             self._next.cancel()
             self._next = None
@@ -145,12 +132,12 @@ class Dialer:
             stream.close()
 
     def succeeded(self) -> None:
-        """Take note that somebody is there who is what was looked for."""
+        """Note that the right peer is there: the outage is over."""
         self._absent_since = None
         self._failures.clear()
 
     def ended(self, link: Link) -> None:
-        """Take note that a link has ended."""
+        """Note that a link has ended."""
         if link not in self._links and link is not self._winner:
             return  # it was not needed
         now = self._loop.time()
@@ -176,16 +163,14 @@ class Dialer:
         self._next = self._loop.call_later(pause_s, self._attempt)
         if self._is_name and now >= self._resolve_at:
             self._resolve_at = float("inf")
-            # The search for an address can take many seconds and cannot be broken off.
+            # A look-up can take many seconds and cannot be cancelled.
             threading.Thread(target=self._resolve, name="holdfast-resolve", daemon=True).start()
         if not self._addresses or now < self._connected_at + _NEXT_LINK_S:
             return
         self._attempted_at = now
-        family, address = self._addresses[self._turn % len(self._addresses)]
-        self._turn += 1
+        family, address = self._addresses[self._next_address % len(self._addresses)]
+        self._next_address += 1
         self._connect(family, address)
-
-    # Without tasks: one that is begun while the loop ends would be complained of.
 
     def _connect(self, family: socket.AddressFamily, address: _Address) -> None:
         try:
@@ -198,11 +183,11 @@ class Dialer:
         if number == errno.EINPROGRESS:
             timeout = self._loop.call_later(_CONNECT_TIMEOUT_S, self._give_up, stream)
             self._attempts[stream] = address, timeout
-            self._loop.add_writer(stream, self._look, stream)
+            self._loop.add_writer(stream, self._on_writable, stream)
         else:
             self._connected_or_failed(stream, address, number)
 
-    def _look(self, stream: socket.socket) -> None:
+    def _on_writable(self, stream: socket.socket) -> None:
         number = stream.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
         self._connected_or_failed(stream, self._forget(stream), number)
 
@@ -235,10 +220,13 @@ class Dialer:
         return address
 
     def _failed(self, address: _Address, number: int | None) -> None:
-        # A host may have addresses of two kinds, and be reached over one alone.
-        failures = {**self._failures, address: _reason(number)}
+        # A host may have IPv4 and IPv6 addresses, and be reachable over one kind only.
+        failures = {
+            **self._failures,
+            address: "nothing answers" if number == errno.ETIMEDOUT else system_words(number),
+        }
         reasons = [failures.get(address) for _, address in self._addresses]
-        # A name may lead to other addresses each time that it is looked up.
+        # The addresses of a name may change with each look-up.
         self._failures = {each: failures[each] for _, each in self._addresses if each in failures}
         if None not in reasons:
             self._on_failed("; ".join(dict.fromkeys(filter(None, reasons))))
@@ -246,42 +234,34 @@ class Dialer:
             self._next.cancel()
             self._next = self._loop.call_later(0.0, self._attempt)
 
-    def _place_of(self, address: _Address) -> bytes:
+    def _rank_of(self, address: _Address) -> bytes:
         import hashlib  # most endpoints are no names
 
         return hashlib.blake2b(f"{self._identity} {address}".encode(), digest_size=8).digest()
 
     def _resolve(self) -> None:
         """Look up the host's addresses; on a thread of its own."""
-        endpoint = self._endpoint
-        host, port = endpoint.host, endpoint.port
-        family, again_s = socket.AF_UNSPEC, _RESOLVE_AGAIN_S
+        host = self._endpoint.host
         reason = ""
         found: list[Any] = []
         try:
-            if endpoint.is_ros1:
-                from holdfast.transport.ros1 import look_up
-
-                # A service that is started again is at another port; and ROS 1 speaks IPv4.
-                family, again_s = socket.AF_INET, _LOOK_UP_AGAIN_S
-                host, port = look_up(endpoint)
+            host, port, family = self._scheme.look_up(self._endpoint)
             found = socket.getaddrinfo(host, port, family, type=socket.SOCK_STREAM)
         except TransportError as error:
             reason = str(error)
         except (OSError, UnicodeError):
             reason = f"host name not found: {host}"
-        except Exception as error:  # noqa: BLE001 - else nobody would ever look again
+        except Exception as error:  # noqa: BLE001 - look-ups must go on
             reason = f"{type(error).__name__}: {error}"
         addresses: list[tuple[socket.AddressFamily, _Address]] = [
             (entry[0], entry[4]) for entry in found
         ]
-        # Of two kinds the system knows which is likelier to work.
+        # The system orders the kinds by preference; within a kind, the order is this robot's.
         kinds = [family for family, _ in addresses]
-        addresses.sort(key=lambda each: (kinds.index(each[0]), self._place_of(each[1])))
+        addresses.sort(key=lambda each: (kinds.index(each[0]), self._rank_of(each[1])))
 
         def take() -> None:
-            self._resolve_at = self._loop.time() + again_s
-            # Without new ones, those of before may still be right.
+            self._resolve_at = self._loop.time() + self._scheme.lookup_interval_s
             self._addresses = addresses or self._addresses
             if not self._addresses:
                 self._on_failed(reason)
@@ -291,10 +271,3 @@ class Dialer:
 
         with contextlib.suppress(RuntimeError):  # the loop is closed
             self._loop.call_soon_threadsafe(take)
-
-
-def _reason(number: int | None) -> str:
-    """Write the system's own words as the rest of a sentence."""
-    if number == errno.ETIMEDOUT:
-        return "nothing answers"
-    return system_words(number)

@@ -1,24 +1,19 @@
-"""Where a service is: which endpoints there are, and which of them would be unsafe.
+"""Endpoints: where a service is.
 
 An endpoint is a protocol and a place: ``tcp/127.0.0.1:7447``, ``tls/planner.example:7447``,
 ``udp/planner.example:7447``, ``unix//run/holdfast/robot.sock``, ``ros1/cloud_active_sensing``.
-Every endpoint is read here before anything is opened, and what cannot work is refused with the
-reason.
+Endpoints are checked here before anything is opened, and errors give the reason.
 """
 
 from __future__ import annotations
 
-import contextlib
 import errno
-import fcntl
 import ipaddress
 import os
 import re
 import socket
-import stat
-from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple, Self
+from typing import Literal, NamedTuple
 
 import msgspec
 
@@ -27,12 +22,10 @@ from holdfast.errors import TransportError
 __all__ = [
     "AUTHORITY_FILE",
     "CERTIFICATE_FILE",
-    "ENCRYPTED_PROTOCOLS",
     "KEY_FILE",
     "MAX_SOCKET_PATH_BYTES",
-    "PROTOCOLS",
+    "SCHEMES",
     "Endpoint",
-    "PrivateSocket",
     "ServiceAddress",
     "TlsFiles",
     "check_credentials",
@@ -46,29 +39,17 @@ __all__ = [
     "why_not_bound",
 ]
 
-PROTOCOLS = ("tcp", "tls", "udp", "unix", "ros1")
-"""What an endpoint may begin with."""
-
-ENCRYPTED_PROTOCOLS = frozenset({"tls", "udp"})
-"""Those in which both ends prove by a certificate who they are."""
-
 MAX_SOCKET_PATH_BYTES = 107
-"""Bound on the path of a local socket: the system's ``sockaddr_un`` has room for no more."""
+"""Bound on the path of a local socket, from the system's ``sockaddr_un``."""
 
 AUTHORITY_FILE, CERTIFICATE_FILE, KEY_FILE = "authority.pem", "certificate.pem", "key.pem"
 """Names of the credentials' files."""
-
-_UNIX = "unix"
-_ROS1 = "ros1"
 
 _RENAMED = {
     "quic": "over UDP, services are at udp/HOST:PORT",
     "unixsock-stream": "a local socket is written unix/PATH",
 }
-"""Protocols of earlier releases, and what to write instead."""
-
-_SOCKET, _LOCK = "s", "lock"
-"""What a local socket's directory contains."""
+"""Protocols of earlier releases, and their replacements."""
 
 _HOST_NAME = re.compile(
     r"(?=.{1,253}\Z)[A-Za-z0-9_]([A-Za-z0-9_-]*[A-Za-z0-9_])?(\.[A-Za-z0-9_-]+)*"
@@ -77,6 +58,50 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
 _MAX_LABEL = 63
 _INTERFACE = re.compile(r"[!-~]{1,15}")
 _NUMBERS = re.compile(r"[0-9.]+")
+
+
+class SchemeEntry(NamedTuple):
+    """The properties of a scheme that do not need its implementation.
+
+    Attributes
+    ----------
+    implementation : str
+        ``MODULE:CLASS``, a :class:`~holdfast.transport.schemes.Scheme`.
+    is_encrypted : bool
+        Whether both ends authenticate by a certificate.
+    place : {"address", "path", "name"}
+        The form of the place: ``HOST:PORT``, a path or a name in ROS 1.
+    services_listen : str
+        Why a robot cannot listen, as a sentence; empty if it can.
+    """
+
+    implementation: str
+    is_encrypted: bool = False
+    place: Literal["address", "path", "name"] = "address"
+    services_listen: str = ""
+
+
+_STREAMS = "holdfast.transport.schemes:Scheme"
+
+SCHEMES = {
+    "tcp": SchemeEntry(_STREAMS),
+    "tls": SchemeEntry(_STREAMS, is_encrypted=True),
+    "udp": SchemeEntry(
+        "holdfast.transport.datagram_links:DatagramScheme",
+        is_encrypted=True,
+        services_listen="over udp it is the service that listens and the robot that connects; "
+        "write tls/... where a robot listens",
+    ),
+    "unix": SchemeEntry(_STREAMS, place="path"),
+    "ros1": SchemeEntry(
+        "holdfast.transport.ros1:RosScheme",
+        place="name",
+        services_listen="in ROS 1 it is the service that is offered and the robot that calls it",
+    ),
+}
+"""The protocols of endpoints."""
+
+_ALLOWED = f"{', '.join([*SCHEMES][:-1])} and {[*SCHEMES][-1]}"
 
 
 class TlsFiles(msgspec.Struct, frozen=True):
@@ -108,7 +133,7 @@ class Endpoint(NamedTuple):
     Attributes
     ----------
     protocol : str
-        One of :data:`PROTOCOLS`.
+        A key of :data:`SCHEMES`.
     host : str
         Name or address, an IPv6 address without its brackets; for ``unix`` the path, for ``ros1``
         the name in ROS 1.
@@ -121,38 +146,38 @@ class Endpoint(NamedTuple):
     port: int
 
     def __str__(self) -> str:
-        if self.protocol in (_UNIX, _ROS1):
+        if SCHEMES[self.protocol].place != "address":
             return f"{self.protocol}/{self.host}"
         return f"{self.protocol}/{host_and_port(self.host, self.port)}"
 
     @property
     def is_encrypted(self) -> bool:
-        """Whether both ends prove who they are, and nobody between them can read or write."""
-        return self.protocol in ENCRYPTED_PROTOCOLS
+        """Whether both ends are authenticated and the link is encrypted."""
+        return SCHEMES[self.protocol].is_encrypted
 
     @property
     def is_local_socket(self) -> bool:
-        """Whether this is a file of this machine, not an address."""
-        return self.protocol == _UNIX
+        """Whether this is a local socket."""
+        return SCHEMES[self.protocol].place == "path"
 
     @property
     def is_ros1(self) -> bool:
-        """Whether a ROS 1 master knows where it is."""
-        return self.protocol == _ROS1
+        """Whether a ROS 1 master knows its address."""
+        return SCHEMES[self.protocol].place == "name"
 
     @property
     def is_loopback(self) -> bool:
         """Whether only this machine can reach it.
 
-        A host name other than ``localhost`` counts as reachable from outside, whatever it stands
-        for today: what a name stands for can change without anybody here noticing.
+        A host name other than ``localhost`` counts as reachable from outside, because its address
+        can change.
         """
         if self.is_local_socket:
             return True
         if self.is_ros1:
-            from holdfast.transport.tcpros import Surroundings
+            from holdfast.transport.tcpros import RosEnvironment
 
-            return _is_loopback_address(ipaddress.ip_address(Surroundings.of().bind))
+            return _is_loopback_address(ipaddress.ip_address(RosEnvironment.of().bind))
         address = _address_of(self.host)
         if address is not None:
             return _is_loopback_address(address)
@@ -171,126 +196,22 @@ class Endpoint(NamedTuple):
 
 
 class ServiceAddress(NamedTuple):
-    """Where a robot finds a service, or where it lets a service find it.
+    """How a robot and a service find each other.
 
     Attributes
     ----------
     endpoint : str
         See :func:`parse_endpoint`.
     listens : bool
-        False: the service listens there and the robot connects. True: the robot listens there and
-        the service connects, which a service that the robot itself launches does; it is then seen
-        as soon as it is there, without waiting for the robot's next attempt.
+        Whether the robot listens there and the service connects. A service that the robot launches
+        does, so the robot need not poll for it.
     name : str or None
-        The name that the service must have; None takes whichever is there.
+        The name that the service must have; None accepts any.
     """
 
     endpoint: str
     listens: bool = False
     name: str | None = None
-
-
-class PrivateSocket:
-    """A local socket in a directory that no other user can enter.
-
-    The permissions of the directory, not those of the socket, keep others out: a socket's own are
-    set only after it can be connected to. Use it as a context, or call :meth:`remove`. What a
-    process leaves that is killed before it can do that, the next one removes.
-
-    Attributes
-    ----------
-    endpoint : str
-        ``unix/PATH``.
-
-    Raises
-    ------
-    TransportError
-        If the directory for temporary files has too long a path for a socket.
-    """
-
-    def __init__(self) -> None:
-        import tempfile  # only robots that launch services need it
-
-        prefix = f"holdfast-{os.getuid()}-"
-        _remove_abandoned(Path(tempfile.gettempdir()), prefix)
-        self._lock = -1
-        while self._lock < 0:
-            self._directory = Path(tempfile.mkdtemp(prefix=prefix))  # made with mode 0700
-            self._lock = _locked(self._directory)
-        self.endpoint = f"{_UNIX}/{self._directory / _SOCKET}"
-        try:
-            parse_endpoint(self.endpoint)
-        except TransportError as error:
-            self.remove()
-            raise TransportError(
-                f"{error}; set TMPDIR to a directory for temporary files with a shorter path"
-            ) from None
-
-    def remove(self) -> None:
-        """Remove the socket and its directory. May be repeated."""
-        if self._lock >= 0:
-            with contextlib.suppress(OSError), _opened(self._directory) as opened:
-                _remove_directory(self._directory, opened)
-            os.close(self._lock)
-            self._lock = -1
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.remove()
-
-
-def _locked(directory: Path) -> int:
-    """Show that a directory is in use until this process ends, however it does.
-
-    Returns -1 if it was taken for an abandoned one before it could be locked.
-    """
-    lock = os.open(directory / _LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
-    fcntl.flock(lock, fcntl.LOCK_EX)
-    if (directory / _LOCK).exists():
-        return lock
-    os.close(lock)
-    return -1
-
-
-@contextlib.contextmanager
-def _opened(directory: Path) -> Iterator[int]:
-    """Open a directory of ours, never one that somebody else's link leads to.
-
-    Raises
-    ------
-    OSError
-        If it is none, or others can enter it.
-    """
-    opened = os.open(directory, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
-    try:
-        found = os.fstat(opened)
-        if found.st_uid != os.getuid() or stat.S_IMODE(found.st_mode) != 0o700:
-            raise PermissionError(errno.EPERM, os.strerror(errno.EPERM), str(directory))
-        yield opened
-    finally:
-        os.close(opened)
-
-
-def _remove_abandoned(parent: Path, prefix: str) -> None:
-    """Remove the directories of sockets whose processes are gone."""
-    for directory in parent.glob(f"{prefix}*"):
-        # Of somebody else, just being made, or gone meanwhile: then it is not ours to remove.
-        with contextlib.suppress(OSError), _opened(directory) as opened:
-            lock = os.open(_LOCK, os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW, dir_fd=opened)
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                _remove_directory(directory, opened)
-            finally:
-                os.close(lock)
-
-
-def _remove_directory(directory: Path, opened: int) -> None:
-    for name in (_SOCKET, _LOCK):
-        with contextlib.suppress(FileNotFoundError):
-            os.unlink(name, dir_fd=opened)
-    directory.rmdir()
 
 
 def parse_endpoint(text: str) -> Endpoint:
@@ -304,39 +225,40 @@ def parse_endpoint(text: str) -> Endpoint:
     Raises
     ------
     TransportError
-        If it is none, or its protocol is none of :data:`PROTOCOLS`.
+        If it is none, or its protocol is not in :data:`SCHEMES`.
     """
     protocol, slash, place = text.partition("/")
-    if protocol[:-1] in PROTOCOLS and protocol.endswith(":") and place.startswith("/"):
+    if protocol[:-1] in SCHEMES and protocol.endswith(":") and place.startswith("/"):
         raise TransportError(
             f"endpoint {text!r} is a URL: write {protocol[:-1]}/{place.removeprefix('/')}"
         )
     if not slash or not re.fullmatch(r"[a-z][a-z0-9_-]*", protocol):
         raise TransportError(
-            f"endpoint {text!r} does not begin with a protocol: allowed are {_listed(PROTOCOLS)}, "
+            f"endpoint {text!r} does not begin with a protocol: allowed are {_ALLOWED}, "
             f"as in tcp/127.0.0.1:7447"
         )
-    if protocol not in PROTOCOLS:
+    if protocol not in SCHEMES:
         instead = _RENAMED.get(protocol)
         if instead is None:
             import difflib  # for a mistake alone
 
-            close = difflib.get_close_matches(protocol, PROTOCOLS, n=1)
+            close = difflib.get_close_matches(protocol, SCHEMES, n=1)
             instead = f"did you mean {close[0]}?" if close else None
         raise TransportError(
             f"endpoint {text!r}: protocol {protocol} is not allowed"
             + (f" ({instead})" if instead else "")
-            + f"; allowed are {_listed(PROTOCOLS)}, as in tcp/127.0.0.1:7447"
+            + f"; allowed are {_ALLOWED}, as in tcp/127.0.0.1:7447"
         )
     if "?" in place or "#" in place:
         raise TransportError(
             f"endpoint {text!r}: options after '?' or '#' are not allowed; "
             f"give the place alone, as in tcp/127.0.0.1:7447"
         )
-    if protocol == _UNIX:
-        return _local_socket(text, place)
-    if protocol == _ROS1:
-        return _name_in_ros1(text, place)
+    kind = SCHEMES[protocol].place
+    if kind == "path":
+        return _local_socket(text, protocol, place)
+    if kind == "name":
+        return _name_in_ros1(text, protocol, place)
     host, colon, port_text = place.rpartition(":")
     if not colon or place.endswith("]"):
         raise TransportError(
@@ -357,16 +279,12 @@ def parse_endpoint(text: str) -> Endpoint:
 def parse_host(host: str, before: str = "") -> str:
     """Read a host: a name or an address, one of IPv6 in brackets; return it without them.
 
-    Parameters
-    ----------
-    host : str
-    before : str
-        What precedes the host in the examples of messages.
+    ``before`` precedes the host in the examples of error messages.
 
     Raises
     ------
     TransportError
-        If it is none. The message does not name what the host is a part of.
+        If it is malformed.
     """
     if host.startswith("[") and host.endswith("]"):
         inner = host[1:-1]
@@ -395,18 +313,18 @@ def parse_host(host: str, before: str = "") -> str:
 
 
 def host_and_port(host: str, port: int) -> str:
-    """Write HOST:PORT, an address of IPv6 in brackets: what :func:`parse_host` reads."""
+    """Return HOST:PORT, with an IPv6 address in brackets."""
     return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
 
 
 def system_words(number: int | None) -> str:
-    """Write the system's own words for an error's number as the rest of a sentence."""
+    """Return the system's text for an error number, as the rest of a sentence."""
     text = os.strerror(number or 0)
     return text[:1].lower() + text[1:]
 
 
 def why_not_bound(error: OSError) -> str:
-    """Write why the system does not let a socket be bound to an address, and what can be done."""
+    """Return why a socket could not be bound to an address."""
     number = error.errno or 0  # of a name that is not found it is below 0
     # asyncio's own text names the address again.
     reason = os.strerror(number) if number > 0 else error.strerror or str(error)
@@ -416,16 +334,15 @@ def why_not_bound(error: OSError) -> str:
 
 
 def check_endpoint(text: str, *, listens: bool) -> Endpoint:
-    """Read the endpoint of one end of a link.
+    """Read the endpoint of one end of a link; port 0 is only for listening.
 
     Raises
     ------
     TransportError
-        If it is none, or is to be connected to and has port 0.
+        If it is malformed, or has port 0 to connect to.
     """
     endpoint = parse_endpoint(text)
-    has_port = not (endpoint.is_local_socket or endpoint.is_ros1)
-    if not listens and endpoint.port == 0 and has_port:
+    if not listens and endpoint.port == 0 and SCHEMES[endpoint.protocol].place == "address":
         raise TransportError(
             f"endpoint {endpoint}: port 0 is for listening; to connect, give the port, "
             f"as in {endpoint.with_port(7447)}"
@@ -434,33 +351,14 @@ def check_endpoint(text: str, *, listens: bool) -> Endpoint:
 
 
 def check_direction(endpoint: Endpoint, *, service_listens: bool) -> None:
-    """Check that the end that listens is the one that can, with this protocol.
-
-    Raises
-    ------
-    TransportError
-        If robots are to be called over ``udp`` or ``ros1``.
-    """
-    if endpoint.is_ros1 and not service_listens:
-        raise TransportError(
-            f"endpoint {endpoint}: in ROS 1 it is the service that is offered and the robot that "
-            f"calls it"
-        )
-    if endpoint.protocol == "udp" and not service_listens:
-        raise TransportError(
-            f"endpoint {endpoint}: over udp it is the service that listens and the robot that "
-            f"connects; write tls/... where a robot listens"
-        )
+    """Raise TransportError if the robot cannot listen with this protocol, and should."""
+    reason = SCHEMES[endpoint.protocol].services_listen
+    if reason and not service_listens:
+        raise TransportError(f"endpoint {endpoint}: {reason}")
 
 
 def check_name(what: str, name: str) -> None:
-    """Check that a name can be told to the other end.
-
-    Raises
-    ------
-    TransportError
-        If it cannot; the message says what it is the name of.
-    """
+    """Raise TransportError, about ``what``, if a name cannot be sent to the peer."""
     if not _NAME.fullmatch(name):
         raise TransportError(
             f"{what} {name!r}: allowed are 1 to 100 letters, digits, '_', '-' and '.', "
@@ -469,13 +367,12 @@ def check_name(what: str, name: str) -> None:
 
 
 def check_credentials(endpoint: Endpoint, tls: TlsFiles | None) -> None:
-    """Check that an endpoint has the credentials that its protocol needs, and no others.
+    """Check that there are credentials exactly where the protocol needs them.
 
     Raises
     ------
     TransportError
-        If an encrypted endpoint has none, a plain one has some that would not be used, or one of
-        the files cannot be read.
+        If they are missing, would not be used, or cannot be read.
     """
     if endpoint.is_encrypted and tls is None:
         raise TransportError(
@@ -500,10 +397,11 @@ def check_credentials(endpoint: Endpoint, tls: TlsFiles | None) -> None:
                 ) from error
 
 
-def _local_socket(text: str, path: str) -> Endpoint:
+def _local_socket(text: str, protocol: str, path: str) -> Endpoint:
     if not path.strip("/"):
         raise TransportError(
-            f"endpoint {text!r} has no path: write {_UNIX}/PATH, as in {_UNIX}//run/holdfast/s"
+            f"endpoint {text!r} has no path: write {protocol}/PATH, "
+            f"as in {protocol}//run/holdfast/s"
         )
     size = len(path.encode("utf-8", "surrogateescape"))
     if size > MAX_SOCKET_PATH_BYTES:
@@ -511,17 +409,17 @@ def _local_socket(text: str, path: str) -> Endpoint:
             f"endpoint {text!r}: a path of {size} bytes; a local socket's has at most "
             f"{MAX_SOCKET_PATH_BYTES}"
         )
-    return Endpoint(_UNIX, path, 0)
+    return Endpoint(protocol, path, 0)
 
 
-def _name_in_ros1(text: str, name: str) -> Endpoint:
-    from holdfast.transport.tcpros import Surroundings
+def _name_in_ros1(text: str, protocol: str, name: str) -> Endpoint:
+    from holdfast.transport.tcpros import RosEnvironment
 
     try:
-        Surroundings.of().resolved(name)
+        RosEnvironment.of().resolved(name)
     except TransportError as error:
         raise TransportError(f"endpoint {text!r}: {error}") from error
-    return Endpoint(_ROS1, name, 0)
+    return Endpoint(protocol, name, 0)
 
 
 def _address_of(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
@@ -534,7 +432,3 @@ def _address_of(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | No
 def _is_loopback_address(address: ipaddress.IPv4Address | ipaddress.IPv6Address) -> bool:
     mapped = address.ipv4_mapped if isinstance(address, ipaddress.IPv6Address) else None
     return (mapped or address).is_loopback
-
-
-def _listed(names: tuple[str, ...]) -> str:
-    return f"{', '.join(names[:-1])} and {names[-1]}"

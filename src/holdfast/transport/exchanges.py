@@ -1,187 +1,118 @@
-"""Questions and answers over a way that loses some of what is sent, without a clock or a socket.
+"""Requests and replies over a path that loses datagrams, without clock or socket.
 
-There are two ways to the other end. *Datagrams* are fast and may be lost, *the stream* loses
-nothing, but what is lost under it holds up all that follows. Short messages go as datagrams once it
-is known that these get through; what does not fit, and all if datagrams do not get through, goes on
-the stream.
+There are two paths to the other end. *Datagrams* are fast and may be lost. *The stream* loses
+nothing, but a lost packet delays everything behind it. Short messages go as datagrams once these
+are known to get through. Long ones, and all while datagrams are blocked, go on the stream.
 
-A question is sent again until it is answered, and an answer is kept until the robot has said that
-it has it. So the service needs no timer for what is lost: whatever was lost, the robot misses an
-answer, asks again, says how many parts of the answer it has, and is sent the rest.
+A request is retransmitted until it is answered, and replies are kept until the robot acknowledges
+them. So the service needs no retransmission timer: whatever was lost, the robot misses a reply,
+sends the request again with the number of replies that it has, and gets the rest.
 
-*When* it asks again is set by the round trips that were measured, as TCP does it (RFC 6298): a
-smoothed mean, and a margin for how much they vary; twice as long each time.
+The retransmission timeout follows the measured round trips, as in TCP (RFC 6298): a smoothed mean
+plus a margin for the variation, doubled each time.
 
-To ask again takes a round trip, which on a long way is dear, and these messages are short. So while
-the way is seen to lose any, each message is sent twice, a few milliseconds apart, for losses come
-in bunches. What is lost is measured where it should have arrived, over the last 128 datagrams
-(:class:`~holdfast.transport.sealing.ReplayWindow`), and each message carries the count back; where
-nothing is lost, nothing is sent twice. Nobody knows in the beginning, so a link begins with a few
-dozen probes, and as if some were lost. All that is sent again is paid for from a budget of twice
-the bytes that were sent for the first time, so a way in trouble is never given more than three
-times the load.
+A retransmission costs a round trip, which is expensive on a long path, and these messages are
+short. So while a path is losing datagrams each message is sent twice, a few milliseconds apart,
+because losses come in bursts (:mod:`~holdfast.transport.redundancy`). The receiver measures the
+loss over the last 128 datagrams (:class:`~holdfast.transport.datagram_cipher.ReplayWindow`), and
+each message carries that count back. A path without loss gets no copies. A new link starts with a
+few dozen probes, and assumes loss until they have come back.
 
-Where many are lost, as while somebody floods the service's port, the copy goes on the stream
-instead, and so do those of the answer (a *hedge*): when a question has been asked twice and nothing
-was heard of it; at once if a quarter of the last datagrams did not come, and after such a question
-until a probe comes back. Whichever comes first counts.
+Under heavy loss, as while the service's port is flooded, the copy goes on the stream instead, and
+so do those of its replies (a *hedge*): when a request has been sent twice and nothing was heard; at
+once if a quarter of the last datagrams were lost, and after such a request until a probe returns.
+The first reply to arrive counts.
 
 A message is::
 
     kind       1 byte
     lost       1 byte: of the last 128 datagrams of the other end, how many did not come
-    question:  number (4), settled (4): all below it are answered, have (2): parts of the answer
-               that the robot has, then the payload
-    hedge:     a question that was sent as a datagram, too
-    reply:     number (4), index (2): of the part, with two bits that say whether it is the last,
-               and the end alone, then the payload
-    working:   number (4): the question has come, and there is no part yet that the robot lacks
+    request:   number (4), settled (4): all below it are answered, have (2): replies that the robot
+               has, then the payload
+    hedge:     a request that was sent as a datagram, too
+    reply:     number (4), index (2) with two bits for "last" and "end without payload", then the
+               payload
+    working:   number (4): the request has come, and there is no reply yet that the robot lacks
     probe, echo: 8 bytes that are sent back
 """
 
 from __future__ import annotations
 
-import heapq
 import math
 import struct
-from collections.abc import Callable
 from typing import Final, NamedTuple, cast
 
-from holdfast.transport.sealing import KNOWN_AFTER, LOSS_SAMPLE, OVERHEAD
+from holdfast.transport.datagram_cipher import KNOWN_AFTER, LOSS_SAMPLE, OVERHEAD
+from holdfast.transport.redundancy import (
+    MAX_TIMEOUT_S,
+    Paths,
+    RedundantSender,
+    RoundTripEstimator,
+)
 
 __all__ = [
-    "COPY_DELAY_S",
     "KEEP_ALIVE_S",
-    "MAX_ANSWERS",
+    "MAX_CACHED_REQUESTS",
     "MAX_DATAGRAM_BYTES",
-    "MAX_EARLY_BYTES",
     "MAX_PAYLOAD_BYTES",
+    "MAX_REORDERED_BYTES",
     "MESSAGE_OVERHEAD",
-    "Answers",
-    "Arrived",
-    "Part",
-    "Questions",
-    "RoundTrips",
-    "Ways",
+    "ReceivedReply",
+    "ReceivedRequest",
+    "RobotExchange",
+    "ServiceExchange",
 ]
 
-_QUESTION, _REPLY, _WORKING, _PROBE, _ECHO, _HEDGE = range(1, 7)
+_REQUEST, _REPLY, _WORKING, _PROBE, _ECHO, _HEDGE = range(1, 7)
 
-_QUESTION_HEAD: Final = struct.Struct(">IIH")
+_REQUEST_HEAD: Final = struct.Struct(">IIH")
 _REPLY_HEAD: Final = struct.Struct(">IH")
 _WORKING_HEAD: Final = struct.Struct(">I")
 _PROBE_HEAD: Final = struct.Struct(">d")
 _LAST, _END_ALONE = 1 << 15, 1 << 14
-_MAX_PARTS: Final = 1 << 14
+_MAX_REPLIES: Final = 1 << 14
 
-MESSAGE_OVERHEAD: Final = 2 + _QUESTION_HEAD.size
+MESSAGE_OVERHEAD: Final = 2 + _REQUEST_HEAD.size
 """Bytes that a message is longer than its payload, at most."""
 
 MAX_DATAGRAM_BYTES: Final = 1200
-"""Fits into one packet on every way (IPv6 carries 1,280 bytes everywhere)."""
+"""Fits into one packet on every path (IPv6 carries 1,280 bytes everywhere)."""
 
 MAX_PAYLOAD_BYTES: Final = MAX_DATAGRAM_BYTES - OVERHEAD - MESSAGE_OVERHEAD
-"""What is larger goes on the stream."""
-
-COPY_DELAY_S: Final = 0.003
-"""Between a message and its copy, while some are lost."""
+"""Larger payloads go on the stream."""
 
 KEEP_ALIVE_S: Final = 5.0
-"""After so much silence the robot asks whether datagrams still get through; routers that translate
-addresses forget a way that is not used, after 30 s and more."""
+"""After so much silence the robot probes the path; address translation in a router forgets an
+unused one, after 30 s and more."""
 
-MAX_ANSWERS: Final = 1024
-"""Bound on the questions of a robot whose answers are kept, and on parts that came too early."""
+MAX_CACHED_REQUESTS: Final = 1024
+"""Bound on a robot's requests whose replies are kept, and on replies that came out of order."""
 
-MAX_EARLY_BYTES: Final = 16 << 20
-"""Bound on the parts of answers that came before others which are missing: few come so, but a
-service that means harm may send nothing else."""
+MAX_REORDERED_BYTES: Final = 16 << 20
+"""Bound on replies that wait for earlier ones; a hostile service may send nothing else."""
 
-_EXTRA_SHARE: Final = 2
-"""Bytes that may be sent again for each that was sent for the first time."""
+_SENT_BEFORE_FALLBACK: Final = 2
+_MIN_SILENCE_S: Final = 0.1
+_SILENCE_IN_TIMEOUTS: Final = 2.9
+"""After so many datagrams and so much time without an answer, requests go on the stream."""
 
-_EXTRA_BURST: Final = 8192
-_HEADERS_BELOW: Final = 28  # of IPv4 and UDP
-
-_SENT_BEFORE_SILENCE: Final = 2
-_SILENCE_S: Final = 0.1
-_SILENCE_IN_PATIENCES: Final = 2.9
-"""So many questions, and for so long at least, may be sent as datagrams while nothing at all is
-heard; then they take the stream."""
-
-_PROBES_BEFORE_SILENCE: Final = 3
+_PROBES_BEFORE_FALLBACK: Final = 3
 
 _LARGE_BYTES: Final = 1 << 20
 
 _HEDGED_LOSS: Final = LOSS_SAMPLE // 4
-_ASKED_BEFORE_HEDGE: Final = 2
+_SENT_BEFORE_HEDGE: Final = 2
 
 _NEWEST: Final = 4
-_FIRST_PROBES_S: Final = 0.005
-"""In the beginning as many probes as it takes to know whether the way loses any, so far apart."""
+_FIRST_PROBE_INTERVAL_S: Final = 0.005
+"""At the start, between the probes that it takes to know whether the path loses any."""
 
-_FIRST_GUESS_S: Final = 0.2
-_MARGIN_S: Final = 0.01
-"""Least margin over the mean round trip: a busy machine answers a few milliseconds late."""
-
-_SIGNS_S: Final = 0.06
-"""Who works on a question says so every 50 ms."""
-
-_LONGEST_WAIT_S: Final = 1.0
+_PROGRESS_INTERVAL_S: Final = 0.06
+"""A service that computes an answer says so every 50 ms."""
 
 
-class RoundTrips:
-    """How long answers take: RFC 6298, with a least margin of 10 ms and no least sum.
-
-    Attributes
-    ----------
-    smoothed_s : float or None
-        Mean, in which the last ones count most; None before the first.
-    """
-
-    __slots__ = ("_variation_s", "smoothed_s")
-
-    def __init__(self) -> None:
-        self.smoothed_s: float | None = None
-        self._variation_s = 0.0
-
-    def add(self, seconds: float) -> None:
-        """Take one that was measured."""
-        if self.smoothed_s is None:
-            self.smoothed_s = seconds
-            self._variation_s = 0.5 * seconds
-        else:
-            self._variation_s += 0.25 * (abs(seconds - self.smoothed_s) - self._variation_s)
-            self.smoothed_s += 0.125 * (seconds - self.smoothed_s)
-
-    @property
-    def patience_s(self) -> float:
-        """After how long an answer is taken for lost."""
-        if self.smoothed_s is None:
-            return _FIRST_GUESS_S
-        return min(_LONGEST_WAIT_S, self.smoothed_s + max(_MARGIN_S, 4.0 * self._variation_s))
-
-
-class Ways(NamedTuple):
-    """The two ways to the other end.
-
-    Attributes
-    ----------
-    datagram : callable
-        Takes a message of at most :data:`MAX_DATAGRAM_BYTES` less what sealing adds.
-    stream : callable
-        Takes the number of the question that a message belongs to, and the message.
-    lost : callable
-        Returns how many of the other end's last datagrams have not come.
-    """
-
-    datagram: Callable[[bytes], None]
-    stream: Callable[[int, bytes], None]
-    lost: Callable[[], int]
-
-
-class Part(NamedTuple):
-    """A part of an answer, as it arrives at the robot.
+class ReceivedReply(NamedTuple):
+    """A reply, as it arrives at the robot.
 
     Attributes
     ----------
@@ -198,379 +129,287 @@ class Part(NamedTuple):
     last: bool
 
 
-class Arrived(NamedTuple):
-    """A question, as it arrives at the service; the payload of a large one is a view of it."""
+class ReceivedRequest(NamedTuple):
+    """A request, as it arrives at the service; the payload of a large one is a view of it."""
 
     number: int
     payload: bytes
 
 
-class _Sender:
-    """What both ends have in common: the copies, and the budget of all that is sent again."""
-
-    def __init__(self, ways: Ways) -> None:
-        self.ways = ways
-        self.lost_of_ours = 1  # as long as nobody knows
-        self._copies: list[tuple[float, int, int, bytes, Callable[[], bool]]] = []
-        self._num_copies = 0
-        self._budget_bytes = _EXTRA_BURST
-
-    @property
-    def due(self) -> float:
-        return self._copies[0][0] if self._copies else math.inf
-
-    def stream(self, number: int, kind: int, body: bytes) -> None:
-        self.ways.stream(number, bytes((kind, min(255, self.ways.lost()))) + body)
-
-    def first(self, kind: int, body: bytes, now: float, wanted: Callable[[], bool]) -> None:
-        """Send a datagram for the first time, and plan a copy while the way loses some."""
-        earned = _EXTRA_SHARE * _size(body)
-        self._budget_bytes = min(_EXTRA_BURST, self._budget_bytes + earned)
-        self.small(kind, body)
-        if self.lost_of_ours:
-            self._num_copies += 1
-            copy = (now + COPY_DELAY_S, self._num_copies, kind, body, wanted)
-            heapq.heappush(self._copies, copy)
-
-    def hedge(self, number: int, kind: int, body: bytes) -> None:
-        """Send on the stream what was sent as a datagram; it is paid for as a copy is."""
-        self._budget_bytes -= _size(body)
-        self.stream(number, kind, body)
-
-    def again(self, kind: int, body: bytes) -> None:
-        """Send a datagram again, if the budget allows it."""
-        size = _size(body)
-        if size <= self._budget_bytes:
-            self._budget_bytes -= size
-            self.small(kind, body)
-
-    def small(self, kind: int, body: bytes) -> None:
-        """Send a datagram outside of the budget."""
-        self.ways.datagram(bytes((kind, min(255, self.ways.lost()))) + body)
-
-    def expire(self, now: float) -> None:
-        """Send the copies that are due."""
-        while self._copies and self._copies[0][0] <= now:
-            _, _, kind, body, wanted = heapq.heappop(self._copies)
-            if wanted():
-                self.again(kind, body)
-
-
-def _size(body: bytes) -> int:
-    """Return the bytes of a packet."""
-    return len(body) + 2 + OVERHEAD + _HEADERS_BELOW
-
-
-class _Question:
-    """A question that the robot has asked and that is not answered in full."""
+class _PendingRequest:
+    """A request of the robot that is not answered in full."""
 
     __slots__ = (
-        "asked_again_at",
         "call",
         "due_at",
-        "early",
         "have",
         "heard",
         "hedged",
+        "num_sent",
         "number",
         "on_stream",
         "payload",
+        "reordered",
+        "retransmitted_at",
         "sent_at",
-        "times",
-        "wait_s",
+        "timeout_s",
     )
 
     def __init__(self, call: int, number: int, payload: bytes, now: float) -> None:
         self.call = call
         self.number = number
         self.payload = payload
-        self.sent_at = self.asked_again_at = now
-        self.times = 1
+        self.sent_at = self.retransmitted_at = now
+        self.num_sent = 1
         self.have = 0
         self.heard = False
-        self.early: dict[int, tuple[bytes | None, bool]] = {}
+        self.reordered: dict[int, tuple[bytes | None, bool]] = {}
         self.on_stream = self.hedged = False
-        self.wait_s = 0.0
+        self.timeout_s = 0.0
         self.due_at = math.inf
 
 
-class Questions:
-    """The robot's end: it asks, and asks again.
+class RobotExchange:
+    """The robot's end: it sends requests, and retransmits them.
 
-    Whoever uses it calls :meth:`expire` when :attr:`due` has come, and :meth:`received` with each
-    message; each method may send.
+    The owner calls :meth:`expire` when :attr:`due` has come, and :meth:`received` with each
+    message; each method may send. Times are seconds of any clock that never goes back.
 
     Parameters
     ----------
-    ways : Ways
+    paths : Paths
         Before :meth:`begin`, only the stream is used.
 
     Attributes
     ----------
     open : bool
         Whether datagrams are known to get through, in both directions.
-    round_trips : RoundTrips
-    heard_at : float
-        When the last datagram came; minus infinity if none has.
+    unanswered_probes : int
+        Since the last datagram came.
     """
 
-    def __init__(self, ways: Ways) -> None:
-        self._sender = _Sender(ways)
-        self._questions: dict[int, _Question] = {}
+    def __init__(self, paths: Paths) -> None:
+        self._sender = RedundantSender(paths)
+        self._requests: dict[int, _PendingRequest] = {}
         self._number = 0
-        self._probes = 0
+        self.unanswered_probes = 0
         self._probe_at = math.inf
         self._first_probes = 0
         self._unheard = 0
         self._unheard_since = math.inf
         self._hedges = False
         self.open = False
-        self.round_trips = RoundTrips()
-        self.heard_at = -math.inf
+        self.round_trip = RoundTripEstimator()
 
     @property
     def due(self) -> float:
         """When :meth:`expire` is to be called."""
         due = min(self._probe_at, self._sender.due)
-        for question in self._questions.values():
-            due = min(due, question.due_at)
+        for request in self._requests.values():
+            due = min(due, request.due_at)
         return due
 
-    @property
-    def calls(self) -> list[int]:
-        """Those that are not answered in full."""
-        return [question.call for question in self._questions.values()]
-
-    @property
-    def unanswered_probes(self) -> int:
-        """How many times it was asked, since the last datagram came, whether they get through."""
-        return self._probes
-
     def begin(self, now: float) -> None:
-        """Take note that datagrams can be sent, and find out whether they get through.
-
-        Parameters
-        ----------
-        now : float
-            Seconds of any clock that never goes back, here and below.
-        """
+        """Begin to probe: datagrams can be sent from now on."""
         self._first_probes = KNOWN_AFTER + _NEWEST
         self.probe(now)
 
-    def ask(self, call: int, payload: bytes, now: float) -> None:
-        """Ask a question.
-
-        Parameters
-        ----------
-        call : int
-            Names it in what comes of it.
-        payload : bytes
-        now : float
-        """
+    def send(self, call: int, payload: bytes, now: float) -> None:
+        """Send a request; ``call`` names it in its replies."""
         self._number += 1
-        question = _Question(call, self._number, payload, now)
-        self._questions[question.number] = question
+        request = _PendingRequest(call, self._number, payload, now)
+        self._requests[request.number] = request
         if not self.open or len(payload) > MAX_PAYLOAD_BYTES:
-            self._put_on_stream(question)
+            self._put_on_stream(request)
             return
-        question.wait_s = self.round_trips.patience_s
-        self._sends(question, now)
-        self._sender.first(
-            _QUESTION,
-            self._body(question),
+        request.timeout_s = self.round_trip.timeout_s
+        self._note_sent(request, now)
+        self._sender.send_first(
+            _REQUEST,
+            self._body(request),
             now,
-            lambda: question.number in self._questions and not (question.heard or question.hedged),
+            lambda: request.number in self._requests and not (request.heard or request.hedged),
         )
-        if self._hedges or self._sender.lost_of_ours >= _HEDGED_LOSS:
-            self._hedge(question)
+        if self._hedges or self._sender.num_lost >= _HEDGED_LOSS:
+            self._hedge(request)
 
-    def forget(self, call: int) -> None:
-        """Ask no more for what is still to come of a call."""
-        for number, question in list(self._questions.items()):
-            if question.call == call:
-                del self._questions[number]
+    def abandon(self, call: int) -> None:
+        """Wait for no more replies of a call."""
+        for number, request in list(self._requests.items()):
+            if request.call == call:
+                del self._requests[number]
 
     def probe(self, now: float) -> None:
-        """Ask at once whether datagrams get through; the answer shows in ``heard_at``."""
-        self._sender.small(_PROBE, _PROBE_HEAD.pack(now))
+        """Check at once whether datagrams get through."""
+        self._sender.send_unbudgeted(_PROBE, _PROBE_HEAD.pack(now))
         if self._first_probes > 0:
             self._first_probes -= 1
-            self._probe_at = now + _FIRST_PROBES_S
+            self._probe_at = now + _FIRST_PROBE_INTERVAL_S
             return
-        self._probes += 1
-        wait_s = self.round_trips.patience_s * 2.0 ** min(self._probes - 1, 10)
-        self._probe_at = now + min(_LONGEST_WAIT_S, wait_s)
+        self.unanswered_probes += 1
+        wait_s = self.round_trip.timeout_s * 2.0 ** min(self.unanswered_probes - 1, 10)
+        self._probe_at = now + min(MAX_TIMEOUT_S, wait_s)
 
-    def received(self, message: bytes, now: float, *, datagram: bool) -> list[Part]:
-        """Take a message; return what it brings, in order.
+    def received(self, message: bytes, now: float, *, datagram: bool) -> list[ReceivedReply]:
+        """Take a message of the authenticated service; return the replies in it, in order.
 
-        Parameters
-        ----------
-        message : bytes
-            Of the service, which has proved who it is; still it may be malformed.
-        now : float
-        datagram : bool
-            Which way it came.
+        A malformed message is ignored. ``datagram`` tells the path on which it came.
         """
         if len(message) < 2:
             return []
         if datagram:
-            self.heard_at = now
             self.open = True
-            self._probes = self._unheard = 0
+            self.unanswered_probes = self._unheard = 0
             if not self._first_probes:
                 self._probe_at = now + KEEP_ALIVE_S
-        self._sender.lost_of_ours = message[1]
+        self._sender.num_lost = message[1]
         kind, body = message[0], message[2:]
         if kind == _REPLY and len(body) >= _REPLY_HEAD.size:
             number, index = _REPLY_HEAD.unpack_from(body)
-            question = self._questions.get(number)
-            if question is not None:
-                return self._replied(question, index, body[_REPLY_HEAD.size :], now)
+            request = self._requests.get(number)
+            if request is not None:
+                return self._replied(request, index, body[_REPLY_HEAD.size :], now)
         elif kind == _WORKING and len(body) == _WORKING_HEAD.size:
-            question = self._questions.get(_WORKING_HEAD.unpack(body)[0])
-            if question is not None and not question.on_stream:
-                question.heard = True
-                question.wait_s = max(question.wait_s, _SIGNS_S)
-                question.due_at = now + question.wait_s
+            request = self._requests.get(_WORKING_HEAD.unpack(body)[0])
+            if request is not None and not request.on_stream:
+                request.heard = True
+                request.timeout_s = max(request.timeout_s, _PROGRESS_INTERVAL_S)
+                request.due_at = now + request.timeout_s
         elif kind == _ECHO and len(body) == _PROBE_HEAD.size:
             self._hedges = False
             round_trip_s = now - _PROBE_HEAD.unpack(body)[0]
-            if self.round_trips.smoothed_s is None and 0.0 <= round_trip_s <= 60.0:
-                self.round_trips.add(round_trip_s)
+            if self.round_trip.smoothed_s is None and 0.0 <= round_trip_s <= 60.0:
+                self.round_trip.add(round_trip_s)
         return []
 
-    def passed_over(self, number: int) -> list[Part]:
-        """Take note that a part came on the stream that is larger than allowed: the call ends."""
-        question = self._questions.pop(number, None)
-        return [] if question is None else [Part(question.call, None, True)]
+    def oversized(self, number: int) -> list[ReceivedReply]:
+        """End a call of which a reply came on the stream that is larger than allowed."""
+        request = self._requests.pop(number, None)
+        return [] if request is None else [ReceivedReply(request.call, None, True)]
 
     def expire(self, now: float) -> None:
-        """Do what is due."""
+        """Send the copies, retransmissions and probes that are due."""
         self._sender.expire(now)
-        for question in list(self._questions.values()):
-            if question.due_at > now:
+        for request in list(self._requests.values()):
+            if request.due_at > now:
                 continue
             silent_s = now - self._unheard_since
-            if self._unheard >= _SENT_BEFORE_SILENCE and silent_s >= self._longest_silence_s:
-                self._fall_silent(now)
+            if self._unheard >= _SENT_BEFORE_FALLBACK and silent_s >= self._max_silence_s:
+                self._fall_back_to_stream(now)
                 return
-            question.wait_s = min(_LONGEST_WAIT_S, 2.0 * question.wait_s)
-            if question.times >= _ASKED_BEFORE_HEDGE and not question.heard:
+            request.timeout_s = min(MAX_TIMEOUT_S, 2.0 * request.timeout_s)
+            if request.num_sent >= _SENT_BEFORE_HEDGE and not request.heard:
                 self._hedges = True
-                self._hedge(question)
-            self._ask_again(question, now)
+                self._hedge(request)
+            self._retransmit(request, now)
         if self._probe_at <= now:
-            if self.open and self._probes >= _PROBES_BEFORE_SILENCE:
-                self._fall_silent(now)
+            if self.open and self.unanswered_probes >= _PROBES_BEFORE_FALLBACK:
+                self._fall_back_to_stream(now)
             else:
                 self.probe(now)
 
     @property
-    def _longest_silence_s(self) -> float:
-        return max(_SILENCE_S, _SILENCE_IN_PATIENCES * self.round_trips.patience_s)
+    def _max_silence_s(self) -> float:
+        return max(_MIN_SILENCE_S, _SILENCE_IN_TIMEOUTS * self.round_trip.timeout_s)
 
-    def _fall_silent(self, now: float) -> None:
-        """Ask on the stream what is not answered, until datagrams get through again."""
+    def _fall_back_to_stream(self, now: float) -> None:
+        """Send unanswered requests on the stream, until datagrams get through again."""
         self.open = False
-        for question in self._questions.values():
-            if not question.on_stream:
-                self._put_on_stream(question)
-        self._probes = self._unheard = 0
+        for request in self._requests.values():
+            if not request.on_stream:
+                self._put_on_stream(request)
+        self.unanswered_probes = self._unheard = 0
         self.probe(now)
 
-    def _hedge(self, question: _Question) -> None:
-        """Ask on the stream as well, once."""
-        if not question.hedged:
-            question.hedged = True
-            self._sender.hedge(question.number, _HEDGE, self._body(question))
+    def _hedge(self, request: _PendingRequest) -> None:
+        """Send the request on the stream as well, once."""
+        if not request.hedged:
+            request.hedged = True
+            self._sender.hedge(request.number, _HEDGE, self._body(request))
 
-    def _put_on_stream(self, question: _Question) -> None:
-        question.on_stream = True
-        question.due_at = math.inf
-        self._sender.stream(question.number, _QUESTION, self._body(question))
-        question.payload = b""  # the stream loses nothing
+    def _put_on_stream(self, request: _PendingRequest) -> None:
+        request.on_stream = True
+        request.due_at = math.inf
+        self._sender.send_on_stream(request.number, _REQUEST, self._body(request))
+        request.payload = b""  # the stream loses nothing
 
-    def _replied(self, question: _Question, index: int, payload: bytes, now: float) -> list[Part]:
-        self._heard_of(question, now)
+    def _replied(
+        self, request: _PendingRequest, index: int, payload: bytes, now: float
+    ) -> list[ReceivedReply]:
+        self._note_heard(request, now)
         last, end_alone = bool(index & _LAST), bool(index & _END_ALONE)
-        index &= _MAX_PARTS - 1
-        if not question.have <= index < question.have + MAX_ANSWERS:
-            return []  # it is there already
-        question.early[index] = (None if end_alone else payload, last)
-        if index > question.have and self._early_bytes > MAX_EARLY_BYTES:
-            return self.passed_over(question.number)
-        parts = []
-        while question.have in question.early:
-            part = Part(question.call, *question.early.pop(question.have))
-            question.have += 1
-            parts.append(part)
-            if part.last:
-                del self._questions[question.number]
-                return parts
-        waited_s = now - question.asked_again_at
-        if question.early and waited_s > self.round_trips.patience_s and not question.on_stream:
-            self._ask_again(question, now)  # the one before it is lost, or late
-        return parts
+        index &= _MAX_REPLIES - 1
+        if not request.have <= index < request.have + MAX_CACHED_REQUESTS:
+            return []  # a duplicate
+        request.reordered[index] = (None if end_alone else payload, last)
+        if index > request.have and self._reordered_bytes > MAX_REORDERED_BYTES:
+            return self.oversized(request.number)
+        replies = []
+        while request.have in request.reordered:
+            reply = ReceivedReply(request.call, *request.reordered.pop(request.have))
+            request.have += 1
+            replies.append(reply)
+            if reply.last:
+                del self._requests[request.number]
+                return replies
+        waited_s = now - request.retransmitted_at
+        if request.reordered and waited_s > self.round_trip.timeout_s and not request.on_stream:
+            self._retransmit(request, now)  # an earlier reply is lost, or late
+        return replies
 
     @property
-    def _early_bytes(self) -> int:
+    def _reordered_bytes(self) -> int:
         return sum(
             len(payload or b"")
-            for question in self._questions.values()
-            for payload, _ in question.early.values()
+            for request in self._requests.values()
+            for payload, _ in request.reordered.values()
         )
 
-    def _heard_of(self, question: _Question, now: float) -> None:
-        if question.on_stream:
+    def _note_heard(self, request: _PendingRequest, now: float) -> None:
+        if request.on_stream:
             return
-        if not question.heard and question.times == 1:
-            # Of one that was asked again nobody knows which of the two is answered (Karn).
-            self.round_trips.add(now - question.sent_at)
-        question.heard = True
-        question.wait_s = max(_SIGNS_S, self.round_trips.patience_s)
-        question.due_at = now + question.wait_s
+        if not request.heard and request.num_sent == 1:
+            # A retransmitted request has no unambiguous round trip (Karn's algorithm).
+            self.round_trip.add(now - request.sent_at)
+        request.heard = True
+        request.timeout_s = max(_PROGRESS_INTERVAL_S, self.round_trip.timeout_s)
+        request.due_at = now + request.timeout_s
 
-    def _ask_again(self, question: _Question, now: float) -> None:
-        question.times += 1
-        question.asked_again_at = now
-        self._sends(question, now)
-        self._sender.again(_QUESTION, self._body(question))
+    def _retransmit(self, request: _PendingRequest, now: float) -> None:
+        request.num_sent += 1
+        request.retransmitted_at = now
+        self._note_sent(request, now)
+        self._sender.retransmit(_REQUEST, self._body(request))
 
-    def _sends(self, question: _Question, now: float) -> None:
-        question.due_at = now + question.wait_s
+    def _note_sent(self, request: _PendingRequest, now: float) -> None:
+        request.due_at = now + request.timeout_s
         if self._unheard == 0:
             self._unheard_since = now
         self._unheard += 1
 
-    def _body(self, question: _Question) -> bytes:
-        settled = next(iter(self._questions))
-        return _QUESTION_HEAD.pack(question.number, settled, question.have) + question.payload
+    def _body(self, request: _PendingRequest) -> bytes:
+        settled = next(iter(self._requests))
+        return _REQUEST_HEAD.pack(request.number, settled, request.have) + request.payload
 
 
-class _Answer:
-    """What a service has answered so far."""
+class _CachedReplies:
+    """The replies to one request, until the robot has them all."""
 
-    __slots__ = ("done", "hedged", "on_stream", "parts")
+    __slots__ = ("bodies", "done", "hedged", "on_stream")
 
     def __init__(self, on_stream: bool) -> None:
         self.on_stream = on_stream
         self.hedged = False
-        self.parts: list[bytes | None] = []
+        self.bodies: list[bytes | None] = []  # None: sent on the stream, which loses nothing
         self.done = False
 
 
-class Answers:
-    """The service's end: it answers, and never speaks first.
+class ServiceExchange:
+    """The service's end: it replies, and never speaks first."""
 
-    Parameters
-    ----------
-    ways : Ways
-    """
-
-    def __init__(self, ways: Ways) -> None:
-        self._sender = _Sender(ways)
-        self._answers: dict[int, _Answer] = {}
+    def __init__(self, paths: Paths) -> None:
+        self._sender = RedundantSender(paths)
+        self._cached: dict[int, _CachedReplies] = {}
         self._settled = 0
 
     @property
@@ -578,124 +417,113 @@ class Answers:
         """When :meth:`expire` is to be called."""
         return self._sender.due
 
-    def received(self, message: bytes, *, datagram: bool) -> Arrived | None:
-        """Take a message; return the question if it is a new one.
+    def received(self, message: bytes, *, datagram: bool) -> ReceivedRequest | None:
+        """Take a message of the authenticated robot; return the request if it is a new one.
 
-        Parameters
-        ----------
-        message : bytes
-            Of the robot, which has proved who it is; still it may be malformed.
-        datagram : bool
-            Which way it came.
+        A malformed message is ignored. ``datagram`` tells the path on which it came.
         """
         if len(message) < 2:
             return None
-        self._sender.lost_of_ours = message[1]
-        # A copy of a large one would hold up all others.
+        self._sender.num_lost = message[1]
+        # Copying a large message would delay all others.
         view = message if len(message) < _LARGE_BYTES else cast(bytes, memoryview(message))
         kind, body = message[0], view[2:]
         if kind == _PROBE and len(body) == _PROBE_HEAD.size and datagram:
-            self._sender.small(_ECHO, body)
+            self._sender.send_unbudgeted(_ECHO, body)
         hedge = kind == _HEDGE and not datagram
-        if not (hedge or kind == _QUESTION) or len(body) < _QUESTION_HEAD.size:
+        if not (hedge or kind == _REQUEST) or len(body) < _REQUEST_HEAD.size:
             return None
-        number, settled, have = _QUESTION_HEAD.unpack_from(body)
+        number, settled, have = _REQUEST_HEAD.unpack_from(body)
         self._settle(min(settled, number))
-        answer = self._answers.get(number)
-        if answer is not None:
+        cached = self._cached.get(number)
+        if cached is not None:
             if hedge:
-                self._hedge(number, answer, have)
+                self._hedge(number, cached, have)
             else:
-                self._asked_again(number, answer, have, datagram=datagram)
+                self._repeat(number, cached, have, datagram=datagram)
             return None
         if not self._enter(number, on_stream=not (datagram or hedge)):
             return None
-        self._answers[number].hedged = hedge
-        return Arrived(number, body[_QUESTION_HEAD.size :])
+        self._cached[number].hedged = hedge
+        return ReceivedRequest(number, body[_REQUEST_HEAD.size :])
 
-    def passed_over(self, number: int) -> bool:
-        """Take note that a question came on the stream that is larger than allowed.
-
-        Returns
-        -------
-        bool
-            Whether it can be answered.
-        """
+    def oversized(self, number: int) -> bool:
+        """Enter a request that is larger than allowed; return whether it can be answered."""
         return self._enter(number, on_stream=True)
 
     def flush(self) -> None:
-        """Send on the stream what the robot may lack: nobody will be there to be asked again."""
-        for number, answer in self._answers.items():
-            self._asked_again(number, answer, 0, datagram=False)
+        """Send on the stream all replies that the robot may lack, before the link closes."""
+        for number, cached in self._cached.items():
+            self._repeat(number, cached, 0, datagram=False)
 
     def reply(self, number: int, payload: bytes | None, now: float, *, last: bool) -> None:
-        """Answer a question, or a part of it; what is not awaited any more goes nowhere.
+        """Send a reply, if the robot still waits for it.
 
         Parameters
         ----------
-        number : int
-            Of the question.
         payload : bytes or None
             None is the end alone.
-        now : float
         last : bool
             Whether nothing more will come.
         """
-        answer = self._answers.get(number)
-        if answer is None or answer.done:
+        cached = self._cached.get(number)
+        if cached is None or cached.done:
             return
-        index = len(answer.parts)
-        if index >= _MAX_PARTS - 1:
+        index = len(cached.bodies)
+        if index >= _MAX_REPLIES - 1:
             last, payload = True, None
-        answer.done = last
+        cached.done = last
         index |= (_LAST if last else 0) | (_END_ALONE if payload is None else 0)
         body = _REPLY_HEAD.pack(number, index) + (payload or b"")
-        if answer.on_stream or len(body) > MAX_PAYLOAD_BYTES + _REPLY_HEAD.size:
-            answer.parts.append(None)  # the stream loses nothing
-            self._sender.stream(number, _REPLY, body)
+        if cached.on_stream or len(body) > MAX_PAYLOAD_BYTES + _REPLY_HEAD.size:
+            cached.bodies.append(None)
+            self._sender.send_on_stream(number, _REPLY, body)
             return
-        answer.parts.append(body)
-        self._sender.first(_REPLY, body, now, lambda: number in self._answers and not answer.hedged)
-        if answer.hedged:
+        cached.bodies.append(body)
+        self._sender.send_first(
+            _REPLY, body, now, lambda: number in self._cached and not cached.hedged
+        )
+        if cached.hedged:
             self._sender.hedge(number, _REPLY, body)
 
     def expire(self, now: float) -> None:
-        """Do what is due."""
+        """Send the copies that are due."""
         self._sender.expire(now)
 
-    def _hedge(self, number: int, answer: _Answer, have: int) -> None:
-        """Answer on the stream as well, and go on so."""
-        answer.hedged = True
-        for body in answer.parts[have:]:
+    def _hedge(self, number: int, cached: _CachedReplies, have: int) -> None:
+        """Send the replies on the stream as well, those to come included."""
+        cached.hedged = True
+        for body in cached.bodies[have:]:
             if body is not None:
                 self._sender.hedge(number, _REPLY, body)
 
-    def _asked_again(self, number: int, answer: _Answer, have: int, *, datagram: bool) -> None:
-        lacks = [part for part in answer.parts[have:] if part is not None]
+    def _repeat(self, number: int, cached: _CachedReplies, have: int, *, datagram: bool) -> None:
+        """Send again the replies that the robot lacks."""
+        lacks = [body for body in cached.bodies[have:] if body is not None]
         if not datagram:
-            answer.on_stream = True
+            cached.on_stream = True
             for body in lacks:
-                self._sender.stream(number, _REPLY, body)
-            answer.parts[have:] = [None] * len(answer.parts[have:])
+                self._sender.send_on_stream(number, _REPLY, body)
+            cached.bodies[have:] = [None] * len(cached.bodies[have:])
             return
         for body in lacks:
-            self._sender.again(_REPLY, body)
+            self._sender.retransmit(_REPLY, body)
         if not lacks:
-            self._sender.small(_WORKING, _WORKING_HEAD.pack(number))
+            self._sender.send_unbudgeted(_WORKING, _WORKING_HEAD.pack(number))
 
     def _enter(self, number: int, *, on_stream: bool) -> bool:
-        if number < self._settled or number in self._answers:
-            return False  # late: the robot has its answer, or has given it up
-        # Those that are not done are the service's to bound: it says when it has too many.
-        if len(self._answers) >= MAX_ANSWERS:
-            done = (known for known, answer in self._answers.items() if answer.done)
-            self._answers.pop(next(done, -1), None)
-        self._answers[number] = _Answer(on_stream)
+        if number < self._settled or number in self._cached:
+            return False  # late: the robot has its answer, or has abandoned the request
+        # The service bounds requests that are not done; here the oldest answered one makes room.
+        if len(self._cached) >= MAX_CACHED_REQUESTS:
+            done = (known for known, cached in self._cached.items() if cached.done)
+            self._cached.pop(next(done, -1), None)
+        self._cached[number] = _CachedReplies(on_stream)
         return True
 
     def _settle(self, settled: int) -> None:
         if settled <= self._settled:
             return
         self._settled = settled
-        for number in [number for number in self._answers if number < settled]:
-            del self._answers[number]
+        for number in [number for number in self._cached if number < settled]:
+            del self._cached[number]

@@ -1,10 +1,9 @@
-"""The bytes on a stream: a magic word, then frames; what is no frame of ours is found at once.
+"""Frames: how messages are delimited on a stream.
 
-A stream has no messages, so each is put into a frame: its length, its kind, the call that it
-belongs to, and its bytes. Whatever connects to a port may send anything, so nothing here believes a
-length: it is compared with its bound before any memory is taken. A message above the bound is
-passed over, byte for byte, and its sender hears so; anything else that is wrong ends the link, with
-a reason for the log. Nothing here knows a socket.
+A stream begins with a magic word. Then each message is a frame: its length, its kind, its call and
+its payload. Any program may connect to a port, so each length is checked against a bound before
+memory is allocated. A message above the bound is skipped, and its sender is informed. Any other
+violation ends the link with a reason for the log. Nothing here knows a socket.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from typing import Final, Literal, NamedTuple, TypeAlias, cast
 import msgspec
 
 from holdfast import __version__
-from holdfast.errors import TransportError
+from holdfast.errors import FrameError, TransportError
 from holdfast.printable import printable
 from holdfast.transport.endpoints import check_name
 
@@ -37,7 +36,6 @@ __all__ = [
     "WIRE_VERSION",
     "Frame",
     "FrameDecoder",
-    "FrameError",
     "Hello",
     "Role",
     "decode_hello",
@@ -50,20 +48,20 @@ __all__ = [
 Role: TypeAlias = Literal["robot", "service"]
 
 WIRE_VERSION: Final = 1
-"""Of the frames and the hello. The messages have a version of their own."""
+"""Of the frames and the hello; the protocol's messages have another version."""
 
 MAGIC: Final = b"holdfast"
 """The first bytes of either end."""
 
-HELLO: Final = 1  # who speaks; the first frame, unless that is a goodbye, and no other
+HELLO: Final = 1  # identifies the sender; the first frame, unless that is a goodbye
 CALL: Final = 2  # a request
 REPLY: Final = 3  # one of the replies to a call
 END: Final = 4  # no more replies to a call
 LAST: Final = 5  # a reply and the end
 PING: Final = 6  # this end lives
-GOODBYE: Final = 7  # why this end closes the link, in words; without any, soon
-KEYS: Final = 8  # with which datagrams are sealed
-MESSAGE: Final = 9  # of an exchange that is too large for a datagram
+GOODBYE: Final = 7  # why this end closes the link; empty: it will close soon
+KEYS: Final = 8  # of the cipher of datagrams
+MESSAGE: Final = 9  # of an exchange, instead of a datagram
 
 MAX_HELLO_BYTES: Final = 4096
 _MAX_GOODBYE_BYTES: Final = 1024
@@ -76,46 +74,40 @@ HEADER_BYTES: Final = _HEADER.size
 """Of each frame."""
 
 
-class FrameError(TransportError):
-    """What came is no frame of ours; the text completes a sentence about whoever sent it."""
-
-
 class Frame(NamedTuple):
-    """A frame that has come.
+    """A received frame.
 
     Attributes
     ----------
-    kind, call : int
     payload : bytes
-        A large one is a ``bytearray``, which nobody else has.
-    passed_over_bytes : int
-        Of a message that is larger than allowed and is not kept, so that the payload is empty.
+        A large one is a ``bytearray`` that nothing else refers to.
+    skipped_bytes : int
+        Size of a message that is larger than allowed and was skipped; then the payload is empty.
     """
 
     kind: int
     call: int
     payload: bytes
-    passed_over_bytes: int = 0
+    skipped_bytes: int = 0
 
 
 class Hello(msgspec.Struct, frozen=True, omit_defaults=True):
-    """Who is at an end of a link.
+    """The first frame: identifies one end of a link.
 
     Attributes
     ----------
     version : int
         :data:`WIRE_VERSION` of its code.
     release : str
-        Of its code.
-    role : {"robot", "service"}
+        Of holdfast there.
     name : str
         A robot's may be empty.
     incarnation : str
-        Of this process; another one is another process, with another memory.
+        Of its process; a restarted process has another.
     lease_ms : float
-        When nothing comes from it for this long, the link may be given up.
+        After this much silence it may be considered lost.
     clock_s : float
-        Of a service: what its machine takes for the time, in seconds since 1970; 0 is not told.
+        The time at a service, in seconds since 1970; 0 is unknown.
     """
 
     version: int
@@ -128,7 +120,7 @@ class Hello(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 class _Version(msgspec.Struct):
-    """What every version's hello has."""
+    """The fields that the hello of every version has."""
 
     version: int
     release: str = "unknown"
@@ -153,12 +145,12 @@ def encode_goodbye(reason: str) -> bytes:
 
 
 def read_goodbye(payload: bytes) -> str:
-    """Return the reason in a goodbye, fit to be shown; empty if there is none."""
+    """Return the reason in a goodbye, printable; empty if there is none."""
     return printable(payload.decode(errors="replace"))
 
 
 def decode_hello(payload: bytes) -> Hello:
-    """Return what the other end says of itself.
+    """Decode the peer's hello.
 
     Raises
     ------
@@ -188,27 +180,27 @@ def decode_hello(payload: bytes) -> Hello:
 
 
 class FrameDecoder:
-    """Makes frames of the bytes of one stream, however they are cut.
+    """Decodes the frames of one stream, in pieces of any size.
 
     Parameters
     ----------
     max_message_bytes : int
-        A larger request or reply is passed over.
+        A larger request or reply is skipped.
     more : mapping of int to int, optional
-        Bounds of the kinds that are known beyond those of any stream.
+        Bounds of further kinds.
 
     Attributes
     ----------
     error : FrameError or None
-        What came after the last frame and is none of ours. Nothing may be fed after that.
+        The violation after the last frame. Nothing may be fed after it.
     """
 
     def __init__(self, max_message_bytes: int, more: Mapping[int, int] | None = None) -> None:
         self.error: FrameError | None = None
         self._buffer = bytearray()
-        self._passing_over = 0
+        self._to_skip = 0
         self._has_magic = False
-        self._greeted = False
+        self._has_hello = False
         self._bounds = {
             CALL: max_message_bytes,
             REPLY: max_message_bytes,
@@ -221,14 +213,14 @@ class FrameDecoder:
 
     @property
     def held_bytes(self) -> int:
-        """Of a frame that has not come as a whole."""
+        """Size of the incomplete frame."""
         return len(self._buffer)
 
     def feed(self, data: bytes) -> list[Frame]:
-        """Take bytes and return the frames that are complete with them."""
+        """Take bytes and return the frames that they complete."""
         frames: list[Frame] = []
-        if self._greeted and not self._buffer and not self._passing_over:
-            # Nearly always it is one frame, and the whole of it.
+        if self._has_hello and not self._buffer and not self._to_skip:
+            # The usual case: exactly one frame.
             start = _HEADER.size
             if len(data) >= start:
                 size, kind, call = _HEADER.unpack_from(data)
@@ -250,15 +242,15 @@ class FrameDecoder:
         at = 0
         if not self._has_magic:
             if not MAGIC.startswith(source[: len(MAGIC)]):
-                raise FrameError(_what_speaks(bytes(source[:16])))
+                raise FrameError(_describe_foreign(bytes(source[:16])))
             if end >= len(MAGIC):
                 self._has_magic = True
                 at = len(MAGIC)
         while self._has_magic:
-            if self._passing_over:
-                passed = min(self._passing_over, end - at)
-                self._passing_over -= passed
-                at += passed
+            if self._to_skip:
+                skipped = min(self._to_skip, end - at)
+                self._to_skip -= skipped
+                at += skipped
             start = at + _HEADER.size
             if start > end:
                 break
@@ -267,14 +259,14 @@ class FrameDecoder:
                 if kind not in (CALL, REPLY, LAST, MESSAGE):
                     raise FrameError(f"sends a frame of kind {kind} with {size} bytes")
                 frames.append(Frame(kind, call, b"", size))
-                self._passing_over = size
+                self._to_skip = size
                 at = start
                 continue
             if start + size > end:
                 break
-            self._greeted = True
+            self._has_hello = True
             if source is buffer and size >= _LARGE_BYTES:
-                # To copy it would take a tenth of a second, in which nobody else is heard.
+                # Not copied: that would block the loop for a tenth of a second.
                 behind = bytes(buffer[start + size :])
                 del buffer[start + size :], buffer[:start]
                 frames.append(Frame(kind, call, cast(bytes, buffer)))
@@ -290,7 +282,7 @@ class FrameDecoder:
             buffer += memoryview(data)[at:]
 
     def _bound(self, kind: int) -> int:
-        if not self._greeted:
+        if not self._has_hello:
             if kind not in (HELLO, GOODBYE):
                 raise FrameError(f"begins with a frame of kind {kind} instead of a hello")
             return MAX_HELLO_BYTES
@@ -304,8 +296,8 @@ class FrameDecoder:
         return bound
 
 
-def _what_speaks(first: bytes) -> str:
-    """Say what it may be that does not begin with the magic word."""
+def _describe_foreign(first: bytes) -> str:
+    """Describe a peer that does not begin with the magic word."""
     if first[:2] in (b"\x16\x03", b"\x15\x03"):
         return "speaks TLS, and this endpoint does not (tls/... goes with tls/...)"
     if re.match(rb"(GET|HEAD|POST|PUT|OPTIONS|CONNECT|PRI|HTTP)\b", first):

@@ -1,7 +1,7 @@
-"""A wire that is none: robots and services of one event loop, with the manners of a real one.
+"""A transport without a wire, for robots and services in one event loop.
 
-What one end sends, the other one hears in a later turn of the loop, so that neither end ever runs
-inside the other; a service can be taken away and come back with a new memory. Nothing is copied.
+Each event is delivered in a later turn of the loop, as with a real transport, so neither end runs
+inside the other. A service can be removed and come back with a new memory. Nothing is copied.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import asyncio
 from collections.abc import Callable, Iterable
 
 from holdfast.errors import InvalidValueError, TransportError
-from holdfast.session.events import TransportEvent
+from holdfast.protocol.events import TransportEvent
 from holdfast.transport.calls import CallTable, PendingCall, too_large
 from holdfast.transport.contract import DEFAULT_MAX_MESSAGE_BYTES, IncomingCall
 
@@ -18,7 +18,7 @@ __all__ = ["InProcessNetwork", "InProcessRobotTransport", "InProcessServiceTrans
 
 
 class InProcessNetwork:
-    """Joins the robot's ends and the service's ends that it has made.
+    """Connects the robot's ends and the service's ends that it has made.
 
     Parameters
     ----------
@@ -35,16 +35,14 @@ class InProcessNetwork:
         """Make a robot's end that knows services of these names."""
         return InProcessRobotTransport(self, services, self._max_message_bytes)
 
-    def service(self, name: str, boot: str, robot: str | None = None) -> InProcessServiceTransport:
-        """Make a service's end; it is there from its ``start`` to its ``close``.
+    def service(
+        self, name: str, incarnation: str, robot: str | None = None
+    ) -> InProcessServiceTransport:
+        """Make a service's end, reachable from its ``start`` to its ``close``.
 
-        Parameters
-        ----------
-        name, boot : str
-        robot : str or None, optional
-            As whom the robots that call it count, as if they had shown a certificate.
+        Its calls have the name ``robot``, as if from a certificate.
         """
-        return InProcessServiceTransport(self, name, boot, robot, self._max_message_bytes)
+        return InProcessServiceTransport(self, name, incarnation, robot, self._max_message_bytes)
 
     def _find(self, name: str) -> InProcessServiceTransport | None:
         """Return the service of this name that started last."""
@@ -52,9 +50,9 @@ class InProcessNetwork:
 
 
 class _InProcessCall:
-    """A call, which both ends hold."""
+    """A call; both ends hold it."""
 
-    __slots__ = ("_call", "_loop", "_payload", "_robot_end", "_service_end")
+    __slots__ = ("_call", "_loop", "_robot_end", "_service_end", "payload", "robot")
 
     def __init__(
         self,
@@ -66,16 +64,9 @@ class _InProcessCall:
         self._call = call
         self._robot_end = robot_end
         self._service_end = service_end
-        self._payload = payload
+        self.payload = payload
+        self.robot = service_end.robot
         self._loop = asyncio.get_running_loop()
-
-    @property
-    def payload(self) -> bytes:
-        return self._payload
-
-    @property
-    def robot(self) -> str | None:
-        return self._service_end.robot
 
     def reply(self, payload: bytes) -> None:
         if len(payload) <= self._service_end.max_message_bytes:
@@ -124,7 +115,7 @@ class InProcessRobotTransport:
         loop.call_soon(self.calls.ended, pending)
 
     def abandon(self, call: int) -> None:
-        """Give a call up."""
+        """Abandon a call."""
         self.calls.abandon(call)
 
     async def close(self, timeout_s: float = 1.0) -> None:
@@ -135,15 +126,17 @@ class InProcessRobotTransport:
             self._network._robots.remove(self)
 
     def appeared(self, service: InProcessServiceTransport) -> None:
-        """Hear, in a later turn, that a service is there."""
-        if service.name in self._services:
-            asyncio.get_running_loop().call_soon(self.calls.appeared, service.name, service.boot)
-
-    def vanished(self, service: InProcessServiceTransport) -> None:
-        """Hear, in a later turn, that a service is gone."""
+        """Deliver, in a later turn, that a service has appeared."""
         if service.name in self._services:
             asyncio.get_running_loop().call_soon(
-                self.calls.vanished, service.name, service.boot, service
+                self.calls.appeared, service.name, service.incarnation
+            )
+
+    def vanished(self, service: InProcessServiceTransport) -> None:
+        """Deliver, in a later turn, that a service has vanished."""
+        if service.name in self._services:
+            asyncio.get_running_loop().call_soon(
+                self.calls.vanished, service.name, service.incarnation, service
             )
 
 
@@ -154,7 +147,7 @@ class InProcessServiceTransport:
         self,
         network: InProcessNetwork,
         name: str,
-        boot: str,
+        incarnation: str,
         robot: str | None,
         max_message_bytes: int,
     ) -> None:
@@ -162,7 +155,7 @@ class InProcessServiceTransport:
         self._deliver: Callable[[IncomingCall], None] | None = None
         self._started = False
         self.name = name
-        self.boot = boot
+        self.incarnation = incarnation
         self.robot = robot
         self.max_message_bytes = max_message_bytes
         self.listens = True
@@ -170,19 +163,13 @@ class InProcessServiceTransport:
 
     @property
     def endpoints(self) -> tuple[str, ...]:
-        """None: there is nothing to connect to."""
+        """No endpoints: there is nothing to connect to."""
         return ()
 
     async def start(self, deliver: Callable[[IncomingCall], None]) -> None:
-        """Be there for robots.
-
-        Raises
-        ------
-        TransportError
-            If it was started before.
-        """
+        """Appear to the robots; raise TransportError if it was started before."""
         if self._started:
-            raise TransportError(f"service {self.name}/{self.boot} was started before")
+            raise TransportError(f"service {self.name}/{self.incarnation} was started before")
         self._started = True
         self._deliver = deliver
         self._network._services.append(self)
@@ -190,14 +177,14 @@ class InProcessServiceTransport:
             robot.appeared(self)
 
     def dismiss(self) -> asyncio.Future[None]:
-        """Be seen by no more robots than those that see it; these are not told."""
+        """Appear to no further robots; those that know the service are not notified."""
         self.listens = False
         gone: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         gone.set_result(None)
         return gone
 
     async def close(self, timeout_s: float = 1.0) -> None:
-        """Be seen no more, and end all calls. May be repeated."""
+        """Vanish, and end all calls. May be repeated."""
         del timeout_s
         deliver, self._deliver = self._deliver, None
         if deliver is None:
@@ -209,7 +196,7 @@ class InProcessServiceTransport:
             call.end()
 
     def received(self, call: _InProcessCall) -> None:
-        """Take a call that a robot has sent."""
+        """Deliver a robot's call."""
         if self._deliver is None:
             call.end()
             return

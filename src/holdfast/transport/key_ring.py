@@ -1,15 +1,13 @@
-"""A private authority: makes the keys of robots and services, rotates and revokes them.
+"""Makes, renews, rotates and revokes the credentials of robots and services.
 
-Both ends of a link show a certificate, and each accepts only those that its authority has signed.
-The authority is one key file, made here, which stays at home; whoever holds it decides who belongs.
-A certificate also says what its owner is: a robot's is good for asking only and a service's for
-answering only (the field that X.509 calls the extended key usage), so a stolen robot cannot pretend
-to be a service to the others. A certificate whose key is lost or stolen is revoked: its number goes
-into a list that the authority signs and that lies beside everybody's credentials. What was ever
-signed is written down, so that no older certificate of a name is forgotten then.
+Each end of a link shows a certificate, and accepts only those of its authority. The authority is
+one key file in the operator's directory. A certificate is for a robot or for a service (X.509's
+extended key usage), so a stolen robot cannot pose as a service. A certificate whose key is lost or
+stolen is revoked: its serial number goes into a signed list beside all credentials. Each signed
+certificate is recorded, so revoking a name revokes its older certificates, too.
 
-This module needs the package ``cryptography``; without it, importing raises
-:class:`~holdfast.transport.credentials.CredentialsError`. To use what was made takes only
+Only this module needs the package ``cryptography``; without it, importing raises
+:class:`~holdfast.errors.CredentialsError`. Using credentials takes only
 :mod:`holdfast.transport.credentials`.
 """
 
@@ -23,10 +21,10 @@ import re
 import socket
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from datetime import UTC, datetime, timedelta
-from ipaddress import ip_address
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
+from holdfast.errors import CredentialsError
 from holdfast.files import (
     NewFile,
     create_directory_atomically,
@@ -34,32 +32,35 @@ from holdfast.files import (
     restore_directory,
     write_atomically,
 )
-from holdfast.transport.credentials import (
-    CredentialsError,
-    Role,
-    date_text,
-    give_to_warnings,
-    warn_if_open,
+from holdfast.transport.authority import (
+    AUTHORITY_DAYS,
+    AUTHORITY_KEY_FILE,
+    Authority,
+    certificate_pem,
+    common_name_of,
+    hosts_of,
+    is_host,
+    is_signed_by,
+    key_pem,
+    new_authority,
+    new_key,
+    normal_host,
+    public_key_of,
+    read_authority,
+    read_certificate,
+    read_file,
+    read_revocations,
+    role_of,
+    sign_certificate,
+    sign_revocations,
 )
+from holdfast.transport.credentials import Role, give_to_warnings
 from holdfast.transport.endpoints import AUTHORITY_FILE, CERTIFICATE_FILE, KEY_FILE
 from holdfast.transport.revocation import REVOKED_FILE
 
-try:
+if TYPE_CHECKING:
     from cryptography import x509
-    from cryptography.exceptions import InvalidSignature
-    from cryptography.hazmat.primitives import hashes
     from cryptography.hazmat.primitives.asymmetric import ec
-    from cryptography.hazmat.primitives.serialization import (
-        Encoding,
-        NoEncryption,
-        PrivateFormat,
-        load_pem_private_key,
-    )
-    from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
-except ImportError as error:
-    raise CredentialsError(
-        "making keys needs the package cryptography: pip install cryptography"
-    ) from error
 
 __all__ = [
     "AUTHORITY_DAYS",
@@ -77,43 +78,32 @@ __all__ = [
 DEFAULT_DAYS = 365
 """Days for which a certificate is valid unless said otherwise."""
 
-AUTHORITY_DAYS = 3650
-"""Days for which a new authority is valid; no certificate outlives its authority."""
-
 MAX_PARTIES = 1000
 """Bound on the names of one call."""
 
 _AUTHORITY = "authority"
-_AUTHORITY_KEY = "authority.key"
 _ISSUED = "issued.csv"
 _ISSUED_FIELDS = ("serial", "name", "role", "expires")
 _MAX_SERIAL = 2**159
 
-# A robot whose clock is a little behind would refuse a certificate that begins now.
-_BACKDATED = timedelta(days=1)
-
 # A name becomes a directory and the certificate's common name, which has 64 characters at most.
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
-_HOST_LABEL = re.compile(r"[A-Za-z0-9_]([A-Za-z0-9_-]{0,61}[A-Za-z0-9_])?")
 
 _PRIVATE_FILE = 0o600
 _PUBLIC_FILE = 0o644
 
 
 class MadeCredentials(NamedTuple):
-    """What :func:`make_credentials` made for one robot or service.
+    """The credentials of one robot or service.
 
     Attributes
     ----------
-    name : str
-    role : {"robot", "service"}
     directory : Path
-        What to copy to its machine.
+        To be copied to its machine.
     hosts : tuple of str
         Names and addresses under which robots may call a service; empty for a robot.
-    expires : datetime
     renewed : bool
-        Whether only the certificate is new, for a key that was there.
+        Whether the key is the old one.
     """
 
     name: str
@@ -125,18 +115,7 @@ class MadeCredentials(NamedTuple):
 
 
 class Issued(NamedTuple):
-    """A certificate that the authority has signed.
-
-    Attributes
-    ----------
-    serial : int
-    name : str
-        Empty if only the number is known.
-    role : {"robot", "service"} or None
-    expires : datetime or None
-    revoked : datetime or None
-        When; None if it is not.
-    """
+    """A certificate that the authority has signed; the name is empty if unknown."""
 
     serial: int
     name: str
@@ -146,14 +125,14 @@ class Issued(NamedTuple):
 
 
 class Revocation(NamedTuple):
-    """What :func:`revoke_credentials` did.
+    """The result of :func:`revoke_credentials`.
 
     Attributes
     ----------
     revoked : tuple of Issued
-        What was not revoked before.
+        The newly revoked certificates.
     before : int
-        How many were.
+        How many were revoked before.
     copies : tuple of Path
         The list in each directory of credentials.
     """
@@ -164,16 +143,7 @@ class Revocation(NamedTuple):
 
 
 class KeyRing(NamedTuple):
-    """What :func:`make_credentials` did.
-
-    Attributes
-    ----------
-    authority_key : Path
-        The file that stays at home.
-    authority_is_new : bool
-    authority_expires : datetime
-    made : tuple of MadeCredentials
-    """
+    """The result of :func:`make_credentials`."""
 
     authority_key: Path
     authority_is_new: bool
@@ -183,21 +153,9 @@ class KeyRing(NamedTuple):
 
 @contextlib.contextmanager
 def alone_in(directory: Path, *, warn: Callable[[str], None] | None = None) -> Iterator[None]:
-    """Keep others out of a directory meanwhile, and first finish what a killed one began.
+    """Lock a directory against other processes, and restore what a killed one left unfinished.
 
-    Parameters
-    ----------
-    directory : Path
-        As for :func:`make_credentials`.
-    warn : callable or None
-        As for :func:`make_credentials`; told if somebody has to be waited for.
-
-    Raises
-    ------
-    CredentialsError
-        If it cannot be made or opened, or the record in it is malformed.
-    OutputError
-        If a file cannot be written.
+    Takes and raises the same as :func:`make_credentials`.
     """
     warn = warn or give_to_warnings
     is_new = not directory.exists()
@@ -215,14 +173,14 @@ def alone_in(directory: Path, *, warn: Callable[[str], None] | None = None) -> I
             fcntl.flock(lock, fcntl.LOCK_EX)
         except OSError as error:  # on some file systems of a network
             warn(f"{directory}: cannot be locked: {error.strerror}; run one command at a time")
-        names = {each.name for each in _written_down(directory).values()}
+        names = {each.name for each in _recorded(directory).values()}
         for name in filter(_NAME.fullmatch, names - {_AUTHORITY}):
             restore_directory(directory / name)
         yield
     finally:
         if is_new:
             with contextlib.suppress(OSError):
-                directory.rmdir()  # if all was refused, and so it is empty
+                directory.rmdir()  # only if it is empty
         os.close(lock)
 
 
@@ -240,17 +198,17 @@ def make_credentials(
 ) -> KeyRing:
     """Make keys for robots and services, and their authority if there is none yet.
 
-    Each gets a directory of its name with ``authority.pem``, ``certificate.pem`` and ``key.pem``,
-    which appears whole or not at all. Another call adds keys of the same authority. Nothing that
-    exists is changed, unless ``renew`` or ``rotate`` is set: then a new certificate replaces the
-    old one, for the same key or a new one, and for at least the same hosts. The old one stays valid
-    until its time is up or it is revoked (:func:`revoke_credentials`). Nobody else may be at work
-    in the directory meanwhile (:func:`alone_in`).
+    Each party gets a directory of its name with ``authority.pem``, ``certificate.pem`` and
+    ``key.pem``, which appears atomically. Another call adds parties of the same authority. Existing
+    files stay, unless ``renew`` or ``rotate`` is set: then a new certificate replaces the old one,
+    for the same key or a new one, and for at least the same hosts. The old one stays valid until it
+    expires or is revoked (:func:`revoke_credentials`). The caller holds the lock
+    (:func:`alone_in`).
 
     Parameters
     ----------
     directory : Path
-        Where all of them go; it is made if it is not there.
+        Of all credentials; made if it does not exist.
     robots, services : sequence of str
         Their names; none at all means one robot ``robot`` and one service ``service``, or with
         ``renew`` or ``rotate`` all that are there.
@@ -258,18 +216,12 @@ def make_credentials(
         Names and addresses under which robots call the services, besides those of this machine.
     days : int
         For which the certificates are valid; never longer than the authority.
-    renew : bool
-        Whether certificates that are there already are replaced. One that is revoked is not.
-    rotate : bool
-        Whether certificates and keys that are there already are replaced.
+    renew, rotate : bool
+        Whether to replace existing certificates, except revoked ones; or keys as well.
     now : datetime or None
-        The time from which they are valid, with its time zone; None takes the clock's.
+        With its time zone; None is the current time.
     warn : callable or None
-        Takes texts that somebody should read; None gives them to :mod:`warnings`.
-
-    Returns
-    -------
-    KeyRing
+        Takes warnings as text; None passes them to :mod:`warnings`.
 
     Raises
     ------
@@ -291,11 +243,11 @@ def make_credentials(
 
     home = directory / _AUTHORITY
     authority_is_new = not home.exists()
-    authority = _new_authority(now) if authority_is_new else _read_authority(home, now, warn)
+    authority = new_authority(now) if authority_is_new else read_authority(home, now, warn)
 
-    # All that can be refused is refused before the first file is written.
-    revoked = () if authority_is_new else _read_revoked(home, authority.certificate)
-    numbers = frozenset(entry.serial_number for entry in revoked)
+    # All refusals come before the first file is written.
+    revoked = None if authority_is_new else read_revocations(home, authority.certificate)
+    numbers = frozenset(entry.serial_number for entry in revoked or ())
     end = min(now + timedelta(days=days), authority.certificate.not_valid_after_utc)
     roles: list[tuple[str, Role]] = [(name, "service") for name in services]
     roles += [(name, "robot") for name in robots]
@@ -328,33 +280,33 @@ def make_credentials(
         create_directory_atomically(
             home,
             {
-                AUTHORITY_FILE: NewFile(_pem(authority.certificate), _PUBLIC_FILE),
-                _AUTHORITY_KEY: NewFile(_key_pem(authority.key), _PRIVATE_FILE),
+                AUTHORITY_FILE: NewFile(certificate_pem(authority.certificate), _PUBLIC_FILE),
+                AUTHORITY_KEY_FILE: NewFile(key_pem(authority.key), _PRIVATE_FILE),
             },
         )
-    # Before any of them is there: what was not written down could not be revoked by its name.
+    # Recorded first: a certificate without a record could not be revoked by its name.
     issued = _read_issued(directory, authority.certificate)
     _write_issued(home, [*issued, *(_issued(each.certificate) for each in parties)])
     made = []
     for party in parties:
         place = directory / party.name
         if party.key is None:
-            write_atomically(place / CERTIFICATE_FILE, _pem(party.certificate))
+            write_atomically(place / CERTIFICATE_FILE, certificate_pem(party.certificate))
         else:
             files = {
-                AUTHORITY_FILE: NewFile(_pem(authority.certificate), _PUBLIC_FILE),
-                CERTIFICATE_FILE: NewFile(_pem(party.certificate), _PUBLIC_FILE),
-                KEY_FILE: NewFile(_key_pem(party.key), _PRIVATE_FILE),
+                AUTHORITY_FILE: NewFile(certificate_pem(authority.certificate), _PUBLIC_FILE),
+                CERTIFICATE_FILE: NewFile(certificate_pem(party.certificate), _PUBLIC_FILE),
+                KEY_FILE: NewFile(key_pem(party.key), _PRIVATE_FILE),
             }
             if (home / REVOKED_FILE).exists():
-                files[REVOKED_FILE] = NewFile(_read(home / REVOKED_FILE), _PUBLIC_FILE)
+                files[REVOKED_FILE] = NewFile(read_file(home / REVOKED_FILE), _PUBLIC_FILE)
             put = replace_directory if place.exists() else create_directory_atomically
             put(place, files)
         made.append(
             MadeCredentials(party.name, party.role, place, party.hosts, end, party.key is None)
         )
     return KeyRing(
-        home / _AUTHORITY_KEY,
+        home / AUTHORITY_KEY_FILE,
         authority_is_new,
         authority.certificate.not_valid_after_utc,
         tuple(made),
@@ -369,23 +321,17 @@ def revoke_credentials(
     now: datetime | None = None,
     warn: Callable[[str], None] | None = None,
 ) -> Revocation:
-    """Revoke certificates: no service and no robot that has the new list accepts them any more.
+    """Revoke certificates: an end that has the new list refuses them.
 
-    The list is written to the authority and beside each party's credentials. What is revoked
-    already stays so, and nothing is ever taken off the list.
+    The list is written to the authority and beside each party's credentials. Entries are never
+    removed.
 
     Parameters
     ----------
-    directory : Path
-        As for :func:`make_credentials`.
     names : sequence of str
-        Of robots and services: all certificates that they ever had.
+        Robots and services; all their certificates are revoked.
     serials : sequence of int
         Numbers of single certificates.
-    now : datetime or None
-        When, with its time zone; None takes the clock's.
-    warn : callable or None
-        As for :func:`make_credentials`.
 
     Raises
     ------
@@ -397,7 +343,7 @@ def revoke_credentials(
     """
     now = (now or datetime.now(UTC)).replace(microsecond=0)
     home = directory / _AUTHORITY
-    authority = _read_authority(home, now, warn or give_to_warnings)
+    authority = read_authority(home, now, warn or give_to_warnings)
     issued = _read_issued(directory, authority.certificate)
     wanted: dict[int, Issued] = {}
     for name in names:
@@ -410,24 +356,24 @@ def revoke_credentials(
             raise CredentialsError(f"serial number {serial:x}: is not between 1 and 2^159")
         known = next((each for each in issued if each.serial == serial), None)
         wanted[serial] = known or Issued(serial, "", None, None)
-    listed = _read_revoked(home, authority.certificate)
-    numbers = {entry.serial_number for entry in listed}
+    listed = read_revocations(home, authority.certificate)
+    numbers = {entry.serial_number for entry in listed or ()}
     new = [each._replace(revoked=now) for each in wanted.values() if each.serial not in numbers]
     if new:
-        content = _sign_revoked(home, listed, new, authority, now)
+        content = sign_revocations(listed, [each.serial for each in new], authority, now)
         write_atomically(home / REVOKED_FILE, content)
     copies = []
-    if new or listed:
-        content = _read(home / REVOKED_FILE)
+    if new or numbers:
+        content = read_file(home / REVOKED_FILE)
         for certificate in _certificates_in(directory):
-            # Also if nothing is new: who wrote it may have been killed before the copies.
+            # Even without a new entry: an earlier call may have been killed before it copied.
             copies.append(certificate.with_name(REVOKED_FILE))
             write_atomically(copies[-1], content)
-    return Revocation(tuple(new), len(listed), tuple(copies))
+    return Revocation(tuple(new), len(numbers), tuple(copies))
 
 
 def list_credentials(directory: Path) -> tuple[Issued, ...]:
-    """Return all certificates that an authority has signed, and what is revoked.
+    """Return all certificates that an authority has signed or revoked.
 
     Raises
     ------
@@ -435,9 +381,10 @@ def list_credentials(directory: Path) -> tuple[Issued, ...]:
         If there is no authority, or a file is malformed.
     """
     home = directory / _AUTHORITY
-    certificate = _read_certificate(home / AUTHORITY_FILE)
+    certificate = read_certificate(home / AUTHORITY_FILE)
     listed = {
-        entry.serial_number: entry.revocation_date_utc for entry in _read_revoked(home, certificate)
+        entry.serial_number: entry.revocation_date_utc
+        for entry in read_revocations(home, certificate) or ()
     }
     issued = [
         each._replace(revoked=listed.pop(each.serial, None))
@@ -467,37 +414,20 @@ def _check_arguments(
             f"host {hosts[0]!r}: only services are called by a host, and none is made"
         )
     for host in hosts:
-        if not _is_host(host):
+        if not is_host(host):
             raise CredentialsError(
                 f"host {host!r}: is no host name and no IP address; for a service at "
                 f"tls/10.0.0.7:7447 it is 10.0.0.7"
             )
 
 
-def _is_host(host: str) -> bool:
-    try:
-        ip_address(host)
-    except ValueError:
-        labels = host.split(".")
-        return len(host) <= 253 and all(_HOST_LABEL.fullmatch(label) for label in labels)
-    return True
-
-
 def _first_file_of(place: Path) -> Path | None:
-    """Return what would be in the way of a new directory, if anything."""
+    """Return a file that a new directory would replace, if any."""
     if not place.is_dir():
         return place if place.exists() else None
     if (place / CERTIFICATE_FILE).exists():
         return place / CERTIFICATE_FILE
     return min(place.iterdir(), default=None)
-
-
-# Making
-
-
-class _Authority(NamedTuple):
-    certificate: x509.Certificate
-    key: ec.EllipticCurvePrivateKey
 
 
 class _Party(NamedTuple):
@@ -510,67 +440,22 @@ class _Party(NamedTuple):
 
 def _present(directory: Path) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return the names of all robots and services that have a certificate here."""
-    robots: list[str] = []
-    services: list[str] = []
-    for certificate in _certificates_in(directory):
-        role = _role_of(_read_certificate(certificate))
-        (services if role == "service" else robots).append(certificate.parent.name)
-    if not robots and not services:
+    found = {
+        each.parent.name: role_of(read_certificate(each)) for each in _certificates_in(directory)
+    }
+    if not found:
         raise CredentialsError(f"{directory}: has no certificates to renew")
-    return tuple(robots), tuple(services)
+    services = tuple(name for name, role in found.items() if role == "service")
+    return tuple(name for name in found if name not in services), services
 
 
-def _new_authority(now: datetime) -> _Authority:
-    key = ec.generate_private_key(ec.SECP256R1())
-    serial = x509.random_serial_number()
-    # Two authorities must not have the same name: a chain is looked up by it.
-    name = _common_name(f"holdfast authority {serial:x}"[:40])
-    certificate = (
-        x509.CertificateBuilder()
-        .subject_name(name)
-        .issuer_name(name)
-        .public_key(key.public_key())
-        .serial_number(serial)
-        .not_valid_before(now - _BACKDATED)
-        .not_valid_after(now + timedelta(days=AUTHORITY_DAYS))
-        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
-        .add_extension(_key_usage(signs_certificates=True), critical=True)
-        .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
-        .sign(key, hashes.SHA256())
-    )
-    return _Authority(certificate, key)
-
-
-def _read_authority(home: Path, now: datetime, warn: Callable[[str], None]) -> _Authority:
-    certificate = _read_certificate(home / AUTHORITY_FILE)
-    path = home / _AUTHORITY_KEY
-    try:
-        key = load_pem_private_key(_read(path), password=None)
-    except (ValueError, TypeError) as error:
-        raise CredentialsError(f"{path}: is no private key in PEM form: {error}") from error
-    if not isinstance(key, ec.EllipticCurvePrivateKey):
-        raise CredentialsError(f"{path}: is no elliptic-curve key, as this program makes them")
-    if key.public_key() != certificate.public_key():
-        raise CredentialsError(f"{path}: is not the key of {home / AUTHORITY_FILE}")
-    warn_if_open(path, warn)
-    if certificate.not_valid_after_utc <= now:
-        raise CredentialsError(
-            f"{home / AUTHORITY_FILE}: has expired on "
-            f"{date_text(certificate.not_valid_after_utc.timestamp())}; make keys with a new "
-            f"authority in another directory"
-        )
-    return _Authority(certificate, key)
-
-
-def _old_certificate(place: Path, role: Role, authority: _Authority) -> x509.Certificate:
+def _old_certificate(place: Path, role: Role, authority: Authority) -> x509.Certificate:
     """Return the certificate that is to be replaced, if it is one of ours."""
     path = place / CERTIFICATE_FILE
-    old = _read_certificate(path)
-    try:
-        old.verify_directly_issued_by(authority.certificate)
-    except (ValueError, TypeError, InvalidSignature) as error:
-        raise CredentialsError(f"{path}: is not of the authority in {place.parent}") from error
-    if _role_of(old) != role or not isinstance(old.public_key(), ec.EllipticCurvePublicKey):
+    old = read_certificate(path)
+    if not is_signed_by(authority.certificate, old):
+        raise CredentialsError(f"{path}: is not of the authority in {place.parent}")
+    if role_of(old) != role or public_key_of(old) is None:
         raise CredentialsError(f"{path}: is not a {role}'s certificate, so it is left alone")
     return old
 
@@ -579,7 +464,7 @@ def _party(
     place: Path,
     role: Role,
     hosts: Sequence[str],
-    authority: _Authority,
+    authority: Authority,
     now: datetime,
     end: datetime,
     old: x509.Certificate | None = None,
@@ -587,87 +472,49 @@ def _party(
     rotate: bool = False,
 ) -> _Party:
     """Certify a new party, or one that has a certificate: with its key or with a new one."""
-    key: ec.EllipticCurvePrivateKey | None = None
-    if old is not None and not rotate:
-        public_key: object = old.public_key()
+    key = new_key() if old is None or rotate else None
+    if key is not None:
+        public_key: ec.EllipticCurvePublicKey | None = key.public_key()
     else:
-        key = ec.generate_private_key(ec.SECP256R1())
-        public_key = key.public_key()
-    assert isinstance(public_key, ec.EllipticCurvePublicKey)
+        assert old is not None
+        public_key = public_key_of(old)
+    assert public_key is not None
     reached_at: tuple[str, ...] = ()
     if role == "service":
-        before = _hosts_of_this_machine() if old is None else _hosts_of(old)
-        reached_at = tuple(dict.fromkeys(map(_normal, (*before, *hosts))))
-    certificate = _sign(place.name, role, reached_at, public_key, authority, now, end)
+        before = _hosts_of_this_machine() if old is None else hosts_of(old)
+        reached_at = tuple(dict.fromkeys(map(normal_host, (*before, *hosts))))
+    certificate = sign_certificate(place.name, role, reached_at, public_key, authority, now, end)
     return _Party(place.name, role, reached_at, certificate, key)
 
 
-def _sign(
-    name: str,
-    role: Role,
-    hosts: Sequence[str],
-    public_key: ec.EllipticCurvePublicKey,
-    authority: _Authority,
-    now: datetime,
-    end: datetime,
-) -> x509.Certificate:
-
-    usage = _usage_of(role)
-    builder = (
-        x509.CertificateBuilder()
-        .subject_name(_common_name(name))
-        .issuer_name(authority.certificate.subject)
-        .public_key(public_key)
-        .serial_number(x509.random_serial_number())
-        .not_valid_before(max(now - _BACKDATED, authority.certificate.not_valid_before_utc))
-        .not_valid_after(end)
-        .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
-        .add_extension(_key_usage(signs_certificates=False), critical=True)
-        .add_extension(x509.ExtendedKeyUsage([usage]), critical=False)
-        .add_extension(x509.SubjectKeyIdentifier.from_public_key(public_key), critical=False)
-        .add_extension(
-            x509.AuthorityKeyIdentifier.from_issuer_public_key(authority.key.public_key()),
-            critical=False,
-        )
-    )
-    if hosts:
-        names = [_general_name(host) for host in hosts]
-        builder = builder.add_extension(x509.SubjectAlternativeName(names), critical=False)
-    return builder.sign(authority.key, hashes.SHA256())
-
-
-# What was signed, and what is revoked
-
-
 def _issued(certificate: x509.Certificate) -> Issued:
-    names = certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
     return Issued(
         certificate.serial_number,
-        str(names[0].value) if names else "",
-        _role_of(certificate),
+        common_name_of(certificate),
+        role_of(certificate),
         certificate.not_valid_after_utc,
     )
 
 
 def _read_issued(directory: Path, authority: x509.Certificate) -> list[Issued]:
-    """Return what was signed: what is written down, and what is there besides."""
-    issued = _written_down(directory)
+    """Return all signed certificates: the recorded ones, and others that lie here."""
+    issued = _recorded(directory)
     for place in _certificates_in(directory):
-        # Anything may lie here; what our authority has not signed is no certificate of ours.
-        with contextlib.suppress(CredentialsError, ValueError, TypeError, InvalidSignature):
-            certificate = _read_certificate(place)
-            certificate.verify_directly_issued_by(authority)
-            issued.setdefault(certificate.serial_number, _issued(certificate))
+        # Anything may lie here; a certificate of another authority is ignored.
+        with contextlib.suppress(CredentialsError, ValueError):
+            certificate = read_certificate(place)
+            if is_signed_by(authority, certificate):
+                issued.setdefault(certificate.serial_number, _issued(certificate))
     return list(issued.values())
 
 
-def _written_down(directory: Path) -> dict[int, Issued]:
-    """Return the record of what was signed, by serial number."""
+def _recorded(directory: Path) -> dict[int, Issued]:
+    """Return the record of signed certificates, by serial number."""
     path = directory / _AUTHORITY / _ISSUED
     issued: dict[int, Issued] = {}
     if path.exists():
         try:
-            for serial, name, role, expires in _rows_of(_read(path).decode()):
+            for serial, name, role, expires in _rows_of(read_file(path).decode()):
                 known: Role = "service" if role == "service" else "robot"
                 end = datetime.fromisoformat(expires)
                 issued[int(serial, 16)] = Issued(int(serial, 16), name, known, end)
@@ -700,136 +547,6 @@ def _write_issued(home: Path, issued: Iterable[Issued]) -> None:
     write_atomically(home / _ISSUED, text)
 
 
-def _read_revoked(home: Path, authority: x509.Certificate) -> tuple[x509.RevokedCertificate, ...]:
-    """Return the entries of the authority's list; none if there is none yet."""
-    revoked = _load_revoked(home, authority)
-    return () if revoked is None else tuple(revoked)
-
-
-def _load_revoked(home: Path, authority: x509.Certificate) -> x509.CertificateRevocationList | None:
-    path = home / REVOKED_FILE
-    if not path.exists():
-        return None
-    try:
-        revoked = x509.load_pem_x509_crl(_read(path))
-    except ValueError as error:
-        raise CredentialsError(f"{path}: is no revocation list in PEM form") from error
-    key = authority.public_key()
-    assert isinstance(key, ec.EllipticCurvePublicKey)
-    if not revoked.is_signature_valid(key):
-        raise CredentialsError(f"{path}: was not signed by {home / AUTHORITY_FILE}")
-    return revoked
-
-
-def _sign_revoked(
-    home: Path,
-    listed: Iterable[x509.RevokedCertificate],
-    new: Iterable[Issued],
-    authority: _Authority,
-    now: datetime,
-) -> bytes:
-    """Return the next list, in PEM."""
-    before = _load_revoked(home, authority.certificate)
-    number = 1
-    if before is not None:
-        number += before.extensions.get_extension_for_class(x509.CRLNumber).value.crl_number
-    builder = (
-        x509.CertificateRevocationListBuilder()
-        .issuer_name(authority.certificate.subject)
-        .last_update(max(now - _BACKDATED, authority.certificate.not_valid_before_utc))
-        # A list that expires would lock everybody out.
-        .next_update(authority.certificate.not_valid_after_utc)
-        .add_extension(x509.CRLNumber(number), critical=False)
-        .add_extension(
-            x509.AuthorityKeyIdentifier.from_issuer_public_key(authority.key.public_key()),
-            critical=False,
-        )
-    )
-    for entry in listed:
-        builder = builder.add_revoked_certificate(entry)
-    for each in new:
-        entry = x509.RevokedCertificateBuilder(each.serial, now).build()
-        builder = builder.add_revoked_certificate(entry)
-    return builder.sign(authority.key, hashes.SHA256()).public_bytes(Encoding.PEM)
-
-
 def _hosts_of_this_machine() -> list[str]:
     own = socket.gethostname()
-    return ["localhost", "127.0.0.1", "::1", *([own] if _is_host(own) else [])]
-
-
-def _normal(host: str) -> str:
-    try:
-        return str(ip_address(host))
-    except ValueError:
-        return host.lower()
-
-
-def _general_name(host: str) -> x509.GeneralName:
-    try:
-        return x509.IPAddress(ip_address(host))
-    except ValueError:
-        return x509.DNSName(host)
-
-
-def _hosts_of(certificate: x509.Certificate) -> tuple[str, ...]:
-    try:
-        names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
-    except x509.ExtensionNotFound:
-        return ()
-    return tuple(str(name.value) for name in names)
-
-
-def _role_of(certificate: x509.Certificate) -> Role | None:
-    try:
-        usages = certificate.extensions.get_extension_for_class(x509.ExtendedKeyUsage).value
-    except x509.ExtensionNotFound:
-        return None
-    roles: tuple[Role, ...] = ("robot", "service")
-    return next((role for role in roles if list(usages) == [_usage_of(role)]), None)
-
-
-def _usage_of(role: Role) -> x509.ObjectIdentifier:
-    if role == "service":
-        return ExtendedKeyUsageOID.SERVER_AUTH
-    return ExtendedKeyUsageOID.CLIENT_AUTH
-
-
-def _key_usage(*, signs_certificates: bool) -> x509.KeyUsage:
-    return x509.KeyUsage(
-        digital_signature=not signs_certificates,
-        content_commitment=False,
-        key_encipherment=False,
-        data_encipherment=False,
-        key_agreement=False,
-        key_cert_sign=signs_certificates,
-        crl_sign=signs_certificates,
-        encipher_only=False,
-        decipher_only=False,
-    )
-
-
-def _common_name(name: str) -> x509.Name:
-    return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
-
-
-def _read_certificate(path: Path) -> x509.Certificate:
-    try:
-        return x509.load_pem_x509_certificate(_read(path))
-    except ValueError as error:
-        raise CredentialsError(f"{path}: is no certificate in PEM form") from error
-
-
-def _read(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise CredentialsError(f"{path}: cannot be read: {error.strerror}") from error
-
-
-def _pem(certificate: x509.Certificate) -> bytes:
-    return certificate.public_bytes(Encoding.PEM)
-
-
-def _key_pem(key: ec.EllipticCurvePrivateKey) -> bytes:
-    return key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
+    return ["localhost", "127.0.0.1", "::1", *([own] if is_host(own) else [])]

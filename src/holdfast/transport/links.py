@@ -1,12 +1,12 @@
-"""One stream to one peer: it speaks frames over a socket, and finds out when the peer is gone.
+"""One stream to one peer: it carries frames over a socket, and detects that the peer is gone.
 
-A stream that is closed is a peer that is gone: the system closes those of a process that dies. What
-only falls silent is given up after a while, so each end says regularly that it lives. And a peer
-that does not read must cost nobody else anything: what cannot be sent waits in a buffer with a
-bound, nothing here waits for it, and who never empties it loses the link.
+A closed stream means a dead peer: the system closes the sockets of a process that dies. A peer that
+falls silent is considered lost after its lease, so each end sends pings. A peer that does not read
+must not delay others: unsent bytes wait in a bounded buffer, nothing waits for them, and a peer
+that never empties it loses the link.
 
-Each end opens with a hello. With TLS the robot speaks first, without it whoever dialled; the other
-end answers, so that nothing is told to a port scanner.
+Each end opens with a hello. With TLS the robot speaks first, without it the end that dialled. The
+other end only answers, so a port scanner learns nothing.
 """
 
 from __future__ import annotations
@@ -16,11 +16,13 @@ import contextlib
 import math
 import socket
 import time
+from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Final
 
+from holdfast.errors import FrameError
 from holdfast.transport.endpoints import host_and_port
+from holdfast.transport.fair_scheduler import SLICE_S
 from holdfast.transport.frames import (
     GOODBYE,
     HELLO,
@@ -28,36 +30,33 @@ from holdfast.transport.frames import (
     PING,
     Frame,
     FrameDecoder,
-    FrameError,
     Hello,
     decode_hello,
     encode_frame,
     encode_goodbye,
     read_goodbye,
 )
-from holdfast.transport.turns import TURN_S, Turns
 
 if TYPE_CHECKING:
+    from holdfast.transport.link_settings import LinkSettings
     from holdfast.transport.tls import PeerCertificate, TlsStream
 
-__all__ = ["HalfReceived", "Link", "LinkOwner", "LinkSettings", "receive_buffer"]
+__all__ = ["OPENING_TIMEOUT_S", "Link", "LinkOwner"]
 
 OPENING_TIMEOUT_S: Final = 5.0
-"""For a connection to become a link: the handshake and the other end's hello."""
+"""For the handshake and the other end's hello."""
 
 STALLED_S: Final = 10.0
-"""A peer that takes nothing of what is to be sent to it for this long does not read."""
+"""A peer that reads nothing for this long, while bytes wait, loses the link."""
 
 _UNSENT_BYTES_AT_LEAST: Final = 4 << 20
-"""May wait for any peer, however small its messages must be."""
+"""Least bound on the bytes that wait for a peer."""
 
 _UNSENT_IN_SYSTEM_BYTES: Final = 128 * 1024
-"""May wait in the system: then even a slow link is seen to move every few seconds."""
+"""In the system's buffer: small, so that even a slow link shows progress every few seconds."""
 
-_RECEIVED_AT_ONCE_BYTES: Final = 256 * 1024
-
-_LOOKED_AT_ONCE_BYTES: Final = 16 * 1024
-"""Of what was received: thousands of frames, or of TLS's records, fit into more."""
+_DECODED_AT_ONCE_BYTES: Final = 16 * 1024
+"""Of received bytes: more can hold thousands of frames or TLS records."""
 
 _PINGS_IN_LEASE: Final = 3
 _CLOSE_TIMEOUT_S: Final = 1.0
@@ -67,117 +66,39 @@ _NO_TLS: Final = "does not speak TLS; as at that end, write tls/... or udp/... w
 _EXPIRED: Final = "has a certificate that has expired"
 
 
-def receive_buffer() -> memoryview:
-    """Return what all links of one end receive into, by turns.
+class LinkOwner(ABC):
+    """The end of a transport to which a link belongs; the link calls it."""
 
-    What has come is copied out before anything else happens on the loop. To allocate as much for
-    each message takes longer than all else that is done about a small one. Ends on loops of
-    different threads must not share one.
-    """
-    return memoryview(bytearray(_RECEIVED_AT_ONCE_BYTES))
+    def on_handshake(self, link: Link) -> None:  # noqa: B027 - optional
+        """Handle the end of the TLS handshake at this end."""
 
-
-class HalfReceived:
-    """Bounds the memory that half-received messages of all links together take.
-
-    Parameters
-    ----------
-    max_bytes : int
-        When they take more, a link is ended: of the owners that hold the most, or half of that, the
-        one whose message began first. So whoever sends much, on many links, ends nobody's that
-        holds little.
-    """
-
-    def __init__(self, max_bytes: int) -> None:
-        self._max_bytes = max_bytes
-        self._sizes: dict[Link, int] = {}
-        self._total = 0
-
-    def note(self, link: Link, size_bytes: int) -> None:
-        """Take note of what a link holds now."""
-        before = self._sizes.get(link, 0)
-        if size_bytes:
-            self._sizes[link] = size_bytes
-        elif before:
-            del self._sizes[link]
-        self._total += size_bytes - before
-        while self._total > self._max_bytes:
-            held: dict[object, int] = {}
-            for each, its_bytes in self._sizes.items():
-                held[each.owner] = held.get(each.owner, 0) + its_bytes
-            least = max(held.values()) / 2
-            oldest = next(each for each in self._sizes if held[each.owner] >= least)
-            self._total -= self._sizes.pop(oldest)
-            oldest.end("has not finished a message, and others need the memory")
-
-
-class LinkSettings(NamedTuple):
-    """What all links of one end have in common.
-
-    Attributes
-    ----------
-    hello : callable
-        Returns this end's first bytes.
-    lease_ms : float
-        This end lets itself be heard several times in this time.
-    max_message_bytes : int
-    half_received : HalfReceived
-    turns : Turns
-    buffer : memoryview
-        From :func:`receive_buffer`.
-    must_read : bool
-        Whether nothing more is heard of an end that does not read what it is sent.
-    """
-
-    hello: Callable[[], bytes]
-    lease_ms: float
-    max_message_bytes: int
-    half_received: HalfReceived
-    turns: Turns
-    buffer: memoryview
-    must_read: bool
-
-
-class LinkOwner(Protocol):
-    """Who is told what happens on a link."""
-
-    def established(self, link: Link) -> None:
-        """Hear that the TLS handshake is complete at this end; not called without TLS."""
-        ...
-
+    @abstractmethod
     def refusal(self, link: Link, hello: Hello) -> str | None:
-        """Return why the other end is not wanted, as the rest of a sentence about it."""
-        ...
+        """Return why the peer is refused, as the rest of a sentence about it; None if welcome."""
 
-    def greeted(self, link: Link, hello: Hello) -> None:
-        """Hear who the other end is; now frames of calls may be sent."""
-        ...
+    @abstractmethod
+    def on_hello(self, link: Link, hello: Hello) -> None:
+        """Handle the peer's hello; from now on frames of calls may be sent."""
 
-    def received(self, link: Link, frame: Frame) -> None:
-        """Take a frame of a call."""
-        ...
+    @abstractmethod
+    def on_frame(self, link: Link, frame: Frame) -> None:
+        """Handle a frame of a call."""
 
-    def leaving(self, link: Link) -> None:
-        """Hear that the other end is about to end the link, and has nothing against this one.
+    def on_goodbye(self, link: Link) -> None:  # noqa: B027 - optional
+        """Handle a goodbye without a reason: the peer will end the link, but still replies.
 
-        It still answers what it is asked, for a while; who needs it no more ends the link.
+        This end closes the link when it needs no more replies.
         """
-        ...
 
-    def went_adrift(self, link: Link) -> None:
-        """Hear that a link goes on without its stream, so that another one has to take its place.
+    def on_stream_lost(self, link: Link) -> None:  # noqa: B027 - optional
+        """Replace a link that goes on with datagrams alone."""
 
-        Only of links that have something beside the stream.
-        """
-        ...
+    def on_datagrams_blocked(self, link: Link) -> None:  # noqa: B027 - optional
+        """Note, once, that no datagram gets through, so that everything goes on the stream."""
 
-    def closed_to_datagrams(self, link: Link) -> None:
-        """Hear that no datagram gets through, so that all goes on the stream; told once."""
-        ...
-
-    def lost(self, link: Link) -> None:
-        """Hear that the link has ended: once of each link, and nothing more of it after that."""
-        ...
+    @abstractmethod
+    def on_ended(self, link: Link) -> None:
+        """Handle the end of the link: called once, and last."""
 
 
 class Link(asyncio.BufferedProtocol):
@@ -185,21 +106,19 @@ class Link(asyncio.BufferedProtocol):
 
     Parameters
     ----------
-    owner : LinkOwner
-    settings : LinkSettings
     speaks_first : bool
-        Whether this end says who it is before it knows who the other one is.
-    tls : TlsStream or None
+        Whether this end sends its hello first.
 
     Attributes
     ----------
-    tls : TlsStream or None
     began_at : float
         By the loop's clock.
+    max_message_bytes : int
+        Larger messages are not sent.
     has_answered : bool
-        Whether an answer came over it that was waited for; the owner notes that.
+        Whether an awaited reply came over it; set by the owner.
     connecting : Task or None
-        Of an accepted connection, which asyncio needs somebody to hold.
+        Of an accepted connection; asyncio itself keeps no reference.
     closed : Future
         Done when the connection is closed.
     hello : Hello or None
@@ -209,15 +128,13 @@ class Link(asyncio.BufferedProtocol):
     address : str or None
         The other end's, HOST:PORT; None over a local socket, or not connected yet.
     reason : str
-        Why the link has ended, as the rest of a sentence about the other end; empty if that has
-        simply closed.
+        Why the link has ended, as the rest of a sentence about the other end; empty if it was
+        closed normally.
     said_goodbye : bool
-        Whether the other end has said that it ends the link, now or soon; one that is killed does
-        not.
+        Whether the other end has announced that it ends the link, now or soon.
     refused : bool
-        Whether it has ended because one of the ends does not want the other, so that to try again
-        at once is of no use.
-    adrift : bool
+        Whether one end has refused the other, so that an immediate retry is of no use.
+    without_stream : bool
         Whether it goes on without its stream.
     """
 
@@ -233,26 +150,27 @@ class Link(asyncio.BufferedProtocol):
         self._settings = settings
         self._speaks_first = speaks_first
         self.tls = tls
+        self.max_message_bytes = settings.max_message_bytes
         self._loop = asyncio.get_running_loop()
         self._transport: asyncio.Transport | None = None
         self._decoder = FrameDecoder(settings.max_message_bytes)
         self._max_unsent_bytes = max(2 * settings.max_message_bytes, _UNSENT_BYTES_AT_LEAST)
         self._ping_interval_s = 1e-3 * settings.lease_ms / _PINGS_IN_LEASE
         self.began_at = now = self._loop.time()
-        self._silent_at = now + OPENING_TIMEOUT_S
-        self._patience_s = 0.0
-        self._moved_at = now
+        self._lease_ends_at = now + OPENING_TIMEOUT_S
+        self._peer_lease_s = 0.0
+        self._progress_at = now
         self._said_hello = False
         self._holds = False
-        # What has come and waits: bytes, from where on, and the frames that were in those before.
+        # Received: undecoded bytes, the offset of the next one, and decoded frames.
         self._unread, self._unread_at = b"", 0
         self._frames: deque[Frame] = deque()
-        self._waits_for_turn = self._waits_for_reader = False
+        self._is_queued = self._is_paused = False
         self._spoke = False
-        self._handed_over_bytes = self._moved_bytes = 0
-        self._timer = self._loop.call_at(self._silent_at, self._tick)
+        self._handed_over_bytes = self._progress_bytes = 0
+        self._timer = self._loop.call_at(self._lease_ends_at, self._tick)
         self._ended = False
-        self._told = False
+        self._notified = False
         self.closed: asyncio.Future[None] = self._loop.create_future()
         self.connecting: asyncio.Task[object] | None = None
         self.hello: Hello | None = None
@@ -261,13 +179,8 @@ class Link(asyncio.BufferedProtocol):
         self.reason = ""
         self.said_goodbye = False
         self.refused = False
-        self.adrift = False
+        self.without_stream = False
         self.has_answered = False
-
-    @property
-    def max_message_bytes(self) -> int:
-        """A larger one is not sent."""
-        return self._settings.max_message_bytes
 
     @property
     def ended(self) -> bool:
@@ -276,9 +189,9 @@ class Link(asyncio.BufferedProtocol):
 
     @property
     def owner(self) -> object:
-        """With whom it shares its turns and its memory.
+        """What shares time slices and memory: the name in the other end's certificate.
 
-        The name in the other end's certificate; None before there is one, and without TLS itself.
+        None before there is a certificate; without TLS the link itself.
         """
         if self.tls is None:
             return self
@@ -290,11 +203,11 @@ class Link(asyncio.BufferedProtocol):
         return False
 
     def protocol(self) -> asyncio.BaseProtocol:
-        """Return what asyncio is to connect: the link itself, unless something is in between."""
+        """Return the protocol for asyncio: the link itself, or an adapter around it."""
         return self
 
     async def connect(self, stream: socket.socket) -> None:
-        """Begin to speak over a connection; never raises."""
+        """Take over a connection; never raises."""
         try:
             await self._loop.create_connection(self.protocol, sock=stream)
         except OSError as error:
@@ -326,7 +239,7 @@ class Link(asyncio.BufferedProtocol):
         self.send(encode_goodbye(""))
 
     def forget(self, call: int) -> None:
-        """Take note that nobody wants to hear more of a call."""
+        """Ignore what still comes of a call."""
 
     def end(
         self,
@@ -336,26 +249,28 @@ class Link(asyncio.BufferedProtocol):
         refused: bool = False,
         abort: bool = False,
     ) -> None:
-        """End the link; the owner hears so in a later turn of the loop. May be repeated.
+        """End the link; the owner is notified in a later turn of the loop. May be repeated.
 
         Parameters
         ----------
         reason : str
             About the other end, for :attr:`reason`.
         goodbye : str or None
-            What the other end is told before; empty text says no more than that.
+            Sent to the other end before, as the reason; may be empty.
         refused : bool
             For :attr:`refused`.
         abort : bool
-            Whether what is still to be sent is thrown away.
+            Whether to drop unsent bytes.
         """
         if self._ended:
             return
+        if not (abort or refused):
+            self._flush()
         if goodbye is not None:
             self.send(
                 encode_goodbye(goodbye) if self._said_hello else MAGIC + encode_goodbye(goodbye)
             )
-            if self.ended:  # it does not read
+            if self.ended:  # the other end does not read
                 return
         self._ended = True
         self.reason = reason
@@ -363,10 +278,12 @@ class Link(asyncio.BufferedProtocol):
         self._timer.cancel()
         self._unread = b""
         self._frames.clear()
-        self._settings.half_received.note(self, 0)
-        self._loop.call_soon(self._tell)
+        self._settings.partial_messages.note(self, 0)
+        self._loop.call_soon(self._notify_owner)
         transport = self._transport
         if transport is None:
+            if self.without_stream and not self.closed.done():
+                self.closed.set_result(None)
             return
         if abort:
             transport.abort()
@@ -377,10 +294,13 @@ class Link(asyncio.BufferedProtocol):
         transport.close()
         self._timer = self._loop.call_later(_CLOSE_TIMEOUT_S, transport.abort)
 
-    # -- what asyncio tells ----------------------------------------------------------------------
+    def _flush(self) -> None:
+        """Send what only a stream can still deliver, before the link ends."""
+
+    # -- callbacks of asyncio --------------------------------------------------------------------
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Begin to speak, if that is this end's part."""
+        """Send the hello or begin the handshake, if this end speaks first."""
         assert isinstance(transport, asyncio.Transport)
         if self._ended:
             transport.abort()
@@ -391,7 +311,6 @@ class Link(asyncio.BufferedProtocol):
         if stream is not None and stream.family != socket.AF_UNIX:
             self.address = _address(transport.get_extra_info("peername"))
             with contextlib.suppress(OSError):
-                # What is sent is meant to arrive now, although more may follow.
                 stream.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
                 stream.setsockopt(
                     socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, _UNSENT_IN_SYSTEM_BYTES
@@ -404,80 +323,80 @@ class Link(asyncio.BufferedProtocol):
             transport.write(self.tls.take())
 
     def get_buffer(self, sizehint: int) -> memoryview:
-        """Return where asyncio puts what comes next."""
+        """Return the buffer for the next bytes."""
         del sizehint
         return self._settings.buffer
 
     def buffer_updated(self, nbytes: int) -> None:
-        """Take what has come."""
+        """Take received bytes."""
         if self._ended:
             return
         self._unread, self._unread_at = bytes(self._settings.buffer[:nbytes]), 0
         now = self._loop.time()
         if self.hello is not None:
-            self._silent_at = now + self._patience_s
-        if self._settings.turns.may_go_on(self.owner, now):
-            self.go_on()
+            self._lease_ends_at = now + self._peer_lease_s
+        if self._settings.scheduler.may_run(self.owner, now):
+            self._run_slice()
         else:
-            self._wait_for_turn()
+            self._enqueue()
 
     def pause_writing(self) -> None:
-        """Take note that the other end does not read as fast as it is sent to."""
-        if self._settings.must_read:
-            self._waits_for_reader = True
+        """Stop reading from an end that does not read."""
+        if self._settings.pauses_for_readers:
+            self._is_paused = True
             self._pause_reading()
 
     def resume_writing(self) -> None:
-        """Take note that the other end has read."""
-        if self._waits_for_reader:
-            self._waits_for_reader = False
-            if not self._ended and not self._waits_for_turn:
-                self._wait_for_turn()
+        """Go on reading."""
+        if self._is_paused:
+            self._is_paused = False
+            if not self._ended and not self._is_queued:
+                self._enqueue()
 
     def eof_received(self) -> None:
         """Let asyncio close this end, as the other one has."""
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Take note that the connection is gone, whoever has closed it."""
+        """Handle the end of the connection."""
         self._transport = None
         self._timer.cancel()
         if not self._ended:
             self._ended = True
-            # One that dies resets the connection if there is something that it has not read.
+            # A dying process resets the connection if it has unread bytes.
             if exc is not None and not isinstance(exc, (ConnectionResetError, BrokenPipeError)):
                 self.reason = getattr(exc, "strerror", None) or str(exc)
-            self._settings.half_received.note(self, 0)
-        self._tell()
+            self._settings.partial_messages.note(self, 0)
+        self._notify_owner()
         if not self.closed.done():
             self.closed.set_result(None)
 
-    # -- what comes ------------------------------------------------------------------------------
+    # -- receiving -------------------------------------------------------------------------------
 
-    def go_on(self) -> None:
-        """Handle what has come, for one turn."""
-        self._waits_for_turn = False
-        if self._ended or self._waits_for_reader:
+    def _run_slice(self) -> None:
+        """Handle received bytes for one slice."""
+        self._is_queued = False
+        if self._ended or self._is_paused:
             return
         owner, began = self.owner, self._loop.time()
         try:
             while self._handle_next():
-                if self.ended or self._waits_for_reader:
+                if self.ended or self._is_paused:
                     break
-                if self._loop.time() >= began + TURN_S and (self._frames or self._unread):
-                    self._wait_for_turn()
+                if self._loop.time() >= began + SLICE_S and (self._frames or self._unread):
+                    self._enqueue()
                     break
             else:
                 if self._transport is not None:
                     self._transport.resume_reading()
         except FrameError as error:
-            # Only one of our own kind is told why.
+            # Only a peer that speaks holdfast gets the reason.
             self.end(
                 str(error), goodbye=str(error) if self.hello is not None else None, refused=True
             )
-        self._settings.turns.spend(owner, self._loop.time() - began)
+        self._settings.scheduler.charge(owner, self._loop.time() - began)
 
     def _handle_next(self) -> bool:
-        """Handle one frame, or look what frames have come; return whether there was anything."""
+        """Handle one frame, or decode the next bytes; return whether there was anything."""
         if self._frames:
             self._take(self._frames.popleft())
             return True
@@ -489,8 +408,8 @@ class Link(asyncio.BufferedProtocol):
             return True
         if not data:
             return False
-        if len(data) > _LOOKED_AT_ONCE_BYTES:
-            self._unread_at = at + _LOOKED_AT_ONCE_BYTES
+        if len(data) > _DECODED_AT_ONCE_BYTES:
+            self._unread_at = at + _DECODED_AT_ONCE_BYTES
             data = data[at : self._unread_at]
         if self._unread_at == at or self._unread_at >= len(self._unread):
             self._unread, self._unread_at = b"", 0
@@ -499,22 +418,22 @@ class Link(asyncio.BufferedProtocol):
             if self.ended:
                 return True
         self._frames.extend(self._decoder.feed(data))
-        self._note_what_is_held()
+        self._note_held_bytes()
         return True
 
-    def _note_what_is_held(self) -> None:
+    def _note_held_bytes(self) -> None:
         held_bytes = self._decoder.held_bytes
-        if self._waits_for_turn:
+        if self._is_queued:
             held_bytes += len(self._unread) - self._unread_at
         if held_bytes or self._holds:
             self._holds = held_bytes > 0
-            self._settings.half_received.note(self, held_bytes)
+            self._settings.partial_messages.note(self, held_bytes)
 
-    def _wait_for_turn(self) -> None:
-        self._waits_for_turn = True
+    def _enqueue(self) -> None:
+        self._is_queued = True
         self._pause_reading()
-        self._note_what_is_held()
-        self._settings.turns.wait(self)
+        self._note_held_bytes()
+        self._settings.scheduler.enqueue(self.owner, self._run_slice)
 
     def _pause_reading(self) -> None:
         if self._transport is not None:
@@ -524,14 +443,14 @@ class Link(asyncio.BufferedProtocol):
         was_established = tls.established
         try:
             data = tls.receive(data)
-        except OSError as error:  # OpenSSL's: it is not imported here, for it takes long
+        except OSError as error:  # ssl.SSLError; importing ssl is slow
             assert self._transport is not None
-            self._transport.write(tls.take())  # it is told, in an alert
-            self.end(tls.what_is_wrong(error), refused=True)
+            self._transport.write(tls.take())  # the alert
+            self.end(tls.describe_error(error), refused=True)
             return b""
         except FrameError:
             if data.startswith(MAGIC) and self._transport is not None:
-                # One of our own kind is told, in clear as it has asked.
+                # A holdfast peer without TLS gets the reason in clear.
                 self._transport.write(MAGIC + encode_goodbye(_NO_TLS))
             raise
         if was_established:
@@ -546,7 +465,7 @@ class Link(asyncio.BufferedProtocol):
                 return b""
             if self._speaks_first:
                 self._say_hello()
-            self._owner.established(self)
+            self._owner.on_handshake(self)
         return data
 
     def _take(self, frame: Frame) -> None:
@@ -565,39 +484,39 @@ class Link(asyncio.BufferedProtocol):
             if not self._speaks_first:
                 self._say_hello()
             self.hello = hello
-            self._patience_s = 1e-3 * hello.lease_ms
-            self._silent_at = self._loop.time() + self._patience_s
+            self._peer_lease_s = 1e-3 * hello.lease_ms
+            self._lease_ends_at = self._loop.time() + self._peer_lease_s
             self._timer.cancel()
             self._tick()
-            self._owner.greeted(self, hello)
+            self._owner.on_hello(self, hello)
         elif kind == GOODBYE:
             reason = read_goodbye(frame.payload)
             self.said_goodbye = True
             if reason:
                 self.end(f"refuses this end, which {reason}", refused=True)
             else:
-                self._owner.leaving(self)
+                self._owner.on_goodbye(self)
         else:
-            self._owner.received(self, frame)
+            self._owner.on_frame(self, frame)
 
     def _say_hello(self) -> None:
         self._said_hello = True
         self.send(self._settings.hello())
 
-    def _tell(self) -> None:
-        if not self._told:
-            self._told = True
-            self._owner.lost(self)
+    def _notify_owner(self) -> None:
+        if not self._notified:
+            self._notified = True
+            self._owner.on_ended(self)
 
     # -- time ------------------------------------------------------------------------------------
 
     def _tick(self) -> None:
-        """Look whether the other end lives and reads, and let it know that this one does."""
+        """Check that the other end lives and reads, and send a ping if this end was silent."""
         now = self._loop.time()
-        self._excuse(now)
-        if now >= self._silent_at:
-            # If it is this process that stood still, what came meanwhile is still to be read.
-            self._loop.call_soon(self._loop.call_soon, self._give_up_if_silent)
+        self._extend_lease_if_unread(now)
+        if now >= self._lease_ends_at:
+            # If this process has stalled, first read what came meanwhile.
+            self._loop.call_soon(self._loop.call_soon, self._end_if_silent)
             return
         valid_s = math.inf if self.peer is None else self.peer.expires_at - time.time()
         if valid_s <= 0.0:
@@ -609,33 +528,33 @@ class Link(asyncio.BufferedProtocol):
                 self.send(_PING)
             self._spoke = False
             unsent = transport.get_write_buffer_size()
-            moved_bytes = self._handed_over_bytes - unsent
-            if unsent == 0 or moved_bytes != self._moved_bytes:
-                self._moved_at, self._moved_bytes = now, moved_bytes
-            elif now >= self._moved_at + STALLED_S:
+            sent_bytes = self._handed_over_bytes - unsent
+            if unsent == 0 or sent_bytes != self._progress_bytes:
+                self._progress_at, self._progress_bytes = now, sent_bytes
+            elif now >= self._progress_at + STALLED_S:
                 self.end("does not read what it is sent", abort=True)
             if self._ended:
                 return
-        due = self._silent_at
+        due = self._lease_ends_at
         if self.hello is not None:
             due = min(due, now + self._ping_interval_s, now + valid_s)
         self._timer = self._loop.call_at(due, self._tick)
 
-    def _give_up_if_silent(self) -> None:
+    def _end_if_silent(self) -> None:
         if self._ended:
             return
-        self._excuse(self._loop.time())
-        if self._loop.time() < self._silent_at:
+        self._extend_lease_if_unread(self._loop.time())
+        if self._loop.time() < self._lease_ends_at:
             self._tick()
         elif self.hello is None:
             self.end(f"has said no hello within {OPENING_TIMEOUT_S:g} s", abort=True)
         else:
-            self.end(f"was silent for {1e3 * self._patience_s:g} ms", abort=True)
+            self.end(f"was silent for {1e3 * self._peer_lease_s:g} ms", abort=True)
 
-    def _excuse(self, now: float) -> None:
-        """Take nobody for silent who is not listened to."""
-        if self.hello is not None and (self._waits_for_turn or self._waits_for_reader):
-            self._silent_at = now + self._patience_s
+    def _extend_lease_if_unread(self, now: float) -> None:
+        """Extend the lease of a peer from which this end does not read."""
+        if self.hello is not None and (self._is_queued or self._is_paused):
+            self._lease_ends_at = now + self._peer_lease_s
 
 
 def _address(found: object) -> str | None:

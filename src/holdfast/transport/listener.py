@@ -1,8 +1,8 @@
-"""A socket that peers connect to, and the connections of which nothing is known yet.
+"""A listening socket, and accepted connections before their first byte.
 
-Anybody can open a connection, and most that are opened to a port of the internet say nothing or
-nonsense. So a connection costs next to nothing until its first byte has come; those that say
-nothing are closed after a while, and when there are too many, one of whoever has the most goes.
+Anybody can open a connection, and most connections to a public port send nothing or nonsense. So a
+connection costs very little before its first byte. Silent ones are closed after a while; if there
+are too many, one of the network with the most is closed.
 """
 
 from __future__ import annotations
@@ -24,43 +24,50 @@ from holdfast.errors import TransportError
 from holdfast.transport.endpoints import Endpoint, why_not_bound
 from holdfast.transport.links import OPENING_TIMEOUT_S
 
-__all__ = ["BACKLOG", "MAX_SILENT", "Listener", "listen", "one_too_many", "remove_socket_file"]
+__all__ = [
+    "BACKLOG",
+    "MAX_SILENT",
+    "Listener",
+    "connection_to_drop",
+    "listen",
+    "remove_socket_file",
+]
 
 BACKLOG: Final = 1024
 """Connections that wait to be accepted."""
 
 _ACCEPTED_AT_ONCE: Final = 32
-"""Before links that stand are heard again."""
+"""Before the event loop serves existing links."""
 
 _PAUSE_S: Final = 0.1
-"""After the system has refused to accept: no descriptor is free."""
+"""After the system could not accept, because no descriptor was free."""
 
 _LOCK_TIMEOUT_S: Final = 10.0
 _LOCK_PAUSE_S: Final = 0.01
-"""For the lock of a local socket's directory; whoever begins to listen holds it for a moment."""
+"""For the lock of a local socket's directory, which is held only for a moment."""
 
 MAX_SILENT: Final = 256
-"""Connections of which no byte has come."""
+"""Connections without a first byte."""
 
 _MAPPED = b"\0" * 10 + b"\xff\xff"
-"""Before an IPv4 address that is written as one of IPv6."""
+"""Prefix of an IPv4 address within IPv6."""
 
 _T = TypeVar("_T")
 
 
 class Listener:
-    """Accepts connections, and hands over those of which a first byte has come.
+    """Accepts connections, and delivers each when its first byte has come.
 
     Parameters
     ----------
     endpoint : Endpoint
         Port 0 takes a free one.
     accepted : callable
-        Gets the socket of such a connection, and from which network it came.
+        Gets the socket of such a connection, and the network from which it came.
     speaks_first : bool
-        Whether it is this end that has to speak first: then connections are handed over at once.
+        Whether this end speaks first; then connections are delivered at once.
     listening : socket or None
-        One that listens there already, for the process that made it as well.
+        A socket that listens there already and is shared with its owner.
 
     Attributes
     ----------
@@ -89,21 +96,19 @@ class Listener:
             self._socket.setblocking(False)
         except OSError as error:
             raise TransportError(f"cannot listen on {endpoint}: {why_not_bound(error)}") from error
+        self.endpoint = endpoint
         self._socket_file: os.stat_result | None = None
-        if endpoint.is_local_socket and listening is not None:
-            self.endpoint = endpoint
-        elif endpoint.is_local_socket:
-            self._socket_file = Path(endpoint.host).stat()
-            self.endpoint = endpoint
-        else:
+        if not endpoint.is_local_socket:
             self.endpoint = endpoint.with_port(self._socket.getsockname()[1])
+        elif listening is None:
+            self._socket_file = Path(endpoint.host).stat()
         self._silent: dict[socket.socket, bytes] = {}
         self._timers: dict[socket.socket, asyncio.TimerHandle] = {}
         self._pause: asyncio.TimerHandle | None = None
         self._loop.add_reader(self._socket, self._accept)
 
     def close(self) -> None:
-        """Take no more connections, and close those of which nothing has come. May be repeated."""
+        """Stop listening, and close silent connections. May be repeated."""
         if self._socket.fileno() < 0:
             return
         if self._pause is not None:
@@ -125,28 +130,28 @@ class Listener:
             except OSError as error:
                 if error.errno in (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM):
                     self._loop.remove_reader(self._socket)
-                    self._pause = self._loop.call_later(_PAUSE_S, self._go_on)
-                return  # else it was gone before it was accepted
+                    self._pause = self._loop.call_later(_PAUSE_S, self._resume)
+                return  # otherwise the peer is gone already
             connection.setblocking(False)
             network = _network_of(connection.family, address)
             if self._speaks_first:
                 self._accepted(connection, network)
                 continue
             if len(self._silent) >= MAX_SILENT:
-                other = one_too_many(self._silent)
+                other = connection_to_drop(self._silent)
                 self._forget(other)
                 other.close()
             self._silent[connection] = network
             self._timers[connection] = self._loop.call_later(
-                OPENING_TIMEOUT_S, self._look, connection
+                OPENING_TIMEOUT_S, self._deliver_or_close, connection
             )
-            self._loop.add_reader(connection, self._look, connection)
+            self._loop.add_reader(connection, self._deliver_or_close, connection)
 
-    def _go_on(self) -> None:
+    def _resume(self) -> None:
         self._loop.add_reader(self._socket, self._accept)
 
-    def _look(self, connection: socket.socket) -> None:
-        """Hand a connection over if something has come, else close it."""
+    def _deliver_or_close(self, connection: socket.socket) -> None:
+        """Deliver a connection that has a first byte; else close it."""
         network = self._forget(connection)
         try:
             first = connection.recv(1, socket.MSG_PEEK)
@@ -163,22 +168,19 @@ class Listener:
         return self._silent.pop(connection)
 
 
-def one_too_many(networks: Mapping[_T, bytes]) -> _T:
-    """Return which of some connections is to go: the oldest of the network with the most.
+def connection_to_drop(networks: Mapping[_T, bytes]) -> _T:
+    """Return the connection to drop: the oldest of the network with the most.
 
-    So whoever opens a thousand a second keeps out nobody who needs half a second to say hello.
+    So a network that opens a thousand a second does not lock out a peer with a slow hello.
 
-    Parameters
-    ----------
-    networks : mapping
-        From which network each came, the oldest first.
+    ``networks`` has the network of each connection, the oldest first.
     """
     most, _ = Counter(networks.values()).most_common(1)[0]
     return next(each for each, network in networks.items() if network == most)
 
 
 def _network_of(family: int, address: Any) -> bytes:
-    """Return what one owner has of addresses: a host's own one, or 64 bits of IPv6."""
+    """Return what one operator controls: an IPv4 address, or 64 bits of an IPv6 address."""
     if family == socket.AF_INET:
         return socket.inet_pton(family, address[0])
     if family == socket.AF_INET6:
@@ -188,36 +190,27 @@ def _network_of(family: int, address: Any) -> bytes:
 
 
 def listen(endpoint: Endpoint) -> socket.socket:
-    """Return a socket that listens at an endpoint.
-
-    Raises
-    ------
-    OSError, TransportError
-        If it cannot.
-    """
+    """Return a socket that listens at an endpoint; raise OSError or TransportError otherwise."""
     if endpoint.is_local_socket:
-        # Who has bound and does not listen yet looks as if it had been killed.
+        # Locked, because a socket that is bound and does not listen yet looks abandoned.
         with _locked(Path(endpoint.host).parent, endpoint):
             _remove_stale_socket(endpoint)
             return _listening(socket.socket(socket.AF_UNIX), endpoint.host)
-    # As bytes, for the codec of other letters takes long to load.
+    # As bytes: the codec for international names is slow to import.
     family, *_, address = socket.getaddrinfo(
         endpoint.host.encode(), endpoint.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
     )[0]
     made = socket.socket(family)
-    # A service that is started again may have the port of the one that died.
+    # A restarted service may reuse the port at once.
     made.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     return _listening(made, address)
 
 
 def remove_socket_file(endpoint: Endpoint, made: os.stat_result) -> None:
-    """Remove a local socket's file, unless somebody else listens there meanwhile.
+    """Remove a local socket's file, unless another process listens there now.
 
-    Parameters
-    ----------
-    endpoint : Endpoint
-    made : os.stat_result
-        Of the file as it was made. Its socket is still open, so no other file is taken for it.
+    ``made`` is the file's status when it was made. Its socket is still open, so the inode is not
+    reused.
     """
     path = Path(endpoint.host)
     with contextlib.suppress(OSError):
@@ -237,7 +230,7 @@ def _listening(made: socket.socket, address: Any) -> socket.socket:
 
 @contextlib.contextmanager
 def _locked(directory: Path, endpoint: Endpoint) -> Iterator[None]:
-    """Let nobody else begin to listen in a directory meanwhile; the lock leaves no file behind."""
+    """Lock a directory against other listeners; the lock leaves no file behind."""
     opened = os.open(directory, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         until = time.monotonic() + _LOCK_TIMEOUT_S
@@ -258,13 +251,7 @@ def _locked(directory: Path, endpoint: Endpoint) -> Iterator[None]:
 
 
 def _remove_stale_socket(endpoint: Endpoint) -> None:
-    """Remove what a process has left that was killed.
-
-    Raises
-    ------
-    TransportError
-        If there is something else of that name, or somebody listens there.
-    """
+    """Remove the socket file of a killed process; raise TransportError if it is in use."""
     path = Path(endpoint.host)
     try:
         if not stat.S_ISSOCK(path.lstat().st_mode):
@@ -279,5 +266,5 @@ def _remove_stale_socket(endpoint: Endpoint) -> None:
             path.unlink(missing_ok=True)
             return
         except BlockingIOError:
-            pass  # somebody listens who does not keep up
+            pass  # a listener with a full backlog
     raise TransportError(f"cannot listen on {endpoint}: another process listens there")

@@ -1,10 +1,10 @@
-"""The authority's list of certificates that are valid no more, though their time is not up.
+"""The authority's list of revoked certificates.
 
-It lies beside the credentials as ``revoked.pem`` (an X.509 certificate revocation list), is signed
-by the authority, and need not be there. A robot has the ``ssl`` module look into it in each
-handshake. A service reads the numbers in it, with nothing but the standard library, and looks them
-up as soon as a handshake is complete: so it knows whom it refuses, and ends links that stand. Who
-reads them must have let a handshake check the signature, as ``load_credentials`` does.
+It is an X.509 certificate revocation list, ``revoked.pem`` beside the credentials, signed by the
+authority, and optional. A robot passes it to the ``ssl`` module, which checks it in each handshake.
+A service reads the serial numbers itself and checks them after each handshake, so it knows the name
+of the refused robot, and can end existing links. This needs only the standard library. It is safe
+because ``load_credentials`` has verified the signature in a handshake.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ REVOKED_FILE = "revoked.pem"
 """Name of the list in a directory of credentials."""
 
 _MAX_BYTES = 16 << 20
-"""Of a list: some four hundred thousand certificates."""
+"""Of a list: about 400,000 certificates."""
 
 _BLOCK = re.compile(rb"-----BEGIN ([A-Z0-9 ]+)-----(.*?)-----END \1-----", re.DOTALL)
 
@@ -36,19 +36,19 @@ _INTEGER, _SEQUENCE, _TIMES = 0x02, 0x30, (0x17, 0x18)
 
 
 def refuse_revoked(context: ssl.SSLContext, directory: Path) -> None:
-    """Have handshakes refuse what the list beside some credentials names, if there is one.
+    """Make handshakes refuse the certificates in a directory's list, if there is one.
 
     Raises
     ------
     TransportError
-        If the list cannot be read. Whether the authority has signed it shows in a handshake.
+        If the list cannot be read. Its signature is checked in a handshake.
     """
     import ssl
 
     path = directory / REVOKED_FILE
     if not path.exists():
         return
-    revoked_serials(path)  # above all it is nothing else: a certificate in it would be believed
+    revoked_serials(path)  # checks that the file has no certificate, which would be trusted
     try:
         context.load_verify_locations(cafile=path)
     except (OSError, ssl.SSLError) as error:
@@ -57,12 +57,7 @@ def refuse_revoked(context: ssl.SSLContext, directory: Path) -> None:
 
 
 def revoked_serials(path: Path) -> frozenset[int]:
-    """Return the serial numbers of the certificates in a list; none if there is no such file.
-
-    Parameters
-    ----------
-    path : Path
-        In PEM form.
+    """Return the serial numbers in a list in PEM form; none if there is no such file.
 
     Raises
     ------
@@ -88,14 +83,14 @@ def revoked_serials(path: Path) -> frozenset[int]:
 
 
 def _serials(der: bytes) -> Iterator[int]:
-    """Yield the numbers in a list (RFC 5280, section 5.1)."""
+    """Yield the serial numbers in a list (RFC 5280, section 5.1)."""
     ((tag, whole),) = _values(der)
     _expect(tag, _SEQUENCE)
     tag, signed = next(_values(whole))
     _expect(tag, _SEQUENCE)
     fields = list(_values(signed))
     tags = [tag for tag, _ in fields]
-    # A version, an algorithm and an issuer, then one time or two, then entries if there are any.
+    # Version, algorithm, issuer, one or two times, then the entries if there are any.
     at = next(index for index, tag in enumerate([*tags, _TIMES[0]]) if tag in _TIMES)
     while at < len(fields) and tags[at] in _TIMES:
         at += 1
@@ -108,7 +103,7 @@ def _serials(der: bytes) -> Iterator[int]:
 
 
 def _values(data: bytes) -> Iterator[tuple[int, bytes]]:
-    """Yield the tags and contents of values that stand one after another."""
+    """Yield tags and contents of consecutive DER values."""
     at = 0
     while at < len(data):
         tag, size = data[at], data[at + 1]

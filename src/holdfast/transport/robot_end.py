@@ -1,9 +1,8 @@
-"""The robot's end of streams: a link to each service, and the calls that are on their way on it.
+"""The robot's end: a link to each service, and the calls on it.
 
-A service is there from the moment that its link is, and gone when that ends. Over TLS the robot
-need not wait for the service to say which process it is: the handshake has proved that it is the
-service, and told whether it is the process that the robot knew. So the first question to a service
-that was started again is on its way a round trip sooner.
+A service appears when its link is open, and vanishes when the link ends. Over TLS the robot need
+not wait for the hello: the handshake proves that the peer is the service, and whether it is
+the known process. So the first request to a restarted service leaves one round trip sooner.
 """
 
 from __future__ import annotations
@@ -15,8 +14,8 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from itertools import count
 
-from holdfast.errors import InvalidValueError, TransportError
-from holdfast.session.events import TransportEvent
+from holdfast.errors import FrameError, InvalidValueError, TransportError
+from holdfast.protocol.events import TransportEvent
 from holdfast.transport.calls import CallTable, PendingCall, too_large
 from holdfast.transport.contract import DEFAULT_MAX_MESSAGE_BYTES
 from holdfast.transport.dialer import Dialer
@@ -29,6 +28,7 @@ from holdfast.transport.endpoints import (
     check_endpoint,
     check_name,
 )
+from holdfast.transport.fair_scheduler import FairScheduler
 from holdfast.transport.frames import (
     CALL,
     END,
@@ -36,21 +36,21 @@ from holdfast.transport.frames import (
     LAST,
     REPLY,
     Frame,
-    FrameError,
     Hello,
     encode_hello,
 )
-from holdfast.transport.links import HalfReceived, Link, LinkSettings, receive_buffer
-from holdfast.transport.listener import Listener, one_too_many
+from holdfast.transport.link_settings import LinkSettings, PartialMessageBudget, receive_buffer
+from holdfast.transport.links import Link, LinkOwner
+from holdfast.transport.listener import Listener, connection_to_drop
+from holdfast.transport.schemes import load_scheme
 from holdfast.transport.tls import ClientCredentials, TlsStream
-from holdfast.transport.turns import Turns
 
 __all__ = ["StreamRobotTransport"]
 
 _CALL_NUMBERS = 1 << 32
 
 _PAUSE_S = 0.004
-"""Between turns of services that send more than anybody has asked for: a robot decides, too."""
+"""Between time slices of services that send too much: the robot's own loop comes first."""
 
 _SAYS_NO_HELLO = "closes connections without a hello: it is no holdfast service, or is just ending"
 
@@ -59,12 +59,11 @@ _TAKES_NO_TLS = (
     "holdfast service, or is just ending"
 )
 
-_MAX_UNGREETED = 64
-"""Connections to a robot that listens, of which nobody knows who they are."""
+_MAX_WITHOUT_HELLO = 64
+"""Connections to a listening robot without a hello yet."""
 
-
-_MAX_TOLD_REASONS = 8
-"""So many are not told again; a service may send a new one in each goodbye."""
+_MAX_REPORTED_REASONS = 8
+"""Reasons that are not reported again; bounded, as a service may send a new one each time."""
 
 
 class StreamRobotTransport:
@@ -79,22 +78,22 @@ class StreamRobotTransport:
     incarnation : str
         Of this process.
     lease_ms : float
-        Services give this robot up when nothing comes from it for this long; it lets itself be
-        heard more often. How long a service may be silent, the service says.
+        After this much silence services consider this robot lost. A service's own lease is in its
+        hello.
     max_message_bytes : int
         A larger request is refused here, a larger reply is dropped.
     tls : TlsFiles or None
         The robot's credentials, for ``tls``.
     on_unreachable : callable or None
-        Is told the service and the reason, as the rest of a sentence about it, when it cannot be
-        connected to, refuses this robot or is not what the robot looks for. The last few reasons
-        are not told again until the service is there again.
-    on_closed_to_datagrams : callable or None
-        Is told, once, of a service at ``udp`` to which no datagram gets through, so that the
-        stream carries all.
+        Called with the service and the reason, as the rest of a sentence about it, when it cannot
+        be reached, refuses this robot or is another service. Recent reasons are not repeated until
+        the service has appeared.
+    on_datagrams_blocked : callable or None
+        Called once for a service at ``udp`` to which no datagram gets through, so that everything
+        goes on the stream.
     on_unusable : callable or None
-        Is told why credentials that somebody has replaced cannot be used, so that those of before
-        stay in use.
+        Called with the reason when replaced credentials cannot be used; the previous ones stay in
+        use.
 
     Raises
     ------
@@ -112,7 +111,7 @@ class StreamRobotTransport:
         max_message_bytes: int = DEFAULT_MAX_MESSAGE_BYTES,
         tls: TlsFiles | None = None,
         on_unreachable: Callable[[str, str], None] | None = None,
-        on_closed_to_datagrams: Callable[[str], None] | None = None,
+        on_datagrams_blocked: Callable[[str], None] | None = None,
         on_unusable: Callable[[str], None] | None = None,
     ) -> None:
         if name:
@@ -123,15 +122,15 @@ class StreamRobotTransport:
             partial(encode_hello, "robot", name, incarnation, lease_ms),
             lease_ms,
             max_message_bytes,
-            HalfReceived(2 * (max_message_bytes + HEADER_BYTES)),
-            Turns(_PAUSE_S),
+            PartialMessageBudget(2 * (max_message_bytes + HEADER_BYTES)),
+            FairScheduler(_PAUSE_S),
             receive_buffer(),
-            must_read=False,
+            pauses_for_readers=False,
         )
         self.calls = CallTable()
         self.on_unreachable = on_unreachable
-        self.on_closed_to_datagrams = on_closed_to_datagrams
-        self._services: dict[str, _Service] = {}
+        self.on_datagrams_blocked = on_datagrams_blocked
+        self._services: dict[str, _ServiceLinks] = {}
         credentials: ClientCredentials | None = None
         for service, address in services.items():
             endpoint = check_endpoint(address.endpoint, listens=address.listens)
@@ -141,12 +140,8 @@ class StreamRobotTransport:
                 check_name("name of a service", address.name)
             if credentials is None and tls is not None and endpoint.is_encrypted:
                 credentials = ClientCredentials(tls, on_unusable)
-            if endpoint.protocol == "udp":
-                from holdfast.transport.sealing import require_cryptography
-
-                require_cryptography()
             own = credentials if endpoint.is_encrypted else None
-            self._services[service] = _Service(self, service, address, endpoint, own)
+            self._services[service] = _ServiceLinks(self, service, address, endpoint, own)
         self._started = False
         self._closed = False
 
@@ -156,7 +151,7 @@ class StreamRobotTransport:
         return link is not None and link.sends_datagrams
 
     def start(self, deliver: Callable[[TransportEvent], None]) -> None:
-        """Begin to connect, and to deliver events; returns at once, connected or not.
+        """Begin to connect and to deliver events; returns at once.
 
         Raises
         ------
@@ -191,7 +186,7 @@ class StreamRobotTransport:
         loop.call_soon(self.calls.ended, pending)
 
     def abandon(self, call: int) -> None:
-        """Give a call up: nothing more of it is delivered, not even its end."""
+        """Abandon a call: nothing more of it is delivered, not even its end."""
         pending = self.calls.abandon(call)
         if pending is not None:
             for service in self._services.values():
@@ -208,7 +203,7 @@ class StreamRobotTransport:
         self.calls.close()
         return [closing for service in self._services.values() for closing in service.stop()]
 
-    def _service(self, service: str) -> _Service:
+    def _service(self, service: str) -> _ServiceLinks:
         try:
             return self._services[service]
         except KeyError:
@@ -217,8 +212,8 @@ class StreamRobotTransport:
             ) from None
 
 
-class _Service:
-    """One service, as a robot sees it: the owner of its links.
+class _ServiceLinks(LinkOwner):
+    """The links to one service, and the calls on them.
 
     Attributes
     ----------
@@ -238,27 +233,28 @@ class _Service:
         self._name = name
         self._address = address
         self._credentials = credentials
+        self._scheme = load_scheme(endpoint.protocol)
         self._listener: Listener | None = None
         self._dialer: Dialer | None = None
-        # Those over which it is seen, with the boot that was told, the newest last. There are
-        # several only where the robot listens.
+        # The links with a known process, with the incarnation that was reported, the newest last.
+        # There are several only where the robot listens.
         self._links: dict[Link, str] = {}
-        # One with its boot that waits until what the process before it owes has come.
+        # A link to the next process, while the current one still owes replies; and its incarnation.
         self._successor: tuple[Link, str] | None = None
-        # Whether, since the one that is called has said goodbye, nobody else was found.
-        self._found_no_other = False
-        # In the order of their beginning, with the network from which each came.
+        # Whether the current process has said goodbye and no other was found.
+        self._has_no_successor = False
+        # All links, the oldest first, with the network from which each came.
         self._made: dict[Link, bytes] = {}
         self._calls: dict[Link, dict[int, PendingCall]] = {}
         self._numbers = count()
-        # What the last hello said, under which boot that was told, and whether the handshake alone
-        # is believed: not after one to which no hello came, or a refusal.
+        # From the last hello, and the name under which that process was reported.
         self._incarnation: str | None = None
-        self._boot = ""
+        self._reported = ""
+        # Whether a TLS handshake is enough to report a process, before its hello.
         self._handshake_is_enough = False
         self._early = count(1)
-        self._told_reasons: deque[str] = deque(maxlen=_MAX_TOLD_REASONS)
-        self._told_closed = False
+        self._reported_reasons: deque[str] = deque(maxlen=_MAX_REPORTED_REASONS)
+        self._reported_blocked = False
         self._stopped = False
         self.endpoint = endpoint
 
@@ -275,7 +271,11 @@ class _Service:
             )
         else:
             self._dialer = Dialer(
-                self.endpoint, self._make_link, self._found_nobody, self._robot.identity
+                self.endpoint,
+                self._scheme,
+                self._make_link,
+                self._all_failed,
+                self._robot.identity,
             )
             self._dialer.start()
 
@@ -291,15 +291,15 @@ class _Service:
         return [link.closed for link in links]
 
     def link_for_call(self) -> Link | None:
-        """Return the link for a new call.
+        """Return the link for a new call: the successor's, if there is one.
 
-        Who asks anew has what it asked for before, or does not want it any more.
+        A robot that makes a new call has abandoned the previous one or has its answer.
         """
         if self._successor is None:
             return self.current
-        # In a later turn, for nothing is delivered from here. Then the call is asked again, with
-        # what the other process does not know.
-        asyncio.get_running_loop().call_soon(self._move_on)
+        # In a later turn, because nothing is delivered from here. The robot then repeats the call
+        # with the state that the new process lacks.
+        asyncio.get_running_loop().call_soon(self._switch)
         return self._successor[0]
 
     def send(self, link: Link, pending: PendingCall, payload: bytes) -> None:
@@ -308,7 +308,6 @@ class _Service:
         link.send_message(CALL, number, payload)
 
     def forget(self, pending: PendingCall) -> None:
-        """Take note that nobody wants to hear more of a call."""
         link = pending.peer
         if isinstance(link, Link):
             for number, call in list(self._calls.get(link, {}).items()):
@@ -316,7 +315,7 @@ class _Service:
                     del self._calls[link][number]
                     link.forget(number)
             if link.said_goodbye and self._successor is not None:
-                asyncio.get_running_loop().call_soon(self._move_on_if_free)
+                asyncio.get_running_loop().call_soon(self._switch_if_free)
 
     # -- links -----------------------------------------------------------------------------------
 
@@ -325,23 +324,14 @@ class _Service:
         if self._credentials is not None:
             host = None if self._address.listens else self.endpoint.host
             tls = TlsStream(self._credentials.context(), host, self._incarnation)
-        link: Link
-        if self.endpoint.protocol == "udp":
-            from holdfast.transport.datagrams import RobotDatagramLink
-
-            assert tls is not None
-            link = RobotDatagramLink(self, self._robot.settings, tls=tls)
-        elif self.endpoint.is_ros1:
-            from holdfast.transport.ros1 import RobotRosLink
-
-            link = RobotRosLink(self, self._robot.settings, self.endpoint)
-        else:
-            link = Link(
-                self,
-                self._robot.settings,
-                speaks_first=tls is not None or not self._address.listens,
-                tls=tls,
-            )
+        link = self._scheme.make_link(
+            self,
+            self._robot.settings,
+            self.endpoint,
+            tls,
+            role="robot",
+            dialled=not self._address.listens,
+        )
         self._made[link] = network
         return link
 
@@ -351,22 +341,20 @@ class _Service:
             for link, its_network in self._made.items()
             if link.hello is None and not link.ended
         }
-        if len(unknown) >= _MAX_UNGREETED:
-            one_too_many(unknown).end("has said no hello, and others wait", abort=True)
+        if len(unknown) >= _MAX_WITHOUT_HELLO:
+            connection_to_drop(unknown).end("has said no hello, and others wait", abort=True)
         link = self._make_link(network)
         link.connecting = asyncio.get_running_loop().create_task(link.connect(connection))
 
-    def established(self, link: Link) -> None:
-        """Take note that the other end has proved to be a service."""
+    def on_handshake(self, link: Link) -> None:
         if not self._handshake_is_enough or self._address.listens or self._links:
             return
         assert link.tls is not None
         same = link.tls.is_known_incarnation
-        # What the process is called is not known yet: whatever it is, it is another one.
-        self._appeared(link, self._boot if same else f"not-named-yet-{next(self._early)}")
+        # The incarnation is not known yet, only that it is another one.
+        self._appeared(link, self._reported if same else f"not-named-yet-{next(self._early)}")
 
     def refusal(self, link: Link, hello: Hello) -> str | None:
-        """Refuse whoever is not the service that is looked for."""
         del link
         if hello.role != "service":
             return "is a robot, and a service was expected"
@@ -375,52 +363,52 @@ class _Service:
             return f"is the service {hello.name}, and {wanted} was expected"
         return None
 
-    def greeted(self, link: Link, hello: Hello) -> None:
-        """Take note of what the other end says of itself."""
-        boot = self._links.get(link)
-        if boot is None:
-            boot = self._boot if hello.incarnation == self._incarnation else hello.incarnation
-        self._incarnation, self._boot = hello.incarnation, boot
+    def on_hello(self, link: Link, hello: Hello) -> None:
+        incarnation = self._links.get(link)
+        if incarnation is None:
+            is_known = hello.incarnation == self._incarnation
+            incarnation = self._reported if is_known else hello.incarnation
+        self._incarnation, self._reported = hello.incarnation, incarnation
         self._handshake_is_enough = True
-        self._told_reasons.clear()
+        self._reported_reasons.clear()
         if self._dialer is not None:
             self._dialer.succeeded()
         before = self.current
         if link not in self._links and before is not None and before.said_goodbye:
             self._calls[link] = {}
-            self._successor = link, boot
+            self._successor = link, incarnation
             if self._dialer is not None:
-                self._dialer.won(link)
-            self._move_on_if_free()
+                self._dialer.selected(link)
+            self._switch_if_free()
             return
         if link not in self._links:
-            self._appeared(link, boot)
-        self._replace_others(link, boot)
+            self._appeared(link, incarnation)
+        self._replace_others(link, incarnation)
 
-    def _appeared(self, link: Link, boot: str) -> None:
-        is_news = boot not in self._links.values()
-        self._links[link] = boot
+    def _appeared(self, link: Link, incarnation: str) -> None:
+        is_news = incarnation not in self._links.values()
+        self._links[link] = incarnation
         self._calls.setdefault(link, {})
-        self._found_no_other = False
+        self._has_no_successor = False
         if self._dialer is not None:
-            self._dialer.won(link)
+            self._dialer.selected(link)
         if is_news:
-            self._robot.calls.appeared(self._name, boot)
+            self._robot.calls.appeared(self._name, incarnation)
 
-    def _replace_others(self, by: Link, boot: str) -> None:
-        """End the links that go on without a stream or are about to end: there is a better one.
+    def _replace_others(self, by: Link, incarnation: str) -> None:
+        """End links without a stream or with a goodbye: there is a better one.
 
-        Those to the same process first hear the answers that are on their way.
+        Links to the same process first get the replies that are on their way.
         """
-        for link, its_boot in list(self._links.items()):
-            ending = link is not by and (link.adrift or link.said_goodbye)
-            if ending and (its_boot != boot or not self._calls[link]):
+        for link, its_incarnation in list(self._links.items()):
+            ending = link is not by and (link.without_stream or link.said_goodbye)
+            if ending and (its_incarnation != incarnation or not self._calls[link]):
                 link.end("", goodbye="")
 
-    # -- a process that is about to end ----------------------------------------------------------
+    # -- a draining process ----------------------------------------------------------------------
 
-    def leaving(self, link: Link) -> None:
-        """Look for another process, while this one still answers."""
+    def on_goodbye(self, link: Link) -> None:
+        """Look for another process, while this one still replies."""
         if self._dialer is not None and link is self.current and not self._stopped:
             self._dialer.start()
         else:
@@ -430,39 +418,38 @@ class _Service:
         if not self._calls.get(link):
             link.end("", goodbye="")
 
-    def _found_nobody(self, reason: str) -> None:
-        """Take note that nobody is at any of the service's addresses."""
+    def _all_failed(self, reason: str) -> None:
+        """Note that no address of the service has accepted a connection."""
         current = self.current
         if current is not None and current.said_goodbye:
-            # Other services can be asked, as soon as this one owes nothing.
-            self._found_no_other = True
+            # Once this process owes nothing, the robot can use other services.
+            self._has_no_successor = True
             self._leave(current)
         else:
-            self._tell_unreachable(reason)
+            self._report_unreachable(reason)
 
-    def _move_on_if_free(self) -> None:
-        """Go over to the next process if the one before owes nothing."""
+    def _switch_if_free(self) -> None:
+        """Switch to the successor if the current process owes no replies."""
         current = self.current
         if current is None or not self._calls.get(current):
-            self._move_on()
+            self._switch()
 
-    def _move_on(self) -> None:
+    def _switch(self) -> None:
         successor, self._successor = self._successor, None
         if successor is not None and not self._stopped:
             self._appeared(*successor)
             self._replace_others(*successor)
 
-    def received(self, link: Link, frame: Frame) -> None:
-        """Take a reply, or the end of a call."""
+    def on_frame(self, link: Link, frame: Frame) -> None:
         calls = self._calls.get(link)
         if calls is None:
-            raise FrameError("answers before it has been asked")
+            raise FrameError("replies before it has a request")
         if frame.kind not in (REPLY, LAST, END):
             raise FrameError(f"is a service and sends a frame of kind {frame.kind}")
         call = calls.get(frame.call)
         if call is None:
             return  # it has ended
-        if frame.kind != END and not frame.passed_over_bytes:
+        if frame.kind != END and not frame.skipped_bytes:
             link.has_answered = True
             self._robot.calls.replied(call, frame.payload)
         if frame.kind != REPLY:
@@ -471,27 +458,24 @@ class _Service:
             if calls:
                 return
             if link.said_goodbye and self._successor is not None:
-                self._move_on_if_free()
-            elif (link.adrift and link is not self.current) or (
-                link.said_goodbye and (self._dialer is None or self._found_no_other)
+                self._switch_if_free()
+            elif (link.without_stream and link is not self.current) or (
+                link.said_goodbye and (self._dialer is None or self._has_no_successor)
             ):
                 link.end("", goodbye="")
 
-    def went_adrift(self, link: Link) -> None:
-        """Make another link, while this one goes on."""
+    def on_stream_lost(self, link: Link) -> None:
         if self._dialer is not None and not self._stopped and link is self.current:
             self._dialer.start()
 
-    def closed_to_datagrams(self, link: Link) -> None:
-        """Tell that no datagram gets through, once."""
+    def on_datagrams_blocked(self, link: Link) -> None:
         del link
-        on_closed = self._robot.on_closed_to_datagrams
-        if on_closed is not None and not self._told_closed:
-            self._told_closed = True
-            on_closed(self._name)
+        on_blocked = self._robot.on_datagrams_blocked
+        if on_blocked is not None and not self._reported_blocked:
+            self._reported_blocked = True
+            on_blocked(self._name)
 
-    def lost(self, link: Link) -> None:
-        """Take note that a link has ended."""
+    def on_ended(self, link: Link) -> None:
         self._made.pop(link, None)
         self._calls.pop(link, None)
         if self._successor is not None:
@@ -501,10 +485,10 @@ class _Service:
                     self._dialer.ended(link)
                     self._dialer.start(refused=link.refused)
                 return
-            self._move_on_if_free()
+            self._switch_if_free()
         was_current = next(reversed(self._links), None) is link
-        boot = self._links.pop(link, None)
-        if link.refused or (link.hello is None and boot is not None):
+        incarnation = self._links.pop(link, None)
+        if link.refused or (link.hello is None and incarnation is not None):
             self._handshake_is_enough = False
         dialer = self._dialer
         if dialer is not None:
@@ -512,23 +496,25 @@ class _Service:
         if self._stopped:
             return
         if link.refused:
-            self._tell_unreachable(link.reason)
+            self._report_unreachable(link.reason)
         elif link.hello is None and dialer is not None and not self._links:
             takes_tls = link.tls is None or link.tls.established
-            self._tell_unreachable(link.reason or (_SAYS_NO_HELLO if takes_tls else _TAKES_NO_TLS))
-        if boot is not None and boot in self._links.values():
-            self._robot.calls.lost(link)  # it goes on over another link
-        elif boot is not None:
-            self._robot.calls.vanished(self._name, boot, link)
+            self._report_unreachable(
+                link.reason or (_SAYS_NO_HELLO if takes_tls else _TAKES_NO_TLS)
+            )
+        if incarnation is not None and incarnation in self._links.values():
+            self._robot.calls.peer_lost(link)  # another link to the same process remains
+        elif incarnation is not None:
+            self._robot.calls.vanished(self._name, incarnation, link)
             older = next(reversed(self._links), None)
             if older is not None and was_current:
-                # An older one is still there: from now on it is the one that is called.
+                # An older link is open; from now on it is the current one.
                 self._robot.calls.appeared(self._name, self._links[older])
-        if dialer is not None and not self._links and (boot is not None or link.refused):
+        if dialer is not None and not self._links and (incarnation is not None or link.refused):
             dialer.start(refused=link.refused)
 
-    def _tell_unreachable(self, reason: str) -> None:
+    def _report_unreachable(self, reason: str) -> None:
         on_unreachable = self._robot.on_unreachable
-        if on_unreachable is not None and reason not in self._told_reasons:
-            self._told_reasons.append(reason)
+        if on_unreachable is not None and reason not in self._reported_reasons:
+            self._reported_reasons.append(reason)
             on_unreachable(self._name, reason)

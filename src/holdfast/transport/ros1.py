@@ -1,30 +1,33 @@
-"""Links over ROS 1: the same frames as over TCP, as requests to a service that the master lists.
+"""Links over ROS 1: the same frames as over TCP, as calls of a service that the master lists.
 
-ROS 1's services have one answer to each request, in order, and a service cannot speak unasked. So a
-robot always has at least one request there that is not answered: a question goes as one more
-request, and the answer to it comes in answer to the older one. That is one round trip, as over TCP,
-and the service can say at any time that it lives. Everything above that is the streams' own: calls,
-leases, goodbyes.
+A ROS 1 service sends one response to each request, in order, and cannot send unasked. So a robot
+always keeps at least one request pending there: a new call goes as one more request, and its reply
+comes in the response to an older one. A call then takes one round trip, as over TCP, and the
+service can send a ping at any time. Calls, leases and goodbyes are those of every link.
 
-The master is needed to find a service that nobody has found before. While there is none, a robot
-looks where the service was last.
+The master is only needed to find a service the first time. Without a master, a robot tries the last
+known address.
 """
 
 from __future__ import annotations
 
 import asyncio
+import socket
 import struct
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, ClassVar, Final
 
-from holdfast.errors import TransportError
+from holdfast.errors import CallError, GoneError, TransportError
 from holdfast.transport.endpoints import Endpoint
-from holdfast.transport.links import Link, LinkOwner, LinkSettings
-from holdfast.transport.ros1_calls import CallError, GoneError, call
+from holdfast.transport.frames import Role
+from holdfast.transport.link_settings import LinkSettings
+from holdfast.transport.links import Link, LinkOwner
+from holdfast.transport.ros1_calls import call
+from holdfast.transport.schemes import Scheme
 from holdfast.transport.tcpros import (
     ANY_TYPE,
     MAX_HEADER_BYTES,
+    RosEnvironment,
     ServiceType,
-    Surroundings,
     decode_header,
     encode_header,
     header_of_service,
@@ -35,27 +38,24 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     from holdfast.transport.ros1_node import RosNode
+    from holdfast.transport.tls import TlsStream
 
 __all__ = [
     "EXCHANGE",
-    "RobotRosLink",
-    "ServiceRosLink",
+    "RosScheme",
     "exchange_name",
-    "look_up",
-    "make_node",
-    "place_to_listen",
 ]
 
 EXCHANGE: Final = ServiceType("holdfast_interfaces/Exchange", "07ca5999d9d671038b26b777e731c7f0")
 """The service's type, ``interfaces/srv/Exchange.srv``."""
 
 _LOOKUP_S: Final = 2.0
-_MAX_HELD: Final = 2
-"""Requests that a service leaves unanswered while it has nothing to say."""
+_MAX_PENDING: Final = 2
+"""Requests that a service keeps pending while it has nothing to send."""
 
 _COUNT = struct.Struct("<I")
 _REQUEST = struct.Struct("<II")
-_ANSWER = struct.Struct("<BII")
+_RESPONSE = struct.Struct("<BII")
 _REFUSAL_BYTES: Final = 5
 
 
@@ -64,53 +64,7 @@ def exchange_name(endpoint: Endpoint) -> str:
 
     ``NAME`` itself is the typed service, so that one process can offer both.
     """
-    return Surroundings.of().resolved(f"{endpoint.host}/exchange")
-
-
-def place_to_listen() -> Endpoint:
-    """Return where a service listens, at a port that is free."""
-    return Endpoint("tcp", Surroundings.of().bind, 0)
-
-
-def look_up(endpoint: Endpoint) -> tuple[str, int]:
-    """Ask the master where a service is; on a thread of its own, for two seconds at most.
-
-    Raises
-    ------
-    TransportError
-        If that is not known; the message says why.
-    """
-    master = Surroundings.of().master
-    loop = asyncio.new_event_loop()
-    try:
-        asked = call(master, "lookupService", exchange_name(endpoint), within_s=_LOOKUP_S)
-        return place_of_service(loop.run_until_complete(asked))
-    except GoneError:
-        raise TransportError(f"there is no ROS master at {master}") from None
-    except CallError as error:
-        raise TransportError(f"the ROS master does not say where it is: {error}") from error
-    finally:
-        loop.close()
-
-
-def make_node(
-    ports: Mapping[Endpoint, int],
-    on_event: Callable[..., None] | None,
-    on_shutdown: Callable[[str], None] | None,
-) -> RosNode:
-    """Return a node that says where the services behind some endpoints listen."""
-    from holdfast.transport.ros1_node import RosNode
-
-    first = next(iter(ports))
-    node = RosNode(
-        _node_of(exchange_name(first)),
-        Surroundings.of(),
-        on_event=on_event,
-        on_shutdown=on_shutdown,
-    )
-    for endpoint, port in ports.items():
-        node.offer_at(exchange_name(endpoint), port)
-    return node
+    return RosEnvironment.of().resolved(f"{endpoint.host}/exchange")
 
 
 def _node_of(service: str) -> str:
@@ -119,27 +73,26 @@ def _node_of(service: str) -> str:
 
 
 class _Stream(asyncio.Transport, asyncio.Protocol):
-    """A connection of ROS 1 that is a stream to a link: a protocol below, a transport above."""
+    """Makes a ROS 1 connection a stream: asyncio's protocol, and the link's transport."""
 
     def __init__(self, link: Link) -> None:
         super().__init__()
         self._link = link
         self._loop = asyncio.get_running_loop()
         self._below: asyncio.Transport | None = None
-        self._is_open = False  # the other end's header has come
-        # Of what has come, what is not read yet; from its front bytes go without a copy.
+        self._is_open = False  # the peer's connection header has arrived
         self._raw = bytearray()
         self._is_refused = False
-        self._left = 0  # bytes of the link's that are still to come in this message
-        self._inbox = bytearray()  # bytes for the link
+        self._left = 0  # payload bytes of this message that have not arrived
+        self._inbox = bytearray()  # payload bytes for the link
         self._is_paused = self._is_delivering = False
 
-    # -- what asyncio tells ------------------------------------------------------------------------
+    # -- callbacks of asyncio --------------------------------------------------------------------
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         assert isinstance(transport, asyncio.Transport)
         self._below = transport
-        self._greet()
+        self._send_header()
         self._link.connection_made(self)
 
     def data_received(self, data: bytes) -> None:
@@ -166,7 +119,7 @@ class _Stream(asyncio.Transport, asyncio.Protocol):
         self._below = None
         self._link.connection_lost(exc)
 
-    # -- what the link sees ------------------------------------------------------------------------
+    # -- the transport of the link ---------------------------------------------------------------
 
     def get_extra_info(self, name: str, default: Any = None) -> Any:
         return default if self._below is None else self._below.get_extra_info(name, default)
@@ -186,9 +139,6 @@ class _Stream(asyncio.Transport, asyncio.Protocol):
         if self._inbox and not self._is_delivering:
             self._loop.call_soon(self._deliver)
 
-    def is_closing(self) -> bool:
-        return self._below is None or self._below.is_closing()
-
     def close(self) -> None:
         if self._below is not None:
             self._below.close()
@@ -197,29 +147,23 @@ class _Stream(asyncio.Transport, asyncio.Protocol):
         if self._below is not None:
             self._below.abort()
 
-    # -- both directions ---------------------------------------------------------------------------
+    # -- messages --------------------------------------------------------------------------------
 
-    def _greet(self) -> None:
-        """Say what comes first, if anything does."""
+    def _send_header(self) -> None:
+        """Send the connection header, if this end sends first."""
 
     def _take_header(self, fields: dict[str, str]) -> None:
         raise NotImplementedError
 
     def _read_head(self) -> bool:
-        """Read what stands before a message's bytes; return whether it was there."""
+        """Read a message's header; return whether it was complete."""
         raise NotImplementedError
 
     def _message_ended(self, *, is_empty: bool) -> None:
-        """Take note that a whole message has come.
-
-        Raises
-        ------
-        TransportError
-            If it may not.
-        """
+        """Handle the end of a message; raise TransportError if it is not allowed."""
 
     def _read(self) -> bool:
-        """Read a part of what has come; return whether there may be more."""
+        """Read the next part of the received bytes; return whether there may be more."""
         if not self._is_open:
             if len(self._raw) < _COUNT.size:
                 return False
@@ -255,7 +199,7 @@ class _Stream(asyncio.Transport, asyncio.Protocol):
             self._message_ended(is_empty=True)
 
     def _deliver(self) -> None:
-        """Hand over to the link what it will take."""
+        """Pass payload bytes to the link until it pauses."""
         if self._is_delivering:
             return
         self._is_delivering = True
@@ -271,20 +215,20 @@ class _Stream(asyncio.Transport, asyncio.Protocol):
 
 
 class _RobotStream(_Stream):
-    """The robot's end: it sends requests, and always has one there that waits."""
+    """The robot's end: it sends requests, and always keeps one pending."""
 
     def __init__(self, link: Link, service: str) -> None:
         super().__init__(link)
         self._service = service
-        self._unanswered = 0
+        self._num_pending = 0
 
     def write(self, data: bytes | bytearray | memoryview) -> None:
         if self._below is not None:
-            self._unanswered += 1
+            self._num_pending += 1
             size = len(data)
             self._below.write(_REQUEST.pack(size + _COUNT.size, size) + bytes(data))
 
-    def _greet(self) -> None:
+    def _send_header(self) -> None:
         assert self._below is not None
         fields = {
             "callerid": "/holdfast_robot",
@@ -293,7 +237,7 @@ class _RobotStream(_Stream):
             "type": EXCHANGE.name,
             "persistent": "1",
         }
-        # Requests follow at once: if the service refuses them, it says so.
+        # Requests follow without waiting for the service's header.
         self._below.write(encode_header(fields))
 
     def _take_header(self, fields: dict[str, str]) -> None:
@@ -305,25 +249,25 @@ class _RobotStream(_Stream):
             raise TransportError(
                 f"has no answer: {self._raw[_REFUSAL_BYTES:500].decode(errors='replace')}"
             )
-        if len(self._raw) < _ANSWER.size:
+        if len(self._raw) < _RESPONSE.size:
             return False
-        _, size, count = _ANSWER.unpack_from(self._raw)
-        if not self._unanswered:
-            raise TransportError("answers what was not asked")
-        self._unanswered -= 1
-        if not self._unanswered:
+        _, size, count = _RESPONSE.unpack_from(self._raw)
+        if not self._num_pending:
+            raise TransportError("replies without a request")
+        self._num_pending -= 1
+        if not self._num_pending:
             self.write(b"")
-        self._begin_message(_ANSWER, size, count)
+        self._begin_message(_RESPONSE, size, count)
         return True
 
 
 class _ServiceStream(_Stream):
-    """The service's end: what it has to say waits for a request that it can answer."""
+    """The service's end: bytes to send wait for a request to which they can be the response."""
 
     def __init__(self, link: Link, service: str) -> None:
         super().__init__(link)
         self._service = service
-        self._held = 0
+        self._num_pending = 0
         self._outbox = bytearray()
         self._closes = False
 
@@ -335,23 +279,23 @@ class _ServiceStream(_Stream):
         return super().get_write_buffer_size() + len(self._outbox)
 
     def close(self) -> None:
-        # What is still to be said waits for a request, for as long as the link lets it.
+        # Unsent bytes wait for a request until the link aborts.
         self._closes = True
         if not self._outbox:
             super().close()
 
     def _flush(self) -> None:
-        if self._below is None or not self._held or not self._outbox:
+        if self._below is None or not self._num_pending or not self._outbox:
             return
-        self._answer(bytes(self._outbox))
+        self._respond(bytes(self._outbox))
         self._outbox.clear()
         if self._closes:
             super().close()
 
-    def _answer(self, data: bytes) -> None:
+    def _respond(self, data: bytes) -> None:
         assert self._below is not None
-        self._held -= 1
-        self._below.write(_ANSWER.pack(1, len(data) + _COUNT.size, len(data)) + data)
+        self._num_pending -= 1
+        self._below.write(_RESPONSE.pack(1, len(data) + _COUNT.size, len(data)) + data)
 
     def _take_header(self, fields: dict[str, str]) -> None:
         reason = None
@@ -377,34 +321,102 @@ class _ServiceStream(_Stream):
         return True
 
     def _message_ended(self, *, is_empty: bool) -> None:
-        # A robot sends one without bytes only when none waits.
-        if is_empty and self._held >= _MAX_HELD:
-            raise TransportError(f"sends requests without bytes while {_MAX_HELD} wait")
-        self._held += 1
+        # A robot sends an empty request only when none is pending.
+        if is_empty and self._num_pending >= _MAX_PENDING:
+            raise TransportError(f"sends requests without bytes while {_MAX_PENDING} wait")
+        self._num_pending += 1
         self._flush()
-        if self._held > _MAX_HELD and self._below is not None:
-            self._answer(b"")
+        if self._num_pending > _MAX_PENDING and self._below is not None:
+            self._respond(b"")
 
 
-class RobotRosLink(Link):
-    """The robot's end of a link over ROS 1."""
+class _RosLink(Link):
+    """A link whose stream is a ROS 1 connection."""
 
-    def __init__(self, owner: LinkOwner, settings: LinkSettings, endpoint: Endpoint) -> None:
-        super().__init__(owner, settings, speaks_first=True)
+    def __init__(
+        self, owner: LinkOwner, settings: LinkSettings, endpoint: Endpoint, role: Role
+    ) -> None:
+        super().__init__(owner, settings, speaks_first=role == "robot")
+        self._stream = _RobotStream if role == "robot" else _ServiceStream
         self._service = exchange_name(endpoint)
 
     def protocol(self) -> asyncio.BaseProtocol:
-        """Return what asyncio is to connect."""
-        return _RobotStream(self, self._service)
+        return self._stream(self, self._service)
 
 
-class ServiceRosLink(Link):
-    """The service's end of a link over ROS 1."""
+class RosScheme(Scheme):
+    """``ros1``: a service of ROS 1, found through the master."""
 
-    def __init__(self, owner: LinkOwner, settings: LinkSettings, endpoint: Endpoint) -> None:
-        super().__init__(owner, settings, speaks_first=False)
-        self._service = exchange_name(endpoint)
+    lookup_interval_s: ClassVar[float] = 0.1
 
-    def protocol(self) -> asyncio.BaseProtocol:
-        """Return what asyncio is to connect."""
-        return _ServiceStream(self, self._service)
+    def __init__(self) -> None:
+        self._node: RosNode | None = None
+
+    def make_link(
+        self,
+        owner: LinkOwner,
+        settings: LinkSettings,
+        endpoint: Endpoint,
+        tls: TlsStream | None,
+        *,
+        role: Role,
+        dialled: bool,
+    ) -> Link:
+        """Make the link of a new connection."""
+        del tls, dialled
+        return _RosLink(owner, settings, endpoint, role)
+
+    def look_up(self, endpoint: Endpoint) -> tuple[str, int, socket.AddressFamily]:
+        """Ask the master where a service is; takes at most two seconds.
+
+        Raises
+        ------
+        TransportError
+            If that is not known; the message gives the reason.
+        """
+        master = RosEnvironment.of().master
+        loop = asyncio.new_event_loop()
+        try:
+            lookup = call(master, "lookupService", exchange_name(endpoint), within_s=_LOOKUP_S)
+            return *place_of_service(loop.run_until_complete(lookup)), socket.AF_INET
+        except GoneError:
+            raise TransportError(f"there is no ROS master at {master}") from None
+        except CallError as error:
+            raise TransportError(f"the ROS master does not say where it is: {error}") from error
+        finally:
+            loop.close()
+
+    def listening_endpoint(self, endpoint: Endpoint) -> Endpoint:
+        """Return the address of this machine in ROS, with any free port."""
+        del endpoint
+        return Endpoint("tcp", RosEnvironment.of().bind, 0)
+
+    def bound_endpoint(self, endpoint: Endpoint, listening: Endpoint) -> Endpoint:
+        """Return the endpoint unchanged: the master knows the port."""
+        del listening
+        return endpoint
+
+    async def announce(
+        self,
+        ports: Mapping[Endpoint, int],
+        on_event: Callable[..., None] | None,
+        on_shutdown: Callable[[str], None] | None,
+    ) -> None:
+        """Start a node that registers the endpoints with the master."""
+        from holdfast.transport.ros1_node import RosNode
+
+        self._node = RosNode(
+            _node_of(exchange_name(next(iter(ports)))),
+            RosEnvironment.of(),
+            on_event=on_event,
+            on_shutdown=on_shutdown,
+        )
+        for endpoint, port in ports.items():
+            self._node.offer_at(exchange_name(endpoint), port)
+        await self._node.start()
+
+    async def withdraw(self, timeout_s: float) -> None:
+        """Unregister from the master, within this time."""
+        node, self._node = self._node, None
+        if node is not None:
+            await node.close(timeout_s)

@@ -1,9 +1,9 @@
-"""Questions to ROS 1 masters, nodes and services that never take longer than they may.
+"""XML-RPC calls to ROS 1 masters and nodes, with deadlines.
 
-The standard library's XML-RPC client has no deadline of its own and answers one question at a time.
-Here a question is a coroutine: a hundred nodes are asked at once, and who has not answered in time
-is told from who is not there. That difference matters: a node whose port refuses connections is
-dead, one that is silent may be stopped, far away or slow.
+The standard library's XML-RPC client has no deadline of its own and makes one call at a time. Here
+a call is a coroutine, so a hundred nodes are called at once, and a timeout differs from a refused
+connection: a node whose port refuses connections is dead, a silent one may be stopped, far away or
+slow.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any, Final, NamedTuple, Self
 from urllib.parse import urlsplit
 
-from holdfast.errors import HoldfastError, TransportError
+from holdfast.errors import CallError, GoneError, SilentError, TransportError
 from holdfast.transport.endpoints import host_and_port
 from holdfast.transport.tcpros import (
     ANY_TYPE,
@@ -28,45 +28,30 @@ from holdfast.transport.tcpros import (
 
 __all__ = [
     "CALLER",
-    "CallError",
     "Connection",
-    "GoneError",
     "HttpHead",
-    "SilentError",
     "call",
     "message",
     "offers_service",
 ]
 
 CALLER: Final = "/holdfast"
-"""As whom is asked where no node asks."""
+"""Name of the caller where no node calls."""
 
-_MAX_ANSWER_BYTES: Final = 256 * 1024 * 1024
-
-
-class CallError(HoldfastError):
-    """No usable answer came."""
-
-
-class SilentError(CallError):
-    """No answer came in time."""
-
-
-class GoneError(CallError):
-    """Nobody listens there, so whoever did has ended."""
+_MAX_RESPONSE_BYTES: Final = 256 * 1024 * 1024
 
 
 class HttpHead(NamedTuple):
-    """How a request or an answer of HTTP begins.
+    """The head of an HTTP request or response.
 
     Attributes
     ----------
     line : str
         The first one.
     size : int
-        Of the content, in bytes; -1 if that is not said.
+        Of the content, in bytes; -1 if not given.
     ends : bool
-        Whether the connection ends after it.
+        Whether the connection ends after this message.
     """
 
     line: str
@@ -75,15 +60,7 @@ class HttpHead(NamedTuple):
 
     @classmethod
     async def read(cls, reader: asyncio.StreamReader) -> Self:
-        """Read one.
-
-        Raises
-        ------
-        ValueError
-            If the size is no number.
-        EOFError, OSError, asyncio.LimitOverrunError
-            If none comes.
-        """
+        """Read a head; raise ValueError if the size is no number, or as ``readuntil`` does."""
         line, *lines = (await reader.readuntil(b"\r\n\r\n")).decode("latin-1").split("\r\n")
         fields = {}
         for each in lines:
@@ -94,21 +71,14 @@ class HttpHead(NamedTuple):
 
 
 async def message(reader: asyncio.StreamReader, max_bytes: int, begun: bytes = b"") -> bytes:
-    """Read what comes after its length: a connection header, or a request.
-
-    Parameters
-    ----------
-    reader : StreamReader
-    max_bytes : int
-    begun : bytes
-        Of the length, what has been read already.
+    """Read a message of TCPROS after its length; ``begun`` are bytes of the length read before.
 
     Raises
     ------
     TransportError
-        If it is larger than allowed; the rest of a sentence about whoever has sent it.
+        If it is larger than allowed; the message continues a sentence about the sender.
     EOFError, OSError
-        If none comes.
+        If none arrives.
     """
     size = int.from_bytes(begun + await reader.readexactly(4 - len(begun)), "little")
     if size > max_bytes:
@@ -118,7 +88,7 @@ async def message(reader: asyncio.StreamReader, max_bytes: int, begun: bytes = b
 
 async def _connect(uri: str) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
     host, port = _place_of(uri)
-    # ROS 1 speaks IPv6 only if told to, and of a name with several addresses it takes the first.
+    # As in ROS 1: IPv4 unless the host is an IPv6 address, and the first address of a name.
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
         return await asyncio.open_connection(host, port, family=family, limit=MAX_HEADER_BYTES)
@@ -136,15 +106,7 @@ def _place_of(uri: str) -> tuple[str, int]:
 
 
 class Connection:
-    """A connection to a master or node, for one question after another.
-
-    Parameters
-    ----------
-    uri : str
-        Of its XML-RPC server.
-    caller : str
-        The name of the node that asks.
-    """
+    """A connection to the XML-RPC server of a master or node; ``caller`` is the calling node."""
 
     def __init__(self, uri: str, caller: str = CALLER) -> None:
         self.uri = uri
@@ -152,59 +114,41 @@ class Connection:
         self._streams: tuple[asyncio.StreamReader, asyncio.StreamWriter] | None = None
 
     async def call(self, method: str, *arguments: object, within_s: float) -> Any:
-        """Ask, and return the value that a ROS call answers with.
-
-        Parameters
-        ----------
-        method : str
-        *arguments
-            After the caller's name, which goes before them.
-        within_s : float
-            The whole of it takes no longer.
+        """Call a method with the caller's name and these arguments; return its value.
 
         Raises
         ------
         GoneError
             If nobody listens there.
         SilentError
-            If no answer came in time.
+            If no response came in time.
         CallError
-            If another one came, or one that says no.
+            If the response reports an error or is malformed.
         """
-        return _value_of(await self._answer(method, (self._caller, *arguments), within_s), method)
+        return _value_of(await self._request(method, (self._caller, *arguments), within_s), method)
 
     async def calls(
-        self, questions: Iterable[tuple[str, Sequence[object]]], *, within_s: float
+        self, calls: Iterable[tuple[str, Sequence[object]]], *, within_s: float
     ) -> list[Any]:
-        """Ask several things at once; the answer to one that is refused is None.
+        """Make several calls in one request; the value of a refused one is None.
 
-        Parameters
-        ----------
-        questions : iterable
-            Methods and their arguments, the caller's name as well.
-        within_s : float
-
-        Raises
-        ------
-        CallError
-            As :meth:`call`.
+        Each call is a method and all its arguments, the caller's name included. Raises as
+        :meth:`call` does.
         """
-        asked = [
-            {"methodName": method, "params": list(arguments)} for method, arguments in questions
-        ]
-        answers = await self._answer("system.multicall", (asked,), within_s)
-        if not isinstance(answers, list) or len(answers) != len(asked):
+        batch = [{"methodName": method, "params": list(arguments)} for method, arguments in calls]
+        responses = await self._request("system.multicall", (batch,), within_s)
+        if not isinstance(responses, list) or len(responses) != len(batch):
             raise CallError(f"{self.uri}: system.multicall: the answer has another form")
         values = []
-        for question, answer in zip(asked, answers, strict=True):
+        for made, response in zip(batch, responses, strict=True):
             value = None
-            # That of a call that failed is a dict.
+            # The response to a failed call is a dict.
             with contextlib.suppress(CallError, LookupError, TypeError):
-                value = _value_of(answer[0], str(question["methodName"]))
+                value = _value_of(response[0], str(made["methodName"]))
             values.append(value)
         return values
 
-    async def _answer(self, method: str, arguments: tuple[Any, ...], within_s: float) -> Any:
+    async def _request(self, method: str, arguments: tuple[Any, ...], within_s: float) -> Any:
         try:
             body = xmlrpc.client.dumps(arguments, method).encode()
             async with asyncio.timeout(within_s):
@@ -218,7 +162,7 @@ class Connection:
             self.close()
             if isinstance(error, CallError) or not isinstance(error, Exception):
                 raise
-            # Whatever somebody answers, and however the parser takes it, is no answer.
+            # A malformed response can make the parser raise anything.
             raise CallError(f"{self.uri}: {method}: {error or type(error).__name__}") from error
 
     async def _exchange(self, body: bytes) -> Any:
@@ -234,8 +178,8 @@ class Connection:
         head = await HttpHead.read(reader)
         if head.line.split(" ")[1:2] != ["200"]:
             raise ValueError(f"it answers {head.line:.100}")
-        if not 0 <= head.size <= _MAX_ANSWER_BYTES:
-            raise ValueError(f"its answer has {head.size} bytes; allowed are {_MAX_ANSWER_BYTES}")
+        if not 0 <= head.size <= _MAX_RESPONSE_BYTES:
+            raise ValueError(f"its answer has {head.size} bytes; allowed are {_MAX_RESPONSE_BYTES}")
         content = await reader.readexactly(head.size)
         if head.ends:
             self.close()
@@ -243,7 +187,7 @@ class Connection:
         return values[0]
 
     def close(self) -> None:
-        """Close it; the next question opens another one."""
+        """Close the connection; the next call opens another."""
         if self._streams is not None:
             self._streams[1].close()
             self._streams = None
@@ -261,7 +205,7 @@ def _value_of(answer: object, method: str) -> Any:
 async def call(
     uri: str, method: str, *arguments: object, within_s: float, caller: str = CALLER
 ) -> Any:
-    """Ask one thing; see :meth:`Connection.call`."""
+    """Make one call on a new connection; see :meth:`Connection.call`."""
     connection = Connection(uri, caller)
     try:
         return await connection.call(method, *arguments, within_s=within_s)
@@ -270,34 +214,21 @@ async def call(
 
 
 async def offers_service(uri: str, service: str, *, within_s: float) -> bool | None:
-    """Tell whether a service is offered at its URI.
-
-    Parameters
-    ----------
-    uri : str
-        As ``rosrpc://host:port``.
-    service : str
-    within_s : float
-
-    Returns
-    -------
-    bool or None
-        None if that could not be found out in time.
-    """
-    # What `rosservice` sends to learn a service's type; no call is made.
-    asked = {"probe": "1", "md5sum": ANY_TYPE, "callerid": CALLER, "service": service}
+    """Return whether a service is offered at its URI, ``rosrpc://host:port``; None if unknown."""
+    # `rosservice` sends this header to learn a service's type; no call is made.
+    probe = {"probe": "1", "md5sum": ANY_TYPE, "callerid": CALLER, "service": service}
     writer = None
     try:
         async with asyncio.timeout(within_s):
             reader, writer = await _connect(uri)
-            writer.write(encode_header(asked))
+            writer.write(encode_header(probe))
             return "error" not in decode_header(await message(reader, MAX_HEADER_BYTES))
     except GoneError:
         return False
     except (asyncio.IncompleteReadError, TransportError):
-        # It listens, and hangs up on who asks for this service, or is none of ROS 1.
+        # Another service or another program listens there.
         return False
-    except (CallError, OSError, ValueError):  # the last: of a host that is no name
+    except (CallError, OSError, ValueError):  # ValueError: a malformed host name
         return None
     finally:
         if writer is not None:

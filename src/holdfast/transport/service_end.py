@@ -1,7 +1,7 @@
-"""The service's end of streams: links of many robots, and the calls that come over them.
+"""The service's end: links of many robots, and the calls on them.
 
-A reply is sent when the call ends or this turn of the loop does, whichever comes first: so the last
-reply and the end of a call are one frame.
+A reply is sent when the call ends or this turn of the event loop ends, whichever comes first. So
+the last reply and the end of a call are usually one frame.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
-from holdfast.errors import TransportError
+from holdfast.errors import FrameError, TransportError
 from holdfast.transport.calls import too_large
 from holdfast.transport.contract import DEFAULT_MAX_MESSAGE_BYTES, IncomingCall
 from holdfast.transport.dialer import Dialer
@@ -26,6 +26,7 @@ from holdfast.transport.endpoints import (
     check_endpoint,
     check_name,
 )
+from holdfast.transport.fair_scheduler import FairScheduler
 from holdfast.transport.frames import (
     CALL,
     END,
@@ -33,40 +34,36 @@ from holdfast.transport.frames import (
     LAST,
     REPLY,
     Frame,
-    FrameError,
     Hello,
     encode_hello,
 )
-from holdfast.transport.links import HalfReceived, Link, LinkSettings, receive_buffer
-from holdfast.transport.listener import MAX_SILENT, Listener, one_too_many
+from holdfast.transport.link_settings import LinkSettings, PartialMessageBudget, receive_buffer
+from holdfast.transport.links import Link, LinkOwner
+from holdfast.transport.listener import MAX_SILENT, Listener, connection_to_drop
 from holdfast.transport.revocation import REVOKED_FILE, revoked_serials
-from holdfast.transport.turns import Turns
+from holdfast.transport.schemes import load_scheme
 
 if TYPE_CHECKING:
     import ssl
 
     from holdfast.transport.tls import PeerCertificate
 
-if TYPE_CHECKING:
-    from holdfast.transport.datagrams import DatagramSockets
-    from holdfast.transport.ros1_node import RosNode
-
 __all__ = ["MAX_LINKS", "MAX_UNKNOWN", "StreamServiceTransport"]
 
 MAX_LINKS: Final = 4096
-"""Of robots, at the same time. If there are more, who has the most loses one."""
+"""Of robots, at the same time. Above it the owner of the most links loses one."""
 
 _SAID_GOODBYE: Final = "said goodbye"
 _NO_GOODBYE: Final = "closed the connection without a goodbye, as one that is killed does"
 _SERVICE_ENDS: Final = "this service ends"
 _REVOKED: Final = "has a certificate that has been revoked"
-_FOREIGN: Final = "has a certificate of an authority that is not believed any more"
+_FOREIGN: Final = "has a certificate of an authority that is no longer trusted"
 
-_MAX_UNGREETED: Final = 256
-"""Connections that have sent something, but no hello yet."""
+_MAX_WITHOUT_HELLO: Final = 256
+"""Connections that have sent bytes, but no hello yet."""
 
-MAX_UNKNOWN: Final = MAX_SILENT + _MAX_UNGREETED
-"""Connections of which nobody knows yet who they are: so many sockets more than links."""
+MAX_UNKNOWN: Final = MAX_SILENT + _MAX_WITHOUT_HELLO
+"""Connections without a hello: the number of sockets beyond the links."""
 
 
 class _StreamCall:
@@ -125,29 +122,28 @@ class _StreamCall:
             self._link.send_message(LAST, self._number, reply)
 
     def flush(self) -> None:
-        """Send a reply that waits for the end."""
+        """Send the pending reply."""
         reply, self._reply = self._reply, None
         if reply is not None:
             self._link.send_message(REPLY, self._number, reply)
 
 
-class StreamServiceTransport:
+class StreamServiceTransport(LinkOwner):
     """The service's end: see :class:`~holdfast.transport.contract.ServiceTransport`.
 
     Parameters
     ----------
     name : str
         Under which robots know the service.
-    boot : str
-        Of this process; no other one may ever have had it.
+    incarnation : str
+        Of this process; unique among all processes of the service.
     listen, connect : sequence of str
         Endpoints at which robots connect, and of robots that listen.
     listening : sequence of socket
-        If given, a socket for each of ``listen`` that listens there already, for the process that
-        made it as well.
+        If given, a socket for each of ``listen`` that listens there already and is shared.
     lease_ms : float
-        Robots give this service up when nothing comes from it for this long; it lets itself be
-        heard more often. How long a robot may be silent, the robot says.
+        After this much silence robots consider this service lost. A robot's own lease is in its
+        hello.
     max_message_bytes : int
         A larger request is refused and not kept.
     max_links : int or None
@@ -155,23 +151,23 @@ class StreamServiceTransport:
     tls : TlsFiles or None
         The service's credentials, for ``tls``.
     on_event : callable or None
-        Is told what is worth a line of a log: ``link_refused`` with ``reason`` and, if it is known,
-        ``robot``; ``robot_connected`` with ``robot``; ``robot_disconnected`` with ``robot`` and
-        ``reason``. Each has the robot's ``address``, None over a local socket.
+        Called for the log: ``link_refused`` with ``reason`` and, if known, ``robot``;
+        ``robot_connected`` with ``robot``; ``robot_disconnected`` with ``robot`` and ``reason``.
+        Each has the robot's ``address``, None over a local socket.
     on_shutdown : callable or None
-        Is told why this process is to end where ROS asks that, or another one takes its name there.
+        Called with the reason when ROS ends this process, or another one takes its name there.
 
     Raises
     ------
     TransportError
-        If an endpoint, the name, the boot or the credentials cannot be used.
+        If an endpoint, the name, the incarnation or the credentials cannot be used.
     """
 
     def __init__(
         self,
         name: str,
         *,
-        boot: str,
+        incarnation: str,
         listen: Sequence[str] = (),
         connect: Sequence[str] = (),
         listening: Sequence[socket.socket] = (),
@@ -184,7 +180,7 @@ class StreamServiceTransport:
         needs_endpoint: bool = True,
     ) -> None:
         check_name("name of a service", name)
-        check_name("boot of a service", boot)
+        check_name("incarnation of a service", incarnation)
         if needs_endpoint and not listen and not connect:
             raise TransportError(
                 f"service {name} has no endpoint: give one, as in tcp/127.0.0.1:7447"
@@ -196,30 +192,27 @@ class StreamServiceTransport:
         for endpoint in self._connect:
             check_direction(endpoint, service_listens=False)
         self._listening: Sequence[socket.socket | None] = listening or [None] * len(listen)
-        self._sockets: DatagramSockets | None = None
-        if any(endpoint.protocol == "udp" for endpoint in self._listen):
-            from holdfast.transport.datagrams import DatagramSockets
-            from holdfast.transport.sealing import require_cryptography
-
-            require_cryptography()
-            self._sockets = DatagramSockets()
-        self._boot = boot
+        self._schemes = {
+            endpoint.protocol: load_scheme(endpoint.protocol)
+            for endpoint in (*self._listen, *self._connect)
+        }
+        self._incarnation = incarnation
         self._max_links = MAX_LINKS if max_links is None else max_links
         self._tls = tls
         self._context: ssl.SSLContext | None = None
-        # Who has shaken hands is looked up here; a handshake knows the files of when it began.
+        # Checked after each handshake, which may have used older files.
         self._revoked: frozenset[int] = frozenset()
-        self._believed: frozenset[bytes] = frozenset()
+        self._trusted: frozenset[bytes] = frozenset()
         if tls is not None:
             self._read_credentials(tls)
         self._settings = LinkSettings(
-            lambda: encode_hello("service", name, boot, lease_ms, time.time()),
+            lambda: encode_hello("service", name, incarnation, lease_ms, time.time()),
             lease_ms,
             max_message_bytes,
-            HalfReceived(2 * (max_message_bytes + HEADER_BYTES)),
-            Turns(),
+            PartialMessageBudget(2 * (max_message_bytes + HEADER_BYTES)),
+            FairScheduler(),
             receive_buffer(),
-            must_read=True,
+            pauses_for_readers=True,
         )
         self._on_event = on_event
         self._on_shutdown = on_shutdown
@@ -229,11 +222,10 @@ class StreamServiceTransport:
         self._listeners: list[Listener] = []
         self._dialers: dict[Endpoint, Dialer] = {}
         self._dialled: dict[Link, Dialer] = {}
-        self._ungreeted: dict[Link, bytes] = {}
+        self._without_hello: dict[Link, bytes] = {}
         self._links: dict[Link, set[_StreamCall]] = {}
         self._closing: set[asyncio.Future[None]] = set()
         self._gone: asyncio.Future[None] | None = None
-        self._node: RosNode | None = None
 
     @property
     def endpoints(self) -> tuple[str, ...]:
@@ -241,7 +233,7 @@ class StreamServiceTransport:
         return tuple(str(endpoint) for endpoint in self._listen)
 
     async def start(self, deliver: Callable[[IncomingCall], None]) -> None:
-        """Listen, be seen, and deliver calls; returns when robots can connect.
+        """Listen and deliver calls; returns when robots can connect.
 
         Raises
         ------
@@ -255,55 +247,43 @@ class StreamServiceTransport:
         try:
             for endpoint, listening in zip(self._listen, self._listening, strict=True):
                 accepted = partial(self._accepted, endpoint)
-                place = endpoint
-                if endpoint.is_ros1:
-                    from holdfast.transport.ros1 import place_to_listen
-
-                    place = place_to_listen()
+                place = self._schemes[endpoint.protocol].listening_endpoint(endpoint)
                 self._listeners.append(Listener(place, accepted, listening=listening))
         except TransportError:
             self._stop_listening()
             raise
-        ports = {
-            endpoint: listener.endpoint.port
-            for endpoint, listener in zip(self._listen, self._listeners, strict=True)
-            if endpoint.is_ros1
-        }
-        self._listen = [
-            endpoint if endpoint.is_ros1 else listener.endpoint
-            for endpoint, listener in zip(self._listen, self._listeners, strict=True)
-        ]
+        ports: dict[str, dict[Endpoint, int]] = {}
+        for index, (endpoint, listener) in enumerate(
+            zip(self._listen, self._listeners, strict=True)
+        ):
+            ports.setdefault(endpoint.protocol, {})[endpoint] = listener.endpoint.port
+            scheme = self._schemes[endpoint.protocol]
+            self._listen[index] = scheme.bound_endpoint(endpoint, listener.endpoint)
         for endpoint in self._connect:
-            dialer = Dialer(endpoint, partial(self._make_dialled, endpoint))
+            dialer = Dialer(
+                endpoint, self._schemes[endpoint.protocol], partial(self._make_dialled, endpoint)
+            )
             self._dialers[endpoint] = dialer
             dialer.start()
-        if ports:
-            from holdfast.transport.ros1 import make_node
-
-            self._node = make_node(ports, self._on_event, self._on_shutdown)
-            await self._node.start()
+        for name, its_ports in ports.items():
+            await self._schemes[name].announce(its_ports, self._on_event, self._on_shutdown)
 
     def dismiss(self) -> asyncio.Future[None]:
-        """Take no new links, and ask the robots to go elsewhere.
+        """Take no new links, and ask the robots to leave; the result is done when all have left.
 
-        A robot leaves once it is owed nothing and has found another process, or nobody at all.
-        Until then it is answered: so it loses no time by the search.
-
-        Returns
-        -------
-        Future
-            Done when all have gone.
+        A robot leaves once it has its replies and has found another process, or none. Until then
+        the service still replies, so the search costs the robot no time.
         """
         self._stop_listening()
         self._gone = asyncio.get_running_loop().create_future()
-        for link in list(self._ungreeted):
+        for link in list(self._without_hello):
             link.end("")
         for link in list(self._links):
             link.say_goodbye()
-        self._note_gone()
+        self._resolve_if_all_gone()
         return self._gone
 
-    def _note_gone(self) -> None:
+    def _resolve_if_all_gone(self) -> None:
         if self._gone is not None and not self._links and not self._gone.done():
             self._gone.set_result(None)
 
@@ -323,32 +303,23 @@ class StreamServiceTransport:
             for call in list(calls):
                 call.end()
             link.end(_SERVICE_ENDS, goodbye="")
-        for link in list(self._ungreeted):
+        for link in list(self._without_hello):
             link.end("")
-        node, self._node = self._node, None
-        closing = set(self._closing)
-        if node is not None:
-            closing.add(asyncio.ensure_future(node.close(timeout_s)))
-        if closing:
+        withdrawing = {
+            asyncio.ensure_future(scheme.withdraw(timeout_s)) for scheme in self._schemes.values()
+        }
+        if closing := self._closing | withdrawing:
             await asyncio.wait(closing, timeout=timeout_s)
-        if self._sockets is not None:
-            self._sockets.close()
+        for scheme in self._schemes.values():
+            scheme.close()
 
     def end_links(self, objection: Callable[[PeerCertificate], str | None]) -> int:
-        """End the links of robots whose certificate there is something to be said against.
+        """End the links of robots whose certificate is not accepted; return their number.
 
-        Parameters
-        ----------
-        objection : callable
-            Returns what such a robot is told, as the rest of a sentence about it; else None.
-
-        Returns
-        -------
-        int
-            How many there were.
+        ``objection`` returns the reason, as the rest of a sentence about the robot, or None.
         """
         ended = 0
-        for link in (*self._links, *self._ungreeted):
+        for link in (*self._links, *self._without_hello):
             reason = None if link.peer is None or link.ended else objection(link.peer)
             if reason is not None:
                 link.end(reason, goodbye=reason, refused=True)
@@ -361,20 +332,14 @@ class StreamServiceTransport:
         return len(self._revoked)
 
     def reload_credentials(self) -> int:
-        """Read the credentials anew, and end the links of robots that are not believed any more.
+        """Read the credentials again; return the number of links that this has ended.
 
-        They are those that are revoked now, and those that an authority has signed which was
-        replaced.
-
-        Returns
-        -------
-        int
-            How many links were ended; all others go on as they are.
+        Links end if their certificate is now revoked, or its authority was replaced.
 
         Raises
         ------
         TransportError
-            If they cannot be used; then those of before are kept.
+            If the files cannot be used; then the previous credentials stay in use.
         """
         if self._tls is None:
             return 0
@@ -382,22 +347,20 @@ class StreamServiceTransport:
         return self.end_links(self._objection)
 
     def _objection(self, peer: PeerCertificate) -> str | None:
-        """Return why a certificate is believed no more, as the rest of a sentence about a robot."""
+        """Return why a certificate is not trusted, as the rest of a sentence about a robot."""
         if peer.serial_number in self._revoked:
             return _REVOKED
-        if not peer.authorities <= self._believed:
-            return _FOREIGN
-        return None
+        return None if peer.authorities <= self._trusted else _FOREIGN
 
     # -- links -----------------------------------------------------------------------------------
 
     def _read_credentials(self, tls: TlsFiles) -> None:
-        # OpenSSL takes long to load, which counts in the time that a service takes to be ready.
+        # Imported here, because OpenSSL is slow to load.
         from holdfast.transport.tls import server_context
 
-        context = server_context(tls, self._boot)
+        context = server_context(tls, self._incarnation)
         self._revoked = revoked_serials(tls.authority.with_name(REVOKED_FILE))
-        self._believed = frozenset(context.get_ca_certs(binary_form=True))
+        self._trusted = frozenset(context.get_ca_certs(binary_form=True))
         self._context = context
 
     def _make_link(self, endpoint: Endpoint, network: bytes = b"", *, dialled: bool) -> Link:
@@ -407,23 +370,14 @@ class StreamServiceTransport:
 
             assert self._context is not None
             tls = TlsStream(self._context)
-        link: Link
-        if endpoint.protocol == "udp":
-            from holdfast.transport.datagrams import ServiceDatagramLink
-
-            assert tls is not None and self._sockets is not None
-            link = ServiceDatagramLink(self, self._settings, tls=tls, sockets=self._sockets)
-        elif endpoint.is_ros1:
-            from holdfast.transport.ros1 import ServiceRosLink
-
-            link = ServiceRosLink(self, self._settings, endpoint)
-        else:
-            link = Link(self, self._settings, speaks_first=dialled and tls is None, tls=tls)
-        if len(self._ungreeted) >= _MAX_UNGREETED:
-            other = one_too_many(self._ungreeted)
-            del self._ungreeted[other]
+        link = self._schemes[endpoint.protocol].make_link(
+            self, self._settings, endpoint, tls, role="service", dialled=dialled
+        )
+        if len(self._without_hello) >= _MAX_WITHOUT_HELLO:
+            other = connection_to_drop(self._without_hello)
+            del self._without_hello[other]
             other.end("has said no hello, and others wait", abort=True)
-        self._ungreeted[link] = network
+        self._without_hello[link] = network
         self._closing.add(link.closed)
         link.closed.add_done_callback(self._closing.discard)
         return link
@@ -437,15 +391,15 @@ class StreamServiceTransport:
         link = self._make_link(endpoint, network, dialled=False)
         link.connecting = asyncio.get_running_loop().create_task(link.connect(connection))
 
-    def established(self, link: Link) -> None:
-        """Refuse who is not believed any more, before anything of it is read."""
+    def on_handshake(self, link: Link) -> None:
+        """Refuse a robot that is no longer trusted, before anything of it is read."""
         assert link.peer is not None
         objection = self._objection(link.peer)
         if objection is not None:
             link.end(objection, goodbye=objection, refused=True)
 
     def refusal(self, link: Link, hello: Hello) -> str | None:
-        """Refuse what is no robot, and who would have more than a share of room."""
+        """Refuse a peer that is no robot, or that would exceed its share of links."""
         if hello.role != "robot":
             return "is a service, and a robot was expected"
         if link.peer is not None and hello.name not in ("", link.peer.name):
@@ -455,9 +409,9 @@ class StreamServiceTransport:
         return None
 
     def _make_room(self, name: str | None) -> bool:
-        """End a link of whoever has the most, if that leaves them no fewer than this one then has.
+        """End a link of the name with the most, if it then still has at least as many as this one.
 
-        So a certificate cannot keep others out, however many links are made with it.
+        So one certificate cannot lock others out, however many links it makes.
         """
         standing = [link for link in self._links if not link.ended]
         if len(standing) < self._max_links:
@@ -471,25 +425,25 @@ class StreamServiceTransport:
         oldest.end(reason, goodbye=reason, refused=True)
         return True
 
-    def greeted(self, link: Link, hello: Hello) -> None:
-        """Take note of a robot."""
-        self._ungreeted.pop(link, None)
+    def on_hello(self, link: Link, hello: Hello) -> None:
+        """Take a robot's hello."""
+        self._without_hello.pop(link, None)
         self._links[link] = set()
         dialer = self._dialled.get(link)
         if dialer is not None:
             dialer.succeeded()
-            dialer.won(link)
-        self._tell("robot_connected", robot=_name(link, hello), address=link.address)
+            dialer.selected(link)
+        self._report("robot_connected", robot=_name(link, hello), address=link.address)
 
-    def received(self, link: Link, frame: Frame) -> None:
+    def on_frame(self, link: Link, frame: Frame) -> None:
         """Take a request."""
         calls = self._links.get(link)
         if calls is None:
             return
         if frame.kind != CALL:
             raise FrameError(f"is a robot and sends a frame of kind {frame.kind}")
-        if frame.passed_over_bytes:
-            refusal = too_large(frame.passed_over_bytes, self._settings.max_message_bytes)
+        if frame.skipped_bytes:
+            refusal = too_large(frame.skipped_bytes, self._settings.max_message_bytes)
             link.send_message(LAST, frame.call, refusal)
             return
         deliver = self._deliver
@@ -503,35 +457,29 @@ class StreamServiceTransport:
         call.is_being_delivered = False
         call.flush()
 
-    def leaving(self, link: Link) -> None:
-        """End the link: a robot that goes is owed nothing."""
+    def on_goodbye(self, link: Link) -> None:
+        """End the link: a robot that leaves waits for no reply."""
         link.end("")
 
-    def went_adrift(self, link: Link) -> None:
-        """Nothing: it is the robot that makes another link."""
-
-    def closed_to_datagrams(self, link: Link) -> None:
-        """Nothing: it is the robot that finds out."""
-
-    def lost(self, link: Link) -> None:
-        """Take note that a link has ended."""
-        self._ungreeted.pop(link, None)
+    def on_ended(self, link: Link) -> None:
+        """Note that a link has ended."""
+        self._without_hello.pop(link, None)
         was_there = self._links.pop(link, None) is not None
         if was_there and link.hello is not None:
             reason = link.reason or (_SAID_GOODBYE if link.said_goodbye else _NO_GOODBYE)
             robot = _name(link, link.hello)
-            self._tell("robot_disconnected", robot=robot, reason=reason, address=link.address)
+            self._report("robot_disconnected", robot=robot, reason=reason, address=link.address)
         elif link.reason:
             fields = {"robot": link.peer.name} if link.peer is not None else {}
-            self._tell("link_refused", reason=link.reason, address=link.address, **fields)
-        self._note_gone()
+            self._report("link_refused", reason=link.reason, address=link.address, **fields)
+        self._resolve_if_all_gone()
         dialer = self._dialled.pop(link, None)
         if dialer is not None:
             dialer.ended(link)
             if self._takes_links and (was_there or link.refused):
                 dialer.start(refused=link.refused)
 
-    def _tell(self, name: str, **fields: object) -> None:
+    def _report(self, name: str, **fields: object) -> None:
         if self._on_event is not None:
             self._on_event(name, **fields)
 
@@ -542,5 +490,5 @@ def _certified(link: Link) -> str | None:
 
 
 def _name(link: Link, hello: Hello) -> str:
-    """Return a robot's name; a certificate's counts for more than its own word."""
+    """Return a robot's name: the certificate's, if there is one."""
     return link.peer.name if link.peer is not None else hello.name

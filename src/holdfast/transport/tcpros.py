@@ -1,9 +1,9 @@
-"""What ROS 1 says over TCP, as bytes: connection headers, requests and answers. No socket here.
+"""TCPROS, the protocol of ROS 1 over TCP, as bytes: no socket here.
 
-A connection begins with a header from each end, fields NAME=VALUE that say which service or topic
-is meant and by which digest both know its type. Then a caller sends requests, each after its
-length, and gets an answer to each in the same order: a byte that says whether it was done, then a
-message or, in words, why there is none. A topic's connection has messages alone.
+A connection begins with a header from each end: fields NAME=VALUE that name the service or topic
+and the MD5 digest of its type. Then a caller sends requests, each after its length, and receives a
+response to each in the same order: a byte for success, then a message or an error text. A topic's
+connection carries messages only.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from holdfast.errors import TransportError
 __all__ = [
     "ANY_TYPE",
     "MAX_HEADER_BYTES",
+    "RosEnvironment",
     "ServiceType",
-    "Surroundings",
     "decode_header",
     "encode_answer",
     "encode_header",
@@ -34,10 +34,10 @@ __all__ = [
 ]
 
 MAX_HEADER_BYTES = 64 * 1024
-"""Bound on a connection header; a topic's has the whole definition of its type."""
+"""Bound on a connection header; a topic's contains the whole definition of its type."""
 
 ANY_TYPE = "*"
-"""Stands for any type's digest."""
+"""The digest that matches any type."""
 
 _LENGTH = struct.Struct("<I")
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*)*")
@@ -45,22 +45,14 @@ _MAX_NAME = 200
 
 
 class ServiceType(NamedTuple):
-    """A service's type.
-
-    Attributes
-    ----------
-    name : str
-        Such as ``std_srvs/Trigger``.
-    digest : str
-        Its MD5, by which both ends know that they mean the same.
-    """
+    """A service's type: its name, as in ``std_srvs/Trigger``, and its MD5 digest."""
 
     name: str
     digest: str
 
 
 def encode_header(fields: Mapping[str, str]) -> bytes:
-    """Write a connection header."""
+    """Encode a connection header."""
     parts = []
     for name, value in fields.items():
         field = f"{name}={value}".encode()
@@ -69,7 +61,7 @@ def encode_header(fields: Mapping[str, str]) -> bytes:
 
 
 def header_of_service(node: str, service: str, type_: ServiceType) -> dict[str, str]:
-    """Return what a caller is told of a service."""
+    """Return the fields with which a service answers a caller's header."""
     return {
         "callerid": node,
         "service": service,
@@ -81,12 +73,12 @@ def header_of_service(node: str, service: str, type_: ServiceType) -> dict[str, 
 
 
 def decode_header(data: bytes) -> dict[str, str]:
-    """Read a connection header, without its length.
+    """Decode a connection header, without its length.
 
     Raises
     ------
     TransportError
-        If it is none; the rest of a sentence about whoever has sent it.
+        If it is malformed; the message continues a sentence about its sender.
     """
     fields = {}
     place = 0
@@ -104,22 +96,22 @@ def decode_header(data: bytes) -> dict[str, str]:
 
 
 def encode_message(payload: bytes) -> bytes:
-    """Write a request, or a message of a topic."""
+    """Encode a request, or a message of a topic."""
     return _LENGTH.pack(len(payload)) + payload
 
 
 def encode_answer(payload: bytes) -> bytes:
-    """Write an answer."""
+    """Encode a response."""
     return b"\x01" + encode_message(payload)
 
 
 def encode_refusal(reason: str) -> bytes:
-    """Write that there is no answer."""
+    """Encode a response that reports an error."""
     return b"\x00" + encode_message(reason.encode())
 
 
 def host_and_port_of(uri: str, scheme: str | None = None) -> tuple[str, int] | None:
-    """Return host and port of a URI, or None if it does not name both, by this scheme."""
+    """Return host and port of a URI; None if one is missing or the scheme is another."""
     try:
         parts = urlsplit(uri)
         host, port = parts.hostname, parts.port
@@ -129,17 +121,12 @@ def host_and_port_of(uri: str, scheme: str | None = None) -> tuple[str, int] | N
 
 
 def place_of_service(uri: object) -> tuple[str, int]:
-    """Return host and port of a service.
-
-    Parameters
-    ----------
-    uri : str
-        As a master has it, ``rosrpc://HOST:PORT``.
+    """Return host and port of a service's URI, ``rosrpc://HOST:PORT``.
 
     Raises
     ------
     TransportError
-        If it is none.
+        If it has another form.
     """
     place = host_and_port_of(str(uri), "rosrpc")
     if place is None:
@@ -147,19 +134,19 @@ def place_of_service(uri: object) -> tuple[str, int]:
     return place
 
 
-class Surroundings(NamedTuple):
-    """Where a process is in ROS 1.
+class RosEnvironment(NamedTuple):
+    """The settings of ROS 1 for this process.
 
     Attributes
     ----------
     master : str
         URI of the master.
     host : str
-        By which others reach this machine.
+        Name or address of this machine for other nodes.
     bind : str
         The address at which to listen.
     namespace : str
-        Before names that do not begin with a slash; ends with one.
+        Prefix of names that do not begin with a slash; ends with one.
     """
 
     master: str
@@ -169,12 +156,12 @@ class Surroundings(NamedTuple):
 
     @classmethod
     def of(cls, environment: Mapping[str, str] = os.environ) -> Self:
-        """Return what ``ROS_MASTER_URI``, ``ROS_HOSTNAME``, ``ROS_IP`` and ``ROS_NAMESPACE`` say.
+        """Read ``ROS_MASTER_URI``, ``ROS_HOSTNAME``, ``ROS_IP`` and ``ROS_NAMESPACE``.
 
         Raises
         ------
         TransportError
-            If the master's URI is none.
+            If the master's URI is malformed.
         """
         master = environment.get("ROS_MASTER_URI") or "http://localhost:11311"
         if host_and_port_of(master, "http") is None:
@@ -190,13 +177,7 @@ class Surroundings(NamedTuple):
         )
 
     def resolved(self, name: str) -> str:
-        """Return a name as the master knows it.
-
-        Raises
-        ------
-        TransportError
-            If it is no name.
-        """
+        """Return the absolute name; raise TransportError if it is malformed."""
         if len(name) > _MAX_NAME or not _NAME.fullmatch(name.removeprefix("/")):
             raise TransportError(
                 f"{name!r:.220} is no name in ROS 1: words of letters, digits and '_', each "

@@ -1,29 +1,28 @@
-"""TLS for one link, in memory: bytes of the stream in, bytes of the messages out.
+"""TLS for one link, in memory: encrypted bytes in, messages out.
 
-Both ends show a certificate, TLS 1.3 is the only version, and the one authority that is believed is
-our own. The robot is always the client, whoever dialled: so its certificate can do no more than
-ask, and it looks for the service's host in the service's certificate.
+Both ends show a certificate of our own authority, and TLS 1.3 is the only version. The robot is
+always the client, whichever end dialled. So its certificate only allows calls, and it checks the
+service's host against the service's certificate.
 
-The link reads the socket itself and has the ``ssl`` module decrypt in memory. So nothing of a
-handshake is begun before the other end has sent its first byte, and a port scanner costs no more
-than its connection.
+The link reads the socket and decrypts in memory, so no handshake begins before the peer's first
+byte, and a port scanner costs no more than its connection.
 
-A handshake also tells the robot whether it is the process that it knew, a round trip before that
-process can say so: the robot offers "holdfast/" and the incarnation among the protocols that it
-speaks (ALPN), and a service takes its own.
+The handshake also tells the robot whether it has reached the same process as before, one round trip
+before the hello: the robot offers "holdfast/INCARNATION" as a protocol (ALPN), and a service
+selects its own incarnation.
 """
 
 from __future__ import annotations
 
+import contextlib
 import re
 import ssl
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
-from holdfast.errors import TransportError
+from holdfast.errors import FrameError, TransportError
 from holdfast.transport.credentials import file_versions
 from holdfast.transport.endpoints import AUTHORITY_FILE, TlsFiles
-from holdfast.transport.frames import FrameError
 from holdfast.transport.revocation import refuse_revoked
 
 __all__ = [
@@ -32,29 +31,28 @@ __all__ = [
     "TlsStream",
     "client_context",
     "common_name",
-    "fault_of_certificate",
+    "describe_certificate_error",
     "server_context",
 ]
 
 _ANY_INCARNATION = "holdfast"
 
 _KEY_EXCHANGE = "prime256v1"
-"""The only one: of those that OpenSSL offers, whoever asks for the largest (ffdhe8192) would have
-a service compute for two tenths of a second before it knows who asks. Python 3.11.2, which is
-Debian 12's, cannot choose X25519."""
+"""The only group: with OpenSSL's largest (ffdhe8192), an unauthenticated client would cost a
+service 0.2 s of computing. Python 3.11.2 (Debian 12) cannot choose X25519."""
 
 _READ_BYTES = 16 * 1024
 """The largest record."""
 
 
-_WHAT_TO_DO = {
+_REMEDIES = {
     10: "; 'holdfast keys DIR --renew --{role} NAME' makes another",
     18: "; both ends need files of one 'holdfast keys DIR'",
     19: "; both ends need files of one 'holdfast keys DIR'",
     20: "; both ends need files of one 'holdfast keys DIR'",
     23: "; 'holdfast keys DIR --rotate --{role} NAME' makes a new key",
 }
-"""By OpenSSL's numbers, about a certificate of the other end."""
+"""For a peer's certificate, by OpenSSL's error numbers."""
 
 _ALERTS = {
     "both": {
@@ -81,34 +79,30 @@ _ALERTS = {
         )
     },
 }
-"""What the other end says of this end's certificate (RFC 8446, section 6.2), by this end's role."""
+"""The peer's alerts about this end's certificate (RFC 8446, section 6.2), by this end's role."""
 
 
 class PeerCertificate(NamedTuple):
-    """The certificate with which the other end has proved who it is.
+    """The peer's certificate.
 
     Attributes
     ----------
     name : str
-        Its common name.
-    serial_number : int
+        The common name.
     expires_at : float
         In seconds since 1970.
-    der : bytes
-        The whole of it.
     authorities : frozenset of bytes
-        The one whose signature was believed, as DER; several if some have the same name.
+        The authority that signed it, as DER; several if some have the same name.
     """
 
     name: str
     serial_number: int
     expires_at: float
-    der: bytes
     authorities: frozenset[bytes]
 
 
 def client_context(files: TlsFiles) -> ssl.SSLContext:
-    """Return what a robot's links need; handshakes refuse who is revoked.
+    """Return the context of a robot's links; handshakes refuse revoked certificates.
 
     Raises
     ------
@@ -121,10 +115,10 @@ def client_context(files: TlsFiles) -> ssl.SSLContext:
 
 
 def server_context(files: TlsFiles, incarnation: str) -> ssl.SSLContext:
-    """Return what a service's links need.
+    """Return the context of a service's links.
 
-    Handshakes do not refuse who is revoked: then nobody would know who that was. The service does,
-    as soon as it knows.
+    Handshakes accept revoked certificates. The service refuses them afterwards, so its log has the
+    name.
 
     Raises
     ------
@@ -132,8 +126,8 @@ def server_context(files: TlsFiles, incarnation: str) -> ssl.SSLContext:
         If the credentials cannot be used.
     """
     context = _context(ssl.PROTOCOL_TLS_SERVER, files)
-    context.num_tickets = 0  # nothing is resumed: who comes again shows the certificate again
-    context.set_alpn_protocols([_of(incarnation), _ANY_INCARNATION])
+    context.num_tickets = 0  # no resumption: every link shows the certificate
+    context.set_alpn_protocols([_alpn_name(incarnation), _ANY_INCARNATION])
     return context
 
 
@@ -157,15 +151,12 @@ def _context(protocol: int, files: TlsFiles) -> ssl.SSLContext:
 
 
 class ClientCredentials:
-    """A robot's credentials, read anew for a new link if somebody has replaced them.
-
-    So a list of revoked services counts as soon as it is there.
+    """A robot's credentials, read again for a new link if the files have changed.
 
     Parameters
     ----------
-    files : TlsFiles
     on_unusable : callable or None
-        Is told why what is there now cannot be used.
+        Called with the reason when changed files cannot be used; the previous ones stay in use.
 
     Raises
     ------
@@ -180,7 +171,7 @@ class ClientCredentials:
         self._context = client_context(files)
 
     def context(self) -> ssl.SSLContext:
-        """Return what a new link needs; that of before, if what is there now cannot be used."""
+        """Return the context for a new link."""
         seen = file_versions(self._files)
         if seen != self._seen:
             self._seen = seen
@@ -188,11 +179,11 @@ class ClientCredentials:
                 self._context = client_context(self._files)
             except TransportError as error:
                 if self._on_unusable is not None:
-                    self._on_unusable(f"{error}; those of before stay in use")
+                    self._on_unusable(f"{error}; the previous ones stay in use")
         return self._context
 
 
-def _of(incarnation: str) -> str:
+def _alpn_name(incarnation: str) -> str:
     return f"{_ANY_INCARNATION}/{incarnation}"
 
 
@@ -201,20 +192,19 @@ class TlsStream:
 
     Parameters
     ----------
-    context : SSLContext
     host : str or None
         For a robot: the name or address that the certificate must be for; None if the service has
-        dialled, which has no address that a robot would know.
+        dialled.
     known : str or None
-        For a robot: the incarnation of the service that it knew last.
+        For a robot: the last incarnation of the service.
 
     Attributes
     ----------
     established : bool
-        Whether the handshake is complete at this end. At the robot's it is before the service has
-        looked at the robot's certificate.
+        Whether the handshake is complete at this end. The robot's end completes it before the
+        service has checked the robot's certificate.
     ended : bool
-        Whether the other end has said that nothing more will come.
+        Whether the peer will send nothing more.
     """
 
     def __init__(
@@ -224,7 +214,7 @@ class TlsStream:
         if not self._is_server:
             context.check_hostname = host is not None
             names = [_ANY_INCARNATION]
-            context.set_alpn_protocols([_of(known), *names] if known is not None else names)
+            context.set_alpn_protocols([_alpn_name(known), *names] if known is not None else names)
         self._known = known
         self._incoming = ssl.MemoryBIO()
         self._outgoing = ssl.MemoryBIO()
@@ -237,12 +227,13 @@ class TlsStream:
 
     @property
     def is_known_incarnation(self) -> bool:
-        """For a robot: whether the service is the process that it knew, once established."""
-        return self._known is not None and self._tls.selected_alpn_protocol() == _of(self._known)
+        """For a robot: whether the service is the known process, once established."""
+        chosen = self._tls.selected_alpn_protocol()
+        return self._known is not None and chosen == _alpn_name(self._known)
 
     def begin(self) -> None:
         """Begin the handshake, at the robot's end."""
-        self._shake_hands()
+        self._handshake()
 
     def receive(self, data: bytes) -> bytes:
         """Take bytes of the stream; return those of messages.
@@ -250,9 +241,9 @@ class TlsStream:
         Raises
         ------
         ssl.SSLError
-            If the handshake fails, or the other end says that it did.
+            If the handshake fails at either end.
         FrameError
-            If the other end does not speak TLS at all.
+            If the peer does not speak TLS at all.
         """
         if not self._has_first_byte:
             self._has_first_byte = True
@@ -260,7 +251,7 @@ class TlsStream:
                 raise FrameError("does not speak TLS, and this endpoint does")
         self._incoming.write(data)
         if not self.established:
-            self._shake_hands()
+            self._handshake()
             if not self.established:
                 return b""
         parts = []
@@ -278,31 +269,22 @@ class TlsStream:
         return parts[0] if len(parts) == 1 else b"".join(parts)
 
     def send(self, data: bytes) -> None:
-        """Take bytes of messages; what becomes of them is there to :meth:`take`."""
+        """Encrypt bytes of messages, for :meth:`take`."""
         self._tls.write(data)
 
     def take(self) -> bytes:
-        """Return the bytes that are to be sent, and forget them."""
+        """Return the bytes to send, once."""
         return self._outgoing.read()
 
     def close(self) -> None:
-        """Say that nothing more will come from this end."""
+        """Announce that this end sends nothing more."""
         if self.established:
-            try:
+            with contextlib.suppress(ssl.SSLError):  # the peer's announcement is not awaited
                 self._tls.unwrap()
-            except ssl.SSLError:
-                return  # it is not waited for that the other end says so, too
 
     def peer(self) -> PeerCertificate:
-        """Return the other end's certificate, once established.
-
-        Raises
-        ------
-        FrameError
-            If it does not say who that is.
-        """
+        """Return the peer's certificate, once established; raise FrameError if it has no name."""
         shown = self._tls.getpeercert() or {}
-        der = self._tls.getpeercert(binary_form=True) or b""
         try:
             name = common_name(shown)
         except ValueError as error:
@@ -311,7 +293,6 @@ class TlsStream:
             name,
             int(str(shown.get("serialNumber", "0")), 16),
             float(ssl.cert_time_to_seconds(str(shown["notAfter"]))) if shown else 0.0,
-            der,
             self._authorities(shown.get("issuer")),
         )
 
@@ -320,16 +301,16 @@ class TlsStream:
         named = context.get_ca_certs()
         known = context.get_ca_certs(binary_form=True)
         found = [der for read, der in zip(named, known, strict=True) if read["subject"] == name]
-        # There may be another certificate between the two, which only the handshake has seen.
+        # The issuer may be an intermediate certificate, which only the handshake has seen.
         return frozenset(found or known)
 
-    def what_is_wrong(self, error: OSError) -> str:
-        """Return what OpenSSL's error means, as the rest of a sentence about the other end."""
+    def describe_error(self, error: OSError) -> str:
+        """Return the meaning of OpenSSL's error, as the rest of a sentence about the peer."""
         assert isinstance(error, ssl.SSLError)
         if isinstance(error, ssl.SSLCertVerificationError):
             role = "robot" if self._is_server else "service"
-            fault = fault_of_certificate(error, role)
-            what_to_do = _WHAT_TO_DO.get(error.verify_code, "")
+            fault = describe_certificate_error(error, role)
+            what_to_do = _REMEDIES.get(error.verify_code, "")
             return f"has a certificate that {fault}{what_to_do.format(role=role)}"
         reason = error.reason or ""
         alert = reason.partition("_ALERT_")[2]
@@ -341,31 +322,24 @@ class TlsStream:
             return f"refuses this end's certificate: {meaning.format(role=own)}"
         if "PEER_DID_NOT_RETURN_A_CERTIFICATE" in reason:
             return "shows no certificate"
-        # Of what this Python has no word for, OpenSSL's own, without the places in the sources.
+        # OpenSSL's own words, without source positions.
         text = re.sub(r"^\[.*?\] | \(_ssl.*\)$", "", str(error.args[-1]))
         text = reason.lower().replace("_", " ") if reason else text
         return f"does not speak TLS 1.3 as expected: {text}"
 
-    def _shake_hands(self) -> None:
-        try:
+    def _handshake(self) -> None:
+        with contextlib.suppress(ssl.SSLWantReadError):
             self._tls.do_handshake()
-        except ssl.SSLWantReadError:
-            return
-        self.established = True
+            self.established = True
 
 
 def common_name(shown: Mapping[str, Any]) -> str:
-    """Return the name in a certificate: it is by this that robots are told apart.
-
-    Parameters
-    ----------
-    shown : mapping
-        As ``getpeercert`` returns it.
+    """Return the common name in a certificate, which ``getpeercert`` has returned.
 
     Raises
     ------
     ValueError
-        If it has none or several: the rest of a sentence about it.
+        If there is not exactly one; the message continues a sentence about the certificate.
     """
     subject = shown.get("subject", ())
     names = [str(value) for part in subject for key, value in part if key == "commonName"]
@@ -374,15 +348,8 @@ def common_name(shown: Mapping[str, Any]) -> str:
     return names[0]
 
 
-def fault_of_certificate(error: ssl.SSLCertVerificationError, role: str) -> str:
-    """Return why a certificate is refused, as the rest of a sentence about it.
-
-    Parameters
-    ----------
-    error : SSLCertVerificationError
-    role : {"robot", "service"}
-        Whose it should be.
-    """
+def describe_certificate_error(error: ssl.SSLCertVerificationError, role: str) -> str:
+    """Return why a certificate of this role is refused, as the rest of a sentence about it."""
     message = error.verify_message.rstrip(".")
     match error.verify_code:  # OpenSSL's numbers
         case 9:

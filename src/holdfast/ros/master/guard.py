@@ -1,19 +1,17 @@
-"""A guard for the ROS 1 master: when the master dies, the next one is there before anybody asks.
+"""A guard for the ROS 1 master: when the master dies, a prepared one takes its place at once.
 
-ROS 1 has one process that knows where everything is. While it is away nobody finds a service or a
-topic; what stands already, goes on: topics and persistent services are connections between nodes.
-When it comes back as stock ROS has it, it knows nothing, and no node tells it again.
+The ROS 1 master is one process that knows where everything is. Without it no service or topic is
+found; existing connections between nodes continue. A restarted stock master knows nothing, and
+nodes do not register again.
 
-The guard holds the port. The socket at which nodes connect belongs to it, and each master inherits
-it, so calls to a master that has just died are not refused: they wait, in the kernel, for the next
-one. That one has been waiting, too: a process that has loaded all it needs. It reads what the last
-one had confirmed (:mod:`holdfast.ros.master.process`), leaves out what has died meanwhile
-(:mod:`holdfast.ros.master.plan`), and answers. To a node the master's death is a call that took a
-little longer.
+The guard owns the listening socket, and each master inherits it. So calls to a master that has just
+died are not refused: they wait in the kernel for the next one, which is already running and has
+loaded all code. It reads what its predecessor had confirmed (:mod:`holdfast.ros.master.process`),
+drops what has died meanwhile (:mod:`holdfast.ros.master.plan`), and answers. For a node this is one
+slow call.
 
-A master lives on when the guard is killed, and the next guard watches it. A master that somebody
-else started, as ``roscore`` does, is watched as well; it keeps no journal, so the guard asks it a
-few times a second what it knows.
+A master survives its guard, and the next guard watches it. The guard also watches a foreign master,
+such as ``roscore``'s. That one keeps no journal, so the guard polls it a few times a second.
 """
 
 from __future__ import annotations
@@ -22,15 +20,14 @@ import asyncio
 import contextlib
 import errno
 import os
-import shutil
 import signal
 import socket
-import subprocess
 import uuid
 from collections.abc import Callable, Coroutine
 from time import monotonic
 from urllib.parse import urlsplit
 
+from holdfast.errors import CallError, GoneError, GuardError, SilentError
 from holdfast.ros.master.plan import NodeReport, Reconciled, reconcile, unregistrations
 from holdfast.ros.master.process import (
     MasterState,
@@ -39,24 +36,19 @@ from holdfast.ros.master.process import (
     touch,
     write_journal,
 )
-from holdfast.ros.master.settings import (
-    GuardError,
-    GuardLock,
-    GuardSettings,
-    listens_at,
-    own_directory,
+from holdfast.ros.master.roscore import (
+    ROSOUT,
+    STEADY_S,
+    Rosout,
+    how_it_ended,
+    restart_delay_s,
+    set_versions,
 )
-from holdfast.ros.master.standby import ChildProcess, MasterProcess
+from holdfast.ros.master.settings import GuardLock, GuardSettings, listens_at, own_directory
+from holdfast.ros.master.standby import MasterProcess
 from holdfast.ros.master.survey import ask_everyone, snapshot
-from holdfast.runtime.logs import EventSink
-from holdfast.transport.ros1_calls import (
-    CALLER,
-    CallError,
-    Connection,
-    GoneError,
-    SilentError,
-    call,
-)
+from holdfast.runtime.events import EventSink
+from holdfast.transport.ros1_calls import CALLER, Connection, call
 
 __all__ = ["MasterGuard"]
 
@@ -64,34 +56,21 @@ _PROBE_EVERY_S = 0.5
 _PROBE_S = 1.0
 _POLL_EVERY_S = 0.25
 _POLL_SHARE = 0.1
-"""Of a stock master's time, at most so much is spent on the guard's questions."""
+"""Largest share of a stock master's time spent on the guard's polling."""
 
 _SPARE_DELAY_S = 0.5
-"""The next master is loaded a little after this one began, when the nodes have what they need."""
+"""The next master is loaded this long after a start, when the nodes have been served."""
 
 _SECOND_LOOK_S = 1.0
-_STEADY_S = 1.0
-"""A master that ends earlier than this may have failed at its start."""
-
-_FIRST_DELAY_S, _LAST_DELAY_S = 0.1, 1.0
 _KEPT_S = 5.0
-"""Calls are not kept waiting for a master longer than this; then they are refused."""
+"""Longest time that calls wait for a master; after it they are refused."""
 
 _LOCKED_EVERY_S = 1.0
 _BACKLOG = 1024
-_ROSOUT = "/rosout"
-_ROSOUT_EVERY_S = 1.0
-_VERSION_S = 30.0
 
 
 class MasterGuard:
-    """Watches a master and replaces it when it dies.
-
-    Parameters
-    ----------
-    settings : GuardSettings
-    events : EventSink
-    """
+    """Watches a master and replaces it when it dies."""
 
     def __init__(self, settings: GuardSettings, events: EventSink) -> None:
         self._settings = settings
@@ -103,25 +82,24 @@ class MasterGuard:
         self._own: MasterProcess | None = None
         self._other_pid: int | None = None
         self._is_inherited = False
-        """Whether the other master is one that an earlier guard has started."""
+        """Whether an earlier guard started the other master."""
         self._followed: MasterState | None = None
-        """What a master that keeps no journal knew last."""
+        """The last known state of a master without a journal."""
         self._unwritten: str | None = None
-        """Why that is not written down."""
+        """Why that state is not in the journal."""
         self._held = -1
-        """The journal of a master that keeps one; it can be read even if it was removed."""
+        """An open descriptor of a master's journal; readable even if the file is removed."""
         self._doubtful = MasterState()
-        """Who did not answer when the master began."""
-        self._rosout: ChildProcess | None = None
+        """Registrations of nodes that did not answer at the master's start."""
+        self._rosout = Rosout(settings.address.uri, self._uri, events)
 
     async def run(self, ready: Callable[[str], None]) -> None:
-        """Guard until cancelled; a master that was started here is ended then, too.
+        """Guard until cancelled, then end a master that was started here.
 
         Parameters
         ----------
         ready : callable
-            Is called once, when a master answers, with what was found or done: ``started``,
-            ``resumed`` or ``found``.
+            Called once when a master answers, with ``started``, ``resumed`` or ``found``.
 
         Raises
         ------
@@ -135,18 +113,19 @@ class MasterGuard:
             helpers = [asyncio.create_task(_keep_lock(lock))]
             try:
                 self._new_socket(0.0)
-                # Whatever is missing is said now, not when the master dies.
+                # Missing software is reported now, not when the master dies.
                 await self._next_master().warm()
                 how = await self._begin()
                 ready(how)
                 if self._settings.rosout:
-                    helpers.append(asyncio.create_task(self._help(self._keep_rosout())))
+                    helpers.append(asyncio.create_task(self._help(self._rosout.keep())))
                 if how == "started":
-                    helpers.append(asyncio.create_task(self._help(self._set_versions())))
+                    helpers.append(asyncio.create_task(self._help(set_versions(self._uri))))
                 await self._watch()
             except Exception:
-                # The next guard finds them; nobody gains by a master that ends with its guard.
-                self._own = self._rosout = None
+                # They continue without a guard, and the next one finds them.
+                self._own = None
+                self._rosout.release()
                 raise
             finally:
                 for helper in helpers:
@@ -154,7 +133,7 @@ class MasterGuard:
                 await self._close()
 
     async def _help(self, work: Coroutine[None, None, None]) -> None:
-        """Do what a master is guarded without, too."""
+        """Do optional work: its failure is logged and changes nothing else."""
         try:
             await work
         except Exception as error:  # noqa: BLE001 (whatever it is, the master comes first)
@@ -181,10 +160,10 @@ class MasterGuard:
             connection.close()
         known = self._known()
         nodes, services = await ask_everyone(known)
-        others = {uri for node, uri in known.nodes().items() if node != _ROSOUT}
+        others = {uri for node, uri in known.nodes().items() if node != ROSOUT}
         resumes = any(isinstance(nodes[uri], NodeReport) for uri in others)
         if not resumes:
-            # Nobody is there to whom the parameters matter: they are of another day.
+            # No node of the old graph is left, so its parameters are obsolete.
             known.parameters = {"run_id": str(uuid.uuid1())}
             nodes = {uri: answer or "gone" for uri, answer in nodes.items()}
             services = {service: bool(offered) for service, offered in services.items()}
@@ -203,13 +182,13 @@ class MasterGuard:
                 reason = await self._watch_other()
             noticed_at = monotonic()
             self._events.event("master_lost", reason=reason)
-            short_lives = short_lives + 1 if noticed_at - since < _STEADY_S else 0
+            short_lives = short_lives + 1 if noticed_at - since < STEADY_S else 0
             if short_lives > 1:
-                await asyncio.sleep(_delay(short_lives - 2))
+                await asyncio.sleep(restart_delay_s(short_lives - 2))
             await self._replace(noticed_at)
 
     async def _watch_own(self, master: MasterProcess) -> str:
-        """Wait until the master that was started here is no more; say why."""
+        """Wait for the end of the master that was started here, and return the reason."""
         loading = asyncio.create_task(self._load_spare_later())
         looking = asyncio.create_task(self._help(self._look_again()))
         ended = asyncio.create_task(master.process.wait())
@@ -217,7 +196,7 @@ class MasterGuard:
         try:
             await asyncio.wait((ended, silent), return_when=asyncio.FIRST_COMPLETED)
             if ended.done():
-                reason = _how_it_ended(ended.result())
+                reason = how_it_ended(ended.result())
             else:
                 reason = silent.result()
                 await master.end(at_once=True)
@@ -228,7 +207,7 @@ class MasterGuard:
                 task.cancel()
 
     async def _watch_other(self) -> str:
-        """Wait until a master that somebody else started is no more; say why."""
+        """Wait for the end of a foreign master, and return the reason."""
         watching = [asyncio.create_task(self._closed()), asyncio.create_task(self._silent())]
         following = asyncio.create_task(self._follow())
         told = False
@@ -244,7 +223,7 @@ class MasterGuard:
                     following.result()
                 if not silent.done():
                     continue
-                # Stopped, or so busy that it is of no use to anybody.
+                # Stopped, or too busy to be of use.
                 if self._signal_other(signal.SIGKILL):
                     await closed
                     self._forget_other()
@@ -265,7 +244,7 @@ class MasterGuard:
         self._other_pid, self._is_inherited = None, False
 
     def _signal_other(self, number: signal.Signals) -> bool:
-        """Signal the master that somebody else started, if it is this user's, and here."""
+        """Signal a foreign master, if it is a process of this user on this machine."""
         pid = self._other_pid
         if pid is None or not listens_at(pid, self._settings.address.port):
             return False
@@ -276,9 +255,9 @@ class MasterGuard:
         return True
 
     async def _closed(self) -> str:
-        """Wait until nobody listens at the master's port any more.
+        """Wait until the master's port is closed.
 
-        The system closes a killed process's connections, so the end of one tells at once.
+        The system closes a killed process's connections, so one of them ends at once.
         """
         place = urlsplit(self._uri)
         while True:
@@ -300,19 +279,19 @@ class MasterGuard:
                 await asyncio.sleep(_PROBE_EVERY_S)
 
     async def _silent(self) -> str:
-        """Wait until the master has not answered for too long."""
+        """Wait until the master has been silent for too long."""
         connection = Connection(self._uri)
         probe_s = min(_PROBE_S, self._settings.silent_s)
         failed = 0.0
         try:
-            # What counts is what was waited, not the clock: the guard may have been stopped itself.
+            # Time actually waited counts, not the clock: the guard itself may have been stopped.
             while failed < self._settings.silent_s:
                 self._hold_journal()
                 asked_at = monotonic()
                 try:
                     await connection.call("getPid", within_s=probe_s)
                 except GoneError:
-                    pass  # for others to find out
+                    pass  # _closed() reports it
                 except CallError:
                     failed += min(probe_s, monotonic() - asked_at)
                 else:
@@ -323,7 +302,7 @@ class MasterGuard:
             connection.close()
 
     async def _follow(self) -> None:
-        """Of a master that keeps no journal, keep one of what it answers."""
+        """Journal the state of a master that keeps no journal itself."""
         connection = Connection(self._uri)
         try:
             while self._other_pid is None:
@@ -340,14 +319,14 @@ class MasterGuard:
             connection.close()
 
     async def _recognise(self, connection: Connection) -> None:
-        """Find out which master somebody else has started."""
+        """Identify a foreign master."""
         pid = int(await connection.call("getPid", within_s=_PROBE_S))
-        # A stock master answers at once that it has no such call.
+        # A stock master has no such call and answers so at once.
         (journal,) = await connection.calls([("getJournal", (CALLER,))], within_s=_PROBE_S)
         inherited = journal == str(self._journal)
         self._followed = None
         if not inherited:
-            # That of another master is not its.
+            # An existing journal belongs to another master.
             self._forget_journal()
             await self._write_down(connection)
         self._other_pid, self._is_inherited = pid, inherited
@@ -359,7 +338,7 @@ class MasterGuard:
         )
 
     async def _write_down(self, connection: Connection) -> None:
-        """Write down what a stock master knows, if that has changed."""
+        """Journal a stock master's state, if it has changed."""
         try:
             state = await snapshot(connection)
         except (TypeError, ValueError) as error:
@@ -391,7 +370,7 @@ class MasterGuard:
     # -- the journal -------------------------------------------------------------------------------
 
     def _hold_journal(self) -> None:
-        """Keep the journal that a master writes now open, so that it can be removed by nobody."""
+        """Keep the master's journal open, so that it stays readable if it is removed."""
         if self._followed is not None:
             return
         with contextlib.suppress(OSError):
@@ -407,12 +386,12 @@ class MasterGuard:
 
     def _forget_journal(self) -> None:
         self._let_go()
-        # It is written anew in a moment; whatever is wrong is said then.
+        # It is written anew in a moment, and errors are reported then.
         with contextlib.suppress(OSError):
             self._journal.unlink(missing_ok=True)
 
     def _known(self) -> MasterState:
-        """Return what the last master knew."""
+        """Return the last master's state."""
         if self._followed is not None:
             return self._followed
         known, wrong = None, None
@@ -430,7 +409,7 @@ class MasterGuard:
             if known is not None:
                 reason += "; it was still open here, and nothing is lost"
             else:
-                # The next master would write its own there. Where this is not possible, it cannot.
+                # The next master writes its own journal at this path.
                 aside = self._journal.with_name(f"{self._journal.name}.unread")
                 try:
                     self._journal.replace(aside)
@@ -444,7 +423,7 @@ class MasterGuard:
     # -- replacing ---------------------------------------------------------------------------------
 
     async def _replace(self, noticed_at: float) -> None:
-        """Put a new master at the place of one that is no more."""
+        """Start a new master in place of one that has ended."""
         failures = 0
         while True:
             try:
@@ -452,14 +431,14 @@ class MasterGuard:
                 reconciled = reconcile(known, *await ask_everyone(known))
                 await self._start(reconciled, noticed_at)
             except _TakenError as error:
-                # Somebody was faster, as a unit that starts roscore again.
+                # Another program was faster, such as a unit that restarts roscore.
                 self._events.event("note", reason=str(error))
                 return
             except (GuardError, OSError) as error:
                 self._events.event("master_failed", reason=str(error))
                 await self._drop_spare()
                 self._new_socket(_KEPT_S - (monotonic() - noticed_at))
-                await asyncio.sleep(_delay(failures))
+                await asyncio.sleep(restart_delay_s(failures))
                 failures += 1
             else:
                 return
@@ -475,7 +454,7 @@ class MasterGuard:
             try:
                 master.hand_over(state)
             except (OSError, TypeError, ValueError) as error:
-                # What the journal holds lists the dead, too, but is better than no master.
+                # Then it reads the journal, which lists dead nodes, too.
                 self._events.event("note", reason=f"the new master's state: {_words_of(error)}")
             await master.serve()
         except BaseException:
@@ -486,7 +465,7 @@ class MasterGuard:
         self._hold_journal()
         self._own = master
         self._doubtful = reconciled.doubtful
-        # Where nobody is left a master begins anew, and nothing is missed.
+        # Without nodes a master begins anew, and nothing is lost.
         begins_anew = not state.nodes()
         self._events.event(
             "master_started",
@@ -511,15 +490,12 @@ class MasterGuard:
 
     async def _load_spare_later(self) -> None:
         await asyncio.sleep(_SPARE_DELAY_S)
-        # Without one, the next master takes a little longer, and says what is wrong.
+        # Without a spare the next start takes longer, and reports the error.
         with contextlib.suppress(GuardError):
             self._next_master()
 
     async def _look_again(self) -> None:
-        """Ask those once more who did not answer when the master began.
-
-        A node that died along with the master may have been about to.
-        """
+        """Ask the silent nodes once more: one that died with the master may have seemed slow."""
         await asyncio.sleep(_SECOND_LOOK_S)
         before = self._doubtful
         found = reconcile(before, *await ask_everyone(before))
@@ -541,7 +517,7 @@ class MasterGuard:
             await spare.end(at_once=True)
 
     def _new_socket(self, keep_s: float) -> None:
-        """Make the socket anew at which masters listen, unless calls may still wait at it."""
+        """Replace the listening socket, unless calls may still wait at it."""
         if self._listening is not None:
             if keep_s > 0.0:
                 return
@@ -552,7 +528,7 @@ class MasterGuard:
         self._is_bound = False
 
     def _bind(self) -> None:
-        """Take the master's port; what connects from now on waits for a master."""
+        """Bind the master's port; connections wait for a master from now on."""
         if self._is_bound:
             return
         assert self._listening is not None
@@ -567,67 +543,12 @@ class MasterGuard:
             raise GuardError(text) from error
         self._is_bound = True
 
-    # -- what belongs to a master ------------------------------------------------------------------
-
-    async def _keep_rosout(self) -> None:
-        """Have ``/rosout`` run, as ``roscore`` does."""
-        failures = 0
-        while True:
-            if self._rosout is None and not await self._has_rosout():
-                rosrun = shutil.which("rosrun")
-                if rosrun is None:
-                    self._events.event("note", reason="no rosrun here, so no /rosout")
-                    return
-                begun_at = monotonic()
-                self._rosout = ChildProcess(
-                    (rosrun, "rosout", "rosout", "__name:=rosout"),
-                    {"ROS_MASTER_URI": self._settings.address.uri, "ROS_NAMESPACE": "/"},
-                    errors=subprocess.DEVNULL,
-                )
-                code = await self._rosout.wait()
-                self._rosout = None
-                self._events.event("rosout_ended", reason=_how_it_ended(code))
-                failures = failures + 1 if monotonic() - begun_at < _STEADY_S else 0
-                await asyncio.sleep(_delay(failures))
-            await asyncio.sleep(_ROSOUT_EVERY_S)
-
-    async def _has_rosout(self) -> bool:
-        """Tell whether there is one, if only one whose master is just away."""
-        try:
-            uri = await call(self._uri, "lookupNode", _ROSOUT, within_s=_PROBE_S)
-            await call(uri, "getPid", within_s=_PROBE_S)
-        except GoneError:
-            return False
-        except CallError as error:
-            return "unknown node" not in str(error)
-        return True
-
-    async def _set_versions(self) -> None:
-        """Set the parameters that ``roscore`` sets."""
-        for name, words in (("rosversion", ("roslaunch",)), ("rosdistro", ("-d",))):
-            with contextlib.suppress(OSError, CallError, TimeoutError):
-                process = await asyncio.create_subprocess_exec(
-                    *("rosversion", *words),
-                    stdin=subprocess.DEVNULL,
-                    stdout=subprocess.PIPE,
-                    stderr=subprocess.DEVNULL,
-                )
-                try:
-                    said, _ = await asyncio.wait_for(process.communicate(), _VERSION_S)
-                finally:
-                    if process.returncode is None:
-                        process.kill()
-                if said and process.returncode == 0:
-                    value = said.decode(errors="replace")
-                    await call(self._uri, "setParam", f"/{name}", value, within_s=_PROBE_S)
-
     async def _close(self) -> None:
-        if self._rosout is not None:
-            await self._rosout.end(signal.SIGINT)
+        await self._rosout.end()
         if self._is_inherited:
-            # As the guard that started both would have done.
+            # As the guard that started both would do.
             with contextlib.suppress(CallError):
-                uri = await call(self._uri, "lookupNode", _ROSOUT, within_s=_PROBE_S)
+                uri = await call(self._uri, "lookupNode", ROSOUT, within_s=_PROBE_S)
                 await call(uri, "shutdown", "the guard ends", within_s=_PROBE_S)
             self._signal_other(signal.SIGTERM)
         if self._own is not None:
@@ -649,15 +570,4 @@ def _words_of(error: Exception) -> str:
 
 
 class _TakenError(GuardError):
-    """Somebody else listens at the port."""
-
-
-def _delay(failures: int) -> float:
-    return float(min(_LAST_DELAY_S, _FIRST_DELAY_S * 2 ** min(failures, 16)))
-
-
-def _how_it_ended(code: int) -> str:
-    if code < 0:
-        with contextlib.suppress(ValueError):
-            return f"it was ended by {signal.Signals(-code).name}"
-    return f"it ended with exit code {code}"
+    """Another process listens at the port."""

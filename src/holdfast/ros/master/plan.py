@@ -1,9 +1,9 @@
-"""What a new master is to know, from what the last one knew and what the nodes say themselves.
+"""A new master's state, from the last master's state and the nodes' own answers.
 
-A master's knowledge is a memory of what nodes told it. While no master was there, nodes died, and
-nodes stopped publishing; nobody took note. So before a new master begins, every node and every
-service is asked. Of a topic the node has the last word, and of a service the one who answers at its
-address. Who is silent is believed to be there still: it may be stopped, or far away.
+A master knows what nodes have registered. Without a master, nodes may die or stop publishing
+unnoticed. So before a new master begins, every node and every service is asked. A node's answer
+decides about its topics, and the answer at a service's address about that service. Silent ones are
+kept: they may be stopped, or far away.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ _REGISTRATIONS = {
     "subscribers": "unregisterSubscriber",
     "parameter_subscribers": "unsubscribeParam",
 }
-"""Tables of a master, and how a node takes back what it has in them."""
+"""Tables of a master, and the calls that remove a node from them."""
 
 
 class NodeReport(NamedTuple):
-    """A node's own account: the type of each topic that it publishes, or subscribes to."""
+    """A node's own answer: the type of each topic that it publishes or subscribes to."""
 
     publications: Mapping[str, str]
     subscriptions: Mapping[str, str]
@@ -46,19 +46,18 @@ NodeAnswer: TypeAlias = NodeReport | Literal["gone"] | None
 
 
 class Reconciled(NamedTuple):
-    """What a new master is to know.
+    """A new master's state.
 
     Attributes
     ----------
-    state : MasterState
     gone : tuple of str
         Nodes that have ended.
     silent : tuple of str
         Nodes that did not answer, which are kept.
     lost_services : tuple of str
-        Services that nobody offers any more.
+        Services that no longer exist.
     doubtful : MasterState
-        That part of the state of which nobody could say that it is still so.
+        The part of the state that no answer has confirmed.
     """
 
     state: MasterState
@@ -71,12 +70,12 @@ class Reconciled(NamedTuple):
 def reconcile(
     known: MasterState, nodes: Mapping[str, NodeAnswer], services: Mapping[str, bool | None]
 ) -> Reconciled:
-    """Merge what the last master knew with what nodes and services answered.
+    """Merge the last master's state with the answers of nodes and services.
 
     Parameters
     ----------
     known : MasterState
-        Left as it is.
+        Not changed.
     nodes : mapping
         Answers by the URI of the node's XML-RPC server.
     services : mapping
@@ -97,7 +96,7 @@ def reconcile(
                 kept[key] = staying
     for node, uri in uris.items():
         answer = nodes.get(uri)
-        # Two names at one address: one of them has died, and the other one's topics are not its.
+        # Two names at one address: one node has died, and the topics are the other's.
         if isinstance(answer, NodeReport) and sharing[uri] == 1:
             _add(state, state.publishers, node, uri, answer.publications)
             _add(state, state.subscribers, node, uri, answer.subscriptions)
@@ -133,10 +132,9 @@ def _doubtful(
 
 
 def unregistrations(before: MasterState, after: MasterState) -> list[tuple[str, tuple[str, ...]]]:
-    """Return the calls to a master that take back what is in one state and not in another.
+    """Return the calls to a master that remove what is in one state and not in another.
 
-    Each call names the address, too: of a node that has been started again meanwhile, at another
-    one, it takes nothing back.
+    Each call names the address, too, so it does not affect a node restarted at another address.
 
     Returns
     -------
@@ -157,7 +155,7 @@ def unregistrations(before: MasterState, after: MasterState) -> list[tuple[str, 
 
 
 def _still(table: str, key: str, answer: NodeAnswer) -> bool:
-    """Tell whether a node is to stay registered."""
+    """Return whether a node stays registered."""
     match answer:
         case "gone":
             return False
@@ -175,7 +173,7 @@ def _add(
     uri: str,
     topics: Mapping[str, str],
 ) -> None:
-    """Register a node for its topics where it is not."""
+    """Register a node for topics where it is missing."""
     for topic, kind in topics.items():
         registered = registrations.setdefault(topic, [])
         if (node, uri) not in registered:
@@ -202,10 +200,10 @@ def state_of_snapshot(
     node_uris: Mapping[str, str | None],
     service_uris: Mapping[str, str | None],
 ) -> MasterState:
-    """Return what a stock master knows, from its answers.
+    """Return a stock master's state, from its answers.
 
-    What has no URI any more went away between two questions, and is left out. Who watches
-    parameters, no master tells.
+    Nodes and services without a URI ended between two questions and are left out. No call returns
+    the subscribers of parameters.
 
     Parameters
     ----------

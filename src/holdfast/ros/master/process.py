@@ -1,19 +1,16 @@
-"""A ROS 1 master that writes down what it has been told, before it says that it was told.
+"""A ROS 1 master that journals every change before it confirms it.
 
-A stock master keeps everything in memory: who publishes, who subscribes, which services there are,
-which parameters. Killed, it takes that along. This one is the stock master (``rosmaster``, same
-code, same answers) with a journal: a file that gets every change before the node that asked for it
-is answered. A master that is started from the journal knows all that the last one has confirmed,
-those who watch parameters too, whom no call to a master can read.
+A stock master keeps publishers, subscribers, services and parameters in memory, and loses them when
+it is killed. This one is the stock master (``rosmaster``, same code, same answers) with a journal:
+every change is in the file before the node gets its answer. So a master started from the journal
+knows all that the last one confirmed, even the subscribers of parameters, which no call returns.
 
-The file is written to the page cache only. It outlives the master's process, not the machine, and
-that is what is wanted: the nodes do not outlive the machine either.
+The file reaches the page cache only. It survives the process but not the machine, like the nodes.
+A journal that other programs removed or changed is written anew.
 
-ROS's Python runs this file, which may be older than holdfast's and lacks holdfast: it imports the
-standard library alone and, once it runs, ``rosmaster``. The guard imports :class:`MasterState` and
-the journal from here.
-
-It looks after the file, too: one that was removed or changed by others is written anew.
+ROS's Python runs this file. It may be older than holdfast's and lacks holdfast, so the file imports
+only the standard library and, once it runs, ``rosmaster``. The guard imports :class:`MasterState`
+and the journal from here.
 
 Started as ``process.py SOCKET CONTROL STATE JOURNAL`` (three descriptors and a path) it loads all
 that it needs, says ``warm`` on CONTROL, and waits. On ``go`` it reads what the guard has left in
@@ -37,7 +34,7 @@ from typing import Any, Dict, List, NamedTuple, NoReturn, Optional, Tuple  # noq
 from zlib import crc32
 
 __all__ = [
-    "Journal",
+    "MasterJournal",
     "MasterState",
     "journal_of",
     "parameter_names",
@@ -62,7 +59,7 @@ _TABLES = ("publishers", "subscribers", "services", "types", "parameter_subscrib
 
 
 class MasterState:
-    """All that a master knows.
+    """A master's state.
 
     Attributes
     ----------
@@ -265,25 +262,23 @@ def write_journal(path: Path, state: MasterState) -> int:
 
 
 def touch(path: Path, found: os.stat_result) -> None:
-    """Keep a file from those who remove what is old, as cleaners of ``/tmp`` do."""
+    """Keep a file young for cleaners that remove old files, as in ``/tmp``."""
     if time.time() - found.st_mtime > _TOUCHED_AFTER_S:
         with contextlib.suppress(OSError):
             os.utime(path)
 
 
-class Journal:
-    """What a running master writes into; any thread may.
+class MasterJournal:
+    """A running master's journal; any thread may write.
 
-    It has a copy of its own of all that it has written, so that it can be written anew, shorter,
-    whoever changes what meanwhile. If the disk is full, the master goes on, and with every change
-    it is tried again to write the journal anew. So it is if the file is no longer the one that was
-    written here.
+    It has its own copy of the state, so that it can write a shorter file at any time. If the disk
+    is full, the master continues, and every change tries to write the journal anew. The same holds
+    if the file is not the one that was written here.
 
     Parameters
     ----------
-    path : Path
     state : MasterState
-        What the master knows at its start; kept.
+        The master's state at its start; kept.
     """
 
     def __init__(self, path: Path, state: MasterState) -> None:
@@ -377,7 +372,7 @@ def _load() -> Any:
     class JournalledRegistrations(rosmaster.registrations.RegistrationManager):  # type: ignore[misc, name-defined, unused-ignore]
         """Writes down what a registration has changed; the master holds its lock meanwhile."""
 
-        journal: Journal
+        journal: MasterJournal
 
         def tables(self) -> dict[str, Any]:
             return {
@@ -429,7 +424,7 @@ def _load() -> Any:
     class JournalledParameters(rosmaster.paramserver.ParamDictionary):  # type: ignore[misc, name-defined, unused-ignore]
         """Writes down parameters in the order in which they are set."""
 
-        journal: Journal
+        journal: MasterJournal
 
         def set_param(
             self, key: str, value: Any, notify_task: Any = None, caller_id: Any = None
@@ -446,7 +441,7 @@ def _load() -> Any:
     class JournalledTypes(Dict[str, str]):  # noqa: UP006
         """Writes down a topic's type."""
 
-        journal: Journal
+        journal: MasterJournal
 
         def __setitem__(self, topic: str, kind: str) -> None:
             changed = self.get(topic) != kind
@@ -473,7 +468,7 @@ def _load() -> Any:
             self.topics_types = JournalledTypes(state.types)
             self.restore(manager, state)
             # A file of its own from here on.
-            self.journal = Journal(path, written)
+            self.journal = MasterJournal(path, written)
             self.topics_types.journal = manager.journal = self.journal
             self.param_server.journal = self.journal
             self.path = str(path)

@@ -1,4 +1,4 @@
-"""Where a master is, and where its guard keeps what it needs."""
+"""A master's address, and its guard's settings, directory and lock."""
 
 from __future__ import annotations
 
@@ -12,12 +12,11 @@ from pathlib import Path
 from typing import NamedTuple, Self
 from urllib.parse import urlsplit
 
-from holdfast.errors import HoldfastError
+from holdfast.errors import GuardError
 from holdfast.ros.master.process import touch
 
 __all__ = [
     "DEFAULT_PORT",
-    "GuardError",
     "GuardLock",
     "GuardSettings",
     "MasterAddress",
@@ -28,18 +27,13 @@ __all__ = [
 DEFAULT_PORT = 11311
 
 
-class GuardError(HoldfastError):
-    """The master cannot be guarded; the message says why."""
-
-
 class MasterAddress(NamedTuple):
-    """Where a master is.
+    """A master's address.
 
     Attributes
     ----------
     host : str
-        As nodes name it.
-    port : int
+        In the nodes' ``ROS_MASTER_URI``.
     bind : str
         The address of this machine at which it listens.
     """
@@ -50,18 +44,18 @@ class MasterAddress(NamedTuple):
 
     @property
     def uri(self) -> str:
-        """Return what nodes have in ``ROS_MASTER_URI``."""
+        """The nodes' ``ROS_MASTER_URI``."""
         return f"http://{self.host}:{self.port}/"
 
     @property
     def own_uri(self) -> str:
-        """Return how this machine reaches it."""
+        """The URI for this machine."""
         near = {"0.0.0.0": "127.0.0.1", "::": "[::1]", "::1": "[::1]"}.get(self.bind, self.bind)
         return f"http://{near}:{self.port}/"
 
     @classmethod
     def of(cls, environment: Mapping[str, str], port: int | None = None) -> Self:
-        """Return what ROS's variables say.
+        """Read ROS's variables.
 
         Parameters
         ----------
@@ -101,7 +95,7 @@ class MasterAddress(NamedTuple):
 
 
 def _is_here(host: str) -> bool:
-    """Tell whether a name is this machine's."""
+    """Return whether a name is this machine's."""
     try:
         found = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)
     except OSError:
@@ -118,13 +112,12 @@ class GuardSettings(NamedTuple):
 
     Attributes
     ----------
-    address : MasterAddress
     python : str
         ROS's Python.
     directory : Path or None
-        Where the journal is; None for one of this user that goes when the machine is started anew.
+        Of the journal; None for one of this user that is cleared when the machine restarts.
     silent_s : float
-        A master that has not answered for so long is replaced.
+        A master that has been silent for this long is replaced.
     rosout : bool
         Whether ``/rosout`` is to run, too, as with ``roscore``.
     """
@@ -156,11 +149,6 @@ def own_directory() -> Path:
 class GuardLock:
     """Keeps a second guard of the same master away.
 
-    Parameters
-    ----------
-    path : Path
-    port : int
-
     Raises
     ------
     GuardError
@@ -188,14 +176,14 @@ class GuardLock:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
             return False
-        # What locks is the file, not what is in it, for which the disk may have no room.
+        # The lock is on the file; its content is optional, as the disk may be full.
         with contextlib.suppress(OSError):
             os.ftruncate(descriptor, 0)
             os.pwrite(descriptor, f"{os.getpid()}\n".encode(), 0)
         return True
 
     def keep(self) -> None:
-        """Keep the file from those who remove what is old, and lock it anew if it is gone."""
+        """Keep the file young for cleaners of old files, and lock a new one if it is gone."""
         try:
             found = self._path.lstat()
             if os.path.samestat(found, os.fstat(self._descriptor)):
@@ -217,9 +205,9 @@ class GuardLock:
 
 
 def listens_at(pid: int, port: int) -> bool:
-    """Tell whether a process, which this user may look into, listens at a port of this machine.
+    """Return whether a process of this user listens at a port of this machine.
 
-    A master names its process, but a container has numbers of its own.
+    A master reports its process, but in a container process numbers differ.
     """
     sockets = set()
     for table in ("tcp", "tcp6"):

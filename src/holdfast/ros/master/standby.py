@@ -1,4 +1,4 @@
-"""Processes that live on if this one dies: masters, and those that wait to be one."""
+"""Processes that survive this one: masters, and processes that wait to become one."""
 
 from __future__ import annotations
 
@@ -12,26 +12,26 @@ import threading
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from holdfast.errors import GuardError
 from holdfast.ros.master import process as master_process
 from holdfast.ros.master.process import MasterState
-from holdfast.ros.master.settings import GuardError, GuardSettings
+from holdfast.ros.master.settings import GuardSettings
 
-__all__ = ["ChildProcess", "MasterProcess"]
+__all__ = ["DetachedProcess", "MasterProcess"]
 
 _START_S = 30.0
 _END_S = 2.0
 
 
-class ChildProcess:
-    """A process whose end is told at once, and which nothing but a signal ends.
+class DetachedProcess:
+    """A process whose end is noticed at once, and which survives the event loop.
 
-    The standard library's own coroutines for processes end them along with the event loop.
+    The standard library's subprocess coroutines would end it with the loop.
 
     Parameters
     ----------
-    words : sequence of str
     environment : mapping
-        What differs from this process's.
+        Additions to this process's.
     pass_fds : sequence of int
         Descriptors that it inherits.
     errors : int or None
@@ -39,7 +39,6 @@ class ChildProcess:
 
     Attributes
     ----------
-    pid : int
     ended : asyncio.Future of int
         Its exit code, or the negative number of the signal that ended it.
 
@@ -87,7 +86,7 @@ class ChildProcess:
         return await asyncio.shield(self.ended)
 
     async def end(self, number: signal.Signals) -> None:
-        """End it by a signal, and if that is of no use, for certain; may be repeated."""
+        """End it by a signal, and by SIGKILL if that does not help; may be repeated."""
         for each in (number, signal.SIGKILL):
             if not self.ended.done():
                 with contextlib.suppress(ProcessLookupError):
@@ -96,14 +95,12 @@ class ChildProcess:
 
 
 class MasterProcess:
-    """A process that is a master, or waits to be one.
+    """A process that is a master, or waits to become one.
 
     Parameters
     ----------
-    settings : GuardSettings
     listening : socket
         Which it inherits; need not be bound yet.
-    journal : Path
 
     Raises
     ------
@@ -117,11 +114,11 @@ class MasterProcess:
         self._control, its = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._control.setblocking(False)
         script = str(Path(master_process.__file__).resolve())
-        # In memory, where there is room when the disk is full.
+        # In memory, because the disk may be full.
         self._state = open(os.memfd_create("master-state"), "wb", buffering=0)  # noqa: PTH123, SIM115
         descriptors = (listening.fileno(), its.fileno(), self._state.fileno())
         try:
-            self.process = ChildProcess(
+            self.process = DetachedProcess(
                 (settings.python, script, *map(str, descriptors), str(journal)),
                 {"ROS_MASTER_URI": settings.address.uri},
                 pass_fds=descriptors,
@@ -155,12 +152,12 @@ class MasterProcess:
         self._warm = True
 
     def hand_over(self, state: MasterState) -> None:
-        """Give it what it is to know; without that, it knows what the journal holds.
+        """Hand it its state; without one it reads the journal.
 
         Raises
         ------
         OSError
-            If there is no room; it knows what the journal holds then.
+            If there is no room; it reads the journal then.
         """
         content = memoryview(master_process.journal_of(state))
         try:
@@ -171,7 +168,7 @@ class MasterProcess:
             raise
 
     async def serve(self) -> None:
-        """Have it be the master from now on, with what it was handed.
+        """Make it the master, with the state that it was handed.
 
         Raises
         ------

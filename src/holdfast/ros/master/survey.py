@@ -1,4 +1,4 @@
-"""What nodes, services and stock masters say when they are all asked at once."""
+"""Parallel questions to nodes, services and stock masters."""
 
 from __future__ import annotations
 
@@ -6,24 +6,18 @@ import asyncio
 import contextlib
 from collections.abc import Awaitable
 
+from holdfast.errors import CallError, GoneError
 from holdfast.ros.master.plan import NodeAnswer, NodeReport, lookups_of, state_of_snapshot
 from holdfast.ros.master.process import MasterState
-from holdfast.transport.ros1_calls import (
-    CALLER,
-    CallError,
-    Connection,
-    GoneError,
-    call,
-    offers_service,
-)
+from holdfast.transport.ros1_calls import CALLER, Connection, call, offers_service
 
 __all__ = ["ask_everyone", "snapshot"]
 
 _ANSWER_S = 0.3
-"""How long a node or service is waited for while there is no master."""
+"""Longest wait for a node or service while there is no master."""
 
 _ANSWERS_S = 1.0
-"""And for all of them together."""
+"""Longest wait for all of them together."""
 
 _ASKED_AT_ONCE = 64
 _SNAPSHOT_S = 5.0
@@ -32,7 +26,7 @@ _SNAPSHOT_S = 5.0
 async def ask_everyone(
     known: MasterState,
 ) -> tuple[dict[str, NodeAnswer], dict[str, bool | None]]:
-    """Ask all nodes and services of a master that is no more whether they are there, at once."""
+    """Ask all nodes and services of a dead master, in parallel, whether they are alive."""
     nodes: dict[str, NodeAnswer] = dict.fromkeys(known.nodes().values())
     services: dict[str, bool | None] = dict.fromkeys(known.services)
     few = asyncio.Semaphore(_ASKED_AT_ONCE)
@@ -77,7 +71,7 @@ async def _report_of(uri: str) -> NodeAnswer:
 
 
 async def snapshot(connection: Connection) -> MasterState:
-    """Return what a stock master knows."""
+    """Return a stock master's state."""
     system_state, types, parameters = await connection.calls(
         [
             ("getSystemState", (CALLER,)),

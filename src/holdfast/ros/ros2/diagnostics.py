@@ -1,9 +1,8 @@
-"""What ``/diagnostics`` says: how the robot is doing, and how bad that is.
+"""The robot's state for ``/diagnostics``, with a level.
 
-To stand still is no fault yet. Where the only service dies, the robot holds still for as long as
-its local service takes to start, and then goes on: that is what it is built for, and a warning. It
-is an error once that start fails, or takes longer than the settings allow, or where there is no
-local service to start.
+Holding still is not an error at first. When the only service dies, the robot holds still while its
+local service starts, and then continues: a warning. It is an error once that start fails, takes
+longer than the settings allow, or no local service may be started.
 """
 
 from __future__ import annotations
@@ -13,11 +12,12 @@ from collections.abc import Callable
 from time import monotonic
 from typing import NamedTuple
 
-from holdfast.ros.ros2.part import Ending, Part, PartOfRun
+from holdfast.config.settings import RecoverySettings
+from holdfast.protocol.status import Status
+from holdfast.ros.ros2.run_segment import Ending, RunSegment, SegmentResult
 from holdfast.ros.ros2.telemetry import Telemetry
-from holdfast.settings import RecoverySettings
 
-__all__ = ["Diagnostics", "Level", "Told"]
+__all__ = ["Diagnostics", "Level", "RobotDiagnosis"]
 
 _HOLDING = "holding still"
 
@@ -30,14 +30,13 @@ class Level(enum.IntEnum):
     ERROR = 2
 
 
-class Told(NamedTuple):
-    """What is said.
+class RobotDiagnosis(NamedTuple):
+    """A robot's state for ``/diagnostics``.
 
     Attributes
     ----------
-    level : Level
     word : str
-        How the robot is doing.
+        The robot's condition.
     facts : dict
         Value by key.
     """
@@ -48,11 +47,10 @@ class Told(NamedTuple):
 
 
 class Diagnostics:
-    """Follows the parts of one run.
+    """Follows the segments of one run.
 
     Parameters
     ----------
-    recovery : RecoverySettings
     clock : callable
         Returns seconds.
 
@@ -84,34 +82,36 @@ class Diagnostics:
         elif name in ("launch_failed", "recovery_exited"):
             self._launch_failed = True
 
-    def tell(self, part: PartOfRun | None, last: Part | None, telemetry: Telemetry | None) -> Told:
-        """Return what is to be said now.
+    def tell(
+        self, segment: RunSegment | None, last: SegmentResult | None, telemetry: Telemetry | None
+    ) -> RobotDiagnosis:
+        """Return the current diagnosis.
 
         Parameters
         ----------
-        part : PartOfRun or None
-            The one that runs.
-        last : Part or None
-            What the one before it came to.
+        segment : RunSegment or None
+            The running one.
+        last : SegmentResult or None
+            The result of the previous one.
         telemetry : Telemetry or None
-            That of the last part that has begun.
+            That of the last segment that has begun.
         """
-        condition = None if part is None else part.condition()
+        condition = None if segment is None else segment.condition()
         if condition is not None:
             word, level = condition.word, Level.OK
             if word == _HOLDING:
                 level = self._level_of_holding()
-            elif word == "local_recovery" or self.diverged:
+            elif word == Status.LOCAL_RECOVERY.value or self.diverged:
                 level = Level.WARN
-        elif last is not None and part is None:
+        elif last is not None and segment is None:
             word = last.ending.name.lower()
             level = Level.ERROR if last.ending in (Ending.HELD, Ending.FAILED) else Level.OK
         else:
-            word, level = "starting" if part is not None else "idle", Level.OK
-        if part is not None:
-            # Until the next part has one, what is known last is still worth knowing.
-            self._status = part.status or self._status
-            self._finished = part.num_finished
+            word, level = "starting" if segment is not None else "idle", Level.OK
+        if segment is not None:
+            # Until the next segment has a status, the last known one is shown.
+            self._status = segment.status or self._status
+            self._finished = segment.num_finished
         elif last is not None:
             self._status = last.status or self._status
             self._finished = last.num_finished
@@ -123,12 +123,12 @@ class Diagnostics:
             "holding": str(word == _HOLDING).lower(),
             "trial": "" if trial is None else trial,
             "finished_trials": self._finished,
-            "unexplained_observations": 0 if part is None else part.unexplained_observations,
+            "unexplained_observations": 0 if segment is None else segment.unexplained_observations,
             "filter_diverged": str(self.diverged).lower(),
             "decisions_not_published": 0 if telemetry is None else telemetry.dropped_decisions,
             "last_error": "" if last is None or level != Level.ERROR else last.message[:500],
         }
-        return Told(level, word, {key: str(value) for key, value in facts.items()})
+        return RobotDiagnosis(level, word, {key: str(value) for key, value in facts.items()})
 
     def _level_of_holding(self) -> Level:
         since = self._holding_since

@@ -19,13 +19,12 @@ from holdfast_interfaces.msg import (
 from std_msgs.msg import Header
 
 from holdfast import planning
+from holdfast.arrays import FloatArray
 from holdfast.outcome import TrialResult
 from holdfast.problems.problem import Problem
-from holdfast.ros.ros2.telemetry import Shown
+from holdfast.ros.ros2.telemetry import PublishedDecision
 
 __all__ = ["belief_message", "decision_message", "floats", "outcome_message", "pose_array"]
-
-FloatArray = npt.NDArray[np.float64]
 
 
 def floats(values: npt.ArrayLike) -> array.array[float]:
@@ -58,7 +57,7 @@ def belief_message(state: planning.PlanningState, frame_id: str, stamp: Time) ->
     )
 
 
-def decision_message(shown: Shown, problem: Problem, frame_id: str, stamp: Time) -> Any:
+def decision_message(shown: PublishedDecision, problem: Problem, frame_id: str, stamp: Time) -> Any:
     """Return an order as a message."""
     sensing_action = shown.sensing_action
     return Decision(
@@ -102,8 +101,6 @@ def pose_array(poses: FloatArray, frame_id: str, stamp: Time) -> bytes:
     ----------
     poses : array of shape (N, 7)
         Position and quaternion (x, y, z, w).
-    frame_id : str
-    stamp : Time
     """
     name = frame_id.encode() + b"\0"
     body = struct.pack("<iII", stamp.sec, stamp.nanosec, len(name)) + name

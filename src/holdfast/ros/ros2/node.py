@@ -1,13 +1,13 @@
-"""The lifecycle node: parameters in, a run on a thread of its own, and what others see of it.
+"""The lifecycle node: parameters in, a run on its own thread, and topics, services and actions.
 
-Nothing of a decision is made here. The node reads the parameters when it is configured; while it is
-active, a goal of ``~/run`` or a call of ``~/decide`` starts a part of the run
-(:class:`~holdfast.ros.ros2.part.PartOfRun`), which is the same robot's process as ``holdfast run``
-has. To deactivate the node pauses that part; the next one goes on.
+The node decides nothing. It reads the parameters when it is configured. While it is active, a goal
+of ``~/run`` or a call of ``~/decide`` starts a segment of the run
+(:class:`~holdfast.ros.ros2.run_segment.RunSegment`): the same robot process as in ``holdfast run``.
+Deactivating the node pauses the segment; the next one continues the run.
 
-Threads: rclpy's executor calls the node's methods, on several threads; the robot's loop, the
-environment and the telemetry have one each. A callback waits for the robot only with a deadline,
-except for that of the goal that is running, which has a thread of the executor to itself.
+Threads: rclpy's executor calls the node's methods on several threads. The robot's loop, the
+environment and the telemetry have one thread each. Callbacks wait for the robot only with a
+deadline, except the running goal's, which keeps one thread of the executor.
 """
 
 from __future__ import annotations
@@ -34,24 +34,24 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 
 from holdfast.errors import HoldfastError
 from holdfast.planning import PlanningState
+from holdfast.protocol.events import Act, Sense
 from holdfast.recording.run_directory import RunDirectory
-from holdfast.ros.executive import Call, Code, Executive
+from holdfast.robot.links import check_services
+from holdfast.ros.executive import DecideCode, DecideRequest, DecisionHandover
 from holdfast.ros.poses import PoseLayout, pose_layout
 from holdfast.ros.ros2 import messages
 from holdfast.ros.ros2.diagnostics import Diagnostics
 from holdfast.ros.ros2.parameters import (
     OWN,
-    Parameters,
+    NodeParameters,
     in_parameters,
     known_parameters,
     read_parameters,
 )
-from holdfast.ros.ros2.part import Ending, Part, PartOfRun
-from holdfast.ros.ros2.telemetry import Shown, Telemetry
+from holdfast.ros.ros2.run_segment import Ending, RunSegment, SegmentResult
+from holdfast.ros.ros2.telemetry import PublishedDecision, Telemetry
 from holdfast.ros.ros2.worlds import make_world
-from holdfast.runtime.links import check_services
-from holdfast.runtime.logs import event_in_words
-from holdfast.session.effects import Act, Sense
+from holdfast.runtime.log_lines import fields_as_text
 
 __all__ = ["NUM_THREADS", "HoldfastNode"]
 
@@ -104,7 +104,7 @@ class _Events:
         if name in _TOLD_AT_ONCE:
             self._diagnostics.event(name)
             if name in _LOGGED:
-                words = in_parameters(event_in_words(fields))
+                words = in_parameters(fields_as_text(fields))
                 self._node.get_logger().info(f"{name.replace('_', ' ')}: {words}")
             self._telemetry.notice()
 
@@ -113,12 +113,7 @@ class _Events:
 
 
 class HoldfastNode(LifecycleNode):  # type: ignore[misc]
-    """The robot's part of active sensing.
-
-    Parameters
-    ----------
-    name : str
-    """
+    """The robot's part of active sensing."""
 
     SUCCESS = TransitionCallbackReturn.SUCCESS
 
@@ -131,15 +126,15 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
         self._declare()
         # Guards the fields below.
         self._changed = threading.RLock()
-        self._parameters_read: Parameters | None = None
+        self._parameters_read: NodeParameters | None = None
         self._layout: PoseLayout | None = None
         self._active = False
-        self._part: PartOfRun | None = None
+        self._segment: RunSegment | None = None
         self._telemetry: Telemetry | None = None
         self._diagnostics: Diagnostics | None = None
-        self._executive: Executive | None = None
+        self._handover: DecisionHandover | None = None
         self._goal: Any = None
-        self._last_part: Part | None = None
+        self._last_result: SegmentResult | None = None
         self._calls = threading.BoundedSemaphore(_MOST_CALLS)
         self._goals_ended = threading.Event()
         self._goals_ended.set()
@@ -219,7 +214,7 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
         return self.get_parameter("autostart").value is True
 
     def how_to_activate(self) -> str:
-        """Return what somebody does to have the node active."""
+        """Return the commands that activate the node."""
         set_state = f"ros2 lifecycle set {self.get_fully_qualified_name()}"
         steps = {
             "unconfigured": f"{set_state} configure, then {set_state} activate",
@@ -239,13 +234,13 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
             make_world(self, read)
             # Whether a run can begin there, or go on.
             RunDirectory.resume_if_begun(read.run_directory, read.configuration).close()
-        except Exception as error:  # noqa: BLE001 - rclpy would not say what it was
+        except Exception as error:  # noqa: BLE001 - rclpy would hide it
             self.get_logger().error(f"not configured: {_in_words(error)}")
             return TransitionCallbackReturn.FAILURE
         with self._changed:
             self._parameters_read = read
             self._layout = layout
-            self._last_part = None
+            self._last_result = None
             self._diagnostics = Diagnostics(read.configuration.recovery)
         self.get_logger().info(
             f"configured: {read.configuration.problem_name}, "
@@ -289,12 +284,12 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
         """End what runs, so that it can go on later, and let nothing begin."""
         with self._changed:
             self._active = False
-            part, telemetry = self._part, self._telemetry
+            segment, telemetry = self._segment, self._telemetry
             read = self._parameters_read
-        if part is not None and read is not None:
-            part.pause(why, read.pause_timeout_s)
+        if segment is not None and read is not None:
+            segment.pause(why, read.pause_timeout_s)
             # It ends itself within the time that it was given; the rest is for a slow disk.
-            if not part.ended.wait(read.pause_timeout_s + 10.0):
+            if not segment.ended.wait(read.pause_timeout_s + 10.0):
                 self.get_logger().error("the run has not ended; its journal has everything")
         if telemetry is not None:
             telemetry.close()
@@ -302,12 +297,12 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
     def _forget(self) -> None:
         with self._changed:
             self._parameters_read = None
-            self._last_part = None
+            self._last_result = None
             self._telemetry = None
             self._diagnostics = None
 
     def end(self) -> bool:
-        """End in order, whatever the state: for a process that was told to end.
+        """End in order, in any state, when the process is asked to end.
 
         Returns
         -------
@@ -320,11 +315,11 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
         if is_asked and self._goals_ended.wait(_RESULT_S):
             # rclpy sends the result some turns of the executor later, and does not say when.
             time.sleep(_RESULT_S)
-        return self._part is None
+        return self._segment is None
 
     # -- runs ------------------------------------------------------------------------------------
 
-    def _begin_part(self) -> PartOfRun:
+    def _begin_segment(self) -> RunSegment:
         """Start the next part of the run; the caller holds the lock."""
         read, diagnostics = self._parameters_read, self._diagnostics
         assert read is not None
@@ -342,9 +337,9 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
         )
 
         def on_order(state: PlanningState, order: Act | Sense) -> None:
-            telemetry.order(state, order, part.status)
+            telemetry.order(state, order, segment.status)
 
-        part = PartOfRun(
+        segment = RunSegment(
             configuration,
             read.run_directory,
             world.maker,
@@ -352,29 +347,29 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
             sink=_Events(self, diagnostics, telemetry),
             on_order=on_order,
             on_timing=telemetry.time,
-            on_end=self._part_ended,
+            on_end=self._segment_ended,
             interrupt=world.interrupt,
             interrupt_at_once=world.interrupt_at_once,
         )
-        self._executive = world.executive
+        self._handover = world.handover
         self._telemetry = telemetry
-        self._part = part
-        part.start()
-        return part
+        self._segment = segment
+        segment.start()
+        return segment
 
-    def _part_ended(self, came_to: Part) -> None:
+    def _segment_ended(self, outcome: SegmentResult) -> None:
         with self._changed:
-            telemetry, executive = self._telemetry, self._executive
-            self._last_part = came_to
-        if executive is not None:
-            finished = came_to.ending == Ending.FINISHED
-            executive.end(Code.FINISHED if finished else Code.ENDED, came_to.message)
+            telemetry, handover = self._telemetry, self._handover
+            self._last_result = outcome
+        if handover is not None:
+            finished = outcome.ending == Ending.FINISHED
+            handover.end(DecideCode.FINISHED if finished else DecideCode.ENDED, outcome.message)
         if telemetry is not None:
             telemetry.close()
-        level = "info" if came_to.ending in (Ending.FINISHED, Ending.PAUSED) else "error"
-        getattr(self.get_logger(), level)(f"{came_to.ending.name.lower()}: {came_to.message}")
+        level = "info" if outcome.ending in (Ending.FINISHED, Ending.PAUSED) else "error"
+        getattr(self.get_logger(), level)(f"{outcome.ending.name.lower()}: {outcome.message}")
         with self._changed:
-            self._part = None
+            self._segment = None
         self._tell_diagnostics()
 
     def _judge_goal(self, request: Any) -> GoalResponse:
@@ -390,17 +385,17 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
 
     def _cancel(self, goal: Any) -> CancelResponse:
         with self._changed:
-            part = self._part if goal == self._goal else None
+            segment = self._segment if goal == self._goal else None
             read = self._parameters_read
-        if part is not None and read is not None:
-            part.pause("the goal was cancelled", read.pause_timeout_s)
+        if segment is not None and read is not None:
+            segment.pause("the goal was cancelled", read.pause_timeout_s)
         return CancelResponse.ACCEPT
 
     def _execute(self, goal: Any) -> Any:
         """Run until it is done, or held; on a thread of the executor."""
         read = self._parameters_read
         refusal = None
-        part = None
+        segment = None
         with self._changed:
             if not self._active or read is None:
                 refusal = "the node is not active"
@@ -409,32 +404,32 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
             else:
                 try:
                     # One that a call of ~/decide has begun is gone on with.
-                    part = self._part or self._begin_part()
+                    segment = self._segment or self._begin_segment()
                 except Exception as error:  # noqa: BLE001 - rclpy would call it finished
                     goal.abort()
                     return _Run.Result(code=_Run.Result.HELD, message=_in_words(error))
                 self._goal = goal
                 self._goals_ended.clear()
-        if part is None or read is None:
+        if segment is None or read is None:
             goal.abort()
             return _Run.Result(code=_Run.Result.REFUSED, message=refusal or "")
         try:
             if goal.is_cancel_requested:
-                part.pause("the goal was cancelled", read.pause_timeout_s)
-            part.ended.wait()
-            came_to = part.came_to
-            assert came_to is not None
-            if came_to.ending == Ending.FINISHED:
+                segment.pause("the goal was cancelled", read.pause_timeout_s)
+            segment.ended.wait()
+            outcome = segment.outcome
+            assert outcome is not None
+            if outcome.ending == Ending.FINISHED:
                 goal.succeed()
             elif goal.is_cancel_requested:
                 goal.canceled()
             else:
                 goal.abort()
             return _Run.Result(
-                code=int(came_to.ending),
-                message=came_to.message,
+                code=int(outcome.ending),
+                message=outcome.message,
                 run_directory=str(read.run_directory),
-                trials=[messages.outcome_message(result) for result in came_to.trials],
+                trials=[messages.outcome_message(result) for result in outcome.trials],
             )
         finally:
             with self._changed:
@@ -445,49 +440,49 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
 
     def _decide(self, request: Any, response: Any) -> Any:
         if not self._calls.acquire(blocking=False):
-            response.code = Code.HOLDING
+            response.code = DecideCode.HOLDING
             response.message = f"{_MOST_CALLS} calls are waiting already; make the same call again"
             return response
         try:
             return self._decide_one(request, response)
         except Exception as error:  # noqa: BLE001 - else there is no answer at all
-            response.code, response.message = Code.ENDED, _in_words(error)
+            response.code, response.message = DecideCode.ENDED, _in_words(error)
             return response
         finally:
             self._calls.release()
 
     def _decide_one(self, request: Any, response: Any) -> Any:
         with self._changed:
-            read, last = self._parameters_read, self._last_part
+            read, last = self._parameters_read, self._last_result
             reason = self._no_calls()
-            part: PartOfRun | None = None
-            executive: Executive | None = None
+            segment: RunSegment | None = None
+            handover: DecisionHandover | None = None
             if reason is None and (last is None or last.ending != Ending.FINISHED):
-                part = self._part or self._begin_part()
-                executive = self._executive
+                segment = self._segment or self._begin_segment()
+                handover = self._handover
         if reason is not None:
-            response.code, response.message = Code.INACTIVE, reason
+            response.code, response.message = DecideCode.INACTIVE, reason
             return response
-        if executive is None or part is None or read is None:
-            response.code = Code.FINISHED
+        if handover is None or segment is None or read is None:
+            response.code = DecideCode.FINISHED
             response.message = "" if last is None else last.message
             return response
         if request.done > _Decide.Request.FAILED:
-            reply = executive.call(Call(), read.decide_timeout_s)  # asks what is due
-            if reply.code in (Code.OK, Code.HOLDING):
+            reply = handover.call(DecideRequest(), read.decide_timeout_s)  # asks what is due
+            if reply.code in (DecideCode.OK, DecideCode.HOLDING):
                 message = f"done {request.done}: allowed are 0 to {_Decide.Request.FAILED}"
-                reply = reply._replace(code=Code.BAD_REQUEST, message=message)
+                reply = reply._replace(code=DecideCode.BAD_REQUEST, message=message)
         else:
-            call = Call(
+            call = DecideRequest(
                 request.trial,
                 request.number,
                 np.array(request.observation, dtype=np.float64),
                 request.reward if request.has_reward else None,
                 (False, True, "failed")[request.done],
             )
-            reply = executive.call(call, read.decide_timeout_s)
+            reply = handover.call(call, read.decide_timeout_s)
         response.code, response.message = reply.code, reply.message
-        response.status = part.status
+        response.status = segment.status
         due = reply.due
         if due is not None:
             response.trial, response.number, response.step = due.trial, due.number, due.step
@@ -515,8 +510,8 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
 
     # -- what others see -------------------------------------------------------------------------
 
-    def _show_order(self, shown: Shown) -> None:
-        read, goal, part = self._parameters_read, self._goal, self._part
+    def _show_order(self, shown: PublishedDecision) -> None:
+        read, goal, segment = self._parameters_read, self._goal, self._segment
         if read is None or not self._active:
             return
         problem = read.configuration.problem
@@ -524,7 +519,7 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
         message = messages.decision_message(shown, problem, read.frame_id, now)
         self._decision_publisher.publish(message)
         if goal is not None:
-            finished = 0 if part is None else part.num_finished
+            finished = 0 if segment is None else segment.num_finished
             goal.publish_feedback(_Run.Feedback(finished=finished, decision=message))
 
     def _wants_entropies(self) -> bool:
@@ -550,11 +545,11 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
 
     def _tell_diagnostics(self) -> None:
         with self._changed:
-            read, part, telemetry = self._parameters_read, self._part, self._telemetry
-            last, active, diagnostics = self._last_part, self._active, self._diagnostics
+            read, segment, telemetry = self._parameters_read, self._segment, self._telemetry
+            last, active, diagnostics = self._last_result, self._active, self._diagnostics
         if read is None or diagnostics is None or not active:
             return
-        told = diagnostics.tell(part, last, telemetry)
+        told = diagnostics.tell(segment, last, telemetry)
         facts = told.facts | {"run_directory": str(read.run_directory)}
         status = _Level(
             level=bytes((told.level,)),
@@ -568,8 +563,8 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
         message = diagnostic_msgs.msg.DiagnosticArray(status=[status])
         message.header.stamp = self.get_clock().now().to_msg()
         self._diagnostics_publisher.publish(message)
-        # Who decides; once nobody does any more, how it has ended.
-        word = told.word if part is None else told.facts["status"] or told.word
+        # The status; after the end of the run, how it ended.
+        word = told.word if segment is None else told.facts["status"] or told.word
         self._status_publisher.publish(std_msgs.msg.String(data=word))
 
 

@@ -5,7 +5,7 @@ given is the configuration file's value or, without one there, the default. ROS'
 null, for which an empty text stands, and no list of mappings, for which there is ``assignments``,
 each ``SECTION.KEY=YAML``, as ``holdfast run --set`` has it.
 
-Values are checked where the settings are: a parameter may be of any type, and what is wrong is said
+Values are checked by the settings' own code: a parameter may have any type, and errors are reported
 when the node is configured, with key, value and limit.
 """
 
@@ -17,12 +17,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from holdfast.configuration import Configuration, load, settings_keys
+from holdfast.config.loader import Configuration, load, settings_keys
+from holdfast.config.yaml_document import read
 from holdfast.errors import ConfigurationError
 from holdfast.ros.robot_interface import ROBOT_PARAMETERS
-from holdfast.yaml_document import read
 
-__all__ = ["OWN", "Parameters", "in_parameters", "known_parameters", "read_parameters"]
+__all__ = ["OWN", "NodeParameters", "in_parameters", "known_parameters", "read_parameters"]
 
 _SECTIONS_OF_PROBLEMS = ("model.", "state_space_planner.")
 _ENVIRONMENT = "environment."
@@ -85,22 +85,17 @@ _FOR_OPTIONS = {
 """What a message's words for those who use the command are for those who use the node."""
 
 
-class Parameters(NamedTuple):
+class NodeParameters(NamedTuple):
     """What the parameters come to.
 
     Attributes
     ----------
-    configuration : Configuration
     run_directory : Path
         Absolute.
-    rate_hz : float or None
-    frame_id : str
     environment : str
         One of :data:`KINDS`.
     mapping : dict
         What says how the robot is reached through ROS, by the parameters' names.
-    decide_timeout_s, pause_timeout_s, belief_rate_hz : float
-    publish_entropies : bool
     """
 
     configuration: Configuration
@@ -128,13 +123,13 @@ def in_parameters(text: str) -> str:
     return text
 
 
-def read_parameters(values: Mapping[str, Any]) -> Parameters:
+def read_parameters(values: Mapping[str, Any]) -> NodeParameters:
     """Check the parameters, and load the configuration that they make.
 
     Parameters
     ----------
     values : mapping
-        Plain data by the parameter's name; what is None was not given.
+        Plain data by the parameter's name; None means not given.
 
     Raises
     ------
@@ -173,7 +168,7 @@ def read_parameters(values: Mapping[str, Any]) -> Parameters:
                     f"environment.{key} is given, and environment.kind is {environment}, which "
                     "needs none; leave one of the two out"
                 )
-        # What the file says of a world of its own is for other uses of it.
+        # The file's own environment is for other uses of it.
         overrides["environment.object"] = _OBJECTS[environment]
         overrides |= {"environment.directory": None, "environment.arguments": {}}
     path = own["configuration"]
@@ -184,7 +179,7 @@ def read_parameters(values: Mapping[str, Any]) -> Parameters:
         )
     configuration = load(path, problem=own["problem"] or None, overrides=overrides)
     default = Path("runs") / f"{Path(path).stem}-seed{configuration.simulator.seed}"
-    return Parameters(
+    return NodeParameters(
         configuration,
         Path(own["run_directory"] or default).absolute(),
         own["rate_hz"] or None,

@@ -1,12 +1,11 @@
-"""What a robot decides and believes, for whoever looks on: never at the expense of a decision.
+"""A robot's decisions and beliefs for observers, without delaying a decision.
 
-The robot's loop only leaves a note of each order it gives, in a microsecond; a thread of low
-priority makes messages of these notes. If it falls behind, it drops beliefs first (they hold
-memory), and the entropies with them; after that the oldest decisions. The robot never waits.
+The robot's loop only notes each order, which takes a microsecond. A thread of low priority makes
+messages of the notes. If it falls behind, it drops beliefs first (they hold memory), their
+entropies with them, and then the oldest decisions. The robot never waits.
 
-A service's answer does not have the entropies behind a sensing action. As every decision is a
-function of the state, they are computed once more, here, with an instance of the problem of its
-own.
+A service's answer lacks the entropies behind a sensing action. As every decision is a function of
+the state, they are recomputed here, with a separate instance of the problem.
 """
 
 from __future__ import annotations
@@ -20,18 +19,16 @@ from time import monotonic
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-from holdfast import planning
-from holdfast.configuration import Configuration
-from holdfast.planning import PlanningState
-from holdfast.runtime.links import RECOVERY_SERVICE
-from holdfast.session.effects import Act, Sense, Timing
-from holdfast.session.status import Status
+from holdfast.arrays import FloatArray
+from holdfast.config.loader import Configuration
+from holdfast.planning import Planner, PlanningState
+from holdfast.protocol.events import Act, Sense, Timing
+from holdfast.protocol.status import Status
+from holdfast.robot.links import RECOVERY_SERVICE
 
-__all__ = ["Shown", "Telemetry"]
+__all__ = ["PublishedDecision", "Telemetry"]
 
-FloatArray = npt.NDArray[np.float64]
 
 _MAX_STATE_BYTES = 32 << 20
 _MIN_STATES = 4
@@ -49,19 +46,17 @@ _ENTROPIES = ("action_entropy", "path_entropy", "state_entropy", "action_covaria
 ``expected_return`` computes are returns, which the message has no field for.)"""
 
 
-class Shown(NamedTuple):
+class PublishedDecision(NamedTuple):
     """An order to the environment, for people.
 
     Attributes
     ----------
-    trial, step, stage : int
     sensing_action : int or None
         None for a task action.
     entropies : array of shape (J,)
         Empty if they were not computed.
     task_action : array of shape (action_size,)
         Empty for a sensing action.
-    status, decided_by : str
     state : PlanningState or None
         In which it was decided; None if there was no time for it.
     """
@@ -80,17 +75,16 @@ class Shown(NamedTuple):
 class _Note:
     __slots__ = ("at", "shown")
 
-    def __init__(self, shown: Shown) -> None:
+    def __init__(self, shown: PublishedDecision) -> None:
         self.shown = shown
         self.at = monotonic()
 
 
 class Telemetry:
-    """Shows orders and beliefs, on a thread of its own.
+    """Publishes orders and beliefs, on its own thread.
 
     Parameters
     ----------
-    configuration : Configuration
     on_order : callable
         Shows an order.
     on_belief : callable
@@ -102,13 +96,13 @@ class Telemetry:
     belief_rate_hz : float
         Beliefs shown a second, at most.
     wants_entropies : callable
-        Tells whether to compute them.
+        Returns whether to compute them.
     """
 
     def __init__(
         self,
         configuration: Configuration,
-        on_order: Callable[[Shown], None],
+        on_order: Callable[[PublishedDecision], None],
         on_belief: Callable[[PlanningState], None],
         on_notice: Callable[[], None],
         on_failure: Callable[[Exception], None],
@@ -157,7 +151,7 @@ class Telemetry:
     def order(self, state: PlanningState, order: Act | Sense, status: str) -> None:
         """Take note of an order; returns at once."""
         sensing = isinstance(order, Sense)
-        shown = Shown(
+        shown = PublishedDecision(
             state.trial,
             state.step,
             state.stage,
@@ -220,7 +214,7 @@ class Telemetry:
                     self.has_failed = True
                     self._on_failure(error)
 
-    def _show(self, shown: Shown) -> None:
+    def _show(self, shown: PublishedDecision) -> None:
         state = shown.state
         if state is not None and monotonic() >= self._next_belief:
             self._next_belief = monotonic() + self._belief_every_s
@@ -228,7 +222,7 @@ class Telemetry:
         sensing = state is not None and shown.sensing_action is not None
         if sensing and self._settings.selector.method in _ENTROPIES and self._wants_entropies():
             assert state is not None
-            _, info = planning.choose_sensing_action(self._problem, self._settings, state)
+            _, info = Planner(self._problem, self._settings).choose_sensing_action(state)
             if info.entropies is not None:
                 shown = shown._replace(entropies=info.entropies)
         self._on_order(shown)

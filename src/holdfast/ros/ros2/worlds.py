@@ -1,4 +1,4 @@
-"""What the node's robot acts on."""
+"""The environment of the node's robot: simulated, an executive's, or a robot behind ROS."""
 
 from __future__ import annotations
 
@@ -6,41 +6,35 @@ import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from holdfast.configuration import Configuration
-from holdfast.ros.executive import Code, Executive, ExecutiveMaker
-from holdfast.ros.ros2.parameters import Parameters
-from holdfast.runtime.environment import EnvironmentMaker, load_environment
+from holdfast.config.loader import Configuration
+from holdfast.robot.environment import EnvironmentMaker, load_environment
+from holdfast.ros.executive import DecideCode, DecisionHandover, ExecutiveMaker
+from holdfast.ros.ros2.parameters import NodeParameters
 
 __all__ = ["World", "make_world"]
 
 
 class World(NamedTuple):
-    """What one part of a run acts on.
+    """What one segment of a run acts on.
 
     Attributes
     ----------
-    maker : EnvironmentMaker
     interrupt : callable
         Ends the call of the environment that goes on, if that can be; given the reason.
     interrupt_at_once : bool
-        Whether that costs nothing, because what was interrupted is asked for again.
-    executive : Executive or None
+        Whether that costs nothing, because an interrupted call is repeated.
+    handover : DecisionHandover or None
         Where calls of ``~/decide`` meet the run; None where the node itself performs.
     """
 
     maker: EnvironmentMaker
     interrupt: Callable[[str], None]
     interrupt_at_once: bool = False
-    executive: Executive | None = None
+    handover: DecisionHandover | None = None
 
 
-def make_world(node: Any, parameters: Parameters) -> World:
-    """Make what the parameters name, for one part of a run.
-
-    Parameters
-    ----------
-    node : rclpy.node.Node
-    parameters : Parameters
+def make_world(node: Any, parameters: NodeParameters) -> World:
+    """Make what the parameters name, for one segment of a run.
 
     Raises
     ------
@@ -54,17 +48,17 @@ def make_world(node: Any, parameters: Parameters) -> World:
     problem = Configuration.from_plain(configuration.plain()).problem
     timeout_ms = configuration.environment.timeout_ms
     if parameters.environment == "executive":
-        executive = Executive(problem, configuration.planning.sensing_interval)
+        handover = DecisionHandover(problem, configuration.planning.sensing_interval)
         return World(
-            ExecutiveMaker(executive, configuration.problem, timeout_ms),
-            functools.partial(executive.end, Code.ENDED),
+            ExecutiveMaker(handover, configuration.problem, timeout_ms),
+            functools.partial(handover.end, DecideCode.ENDED),
             interrupt_at_once=True,
-            executive=executive,
+            handover=handover,
         )
     from holdfast.ros.robot_interface import RobotInterface
     from holdfast.ros.ros2_environment import cancel_ros_environments, make_ros_environment
 
-    # What is wrong with the parameters is to be said now, not when a trial begins.
+    # Invalid parameters are reported now, not when a trial begins.
     RobotInterface(parameters.mapping, problem.sensing_actions, problem.action_size)
     make: Any = functools.partial(make_ros_environment, node, parameters.mapping)
     maker = EnvironmentMaker("the robot", problem, configuration.simulator.seed, timeout_ms, make)

@@ -1,0 +1,345 @@
+"""Calls of a problem's functions, with their results checked.
+
+A problem is a user's own code, and NumPy forgives much: a mean without its last axis broadcasts to
+something, a variance for one coordinate of two to something else, and the decisions are quietly
+wrong. So every array that a problem returns passes through here. One that does not fit is an error
+that names the function, what it returned and what was needed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from holdfast import _kernel
+from holdfast.arrays import BoolArray, FloatArray, IntArray, in_brief
+from holdfast.errors import ProblemError
+from holdfast.problem_attributes import has_own, name_of
+
+__all__ = [
+    "executed_action",
+    "expected_move",
+    "expected_path",
+    "goals",
+    "known_state_return",
+    "log_likelihood",
+    "move_each",
+    "next_stage",
+    "next_stages",
+    "observation_mean",
+    "observation_variance",
+    "policy",
+    "rewards",
+    "sample_observation",
+    "scalar",
+    "states_of",
+    "truth",
+    "unusable_prediction",
+]
+
+MAX_OBSERVATION_SIZE = 1024
+
+
+def observation_mean(problem: Any, states: FloatArray, sensing_action: int) -> FloatArray:
+    """Return the expected observation, shape ``(..., observation_size)``."""
+    mean = problem.observation_mean(states, sensing_action)
+    leading = states.shape[:-1]
+    if not _is_float_array(mean) or mean.ndim != states.ndim or mean.shape[:-1] != leading:
+        raise _misfit(
+            problem,
+            f"observation_mean of sensing action {sensing_action}",
+            mean,
+            (*leading, "observation_size"),
+        )
+    if not 1 <= mean.shape[-1] <= MAX_OBSERVATION_SIZE:
+        raise ProblemError(
+            f"observation_mean of {name_of(problem)} has {mean.shape[-1]} coordinates: allowed are "
+            f"1 to {MAX_OBSERVATION_SIZE}"
+        )
+    checked: FloatArray = mean
+    return checked
+
+
+def observation_variance(
+    problem: Any, states: FloatArray, sensing_action: int, mean: FloatArray
+) -> FloatArray:
+    """Return the variance, shape ``(observation_size,)`` or that of ``mean``."""
+    variance = problem.observation_variance(states, sensing_action)
+    if not isinstance(variance, np.ndarray) or variance.shape not in (mean.shape[-1:], mean.shape):
+        raise _misfit(
+            problem,
+            f"observation_variance of sensing action {sensing_action}",
+            variance,
+            mean.shape[-1:] if mean.ndim == 1 else f"{mean.shape[-1:]} or {mean.shape}",
+        )
+    checked: FloatArray = variance
+    return checked
+
+
+def unusable_prediction(
+    problem: Any, sensing_action: int, mean: FloatArray, variance: FloatArray
+) -> ProblemError:
+    """Return the error about the first entry of a mean or variance that no observation can have.
+
+    The caller knows that there is one: that is found sooner than where it is.
+    """
+    function, values, need = "observation_mean", mean, "finite"
+    unusable = ~np.isfinite(mean)
+    if not unusable.any():
+        function, values, need = "observation_variance", variance, "positive and finite"
+        # A comparison with NaN is false.
+        unusable = ~((variance > 0.0) & (variance < np.inf))
+    index = tuple(map(int, np.argwhere(unusable)[0]))
+    return ProblemError(
+        f"{function} of {name_of(problem)}, sensing action {sensing_action}, is {values[index]} at "
+        f"{_written(index)} of shape {_written(values.shape)}: every entry must be {need}"
+    )
+
+
+def sample_observation(
+    problem: Any, state: FloatArray, sensing_action: int, stream: object
+) -> FloatArray:
+    """Return an observation that was drawn in one state, shape ``(observation_size,)``."""
+    drawn = problem.sample_observation(state, sensing_action, stream)
+    if not isinstance(drawn, np.ndarray) or drawn.dtype.kind not in "fiu" or drawn.ndim != 1:
+        raise _misfit(
+            problem,
+            f"sample_observation of sensing action {sensing_action}",
+            drawn,
+            "(observation_size,)",
+        )
+    if not 1 <= drawn.size <= MAX_OBSERVATION_SIZE or not np.isfinite(drawn).all():
+        raise ProblemError(
+            f"sample_observation of {name_of(problem)} returned {in_brief(drawn)} of "
+            f"{drawn.size} coordinates: need 1 to {MAX_OBSERVATION_SIZE}, all of them finite"
+        )
+    checked: FloatArray = drawn
+    return checked
+
+
+def log_likelihood(
+    problem: Any, states: FloatArray, sensing_action: int, observation: FloatArray
+) -> FloatArray:
+    """Return the log-likelihoods of an observation, shape ``(num_particles,)``."""
+    found = problem.log_likelihood(states, sensing_action, observation)
+    values = _array(problem, "log_likelihood", found, states.shape[:-1])
+    if np.isnan(values).any() or (values == np.inf).any():
+        raise ProblemError(
+            f"log_likelihood of {name_of(problem)}, observation {in_brief(observation)} under "
+            f"sensing action {sensing_action}, is NaN or plus infinity for a particle"
+        )
+    return values
+
+
+def policy(problem: Any, states: FloatArray, stage: int | IntArray) -> FloatArray:
+    """Return the commanded actions, shape ``(..., action_size)``."""
+    shape = (*states.shape[:-1], problem.action_size)
+    return _array(problem, "policy", problem.policy(states, stage), shape)
+
+
+def executed_action(problem: Any, commanded: FloatArray) -> FloatArray:
+    """Return the executed actions, of the shape of ``commanded``."""
+    return _array(problem, "execute", problem.execute(commanded), commanded.shape)
+
+
+def next_stage(problem: Any, estimate: FloatArray, stage: int) -> int:
+    """Return the stage that follows."""
+    value = _single(problem, "next_stage", problem.next_stage(estimate, stage))
+    # A comparison with NaN is false.
+    if not 0 <= value < problem.num_stages:
+        raise ProblemError(
+            f"next_stage of {name_of(problem)} is {value!r:.40}: allowed are 0 to "
+            f"{problem.num_stages - 1}"
+        )
+    return int(value)
+
+
+def next_stages(problem: Any, states: FloatArray, stages: IntArray) -> IntArray:
+    """Return the stages that follow, one for each state."""
+    following = problem.next_stage(states, stages)
+    return _stages(problem, "next_stage", following, states)
+
+
+def expected_move(
+    problem: Any, states: FloatArray, actions: FloatArray, noise_free: object
+) -> FloatArray:
+    """Return where executed actions lead without noise, of the shape of ``states``, read-only.
+
+    A problem without ``expected_move`` is asked for its ``move`` with the stream ``noise_free``.
+    """
+    if has_own(problem, "expected_move", ("move",)):
+        found = problem.expected_move(states, actions)
+        moved = _array(problem, "expected_move", found, states.shape)
+    else:
+        found = problem.move(states, actions, noise_free)
+        moved = _array(problem, "move", found, states.shape)
+    # The caller checks that the actions there are finite, once for many steps.
+    moved.setflags(write=False)
+    return moved
+
+
+def expected_path(
+    problem: Any, states: FloatArray, stage: int, offsets: Sequence[int], threads: int
+) -> tuple[FloatArray, IntArray]:
+    """Return the states and stages after each number of steps, the states read-only."""
+    found = problem.expected_path(states, stage, offsets, threads)
+    if not isinstance(found, tuple) or len(found) != 2:
+        raise _returned(problem, "expected_path", found, "a tuple of two arrays")
+    states_at = _array(problem, "expected_path", found[0], (len(offsets), *states.shape))
+    stages_at = _stages(problem, "expected_path", found[1], states_at)
+    states_at.setflags(write=False)
+    return states_at, stages_at
+
+
+def rewards(problem: Any, states: FloatArray, actions: FloatArray) -> FloatArray:
+    """Return the rewards of executed actions that led to many states."""
+    return _finite(problem, "reward", problem.reward(states, actions), states.shape[:-1])
+
+
+def goals(problem: Any, states: FloatArray) -> BoolArray:
+    """Return which of many states are goals."""
+    reached = problem.is_goal(states)
+    shape = states.shape[:-1]
+    if not isinstance(reached, np.ndarray) or reached.dtype != np.bool_ or reached.shape != shape:
+        raise ProblemError(
+            f"is_goal of {name_of(problem)}, asked of {states.shape[0]} states at once, returned "
+            f"{reached!r:.80}: need as many truth values"
+        )
+    return reached
+
+
+def known_state_return(problem: Any, states: FloatArray, stages: IntArray) -> FloatArray | None:
+    """Return the problem's own returns of acting in known states; None if it has none."""
+    function = getattr(problem, "known_state_return", None)
+    if function is None:
+        return None
+    rows = np.ascontiguousarray(states).reshape(-1, states.shape[-1])
+    rows.setflags(write=False)
+    own_stages = np.ascontiguousarray(stages).reshape(-1)
+    own_stages.setflags(write=False)
+    values = _finite(problem, "known_state_return", function(rows, own_stages), rows.shape[:1])
+    return values.reshape(stages.shape)
+
+
+def states_of(
+    problem: Any, function: str, states: FloatArray, shape: tuple[int, ...]
+) -> FloatArray:
+    """Return states that a function of the problem made, read-only from now on."""
+    _array(problem, function, states, shape)
+    if not _kernel.all_finite(states):
+        rows = states.reshape(-1, shape[-1])
+        bad = int(np.argmin(np.isfinite(rows).all(axis=-1)))
+        where = in_brief(rows[bad])
+        raise ProblemError(f"{function} of {name_of(problem)} put particle {bad} at {where}")
+    contiguous = np.ascontiguousarray(states)
+    contiguous.setflags(write=False)
+    return contiguous
+
+
+def move_each(
+    problem: Any,
+    states: FloatArray,
+    actions: FloatArray,
+    streams: Sequence[object],
+    threads: int,
+) -> FloatArray:
+    """Return several beliefs moved, each by its own action, read-only from now on.
+
+    Parameters
+    ----------
+    states : array of shape (b, n, state_size)
+    actions : array of shape (b, action_size)
+    streams : sequence of Stream
+        One for each belief.
+    threads : int
+        At most so many, if the problem has a ``move_each``; 0 is all.
+    """
+    if has_own(problem, "move_each", ("move",)):
+        moved = problem.move_each(states, actions, streams, threads)
+        return states_of(problem, "move_each", moved, states.shape)
+    together = np.empty(states.shape)
+    for row, (own, action, stream) in enumerate(zip(states, actions, streams, strict=True)):
+        together[row] = states_of(problem, "move", problem.move(own, action, stream), own.shape)
+    together.setflags(write=False)
+    return together
+
+
+def scalar(problem: Any, function: str, value: object) -> float:
+    """Return one number that a function of the problem gave for one state."""
+    return float(_single(problem, function, value))
+
+
+def truth(problem: Any, function: str, value: object) -> bool:
+    """Return what a function of the problem says of one state: true or false, or 1 or 0."""
+    single = _single(problem, function, value)
+    if single not in (0, 1):
+        raise ProblemError(f"{function} of {name_of(problem)} is {single!r}: must be True or False")
+    return bool(single)
+
+
+def _array(problem: Any, function: str, value: Any, shape: tuple[int, ...]) -> FloatArray:
+    if not _is_float_array(value) or value.shape != shape:
+        raise _misfit(problem, function, value, shape)
+    checked: FloatArray = value
+    return checked
+
+
+def _finite(problem: Any, function: str, value: Any, shape: tuple[int, ...]) -> FloatArray:
+    values = _array(problem, function, value, shape)
+    if not _kernel.all_finite(np.ascontiguousarray(values)):
+        raise ProblemError(
+            f"{function} of {name_of(problem)} returned {in_brief(values)}: all must be finite"
+        )
+    return values
+
+
+def _stages(problem: Any, function: str, stages: Any, states: FloatArray) -> IntArray:
+    shape = states.shape[:-1]
+    if not isinstance(stages, np.ndarray) or stages.dtype.kind not in "iu" or stages.shape != shape:
+        raise _misfit(problem, function, stages, shape, "an array of integers")
+    if stages.size and (stages.min() < 0 or stages.max() >= problem.num_stages):
+        outside = (stages < 0) | (stages >= problem.num_stages)
+        bad = np.unravel_index(int(np.argmax(outside)), shape)
+        raise ProblemError(
+            f"{function} of {name_of(problem)} has the stage {stages[bad]} for state "
+            f"{in_brief(states[bad])}: allowed are 0 to {problem.num_stages - 1}"
+        )
+    return stages
+
+
+def _single(problem: Any, function: str, value: object) -> Any:
+    if type(value) in (int, float, bool):
+        return value
+    if isinstance(value, (list, tuple)):
+        raise _misfit(problem, function, value, ())
+    number = np.asarray(value)
+    if number.ndim != 0 or number.dtype.kind not in "fiub":
+        raise _misfit(problem, function, value, ())
+    return value
+
+
+def _is_float_array(value: object) -> bool:
+    return isinstance(value, np.ndarray) and value.dtype == np.float64
+
+
+def _misfit(
+    problem: Any, function: str, value: object, shape: object, array: str = "a float64 array"
+) -> ProblemError:
+    need = "one number" if shape == () else f"{array} of shape {_written(shape)}"
+    return _returned(problem, function, value, need)
+
+
+def _returned(problem: Any, function: str, value: object, need: str) -> ProblemError:
+    if isinstance(value, np.ndarray):
+        came = f"{value.dtype} of shape {value.shape}"
+    else:
+        came = f"{type(value).__name__} ({' '.join(repr(value).split())[:40]})"
+    return ProblemError(f"{function} of {name_of(problem)} returned {came}: need {need}")
+
+
+def _written(shape: object) -> str:
+    if isinstance(shape, tuple):
+        return f"({', '.join(map(str, shape))}{',' if len(shape) == 1 else ''})"
+    return str(shape)

@@ -1,0 +1,147 @@
+"""How a command ends: exit codes, the message of an error, and signals that end a run in order."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import sys
+from collections.abc import Iterator, Sequence
+from types import TracebackType
+
+from holdfast.errors import HoldfastError, RunError
+from holdfast.printable import printable
+from holdfast.runtime.command_line import wants_json
+
+__all__ = [
+    "EXIT_CAN_GO_ON",
+    "EXIT_DIFFERENT",
+    "EXIT_ERROR",
+    "EXIT_SIGNAL",
+    "EXIT_WRONG_ANSWER",
+    "EndedBySignal",
+    "ended_by_signals",
+    "interrupted_by",
+    "print_defect",
+    "print_error",
+    "signal_of",
+]
+
+EXIT_DIFFERENT = 1
+"""The decisions of two compared runs differ."""
+
+EXIT_ERROR = 2
+"""An error: holdfast refuses something, or it cannot be done."""
+
+EXIT_WRONG_ANSWER = 3
+"""A service answered otherwise than the robot's own planner; events.jsonl says which and when."""
+
+EXIT_CAN_GO_ON = 4
+"""An error ended the run; the run can go on once the reason is gone."""
+
+EXIT_SIGNAL = 128
+"""Added to the number of the signal that ended a run, as shells do it."""
+
+
+def print_error(error: HoldfastError, arguments: Sequence[str]) -> None:
+    """Print what ended a command on the standard error: as text, or as the last of its events.
+
+    Parameters
+    ----------
+    arguments : sequence of str
+        The words after ``holdfast``; ``--log json`` among them asks for events.
+    """
+    if not wants_json(arguments):
+        sys.stderr.write(f"holdfast: error: {printable(str(error))}\n")
+        return
+    from holdfast.runtime.logs import write_event
+
+    text = error.reason if isinstance(error, RunError) else str(error)
+    # The rest, such as lines of the user's code, apart: a value of an event has its bound.
+    reason, _, details = text.partition("\n")
+    fields = {"reason": reason}
+    if details:
+        fields["details"] = details
+    if isinstance(error, RunError) and error.command:
+        fields["resume_command"] = error.command
+    component = {"serve": "service", "chaos": "chaos"}.get(arguments[0], "robot")
+    write_event(component, "error", **fields)
+
+
+def print_defect(
+    kind: type[BaseException], error: BaseException, trace: TracebackType | None
+) -> None:
+    """Print an unexpected exception with its traceback, as the interpreter would.
+
+    Parameters
+    ----------
+    kind, error, trace
+        As those of :func:`sys.excepthook`.
+    """
+    import traceback
+
+    sys.stderr.write(printable("".join(traceback.format_exception(kind, error, trace))))
+
+
+class EndedBySignal(KeyboardInterrupt):
+    """A signal other than Ctrl-C's, or one that our handler took, ended the run."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(number)
+        self.signal = signal.Signals(number)
+
+
+@contextlib.contextmanager
+def ended_by_signals(*, once: bool = False) -> Iterator[None]:
+    """Let SIGTERM and SIGHUP end the block as Ctrl-C does, and exit with their numbers.
+
+    Parameters
+    ----------
+    once : bool
+        Whether later signals, Ctrl-C included, are ignored up to the end of the process: for a
+        command that must end its child processes undisturbed.
+    """
+    ended = False
+
+    def end(number: int, frame: object) -> None:
+        nonlocal ended
+        del frame
+        ended = True
+        # A second signal must not cut the orderly end short. A handler that does nothing, because
+        # Python complains of a pending signal that is set to SIG_IGN.
+        for handled in saved:
+            signal.signal(handled, _ignore)
+        raise EndedBySignal(number)
+
+    # A signal that is ignored from the start stays ignored, as nohup expects.
+    numbers = (signal.SIGTERM, signal.SIGHUP, *((signal.SIGINT,) if once else ()))
+    saved = {
+        number: before
+        for number in numbers
+        if (before := signal.getsignal(number)) is not signal.SIG_IGN
+    }
+    try:
+        for number in saved:
+            signal.signal(number, end)
+        yield
+    except KeyboardInterrupt as interruption:
+        raise SystemExit(EXIT_SIGNAL + signal_of(interruption)) from None
+    finally:
+        for number, before in saved.items():
+            signal.signal(number, signal.SIG_IGN if once and ended else before)
+
+
+def _ignore(number: int, frame: object) -> None:
+    del number, frame
+
+
+def signal_of(interruption: KeyboardInterrupt) -> signal.Signals:
+    """Return the signal that interrupted."""
+    if isinstance(interruption, EndedBySignal):
+        return interruption.signal
+    return signal.SIGINT
+
+
+def interrupted_by(interruption: KeyboardInterrupt) -> str:
+    """Return the words for a person: ``Interrupted`` after Ctrl-C, else ``Ended by SIGTERM``."""
+    number = signal_of(interruption)
+    return "Interrupted" if number == signal.SIGINT else f"Ended by {number.name}"

@@ -1,0 +1,413 @@
+"""The configuration file: from the thesis's YAML to a problem and validated settings.
+
+One file describes a run, and it is checked before anything is run. The sections and keys are the
+thesis's, so that its files load unchanged; ``problem: NAME`` on top and the sections ``selector``,
+``offload``, ``recovery`` and ``environment`` are ours, and optional. The module of a user's problem
+or environment is looked for beside the file and in the current directory, or in
+``problem_directory`` and ``environment.directory``. Missing sections and keys take their defaults,
+and :meth:`Configuration.to_yaml` writes every value in use.
+
+The bounds stand with the settings (:mod:`holdfast.config.settings`) and with each problem (its
+``Model`` and ``StateSpacePlanner``). Checks that involve two keys are here.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from importlib.machinery import PathFinder
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import msgspec.inspect
+
+from holdfast.config.problem_builder import build_from, find_problem, schemas_of
+from holdfast.config.settings import (
+    ENTROPY_METHODS,
+    NEIGHBOR_ESTIMATORS,
+    UNINFORMED_METHODS,
+    ActiveSensingSettings,
+    EnvironmentSettings,
+    OffloadSettings,
+    ParticleFilterSettings,
+    PlanningSettings,
+    RecoverySettings,
+    SelectorSettings,
+    SimulatorSettings,
+    estimator_of,
+    unfit_for_the_method,
+)
+from holdfast.config.source import SECTIONS, SETTINGS, Source, module_directory
+from holdfast.config.validation import described, shown
+from holdfast.config.yaml_document import MAX_BYTES, Document, read, write
+from holdfast.errors import ConfigurationError, InvalidValueError
+from holdfast.estimators import MAX_PRIOR_NEIGHBORS_POINTS
+from holdfast.files import read_bounded
+from holdfast.problem_attributes import resolution_of
+from holdfast.problems.problem import Problem
+
+__all__ = ["Configuration", "load", "settings_keys"]
+
+
+@dataclass(frozen=True)
+class Configuration:
+    """Everything that a run depends on, validated.
+
+    Two configurations are equal if they say the same, wherever their files are.
+
+    Attributes
+    ----------
+    problem : Problem
+        The problem, built from ``model`` and ``state_space_planner``.
+    problem_name : str
+        Its registered name, or ``module:Class``.
+    planning : PlanningSettings
+        Settings of the planner.
+    simulator : SimulatorSettings
+        Trials, their length and their seed.
+    model, state_space_planner : mapping
+        The problem's two sections with all defaults filled in, as plain data.
+    path : Path
+        The file that this was read from.
+    problem_directory : Path or None
+        Where the module of ``module:Class`` was found; None for one that is installed.
+    unlisted : tuple of str
+        Arguments of the problem's constructor that have their default because a file cannot hold
+        it, so that they are not in ``model``.
+    offload : OffloadSettings
+        Which services decide. ``tls`` is an absolute path.
+    recovery : RecoverySettings
+        The local service that decides while no other can.
+    environment : EnvironmentSettings
+        The world that the robot acts on. ``directory`` is where its module was found; None for one
+        that is installed.
+    """
+
+    problem: Problem = field(compare=False, repr=False)
+    problem_name: str
+    planning: PlanningSettings
+    simulator: SimulatorSettings
+    model: Mapping[str, Any]
+    state_space_planner: Mapping[str, Any]
+    path: Path = field(compare=False)
+    problem_directory: Path | None = field(default=None, compare=False)
+    unlisted: tuple[str, ...] = field(default=(), compare=False)
+    offload: OffloadSettings = field(default_factory=OffloadSettings)
+    recovery: RecoverySettings = field(default_factory=RecoverySettings)
+    environment: EnvironmentSettings = field(default_factory=EnvironmentSettings)
+
+    def to_yaml(self) -> str:
+        """Return the resolved configuration as a file that loads to an equal configuration.
+
+        Returns
+        -------
+        str
+            YAML with every key, those of the defaults included. A comment names the arguments of
+            a problem's constructor whose defaults YAML cannot hold.
+        """
+        comment = (
+            "# The configuration of a holdfast run, resolved: every key, with the value in use.\n"
+        )
+        if self.unlisted:
+            comment += (
+                "# Not listed, because YAML cannot hold what they are by default:\n"
+                f"# {', '.join(f'model.{key}' for key in self.unlisted)}\n"
+            )
+        return comment + write(self._sections())
+
+    def plain(self) -> dict[str, Any]:
+        """Return the configuration as plain data, from which another process can rebuild it.
+
+        Returns
+        -------
+        dict
+            Text, numbers, lists and mappings; see :meth:`from_plain`.
+        """
+        return {"path": str(self.path.absolute()), "configuration": self._sections()}
+
+    @classmethod
+    def from_plain(cls, plain: Mapping[str, Any]) -> Configuration:
+        """Rebuild a configuration from :meth:`plain`, in another process as well.
+
+        Parameters
+        ----------
+        plain : mapping
+            What :meth:`plain` returned.
+
+        Returns
+        -------
+        Configuration
+            An equal configuration.
+
+        Raises
+        ------
+        ConfigurationError
+            If the data is not that of a configuration.
+        """
+        if not isinstance(plain.get("path"), str) or "configuration" not in plain:
+            raise ConfigurationError(
+                "a configuration as plain data has the keys path and configuration"
+            )
+        return _build(Document(plain["configuration"], {}), Path(plain["path"]), None, {})
+
+    def _sections(self) -> dict[str, Any]:
+        sections: dict[str, Any] = {
+            "model": self.model,
+            "state_space_planner": self.state_space_planner,
+            "particle_filter": self.planning.particle_filter,
+            "active_sensing": self.planning.active_sensing,
+            "selector": self.planning.selector,
+            "simulator": self.simulator,
+            "offload": self.offload,
+            "recovery": self.recovery,
+            "environment": self.environment,
+        }
+        directory = self.problem_directory
+        return {
+            "problem": self.problem_name,
+            **({} if directory is None else {"problem_directory": str(directory)}),
+            **{name: msgspec.to_builtins(sections[name]) for name in SECTIONS},
+        }
+
+
+def load(
+    path: str | Path,
+    *,
+    problem: str | None = None,
+    num_trials: int | None = None,
+    seed: int | None = None,
+    overrides: Mapping[str, Any] | None = None,
+) -> Configuration:
+    """Read a configuration file.
+
+    Parameters
+    ----------
+    path : str or Path
+        The YAML file.
+    problem : str, optional
+        Name of the problem, instead of the one that the file gives or implies.
+    num_trials, seed : int, optional
+        Instead of the file's ``simulator.num_trials`` and ``simulator.seed``.
+    overrides : mapping, optional
+        Further values instead of the file's, by ``section.key`` (``offload.services``). None is a
+        value, too. Paths among them are relative to the current directory.
+
+    Returns
+    -------
+    Configuration
+        The problem and the settings.
+
+    Raises
+    ------
+    ConfigurationError
+        If the file cannot be read or used.
+    UnknownProblemError
+        If it names a problem that is neither registered nor importable.
+    """
+    path = Path(path)
+    document = read(_content(path), str(path))
+    given: dict[str, Any] = {}
+    if num_trials is not None:
+        given["simulator.num_trials"] = num_trials
+    if seed is not None:
+        given["simulator.seed"] = seed
+    given |= overrides or {}
+    return _build(
+        document, path, problem, {_section_and_key(name): value for name, value in given.items()}
+    )
+
+
+def settings_keys() -> dict[str, str]:
+    """Return every ``section.key`` whose meaning does not depend on the problem.
+
+    Returns
+    -------
+    dict of str
+        The allowed values and the default, in words.
+    """
+    keys = {}
+    for section, schema in SETTINGS.items():
+        defaults = msgspec.to_builtins(schema())
+        fields = msgspec.inspect.type_info(schema).fields  # type: ignore[attr-defined]
+        for item in fields:
+            default = json.dumps(defaults[item.encode_name])
+            keys[f"{section}.{item.encode_name}"] = f"{described(item.type)}; default {default}"
+    return keys
+
+
+def _section_and_key(name: str) -> tuple[str, str]:
+    section, _, key = name.partition(".")
+    return section, key
+
+
+def _content(path: Path) -> bytes:
+    """Return the content of the file, at most one byte over the limit."""
+    try:
+        return read_bounded(path, MAX_BYTES + 1)
+    except FileNotFoundError:
+        raise ConfigurationError(f"{path}: there is no such file") from None
+    except IsADirectoryError:
+        raise ConfigurationError(f"{path}: is a directory, not a configuration file") from None
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else str(error)
+        raise ConfigurationError(f"{path}: cannot be read: {reason}") from None
+
+
+def _build(
+    document: Document,
+    path: Path,
+    problem_name: str | None,
+    overrides: Mapping[tuple[str, str], Any],
+) -> Configuration:
+    """Check everything and build the problem."""
+    source = Source(document, path, overrides)
+    name, problem_class, directory = find_problem(source, problem_name)
+    source.schemas |= schemas_of(problem_class)
+    particle_filter = source.section("particle_filter", ParticleFilterSettings)
+    active_sensing = source.section("active_sensing", ActiveSensingSettings)
+    selector = source.section("selector", SelectorSettings)
+    simulator = source.section("simulator", SimulatorSettings)
+    recovery = source.section("recovery", RecoverySettings)
+    offload = _checked_offload(source, source.section("offload", OffloadSettings), recovery)
+    environment = _located_environment(source, source.section("environment", EnvironmentSettings))
+    built = build_from(source, name, problem_class)
+
+    num_particles = particle_filter.num_particles
+    num_neighbors = active_sensing.num_nearest_neighbors
+    estimator = estimator_of(selector, num_particles)
+    if (
+        selector.method in ENTROPY_METHODS
+        and estimator in NEIGHBOR_ESTIMATORS
+        and num_neighbors >= num_particles
+    ):
+        raise source.error(
+            ("active_sensing", "num_nearest_neighbors"),
+            f"is {num_neighbors}; the {estimator} estimator needs it below"
+            f" particle_filter.num_particles, which is {num_particles}",
+        )
+    of_states = selector.method == "state_entropy"
+    has_a_list = isinstance(selector.resolution, tuple)
+    if of_states or (has_a_list and selector.method not in UNINFORMED_METHODS):
+        try:
+            resolution_of(built.problem, selector.resolution, of_states=of_states)
+        except InvalidValueError as error:
+            key = "method" if selector.resolution is None else "resolution"
+            raise source.error(
+                ("selector", key), str(error).removeprefix(f"selector.{key} ")
+            ) from None
+    if (
+        selector.method in ENTROPY_METHODS
+        and estimator == "prior_neighbors"
+        and num_particles > MAX_PRIOR_NEIGHBORS_POINTS
+    ):
+        raise source.error(
+            ("particle_filter", "num_particles"),
+            f"is {num_particles}; the prior_neighbors estimator allows"
+            f" {MAX_PRIOR_NEIGHBORS_POINTS}",
+        )
+    planning = PlanningSettings(
+        particle_filter=particle_filter,
+        active_sensing=active_sensing,
+        selector=selector,
+        sensing_interval=simulator.sensing_intervals,
+    )
+    if (unfit := unfit_for_the_method(planning)) is not None:
+        raise source.error(*unfit)
+    actions = built.problem.sensing_actions
+    if selector.method == "fixed" and selector.sensing_action >= len(actions):
+        raise source.error(
+            ("selector", "sensing_action"),
+            f"is {selector.sensing_action}; {name} has the sensing actions 0 to {len(actions) - 1}"
+            f" ({', '.join(actions)})",
+        )
+    return Configuration(
+        problem=built.problem,
+        problem_name=name,
+        planning=planning,
+        simulator=simulator,
+        model=built.model,
+        state_space_planner=built.state_space_planner,
+        path=path,
+        problem_directory=directory,
+        unlisted=built.unlisted,
+        offload=offload,
+        recovery=recovery,
+        environment=environment,
+    )
+
+
+def _checked_offload(
+    source: Source, offload: OffloadSettings, recovery: RecoverySettings
+) -> OffloadSettings:
+    """Check what involves two values, and make paths absolute."""
+    for index, service in enumerate(offload.services):
+        first = offload.services.index(service)
+        if first != index:
+            raise source.error(
+                ("offload", "services", index),
+                f"is {shown(service)}, as offload.services[{first}] is already; each stands once,"
+                " in order of preference",
+            )
+    deadline_ms, timeout_ms = offload.decision_deadline_ms, offload.decision_timeout_ms
+    if deadline_ms is not None:
+        key = ("offload", "decision_deadline_ms")
+        if recovery.launch == "never":
+            raise source.error(
+                key,
+                f"is {deadline_ms:g}; then the local service decides instead, which is never there"
+                " with recovery.launch never; leave one of the two out",
+            )
+        if deadline_ms >= timeout_ms:
+            raise source.error(
+                key,
+                f"is {deadline_ms:g}; it must be below offload.decision_timeout_ms, after which a"
+                f" decision is given up, which is {timeout_ms:g}",
+            )
+    if offload.detection_timeout_ms > timeout_ms:
+        raise source.error(
+            ("offload", "detection_timeout_ms"),
+            f"is {offload.detection_timeout_ms:g}; it must be at most offload.decision_timeout_ms,"
+            f" after which a decision is given up, which is {timeout_ms:g}",
+        )
+    if offload.tls is None:
+        return offload
+    directory = source.directory_of(("offload", "tls")) / offload.tls
+    return msgspec.structs.replace(offload, tls=str(directory.resolve()))
+
+
+def _located_environment(source: Source, settings: EnvironmentSettings) -> EnvironmentSettings:
+    """Check the name of the environment and find its module, without importing it."""
+    name = settings.object
+    if name is None:
+        return settings
+    key = ("environment", "object")
+    module, colon, class_name = name.partition(":")
+    if not colon:
+        directory_key = ("environment", "directory")
+        if settings.directory is not None and (
+            source.is_overridden(directory_key) or not source.is_overridden(key)
+        ):
+            raise source.error(
+                directory_key,
+                f"is {shown(settings.directory)}; only an environment that is named module:Class"
+                " has one",
+            )
+        return msgspec.structs.replace(settings, directory=None)
+    if not all(part.isidentifier() for part in [*module.split("."), class_name]):
+        raise source.error(
+            key, f"is {shown(name)}; expected module:Class or the name of an entry point"
+        )
+    directory = module_directory(source, ("environment", "directory"), settings.directory, module)
+    package = module.partition(".")[0]
+    if directory is None and package not in sys.modules and PathFinder.find_spec(package) is None:
+        raise source.error(
+            key,
+            f"is {shown(name)}; there is no module {package} beside {source.path.name}, in the"
+            " current directory or among the installed ones",
+        )
+    return msgspec.structs.replace(
+        settings, directory=None if directory is None else str(directory)
+    )

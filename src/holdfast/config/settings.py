@@ -1,0 +1,430 @@
+"""The settings of a run, as validated, immutable data.
+
+Each class is one section of the configuration file and has the key names of the thesis's YAML, so
+that its files load unchanged; the fields that the thesis does not have come after its own and have
+defaults. Bounds stand beside the fields, once. :func:`holdfast.config.loader.load` reports a breach
+of them with file, line, key and value; for settings that are made in Python :func:`check_settings`
+does, without the file, at the start of every trial.
+"""
+
+from __future__ import annotations
+
+import itertools
+from typing import Annotated, Any, Literal
+
+import msgspec
+
+from holdfast.errors import InvalidValueError
+
+__all__ = [
+    "ActiveSensingSettings",
+    "EnvironmentSettings",
+    "OffloadSettings",
+    "ParticleFilterSettings",
+    "PlanningSettings",
+    "RecoverySettings",
+    "SelectorSettings",
+    "SimulatorSettings",
+    "check_settings",
+    "estimator_of",
+    "path_steps",
+    "unfit_for_path_entropy",
+    "unfit_for_the_method",
+]
+
+MAX_PARTICLES = 10_000_000
+"""Bound on ``num_particles``: states of six coordinates then fill 480 MB."""
+
+MAX_SERVICES = 16
+"""Bound on ``offload.services``: each has its links."""
+
+FEW_PARTICLES = 500
+"""Up to so many ``prior_neighbors`` has the less bias and takes little longer; its time grows with
+their square."""
+
+MAX_PATH_STEPS = 10_000
+"""Bound on the entries of ``selector.path_offsets``, and on the steps that they come to."""
+
+MAX_PATH_OFFSETS = 64
+"""Bound on the number of entries of ``selector.path_offsets``."""
+
+Count = Annotated[int, msgspec.Meta(ge=1)]
+NonNegativeCount = Annotated[int, msgspec.Meta(ge=0)]
+Positive = Annotated[float, msgspec.Meta(gt=0.0)]
+Resolution = Annotated[float, msgspec.Meta(ge=1e-150, le=1e150)]
+Resolutions = Annotated[tuple[Resolution, ...], msgspec.Meta(min_length=1, max_length=64)]
+Milliseconds = Annotated[float, msgspec.Meta(gt=0.0, le=3_600_000.0)]
+Seed = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
+Text = Annotated[str, msgspec.Meta(min_length=1, max_length=4096)]
+
+Method = Literal[
+    "action_entropy",
+    "path_entropy",
+    "state_entropy",
+    "action_covariance",
+    "expected_return",
+    "random",
+    "fixed",
+]
+"""How a sensing action is chosen: ``holdfast.sensing.choose_sensing_action`` has a branch each."""
+
+ENTROPY_METHODS: frozenset[Method] = frozenset({"action_entropy", "path_entropy", "state_entropy"})
+"""Those that minimise an entropy and so need an estimator."""
+
+UNINFORMED_METHODS: frozenset[Method] = frozenset({"random", "fixed"})
+"""Those that use no belief."""
+
+Estimator = Literal[
+    "nearest_neighbor", "prior_neighbors", "gaussian_mixture_upper", "gaussian_mixture_lower"
+]
+"""How an entropy is estimated: :mod:`holdfast.estimators` has a class for each."""
+
+NEIGHBOR_ESTIMATORS: frozenset[Estimator] = frozenset({"nearest_neighbor", "prior_neighbors"})
+"""Those that count nearest neighbours."""
+
+
+class ParticleFilterSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The section ``particle_filter``.
+
+    Attributes
+    ----------
+    num_particles : int
+        Number of particles, at least 1. The more the fewer steps a task takes; no other
+        change of the defaults was found to help over several problems (``docs/results.md``). The
+        thesis has 100.
+    resampling_threshold : float
+        Resample after an observation when the effective sample size is at most this fraction of
+        the number of particles. 1 (the default) resamples after every observation.
+    estimate : {"mean", "most_likely"}
+        The state for which the policy is asked: the mean of the belief, or the particle of the
+        greatest weight. Of equal weights, as all are after resampling, it is the first particle:
+        no more than a draw from the belief.
+    """
+
+    num_particles: Annotated[int, msgspec.Meta(ge=1, le=MAX_PARTICLES)] = 300
+    resampling_threshold: Annotated[float, msgspec.Meta(ge=0.0, le=1.0)] = 1.0
+    estimate: Literal["mean", "most_likely"] = "mean"
+
+
+class ActiveSensingSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The section ``active_sensing``: Algorithm 2 and its entropy estimate.
+
+    Attributes
+    ----------
+    horizon : int
+        Number H of entropies added up: now, and after each of H - 1 predicted steps.
+    discount : float
+        Weight of the entropy, or for ``expected_return`` of the reward, h steps ahead is
+        ``discount**h``.
+    num_observation_samples : int
+        Number M of hypothetical observations of each sensing action.
+    num_nearest_neighbors : int
+        The k of ``nearest_neighbor`` and ``prior_neighbors``, below ``num_particles``; without
+        effect for the other estimators.
+    num_cores : int
+        Threads of a decision; 0 means all cores (or what ``OMP_NUM_THREADS`` says). Changes time
+        only, never a result. Moving 4,096 particles or more always uses all cores.
+    """
+
+    horizon: Annotated[int, msgspec.Meta(ge=1, le=1000)] = 1
+    discount: Annotated[float, msgspec.Meta(ge=0.0, le=1.0)] = 1.0
+    num_observation_samples: Annotated[int, msgspec.Meta(ge=1, le=1_000_000)] = 10
+    num_nearest_neighbors: Count = 5
+    num_cores: NonNegativeCount = 0
+
+
+class SelectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The section ``selector``: how the sensing action is chosen.
+
+    Attributes
+    ----------
+    method : Method
+        What is minimised: an entropy, or the trace of the covariance of the actions; or what is
+        maximised: the expected return less the price of sensing. ``random`` and ``fixed`` use
+        no belief. ``path_entropy`` adds up the entropies of the actions at several steps of the
+        way that the policy leads each particle without noise.
+    sensing_action : int
+        Index of the sensing action that ``fixed`` chooses.
+    estimator : Estimator or None
+        How the entropies are estimated. ``prior_neighbors`` has less bias where a sharp observation
+        leaves few particles: 300 choose about as well as 1,000 with ``nearest_neighbor``; at most
+        4,096. A mixture takes few particles for certainty: use it with so many that they lie closer
+        than its noise (docs/results.md). Distances between neighbours depend on the units of the
+        coordinates, unless ``resolution`` has a number for each; with the motion noise as its own,
+        the mixture does not. None: ``nearest_neighbor``, but ``prior_neighbors`` for
+        ``path_entropy`` with at most 500 particles.
+    actions : {"commanded", "executed"}
+        Whether ``action_entropy``, ``path_entropy`` and ``action_covariance`` take the policy's
+        actions before or after the limits of a step.
+    resolution : float, tuple of float or None
+        Distance below which two actions (or, for ``state_entropy``, states) do not differ in
+        practice, in their unit, from 1e-150 to 1e150; for a mixture, the standard deviation of the
+        noise that blurs them.
+        With as many numbers as coordinates each has its own, in its own unit; then the choice does
+        not depend on units, that of ``action_covariance`` included. None takes the problem's
+        resolution, and for a mixture its motion noise, unless that has none for a coordinate,
+        there are more coordinates of a state than of an action, or the problem has a resolution of
+        states.
+    path_offsets : tuple of int
+        At which steps of the path ``path_entropy`` takes the actions: strictly increasing, from 0
+        (the next action) to 10,000, 1 to 64 of them. The default takes the next action and the one
+        after the next sensing step.
+    path_unit : {"sensing_intervals", "steps"}
+        What the offsets count. An interval is ``simulator.sensing_intervals + 1`` steps; the
+        offsets in steps are at most 10,000 as well.
+    path_discount : float
+        The entropy at offset h counts ``path_discount**h`` times, h in ``path_unit``; above 0,
+        at most 1. Before an action h intervals away, the robot senses h more times.
+    rollout_reward : {"problem", "steps"}
+        Whose sum is the return of ``expected_return``: the problem's rewards, or -1 for each step
+        up to the goal. A problem without rewards has the steps in any case.
+    rollout_steps : int
+        Steps after which a rollout of ``expected_return`` that has not reached the goal ends.
+    rollout_looks : int
+        In a rollout of ``expected_return`` the state gets known at each of so many of the next
+        sensing steps with equal chances, 1 over this number, and at the last one for sure.
+    max_observation_samples : int
+        Bound on the hypothetical observations of a sensing action with ``expected_return``: it
+        begins with ``num_observation_samples``, which must not be more, and doubles them for those
+        sensing actions whose return differs from the best one's by less than two standard errors.
+    """
+
+    method: Method = "path_entropy"
+    sensing_action: NonNegativeCount = 0
+    estimator: Estimator | None = None
+    actions: Literal["commanded", "executed"] = "commanded"
+    resolution: Resolution | Resolutions | None = None
+    path_offsets: Annotated[
+        tuple[Annotated[int, msgspec.Meta(ge=0, le=MAX_PATH_STEPS)], ...],
+        msgspec.Meta(min_length=1, max_length=MAX_PATH_OFFSETS),
+    ] = (0, 1)
+    path_unit: Literal["sensing_intervals", "steps"] = "sensing_intervals"
+    path_discount: Annotated[float, msgspec.Meta(gt=0.0, le=1.0)] = 0.5
+    rollout_reward: Literal["problem", "steps"] = "problem"
+    rollout_steps: Annotated[int, msgspec.Meta(ge=1, le=100_000)] = 200
+    rollout_looks: Annotated[int, msgspec.Meta(ge=1, le=1000)] = 4
+    max_observation_samples: Annotated[int, msgspec.Meta(ge=1, le=1_000_000)] = 40
+
+
+class SimulatorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The section ``simulator``: trials, their length and how often the robot senses.
+
+    Attributes
+    ----------
+    num_trials : int
+        Number of trials.
+    max_steps : int
+        Steps after which a trial has failed.
+    sensing_intervals : int
+        Steps between two sensing steps: the robot senses at every step t with
+        ``t % (sensing_intervals + 1) == 0``. (The thesis's spelling of the key.)
+    verbosity : int
+        Accepted because the thesis's files have it; without effect.
+    seed : int
+        Seed of every random stream.
+    """
+
+    num_trials: Annotated[int, msgspec.Meta(ge=1, le=10_000_000)] = 10
+    max_steps: Annotated[int, msgspec.Meta(ge=1, le=10_000_000)] = 500
+    sensing_intervals: NonNegativeCount = 8
+    verbosity: NonNegativeCount = 0
+    seed: Seed = 0
+
+
+class OffloadSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The section ``offload``: which services decide, and how soon one is considered lost.
+
+    Nothing here changes a decision, only when and where it is made.
+
+    Attributes
+    ----------
+    services : tuple of str
+        Endpoints of the services in order of preference (``tcp/10.0.0.7:7447``);
+        at most 16, each once. None: the planner runs in the robot's own process.
+    detection_timeout_ms : float
+        A service from which a decision is awaited and that shows no sign of progress for this long
+        counts as dead. (A killed one is found sooner, by its broken link.)
+    startup_timeout_ms : float
+        At the start of a run, how long to wait for a service that has never been seen yet.
+    lease_ms : float
+        How long this robot may be silent before services give up the link to it. It is silent while
+        its own code computes, and a service has no hurry: of a robot that dies it hears by the end
+        of the link. How long a service may be silent is its own ``holdfast serve --lease-ms``; for
+        the local service, which the robot starts, it is this one.
+    decision_deadline_ms : float or None
+        A decision that is not there this long after it was needed is asked of the local service
+        as well, if that is running; the first answer wins.
+    max_hedged_share : float
+        Bound on the decisions that are asked of two services because of the deadline, as a share of
+        all.
+    decision_timeout_ms : float
+        A decision that takes longer than this is given up even if its service shows progress.
+    verify_share : float
+        Share of the services' answers that this robot computes again with its own planner while it
+        moves, from 0 to 1. A service whose answer differs is not asked again in the run. Answers
+        that differ from each other or break the problem's limits are always computed again.
+    tls : str or None
+        Directory with this robot's credentials, as ``holdfast keys`` makes it. In a file it may be
+        relative to that file.
+    name : str or None
+        The robot's name in the logs of services: at most 100 letters, digits, ``_``, ``-`` and
+        ``.``; with a certificate it must be the one in it. None takes the certificate's or, without
+        one, this machine's.
+    """
+
+    services: Annotated[tuple[Text, ...], msgspec.Meta(max_length=MAX_SERVICES)] = ()
+    detection_timeout_ms: Milliseconds = 250.0
+    startup_timeout_ms: Milliseconds = 1000.0
+    lease_ms: Annotated[float, msgspec.Meta(ge=50.0, le=60_000.0)] = 30_000.0
+    decision_deadline_ms: Milliseconds | None = None
+    max_hedged_share: Annotated[float, msgspec.Meta(ge=0.0, le=1.0)] = 0.1
+    decision_timeout_ms: Milliseconds = 60_000.0
+    verify_share: Annotated[float, msgspec.Meta(ge=0.0, le=1.0)] = 0.05
+    tls: Text | None = None
+    name: Text | None = None
+
+
+class RecoverySettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The section ``recovery``: the local service that decides while no other can.
+
+    Attributes
+    ----------
+    launch : {"on_failure", "at_start", "never"}
+        When it is started: once the services named are found dead, with the run, or never; then
+        the robot holds still until one of them answers.
+    launch_timeout_ms : float
+        A local service that has not been seen this long after its launch is ended and launched
+        again. Doubles with each such launch in a row, up to 8 times: a busy machine is only slow.
+    relaunch_delay_ms : float
+        Pause after a failed launch; it doubles with each failure in a row, up to 32 times.
+    journal_survives : {"process_crash", "power_cut"}
+        What each journalled step outlives: the end of the process (microseconds), or of the whole
+        machine (the time that a disk takes to write).
+    """
+
+    launch: Literal["on_failure", "at_start", "never"] = "on_failure"
+    launch_timeout_ms: Milliseconds = 5000.0
+    relaunch_delay_ms: Milliseconds = 100.0
+    journal_survives: Literal["process_crash", "power_cut"] = "process_crash"
+
+
+class EnvironmentSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The section ``environment``: the world that the robot acts on.
+
+    Nothing here changes a decision, given what was sensed.
+
+    Attributes
+    ----------
+    object : str or None
+        Class of the user's environment, ``module:Class`` or the name of an entry point of the
+        group ``holdfast.environments``. None: the world is simulated from the problem.
+    directory : str or None
+        Directory of the module of ``module:Class``. None: the file's own or the current one, else
+        the module is installed. In a file it may be relative to that file.
+    arguments : dict
+        Plain data, passed to the class as keyword arguments.
+    timeout_ms : float
+        Sensing, performing or any other call of the environment that takes longer than this has
+        failed.
+    """
+
+    object: Text | None = None
+    directory: Text | None = None
+    arguments: dict[str, Any] = msgspec.field(default_factory=dict)
+    timeout_ms: Milliseconds = 60_000.0
+
+
+class PlanningSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """All that a decision depends on besides the problem and the state.
+
+    Attributes
+    ----------
+    sensing_interval : int
+        Steps between two sensing steps.
+    """
+
+    particle_filter: ParticleFilterSettings = msgspec.field(default_factory=ParticleFilterSettings)
+    active_sensing: ActiveSensingSettings = msgspec.field(default_factory=ActiveSensingSettings)
+    selector: SelectorSettings = msgspec.field(default_factory=SelectorSettings)
+    sensing_interval: NonNegativeCount = 8
+
+
+def estimator_of(selector: SelectorSettings, num_particles: int) -> Estimator:
+    """Return how the entropies of so many particles are estimated."""
+    if selector.estimator is not None:
+        return selector.estimator
+    few = num_particles <= FEW_PARTICLES
+    return "prior_neighbors" if few and selector.method == "path_entropy" else "nearest_neighbor"
+
+
+def path_steps(settings: PlanningSettings) -> tuple[int, ...]:
+    """Return ``selector.path_offsets`` in steps."""
+    selector = settings.selector
+    if selector.path_unit == "steps":
+        return selector.path_offsets
+    interval = settings.sensing_interval + 1
+    return tuple(offset * interval for offset in selector.path_offsets)
+
+
+def unfit_for_path_entropy(settings: PlanningSettings) -> tuple[tuple[str, str], str] | None:
+    """Return which key the method ``path_entropy`` cannot use as it is, and why; None if all fit.
+
+    For what the bounds of a single key do not say.
+    """
+    if settings.selector.method != "path_entropy":
+        return None
+    offsets = settings.selector.path_offsets
+    key = ("selector", "path_offsets")
+    if any(after <= before for before, after in itertools.pairwise(offsets)):
+        return key, f"is {list(offsets)}; the offsets must increase strictly"
+    steps = path_steps(settings)
+    if not steps or len(steps) > MAX_PATH_OFFSETS or steps[0] < 0 or steps[-1] > MAX_PATH_STEPS:
+        return key, (
+            f"is {list(offsets)}, {list(steps)} steps with selector.path_unit "
+            f"{settings.selector.path_unit}; allowed are 1 to {MAX_PATH_OFFSETS} offsets from 0 to "
+            f"{MAX_PATH_STEPS} steps"
+        )
+    horizon = settings.active_sensing.horizon
+    if horizon > 1:
+        return ("active_sensing", "horizon"), (
+            f"is {horizon}; with selector.method path_entropy it must be 1: the offsets of "
+            "selector.path_offsets are how far that looks ahead"
+        )
+    return None
+
+
+def unfit_for_the_method(settings: PlanningSettings) -> tuple[tuple[str, str], str] | None:
+    """Return which key ``selector.method`` cannot use as it is, and why; None if all fit."""
+    if settings.selector.method != "expected_return":
+        return unfit_for_path_entropy(settings)
+    first = settings.active_sensing.num_observation_samples
+    most = settings.selector.max_observation_samples
+    if most >= first:
+        return None
+    return ("selector", "max_observation_samples"), (
+        f"is {most}; with selector.method expected_return it must be at least "
+        f"active_sensing.num_observation_samples, which is {first}"
+    )
+
+
+def check_settings(settings: PlanningSettings) -> None:
+    """Check the bounds of settings that were made in Python.
+
+    Raises
+    ------
+    InvalidValueError
+        If a value is not what its section allows; the message names section and key.
+    """
+    try:
+        checked = msgspec.convert(msgspec.to_builtins(settings), PlanningSettings)
+    except (msgspec.ValidationError, TypeError) as error:
+        raise InvalidValueError(f"settings: {error}") from error
+    for name in PlanningSettings.__struct_fields__:
+        value, kind = getattr(settings, name), type(getattr(checked, name))
+        if not isinstance(value, kind):
+            raise InvalidValueError(
+                f"settings: {name} is of type {type(value).__name__}; it must be a {kind.__name__}"
+            )
+    if (unfit := unfit_for_the_method(settings)) is not None:
+        (section, key), reason = unfit
+        raise InvalidValueError(f"settings: {section}.{key} {reason}")

@@ -1,0 +1,190 @@
+"""A configuration before it is checked: its sections, and the place of each value in the file.
+
+Every complaint names the file, the line, the key with its section, the value and what is allowed
+instead, because a person who reads it has the file open.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from importlib.machinery import PathFinder
+from pathlib import Path
+from typing import Any, TypeVar
+
+import msgspec
+
+from holdfast.config.settings import (
+    ActiveSensingSettings,
+    EnvironmentSettings,
+    OffloadSettings,
+    ParticleFilterSettings,
+    RecoverySettings,
+    SelectorSettings,
+    SimulatorSettings,
+)
+from holdfast.config.validation import close_match, field_names, find_mismatch, shown
+from holdfast.config.yaml_document import Document, KeyPath, dotted
+from holdfast.errors import ConfigurationError
+
+__all__ = ["SECTIONS", "SETTINGS", "Source", "module_directory"]
+
+SETTINGS: Mapping[str, type[msgspec.Struct]] = {
+    "particle_filter": ParticleFilterSettings,
+    "active_sensing": ActiveSensingSettings,
+    "simulator": SimulatorSettings,
+    "selector": SelectorSettings,
+    "offload": OffloadSettings,
+    "recovery": RecoverySettings,
+    "environment": EnvironmentSettings,
+}
+"""The sections whose keys do not depend on the problem, and their types."""
+
+SECTIONS = (
+    "model",
+    "particle_filter",
+    "state_space_planner",
+    "active_sensing",
+    "simulator",
+    "selector",
+    "offload",
+    "recovery",
+    "environment",
+)
+"""In the order in which a resolved configuration lists them."""
+
+_ON_TOP = ("problem", "problem_directory")
+
+_StructT = TypeVar("_StructT", bound=msgspec.Struct)
+
+
+class Source:
+    """A configuration before it is checked, which can say where in it something is wrong.
+
+    Parameters
+    ----------
+    overrides : mapping
+        Values that replace those of the document, by section and key.
+
+    Attributes
+    ----------
+    schemas : dict
+        The type of each section that has one; a problem's own are added to it.
+    """
+
+    def __init__(
+        self, document: Document, path: Path, overrides: Mapping[tuple[str, str], Any]
+    ) -> None:
+        self.path = path
+        self.schemas = dict(SETTINGS)
+        self._document = document
+        self._overrides = frozenset(overrides)
+        data = document.data
+        if data is None:
+            raise ConfigurationError(
+                f"{path}: is empty; a configuration has the sections {', '.join(SECTIONS)}"
+            )
+        if not isinstance(data, Mapping):
+            kind = "a list" if isinstance(data, list) else shown(data)
+            raise ConfigurationError(
+                f"{path}: is {kind} at the top, where a mapping of the sections"
+                f" {', '.join(SECTIONS)} is needed"
+            )
+        for name in data:
+            if name not in (*_ON_TOP, *SECTIONS):
+                raise self.unknown((name,), (*_ON_TOP, *SECTIONS))
+        self.problem: Any = data.get("problem")
+        self.problem_directory: Any = data.get("problem_directory")
+        self.sections: dict[str, dict[str, Any]] = {}
+        for name in SECTIONS:
+            section = data.get(name)
+            if section is not None and not isinstance(section, Mapping):
+                raise self.error((name,), f"is {shown(section)}; expected a mapping of keys")
+            self.sections[name] = dict(section or {})
+        for (name, key), value in overrides.items():
+            if name not in SECTIONS:
+                raise self.unknown((name,), SECTIONS)
+            self.sections[name][key] = value
+
+    def place(self, path: KeyPath) -> str:
+        """Return the file, and the line of the value at ``path`` where there is one."""
+        line = self._document.line(path)
+        return f"{self.path}" if line is None else f"{self.path}, line {line}"
+
+    def is_overridden(self, path: KeyPath) -> bool:
+        """Return whether the value at ``path`` replaces the file's."""
+        return path[:2] in self._overrides
+
+    def directory_of(self, path: KeyPath) -> Path:
+        """Return the directory to which a relative path that stands at ``path`` is relative."""
+        return Path.cwd() if self.is_overridden(path) else self.path.absolute().parent.resolve()
+
+    def error(self, path: KeyPath, message: str) -> ConfigurationError:
+        """Return an error about the value at ``path``."""
+        if self.is_overridden(path):
+            return ConfigurationError(
+                f"{dotted(path)}, given instead of what {self.path} says, {message}"
+            )
+        return ConfigurationError(f"{self.place(path)}: {dotted(path)} {message}")
+
+    def section(self, name: str, schema: type[_StructT]) -> _StructT:
+        """Return a section as its validated struct."""
+        data = self.sections[name]
+        try:
+            return msgspec.convert(data, schema)
+        except msgspec.ValidationError as error:
+            found = find_mismatch(data, schema, (name,))
+            if found is None:  # only if a struct's own check is inconsistent
+                raise ConfigurationError(f"{self.path}: {name}: {error}") from error
+        if found.unknown:
+            raise self.unknown(found.path, found.allowed)
+        if found.missing:
+            raise self.error(found.path, "is missing; it has no default")
+        value = found.value
+        length = f" (a list of {len(value)})" if isinstance(value, list) else ""
+        hint = close_match(value, found.allowed) if isinstance(value, str) else ""
+        if isinstance(value, str) and found.expected.startswith("a list"):
+            hint = f", as in [{value}]"
+        raise self.error(found.path, f"is {shown(value)}{length}; expected {found.expected}{hint}")
+
+    def unknown(self, path: KeyPath, allowed: Collection[str]) -> ConfigurationError:
+        """Return an error about a section or key that is not one of ``allowed``."""
+        what = "section" if len(path) == 1 else "key"
+        homes = [
+            section
+            for section, schema in self.schemas.items()
+            if len(path) == 2 and section != path[0] and path[1] in field_names(schema)
+        ]
+        hint = (
+            f"is a key of {' and '.join(homes)}, not of {dotted(path[:-1])}"
+            if homes
+            else f"is not a known {what}{close_match(str(path[-1]), allowed)}"
+        )
+        text = f"{hint}\nallowed: {', '.join(allowed) or 'no keys'}"
+        if len(path) == 2 and self.is_overridden(path):
+            # The key itself was given instead of the file's, which has nothing to do with it.
+            return ConfigurationError(f"{dotted(path)} {text}")
+        return self.error(path, text)
+
+
+def module_directory(source: Source, key: KeyPath, value: str | None, module: str) -> Path | None:
+    """Return the directory that holds a user's module, as ``value`` at ``key`` says.
+
+    If it is None, that is the file's own, else the current one, for a resolved configuration stands
+    in the directory of its run, far from the module; None if it is in neither.
+    """
+    package = module.partition(".")[0]
+    if value is not None:
+        directory = source.directory_of(key) / value
+        if not directory.is_dir():
+            raise source.error(key, f"is {shown(value)}, where there is no directory")
+        if not _holds(directory, package):
+            raise source.error(key, f"is {shown(value)}, where there is no module {package}")
+        return directory.resolve()
+    beside = source.path.absolute().parent.resolve()
+    return next(
+        (directory for directory in (beside, Path.cwd()) if _holds(directory, package)), None
+    )
+
+
+def _holds(directory: Path, module: str) -> bool:
+    return PathFinder.find_spec(module, [str(directory)]) is not None

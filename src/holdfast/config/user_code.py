@@ -1,0 +1,308 @@
+"""User code: finding it by name, and showing its errors to its author.
+
+A problem or an environment is a person's own code that holdfast calls. When it fails, the frames
+that matter are that person's; those of holdfast and of the libraries between them only hide these.
+When no frame is the person's, the defect is ours and nothing may be hidden.
+
+Such code may raise anything: a script that is imported calls ``sys.exit(0)``, which is no
+``Exception`` and would end a run as if all were done. So its callers catch everything but
+KeyboardInterrupt, which is Ctrl-C, and passes on what has no account here.
+"""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import re
+import sys
+import sysconfig
+import traceback
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from holdfast.errors import ConfigurationError
+
+__all__ = [
+    "account_of_user_error",
+    "describe_problem_error",
+    "find_class",
+    "in_words",
+    "is_users_file",
+    "registered_names",
+]
+
+_HOLDFAST = Path(__file__).resolve().parents[1]
+_LIBRARIES = tuple(
+    Path(path).resolve()
+    for name in ("stdlib", "platstdlib", "purelib", "platlib")
+    if (path := sysconfig.get_path(name))
+)
+_MAX_TEXT = 1000
+_MAX_LINES = 10
+_MAX_FRAMES = 5
+"""Bounds on what an account has of a message, and of the frames at either end."""
+
+_PACKAGE_FOLDERS = frozenset({"site-packages", "dist-packages"})
+
+
+def is_users_file(name: str) -> bool:
+    """Return whether a source file belongs neither to holdfast nor to an installed library.
+
+    Parameters
+    ----------
+    name : str
+        Path of the file, or what Python says where there is none (``<string>``).
+    """
+    if name.startswith("<"):
+        return False
+    path = _place(name)
+    return _PACKAGE_FOLDERS.isdisjoint(path.parts) and not any(
+        path.is_relative_to(folder) for folder in (_HOLDFAST, *_LIBRARIES)
+    )
+
+
+def _place(name: str) -> Path:
+    # Compiled modules give their sources' names as they lie in the package, wherever that is.
+    installed = _HOLDFAST.parent / name
+    if installed.is_relative_to(_HOLDFAST) and installed.is_file():
+        return installed
+    return Path(name).resolve()
+
+
+def account_of_user_error(error: BaseException, name: str) -> str | None:
+    """Say what the user's code raised and where, without the frames of anybody else.
+
+    Parameters
+    ----------
+    error : BaseException
+        What was raised, caught in holdfast.
+    name : str
+        What to call the code, usually the problem's name.
+
+    Returns
+    -------
+    str or None
+        The type and the message, then file, line and source of each frame of the user's, all of
+        bounded length; None if the user's code had no part in it, or only called what ends a
+        command in order (``print``, once the standard output has no reader).
+    """
+    ours = inner = False
+    frames = []
+    for frame in traceback.extract_tb(error.__traceback__):
+        inner = _place(frame.filename).is_relative_to(_HOLDFAST)
+        # Whatever calls holdfast (a script, a notebook) comes first and is not at fault.
+        ours = ours or inner
+        if ours and is_users_file(frame.filename):
+            frames.append(frame)
+    if inner and isinstance(error, SystemExit):
+        return None
+    if isinstance(error, SyntaxError) and error.filename and is_users_file(error.filename):
+        # A file that cannot be parsed has no frame; the error itself says where.
+        source = (error.text or "").strip()
+        where = f'  File "{error.filename}", line {error.lineno}\n    {source:.{_MAX_TEXT}}'
+    elif frames:
+        where = _frames_listed(frames)
+    else:
+        return None
+    return f"{name} raised {in_words(error)}\n{where}"
+
+
+def in_words(error: BaseException) -> str:
+    """Return an error's type and message, cut to a length that a person reads."""
+    kind = type(error).__name__
+    try:
+        text = str(error.msg if isinstance(error, SyntaxError) else error)
+    except KeyboardInterrupt:
+        raise
+    except BaseException:  # noqa: BLE001 - the user may have written it
+        return f"{kind}, which cannot be put into words"
+    lines = text.splitlines()
+    if len(lines) > _MAX_LINES:
+        text = "\n".join([*lines[:_MAX_LINES], f"... ({len(lines)} lines in all)"])
+    if len(text) > _MAX_TEXT:
+        text = f"{text[:_MAX_TEXT]}... ({len(text)} characters in all)"
+    return f"{kind}: {text}" if text else kind
+
+
+def _frames_listed(frames: list[traceback.FrameSummary]) -> str:
+    # A recursion has a thousand of them; a few from its beginning and its end are enough.
+    if len(frames) > 2 * _MAX_FRAMES:
+        left_out = len(frames) - 2 * _MAX_FRAMES
+        listed = [
+            *traceback.format_list(frames[:_MAX_FRAMES]),
+            f"  ... {left_out} more\n",
+            *traceback.format_list(frames[-_MAX_FRAMES:]),
+        ]
+    else:
+        listed = traceback.format_list(frames)
+    return "".join(listed).rstrip()
+
+
+def describe_problem_error(name: str, error: BaseException) -> str:
+    """Put what a problem raised into words, wherever it came from.
+
+    Parameters
+    ----------
+    name : str
+        Of the problem.
+    """
+    return account_of_user_error(error, name) or in_words(error)
+
+
+def registered_names(group: str) -> list[str]:
+    """Return the names of a group of entry points, sorted.
+
+    Parameters
+    ----------
+    group : str
+        Such as ``holdfast.problems``.
+    """
+    import importlib.metadata
+
+    return sorted(
+        {entry_point.name for entry_point in importlib.metadata.entry_points(group=group)}
+    )
+
+
+def find_class(
+    name: str,
+    *,
+    what: str,
+    group: str,
+    search_directory: Path | None,
+    built_in: Iterable[str] = (),
+    error_type: type[ConfigurationError],
+) -> type[Any]:
+    """Find a class by its name.
+
+    Parameters
+    ----------
+    name : str
+        Of an entry point, or ``module:Class``.
+    what : str
+        What it is for, usually the key of the configuration; messages begin with it.
+    group : str
+        Of the entry points.
+    built_in : iterable of str
+        Further names that messages suggest.
+    search_directory : Path or None
+        Directory in which ``module`` is looked for first. It goes on the import path and stays
+        there, as a script's directory does, for the module may import its neighbours later.
+    error_type : type
+        What is raised.
+
+    Raises
+    ------
+    error_type
+        If the name is not registered, or the module or its class cannot be imported, whatever its
+        import raises.
+    """
+    if ":" in name:
+        return _imported_class(name, what, search_directory, error_type)
+    import importlib.metadata
+
+    for entry_point in importlib.metadata.entry_points(group=group, name=name):
+        try:
+            loaded = entry_point.load()
+        except (ImportError, AttributeError) as error:
+            raise error_type(
+                f"{what}: {name} is registered as {entry_point.value}, which cannot be imported: "
+                f"{error}"
+            ) from error
+        except KeyboardInterrupt:
+            raise
+        except BaseException as error:
+            raise _not_imported(name, what, entry_point.value, error, error_type) from error
+        return _as_class(name, what, loaded, error_type)
+    known = sorted({*built_in, *registered_names(group)})
+    likely = _classes_beside(name, search_directory) or difflib.get_close_matches(name, known, n=3)
+    suggestion = f"; did you mean {' or '.join(likely)}?" if likely else ""
+    raise error_type(
+        f"{what}: {name} is not a registered name{suggestion} "
+        f"(registered: {', '.join(known) or 'none'}; a class of your own is named module:Class)"
+    )
+
+
+def _classes_beside(name: str, directory: Path | None) -> list[str]:
+    """Return the classes, as ``module:Class``, that may be meant if a file of that name is there.
+
+    The file is read, not run: it may be no module at all.
+    """
+    import ast
+
+    stem, _, inner = name.removesuffix(".py").partition(".")
+    # A class MyRobot usually stands in my_robot.py.
+    snake = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", stem).lower()
+    for module in dict.fromkeys((stem, snake)):
+        for folder in dict.fromkeys((directory or Path(), Path())):
+            if not module.isidentifier() or not (folder / f"{module}.py").is_file():
+                continue
+            try:
+                text = (folder / f"{module}.py").read_text(encoding="utf-8")
+                statements = ast.parse(text).body
+            except (OSError, ValueError, SyntaxError):
+                continue
+            classes = [each.name for each in statements if isinstance(each, ast.ClassDef)]
+            public = [each for each in classes if not each.startswith("_")]
+            wanted = [each for each in public if each in (inner, stem)]
+            return [f"{module}:{each}" for each in (wanted or public)[:3]]
+    return []
+
+
+def _imported_class(
+    name: str, what: str, search_directory: Path | None, error_type: type[ConfigurationError]
+) -> type[Any]:
+    module_name, _, class_name = name.partition(":")
+    if not all(part.isidentifier() for part in [*module_name.split("."), class_name]):
+        raise error_type(f"{what}: {name} is neither a registered name nor module:Class")
+    if search_directory is not None:
+        if not search_directory.is_dir():
+            raise error_type(
+                f"{what}: {name} is looked for in {search_directory}, which is no directory"
+            )
+        directory = str(search_directory.resolve())
+        if directory not in sys.path:
+            sys.path.insert(0, directory)
+            importlib.invalidate_caches()
+    try:
+        module = importlib.import_module(module_name)
+    except ImportError as error:
+        where = "" if search_directory is None else f" (looked in {search_directory} first)"
+        raise error_type(
+            f"{what}: {name}: the module {module_name} cannot be imported{where}: {error}"
+        ) from error
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:
+        raise _not_imported(name, what, module_name, error, error_type) from error
+    if not hasattr(module, class_name):
+        classes = [key for key, value in vars(module).items() if isinstance(value, type)]
+        close = difflib.get_close_matches(class_name, classes, n=3)
+        suggestion = f"; did you mean {' or '.join(close)}?" if close else ""
+        raise error_type(
+            f"{what}: {name}: the module {module_name} has no {class_name}{suggestion}"
+        )
+    return _as_class(name, what, getattr(module, class_name), error_type)
+
+
+def _not_imported(
+    name: str,
+    what: str,
+    module_name: str,
+    error: BaseException,
+    error_type: type[ConfigurationError],
+) -> ConfigurationError:
+    """Return the error about a module that is there, but does not come through its own import."""
+    account = account_of_user_error(error, name)
+    if account is None:
+        account = f"{name}: the module {module_name} raised {in_words(error)}"
+    return error_type(f"{what}: {account}")
+
+
+def _as_class(
+    name: str, what: str, found: object, error_type: type[ConfigurationError]
+) -> type[Any]:
+    if not isinstance(found, type):
+        raise error_type(f"{what}: {name} is not a class but {type(found).__name__}")
+    return found

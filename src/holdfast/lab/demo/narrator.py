@@ -1,0 +1,209 @@
+"""Turns what happens on the testbed into the demo's state: activities, marks and lines."""
+
+from __future__ import annotations
+
+import time
+from typing import Literal
+
+from holdfast.lab.demo.state import Activity, Change, DemoState, Line, Mark, Observer, Row
+from holdfast.lab.testbed.driver import ServiceCommand, Testbed
+from holdfast.lab.testbed.processes import Process
+from holdfast.lab.testbed.records import LogEvent
+from holdfast.protocol.status import Status
+from holdfast.robot.links import RECOVERY_SERVICE
+
+__all__ = ["Narrator"]
+
+_SENTENCES = {
+    "service_appeared": "sees {who}",
+    "service_vanished": "sees that {who} is gone",
+    "service_suspected": "suspects {who}: {reason}",
+    "launch": "launches the local service",
+    "launched": "the local service is up, {launch_ms:.0f} ms after its launch",
+    "holding": "holds still at step {step}: no service can decide yet",
+    "resumed": "goes on; it held still for {held_ms:.0f} ms",
+    "restore": "sends {who} its state ({bytes:,} bytes)",
+    "resumed_trial": "goes on with trial {trial} at step {step}, from its journal",
+    # The demo has killed the service itself.
+    "unreachable": "",
+    "missed_ticks": "",
+}
+
+
+class Narrator:
+    """Follows a testbed with one cloud service and one robot.
+
+    Attributes
+    ----------
+    statuses : list of list of str
+        The statuses that each process of the robot has had.
+    status_at : float
+        When the robot's status has changed last, in seconds since the epoch.
+    launch_ms : float or None
+        Of the last launch of the local service since the last kill of the cloud.
+    """
+
+    def __init__(
+        self, testbed: Testbed, cloud: ServiceCommand, state: DemoState, observer: Observer
+    ) -> None:
+        self._testbed = testbed
+        self._cloud = cloud
+        self._state = state
+        self._observer = observer
+        self._ready_process: Process | None = None
+        self._killed_at: float | None = None
+        self._num_events = 0
+        self._local: Activity = "off"
+        self._is_up = self._is_held = self._has_done_all = self._has_finished = False
+        self.statuses: list[list[str]] = []
+        self.status_at = state.began_at
+        self.launch_ms: float | None = None
+
+    @property
+    def cloud_decides(self) -> bool:
+        """Whether the robot's decisions are the cloud's."""
+        return self._state.status != Status.LOCAL_RECOVERY.value
+
+    # -- what the demo does --------------------------------------------------------------------
+
+    def started_cloud(self, process: Process) -> None:
+        """Note a start of the cloud service."""
+        self._mark("cloud", "start", process.spawned_at)
+        command = f"holdfast serve --listen {self._cloud.endpoint}"
+        self.say("demo", f"starts the cloud: {command}", process.spawned_at)
+
+    def killed_cloud(self, process: Process, killed_at: float) -> None:
+        """Note a kill of the cloud service."""
+        self._killed_at = killed_at
+        self.launch_ms = None
+        self._mark("cloud", "kill", killed_at)
+        self.say("demo", f"kill -9 {process.pid}: the cloud service", killed_at)
+
+    def started_robot(self, process: Process, *options: str) -> None:
+        """Note a start of the robot."""
+        self.statuses.append([Status.STANDARD.value])
+        self._state.status = Status.STANDARD.value
+        self._is_held = False
+        self._mark("robot", "start", process.spawned_at)
+        command = " ".join(["holdfast run CONFIG --service ...", *options])
+        self.say("demo", f"starts the robot: {command}", process.spawned_at)
+
+    def killed_robot(self, process: Process, killed_at: float) -> None:
+        """Note a kill of the robot, with which its local service ends."""
+        self._is_up = False
+        self._local = "off"
+        self._mark("robot", "kill", killed_at)
+        self.say("demo", f"kill -9 {process.pid}: the robot's own process", killed_at)
+
+    def say(self, who: str, text: str, at: float | None = None) -> None:
+        """Add a line."""
+        line = Line((time.time() if at is None else at) - self._state.began_at, who, text)
+        self._state.lines.append(line)
+        self._observer.say(line)
+
+    # -- what the testbed shows ----------------------------------------------------------------
+
+    def update(self) -> None:
+        """Take in what has happened since the last call."""
+        cloud = self._cloud
+        ready_at = None if cloud.is_away else cloud.ready_at
+        if ready_at is not None and cloud.process is not self._ready_process:
+            self._ready_process = cloud.process
+            self.say("cloud", "listens", ready_at)
+            self._note_changes(ready_at)
+        robot = self._testbed.robot_or_none
+        if robot is None:
+            return
+        new = robot.events[self._num_events :]
+        self._num_events += len(new)
+        for event in new:
+            if event.at >= robot.process.spawned_at and not robot.process.killed:
+                self._take(event)
+        if robot.decisions:
+            last = robot.decisions[-1]
+            self._state.progress = (
+                f"trial {last.trial}, step {last.step}; {robot.steps_done} of {robot.steps} "
+                "steps done"
+            )
+        if robot.is_done and not self._has_finished:
+            self._has_finished = True
+            self._is_up = False
+            self._local = "off"
+            self._note_changes(time.time())
+            self.say("robot", "has finished its run")
+
+    def _take(self, event: LogEvent) -> None:
+        name = event.name
+        if name == "status":
+            self.status_at = event.at
+            self._state.status = str(event["to"])
+            self.statuses[-1].append(str(event["to"]))
+        elif name == "launch":
+            self._local = "starting"
+        elif name == "launched":
+            self._local = "ready"
+            self.launch_ms = float(event["launch_ms"])
+        elif name in ("launch_failed", "recovery_exited"):
+            self._local = "off"
+        elif name in ("holding", "resumed"):
+            self._is_held = name == "holding"
+        self._is_up = True
+        text = self._in_words(event)
+        if text:
+            self.say("robot", text, event.at)
+        if name == "trial" and event["trial"] == self._testbed.robot.num_trials - 1:
+            self._has_done_all = True
+            text = "has done all trials; writes its tables and draws one of them"
+            self.say("robot", text, event.at)
+        self._note_changes(event.at)
+
+    def _in_words(self, event: LogEvent) -> str:
+        """Describe an event to a reader who sees one for the first time; empty for nothing."""
+        name = event.name
+        if name == "status" and self.cloud_decides:
+            return f"status {event['to']}: the cloud decides again"
+        if name == "status":
+            ms = "" if self._killed_at is None else f"{1e3 * (event.at - self._killed_at):.0f} ms"
+            return f"status {event['to']}, {ms} after the kill" if ms else f"status {event['to']}"
+        if name == "trial":
+            how = "the peg is in" if event["success"] else "the peg is not in"
+            return f"trial {event['trial']} ends after {event['steps']} steps: {how}"
+        if name in _SENTENCES:
+            is_local = event.fields.get("service") == RECOVERY_SERVICE
+            who = "the local service" if is_local else "the cloud service"
+            return _SENTENCES[name].format_map({**event.fields, "who": who})
+        reason = f": {event['reason']}" if event.fields.get("reason") else ""
+        return name.replace("_", " ") + reason
+
+    # -- activities ----------------------------------------------------------------------------
+
+    def _mark(self, row: Row, kind: Literal["start", "kill"], at: float) -> None:
+        self._state.marks.append(Mark(at - self._state.began_at, row, kind))
+        self._note_changes(at)
+
+    def _note_changes(self, at: float) -> None:
+        """Note the activity of each row where it has changed."""
+        at_s = at - self._state.began_at
+        robot = self._testbed.robot_or_none
+        cloud: Activity = "off"
+        if not self._cloud.is_away:
+            is_used = self._is_up and self.cloud_decides and not self._has_done_all
+            up: Activity = "deciding" if is_used else "ready"
+            cloud = "starting" if self._cloud.ready_at is None else up
+        local = self._local
+        if local == "ready" and self._is_up and not self.cloud_decides:
+            local = "deciding"
+        doing: Activity = "off"
+        if robot is not None and not robot.process.killed and not robot.is_done:
+            doing = "by_cloud" if self.cloud_decides else "by_local"
+            doing = "held" if self._is_held else doing
+            doing = doing if self._is_up else "starting"
+            doing = "ready" if self._has_done_all else doing
+        self._change("cloud", cloud, at_s)
+        self._change("local", local, at_s)
+        self._change("robot", doing, at_s)
+
+    def _change(self, row: Row, activity: Activity, at_s: float) -> None:
+        changes = self._state.changes[row]
+        if (changes[-1].activity if changes else "off") != activity:
+            changes.append(Change(at_s, activity))

@@ -1,0 +1,323 @@
+"""What the demo does: kill the cloud twice, then the robot, and compare with a run without kills.
+
+Nothing is staged. The demo starts the commands that anyone can type, ends them with SIGKILL, and
+knows of them only what they log. The kills come at fixed fractions of the run's steps, and each
+only after the robot has reacted to the one before, so the demo is the same on a slow machine.
+"""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import msgspec
+
+from holdfast.cli.terminal import counted
+from holdfast.files import write_atomically
+from holdfast.lab.demo.narrator import Narrator
+from holdfast.lab.demo.state import DemoState, Observer
+from holdfast.lab.errors import NoProgressError
+from holdfast.lab.testbed.driver import Testbed
+from holdfast.lab.testbed.processes import free_port
+from holdfast.lab.testbed.records import Decision
+from holdfast.lab.testbed.reference_run import ReferenceRun, make_reference_run
+from holdfast.protocol.status import Status
+from holdfast.recording.compare import Comparison, compare_runs
+from holdfast.robot.links import RECOVERY_SERVICE
+
+__all__ = [
+    "KILLED_RUN_NAME",
+    "REFERENCE_RUN_NAME",
+    "Findings",
+    "Outage",
+    "Plan",
+    "run_demo",
+]
+
+CONFIGURATION_NAME = "demo.yaml"
+FINDINGS_NAME = "findings.json"
+KILLED_RUN_NAME = "killed"
+REFERENCE_RUN_NAME = "undisturbed"
+
+_CONFIGURATION = """\
+# What holdfast demo has run. The same without services, without kills and as fast as it goes:
+#   holdfast run {path}
+problem: peg_in_hole_2d
+particle_filter: {{num_particles: 100}}
+simulator: {{num_trials: {num_trials}, max_steps: {max_steps}, seed: {seed}}}
+"""
+_MAX_STEPS = 250
+
+_FIRST_KILL = 0.14
+_FIRST_RESTART = 0.32
+_SECOND_KILL = 0.47
+_SECOND_RESTART = 0.59
+_ROBOT_KILL = 0.73
+"""As fractions of the run's steps; after the last there is room for delays."""
+
+_USUAL_START_S = 0.4
+_MAX_SLOWNESS = 4.0
+"""A service that takes longer to start is on a slow machine, where the robot is slower too;
+otherwise its run would end before all has happened."""
+
+_PATIENCE_S = 30.0
+"""For a reaction; on an idle machine it takes a hundredth of that."""
+
+_AROUND_S = 3.0
+"""Of the demo, before and after the robot's run."""
+
+
+class Outage(msgspec.Struct, frozen=True, kw_only=True):
+    """One kill of the cloud service and its return.
+
+    Attributes
+    ----------
+    found_ms : float
+        From the kill until the robot's status is ``local_recovery``.
+    first_local_decision_ms : float
+        From then until the robot carries out a decision of the local service. Until then it uses
+        the actions that it has.
+    longest_wait_ms : float
+        Longest time that the robot stood still for a decision while the cloud was away.
+    launched_ms : float or None
+        From the start of the local service until the robot sees it; None if it ran already.
+    listening_ms : float
+        From the start of the new cloud service until it listens.
+    used_again_ms : float
+        From then until the robot has an answer of it.
+    """
+
+    found_ms: float
+    first_local_decision_ms: float
+    longest_wait_ms: float
+    launched_ms: float | None
+    listening_ms: float
+    used_again_ms: float
+
+
+class Findings(msgspec.Struct, frozen=True, kw_only=True):
+    """The content of ``findings.json``.
+
+    Attributes
+    ----------
+    rate_hz : float
+        Task actions per second.
+    robot_acting_again_ms : float
+        From the kill of the robot's own process until a new one carries out its first decision.
+    usual_wait_ms : float
+        Median time that the robot waits for the cloud's task actions: one round trip.
+    statuses : tuple of tuple of str
+        Of each process that the robot had.
+    comparison : Comparison
+        Of the reference run and the run with the kills.
+    """
+
+    problem: str
+    seed: int
+    trials: int
+    steps: int
+    rate_hz: float
+    outages: tuple[Outage, ...]
+    robot_acting_again_ms: float
+    usual_wait_ms: float
+    statuses: tuple[tuple[str, ...], ...]
+    comparison: Comparison
+
+
+class Plan(NamedTuple):
+    """How long the demo is.
+
+    Attributes
+    ----------
+    min_steps : int
+        Trials are added until the run has as many task actions.
+    duration_s : float
+        How long the robot takes for them.
+    """
+
+    min_steps: int = 400
+    duration_s: float = 16.0
+
+
+def run_demo(
+    testbed: Testbed, seed: int, plan: Plan, state: DemoState, observer: Observer
+) -> Findings:
+    """Run the demo in the testbed's directory.
+
+    Returns
+    -------
+    Findings
+        Also written to ``findings.json``.
+
+    Raises
+    ------
+    NoProgressError
+        If something does not happen in time.
+    ProcessEndedError
+        If a process ends that should not.
+    """
+    return _Scenario(testbed, seed, plan, state, observer).run()
+
+
+class _Scenario:
+    def __init__(
+        self, testbed: Testbed, seed: int, plan: Plan, state: DemoState, observer: Observer
+    ) -> None:
+        self._testbed = testbed
+        self._seed = seed
+        self._plan = plan
+        self._state = state
+        self._cloud = testbed.add_service(f"tcp/127.0.0.1:{free_port()}")
+        self._narrator = Narrator(testbed, self._cloud, state, observer)
+        testbed.on_turn = self._narrator.update
+
+    def run(self) -> Findings:
+        testbed = self._testbed
+        directory = testbed.directory
+        reference = self._make_reference_run()
+        slowness = min(_MAX_SLOWNESS, max(1.0, self._start_cloud() / _USUAL_START_S))
+        steps = sum(reference.steps_of_trials)
+        rate_hz = float(max(1, round(steps / (self._plan.duration_s * slowness))))
+        self._state.expected_s = self._state.now_s + _AROUND_S + steps / rate_hz
+        self._state.title += f" at {rate_hz:g} Hz"
+        robot = testbed.start_robot(
+            directory / CONFIGURATION_NAME,
+            directory / KILLED_RUN_NAME,
+            reference.steps_of_trials,
+            rate_hz,
+            *("--service", self._cloud.endpoint),
+        )
+        self._narrator.started_robot(robot.process)
+        self._wait(lambda: bool(robot.decisions), "the robot's first decision")
+        first = self._outage(_FIRST_KILL, _FIRST_RESTART)
+        second = self._outage(_SECOND_KILL, _SECOND_RESTART)
+        acting_again_ms = self._kill_robot()
+        self._wait(lambda: robot.is_done, "the end of the robot's run", steps / rate_hz)
+        robot.table.read()
+        waits = [
+            row.waited_ms
+            for row in robot.decisions
+            if row.kind == "task"
+            and row.service == self._cloud.endpoint
+            and row.status != Status.LOCAL_RECOVERY.value
+        ]
+        findings = Findings(
+            problem="peg_in_hole_2d",
+            seed=self._seed,
+            trials=len(reference.steps_of_trials),
+            steps=steps,
+            rate_hz=rate_hz,
+            outages=(first, second),
+            robot_acting_again_ms=acting_again_ms,
+            usual_wait_ms=statistics.median(waits) if waits else 0.0,
+            statuses=tuple(map(tuple, self._narrator.statuses)),
+            comparison=compare_runs(directory / REFERENCE_RUN_NAME, robot.out),
+        )
+        text = msgspec.json.format(msgspec.json.encode(findings), indent=2)
+        write_atomically(directory / FINDINGS_NAME, text + b"\n")
+        return findings
+
+    def _make_reference_run(self) -> ReferenceRun:
+        directory = self._testbed.directory
+
+        def write_configuration(num_trials: int) -> Path:
+            path = directory / CONFIGURATION_NAME
+            text = _CONFIGURATION.format(
+                path=path, num_trials=num_trials, max_steps=_MAX_STEPS, seed=self._seed
+            )
+            write_atomically(path, text.encode())
+            return path
+
+        reference = make_reference_run(
+            directory / REFERENCE_RUN_NAME, write_configuration, self._plan.min_steps
+        )
+        self._state.title = (
+            f"{reference.configuration.problem_name}, seed {self._seed}: "
+            f"{counted(len(reference.steps_of_trials), 'trial')}, "
+            f"{sum(reference.steps_of_trials)} steps"
+        )
+        text = f"the run without kills, in this process, took {reference.took_s:.2f} s"
+        self._narrator.say("demo", text)
+        return reference
+
+    def _outage(self, kill_at: float, restart_at: float) -> Outage:
+        """Kill the cloud, let the robot do without it for a while, and start it again."""
+        narrator = self._narrator
+        self._wait_for_progress(kill_at)
+        self._wait(lambda: narrator.cloud_decides, "the use of the cloud service")
+        process = self._cloud.process
+        killed_at = process.kill()
+        narrator.killed_cloud(process, killed_at)
+        self._wait(lambda: not narrator.cloud_decides, "the loss being noticed")
+        found_at = max(narrator.status_at, killed_at)
+        local = self._wait_for_decision(
+            lambda row: row.service == RECOVERY_SERVICE and row.at >= found_at,
+            "a decision of the local service",
+        )
+        narrator.say("local", f"decides, from step {local.step} on", local.at)
+        self._wait_for_progress(restart_at)
+        start_s = self._start_cloud()
+        listening_at = self._cloud.process.spawned_at + start_s
+        self._wait(lambda: narrator.cloud_decides, "the cloud being used again")
+        used_at = narrator.status_at
+        # That decision may have been waited for since before.
+        last = self._wait_for_decision(lambda row: row.at > used_at, "the decision after that")
+        decisions = self._testbed.robot.decisions
+        waits = [row.waited_ms for row in decisions if killed_at <= row.at <= last.at]
+        return Outage(
+            found_ms=1e3 * (found_at - killed_at),
+            first_local_decision_ms=1e3 * (local.at - found_at),
+            longest_wait_ms=max(waits),
+            launched_ms=narrator.launch_ms,
+            listening_ms=1e3 * start_s,
+            used_again_ms=1e3 * max(0.0, used_at - listening_at),
+        )
+
+    def _kill_robot(self) -> float:
+        """Kill the robot's own process in mid-step and resume its run; return for how long, in ms.
+
+        It ends with the first decision that the new process carries out.
+        """
+        self._wait_for_progress(_ROBOT_KILL)
+        robot = self._testbed.robot
+        killed_at = robot.process.kill()
+        self._narrator.killed_robot(robot.process, killed_at)
+        robot.resume()
+        self._narrator.started_robot(robot.process, "--resume")
+        resumed_at = robot.process.spawned_at
+        again = self._wait_for_decision(lambda row: row.at > resumed_at, "the robot acting again")
+        return 1e3 * (again.at - killed_at)
+
+    def _start_cloud(self) -> float:
+        """Start the cloud service and wait until it listens; return how long it took in s."""
+        self._narrator.started_cloud(self._cloud.start().process)
+        self._wait(lambda: self._cloud.ready_at is not None, "the cloud service listening")
+        return self._cloud.start_s
+
+    # -- waiting -------------------------------------------------------------------------------
+
+    def _wait_for_progress(self, fraction: float) -> None:
+        robot = self._testbed.robot
+        step = int(fraction * robot.steps)
+        expected_s = robot.steps / robot.rate_hz
+        self._wait(lambda: robot.steps_done >= step, f"step {step} of the run", expected_s)
+
+    def _wait_for_decision(self, wanted: Callable[[Decision], bool], what: str) -> Decision:
+        """Wait for a row in the robot's table, and return it."""
+        decisions = self._testbed.robot.decisions
+        self._wait(lambda: any(map(wanted, decisions)), what)
+        return next(filter(wanted, decisions))
+
+    def _wait(self, done: Callable[[], bool], what: str, expected_s: float = 0.0) -> None:
+        robot = self._testbed.robot_or_none
+
+        def is_over() -> bool:
+            return done() or (robot is not None and robot.is_done)
+
+        self._testbed.wait_until(is_over, what, expected_s + _PATIENCE_S)
+        if not done():
+            raise NoProgressError(
+                f"the robot's run was over before {what}; the logs are in {self._testbed.directory}"
+            )

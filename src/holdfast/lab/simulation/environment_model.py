@@ -1,0 +1,149 @@
+"""What the robot acts on: a world that goes on when the robot's process does not.
+
+It knows how the undisturbed run went, and lets nothing else happen in it: whoever senses or does
+something else, again, too early or too late, is told so at once, as a :class:`Violation`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from holdfast.arrays import FloatArray
+from holdfast.lab.errors import Violation
+from holdfast.lab.simulation.reference_runs import ReferenceRuns
+from holdfast.outcome import TrialResult
+
+__all__ = [
+    "EnvironmentModel",
+]
+
+
+class EnvironmentModel:
+    """The world of one trial.
+
+    Parameters
+    ----------
+    shows_the_same : bool
+        Whether what is sensed again shows the same again. In a world outside of the simulation it
+        does not: a robot that has forgotten what it sensed will know something else.
+
+    Attributes
+    ----------
+    performed : int
+        Task actions so far.
+    """
+
+    def __init__(
+        self, trial: int, max_steps: int, twins: ReferenceRuns, *, shows_the_same: bool
+    ) -> None:
+        self._trial = trial
+        self._max_steps = max_steps
+        self._twins = twins
+        self._twin = twins.get(trial, max_steps)
+        self._shows_the_same = shows_the_same
+        self._times: dict[int, int] = {}
+        self.performed = 0
+
+    @property
+    def done(self) -> bool:
+        """Whether the task is done."""
+        if self.performed == 0:
+            return self._twin.done_at_start
+        return self._twin.deeds[self.performed - 1].done
+
+    def begin_again(self, actions: list[FloatArray]) -> None:
+        """Perform these from the beginning: this world does not outlive the robot's process.
+
+        Raises
+        ------
+        Violation
+            If these are not the first actions of the undisturbed run.
+        """
+        self.performed = 0
+        for step, action in enumerate(actions):
+            self.act(step, action)
+
+    def sense(self, step: int, sensing_action: int) -> FloatArray:
+        """Perform a sensing action and return what it shows.
+
+        Raises
+        ------
+        Violation
+            If the undisturbed run does not sense this now.
+        """
+        where = f"trial {self._trial}: sensing action {sensing_action} of step {step}"
+        if step != self.performed:
+            raise Violation(f"{where}, where {self.performed} task actions have been performed")
+        deeds = self._twin.deeds
+        expected = deeds[step].sensing_action if step < len(deeds) else None
+        if sensing_action != expected:
+            raise Violation(f"{where}: the undisturbed run has {expected}")
+        times = self._times.get(step, 0)
+        self._times[step] = times + 1
+        if times and not self._shows_the_same:
+            repeats = tuple((at, count - 1) for at, count in self._times.items() if count > 1)
+            self._twin = self._twins.get(self._trial, self._max_steps, repeats)
+        shown = self._twin.deeds[step].observation
+        assert shown is not None
+        return shown
+
+    def act(self, step: int, action: FloatArray) -> tuple[float | None, bool]:
+        """Perform a task action; return its reward and whether the task is done.
+
+        Raises
+        ------
+        Violation
+            If the undisturbed run does not do this now.
+        """
+        where = f"trial {self._trial}: task action of step {step}"
+        if step != self.performed:
+            again = " again" if step < self.performed else ""
+            raise Violation(f"{where} performed{again}, where {self.performed} have been performed")
+        if step >= len(self._twin.deeds):
+            raise Violation(f"{where}: the undisturbed run has ended before")
+        deed = self._twin.deeds[step]
+        written = np.asarray(action, dtype="<f8").tobytes()
+        if written != deed.action:
+            expected = np.frombuffer(deed.action, dtype="<f8")
+            raise Violation(f"{where}: {action}, the undisturbed run has {expected}")
+        self.performed += 1
+        return deed.reward, deed.done
+
+    def check_end(self, result: TrialResult, *, rewards_are_known: bool) -> None:
+        """Compare what the robot has to say of the trial.
+
+        Parameters
+        ----------
+        rewards_are_known : bool
+            Whether it has heard of the reward of each action.
+
+        Raises
+        ------
+        Violation
+            If it is not that of the undisturbed run.
+        """
+        twin, steps, digest = self._twin, result.steps, result.digest
+        if not steps == self.performed == len(twin.deeds):
+            raise Violation(
+                f"trial {self._trial} ended after {steps} steps, {self.performed} of which were "
+                f"performed: the undisturbed run has {len(twin.deeds)}"
+            )
+        if digest != twin.digest:
+            raise Violation(
+                f"trial {self._trial}: digest of the decisions {digest[:16]}, the undisturbed run "
+                f"has {twin.digest[:16]}"
+            )
+        reward = None if twin.deeds else 0.0
+        for deed in twin.deeds:
+            if deed.reward is not None:
+                reward = (reward or 0.0) + deed.reward
+        sensed = sum(deed.sensing_action is not None for deed in twin.deeds)
+        for name, said, true in (
+            ("success", result.success, self.done),
+            ("sensing decisions", result.sensing_decisions, sensed),
+            ("reward", result.reward if rewards_are_known else reward, reward),
+        ):
+            if said != true:
+                raise Violation(
+                    f"trial {self._trial}: {name} {said}, the undisturbed run has {true}"
+                )

@@ -1,0 +1,157 @@
+"""Many seeds, on one core or on several, and what was found under them."""
+
+from __future__ import annotations
+
+import multiprocessing
+import signal
+from collections import Counter, deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+
+import msgspec
+
+from holdfast.errors import InvalidValueError
+from holdfast.lab.errors import SimulationError
+from holdfast.lab.simulation.schedule_draws import draw_schedule
+from holdfast.lab.simulation.world import Simulator
+from holdfast.runtime.command_line import MAX_JOBS
+
+__all__ = ["ExplorationTally", "ViolationFound", "explore"]
+
+_BATCH = 25
+"""Seeds that a process runs between two reports: a fraction of a second's work."""
+
+_AHEAD = 3
+"""Batches that wait for each process."""
+
+
+class ViolationFound(msgspec.Struct, frozen=True):
+    """A seed under which something happened that must not."""
+
+    seed: int
+    violation: str
+
+
+class ExplorationTally(msgspec.Struct, kw_only=True):
+    """What was seen under some seeds.
+
+    Attributes
+    ----------
+    held : int
+        Of these, how many ended with a robot that rightly holds still for good.
+    faults : dict of str to int
+        By kind, how many have happened.
+    longest_recovery_s : float
+        Virtual time from the end of the last fault to the end of a run.
+    """
+
+    runs: int = 0
+    held: int = 0
+    faults: dict[str, int] = msgspec.field(default_factory=dict)
+    messages: int = 0
+    longest_recovery_s: float = 0.0
+    findings: list[ViolationFound] = msgspec.field(default_factory=list)
+
+    def add(self, other: ExplorationTally) -> None:
+        """Add what was seen under other seeds."""
+        self.runs += other.runs
+        self.held += other.held
+        self.faults = dict(Counter(self.faults) + Counter(other.faults))
+        self.messages += other.messages
+        self.longest_recovery_s = max(self.longest_recovery_s, other.longest_recovery_s)
+        self.findings = sorted(self.findings + other.findings, key=lambda found: found.seed)
+
+
+def explore(
+    seeds: range,
+    jobs: int,
+    on_batch: Callable[[range, ExplorationTally], bool],
+    batch: int = _BATCH,
+) -> None:
+    """Run the schedules of many seeds.
+
+    Parameters
+    ----------
+    jobs : int
+        Processes; 1 runs all seeds in this one. Changes time only.
+    on_batch : callable
+        Gets the seeds of a batch that was run, in their order, and what was seen; returns whether
+        to go on.
+    batch : int
+        Seeds in one.
+
+    Raises
+    ------
+    InvalidValueError
+        If the number of processes is out of bounds.
+    SimulationError
+        If a process was killed; what it had is not known.
+    """
+    if not 1 <= jobs <= MAX_JOBS:
+        raise InvalidValueError(f"jobs is {jobs}: must be from 1 to {MAX_JOBS}")
+    batches = (seeds[begin : begin + batch] for begin in range(0, len(seeds), batch))
+    if jobs == 1 or len(seeds) <= batch:
+        simulator = Simulator()
+        for some in batches:
+            if not on_batch(some, _run(some, simulator)):
+                return
+    else:
+        _explore_in_processes(batches, jobs, on_batch)
+
+
+def _explore_in_processes(
+    batches: Iterator[range], jobs: int, on_batch: Callable[[range, ExplorationTally], bool]
+) -> None:
+    others = set(multiprocessing.active_children())
+    pool = ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn"), initializer=_begin)
+    try:
+        running: deque[tuple[range, Future[ExplorationTally]]] = deque()
+        while True:
+            while len(running) < _AHEAD * jobs and (some := next(batches, None)) is not None:
+                running.append((some, pool.submit(_run_here, some)))
+            if not running:
+                return
+            some, done = running.popleft()
+            if not on_batch(some, done.result()):
+                return
+    except BrokenProcessPool as error:
+        raise SimulationError(
+            "a process that ran seeds was killed; often the machine is out of memory: fewer "
+            "processes (--jobs) need less"
+        ) from error
+    finally:
+        pool.shutdown(wait=False, cancel_futures=True)
+        # Nobody waits for what they still compute.
+        for process in set(multiprocessing.active_children()) - others:
+            process.kill()
+
+
+_simulator: Simulator | None = None
+
+
+def _begin() -> None:
+    # Ctrl-C reaches every process of the terminal; the first one alone answers it.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def _run_here(seeds: range) -> ExplorationTally:
+    global _simulator
+    if _simulator is None:
+        _simulator = Simulator()
+    return _run(seeds, _simulator)
+
+
+def _run(seeds: range, simulator: Simulator) -> ExplorationTally:
+    tally = ExplorationTally(runs=len(seeds))
+    faults: Counter[str] = Counter()
+    for seed in seeds:
+        outcome = simulator.run(draw_schedule(seed))
+        faults.update(outcome.faults)
+        tally.held += outcome.held is not None
+        tally.messages += outcome.messages
+        tally.longest_recovery_s = max(tally.longest_recovery_s, outcome.recovery_s)
+        if outcome.violation is not None:
+            tally.findings.append(ViolationFound(seed, outcome.violation))
+    tally.faults = dict(faults)
+    return tally

@@ -1,0 +1,418 @@
+"""What is to go wrong in one simulated run: plain data, readable text, and a draw by seed.
+
+Nothing is left to chance while a run goes on. All that happens to it is drawn beforehand and
+written down, down to the single message that is lost, so a run can be told to somebody else as a
+few lines of text, repeated, and made smaller by leaving lines out.
+
+A schedule as text has one line for each item: what it is, and its values. Times are seconds::
+
+    run trial=3 replicas=2 deadline_ms=15
+    crash service=cloud-1 at=0.12 down_s=0.4
+    message service=cloud-1 direction=from number=7 what=delay seconds=0.05
+    kill_robot boundary=57 down_s=0.2
+
+What is left out has the value that it has in a run without faults.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, TypeAlias, get_args
+
+import msgspec
+
+from holdfast.lab.errors import ScheduleError
+
+__all__ = [
+    "LOCAL_SERVICE",
+    "Crash",
+    "Crowd",
+    "Cut",
+    "DiskStall",
+    "KillRobot",
+    "LaunchFault",
+    "MessageFault",
+    "OutOfMemory",
+    "PauseRobot",
+    "RunSettings",
+    "SimulatedFault",
+    "SimulationSchedule",
+    "Slow",
+    "Stop",
+    "cloud_service",
+    "line_of",
+    "parse_schedule",
+]
+
+LOCAL_SERVICE = "local"
+"""Name of the service that the robot launches for itself."""
+
+NUM_TRIALS = 64
+"""Trials to choose from; each has one run without faults, that all others are compared with."""
+
+Seconds = Annotated[float, msgspec.Meta(ge=0.0, le=3600.0)]
+Offset = Annotated[float, msgspec.Meta(ge=-1e9, le=1e9)]
+Count = Annotated[int, msgspec.Meta(ge=0, le=1_000_000)]
+Node = Annotated[str, msgspec.Meta(pattern="^(robot|local|cloud-[1-9])$")]
+Service = Annotated[str, msgspec.Meta(pattern="^(local|cloud-[1-9])$")]
+Direction = Literal["to", "from", "both"]
+
+
+def cloud_service(number: int) -> str:
+    """Return the name of a service of the cloud, numbered from 1."""
+    return f"cloud-{number}"
+
+
+class _Item(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    @property
+    def kind(self) -> str:
+        """The word that its line begins with; of a message, what happens to it."""
+        return str(self.__struct_config__.tag)
+
+
+class RunSettings(_Item, frozen=True, kw_only=True, tag="run", tag_field="item"):
+    """What a run is like as long as nothing goes wrong.
+
+    Attributes
+    ----------
+    trial : int
+        Names what the robot senses and how it moves.
+    num_trials : int
+        Trials one after another; several are shorter, so that all take as long as one.
+    replicas : int
+        Services of the cloud.
+    launch : {"on_failure", "at_start", "never"}
+        When the local service is started.
+    deadline_ms : float or None
+        A decision that is later is asked of the local service too.
+    rate_hz : float or None
+        Task actions a second.
+    sense_s, act_s : float
+        How long the robot takes.
+    latency_s, jitter_s : float
+        Of a message, one way; the jitter keeps the order.
+    task_s, sensing_s : float
+        How long a service computes on the two parts of an answer.
+    launch_s : float
+        From a launch until the local service can be connected to.
+    workers : int
+        Of each service.
+    sessions_kept : int
+        Robots that each service remembers.
+    answers_kept : int
+        By each service, for each robot.
+    certificates : bool
+        Whether the robot proves who it is, and the others of a crowd that they are another. One of
+        these then asks for the session of the robot that is looked at, as a later process of it.
+    forgets_after_s : float
+        A service forgets a robot that it did not hear for so long.
+    environment : {"simulated", "counting", "not_counting"}
+        ``simulated`` is made anew by each process of the robot; the others are outside of it and
+        do, or do not, say how many task actions were performed.
+    journal_survives : {"process_crash", "power_cut"}
+    lease_s : float
+        A link on which one end hears nothing for so long is closed.
+    bytes_per_s : float or None
+        Messages take longer by their size, and those behind them wait; None: they do not.
+    lost_in_cut : bool
+        Whether messages sent into a cut are lost, or come when it heals.
+    robot_clock_rate, services_clock_rate : float
+        Seconds that a clock shows for each second.
+    """
+
+    trial: Annotated[int, msgspec.Meta(ge=0, lt=NUM_TRIALS)] = 0
+    num_trials: Annotated[int, msgspec.Meta(ge=1, le=4)] = 1
+    replicas: Annotated[int, msgspec.Meta(ge=1, le=9)] = 1
+    launch: Literal["on_failure", "at_start", "never"] = "on_failure"
+    deadline_ms: Annotated[float, msgspec.Meta(gt=0.0, le=1e6)] | None = None
+    rate_hz: Annotated[float, msgspec.Meta(ge=0.1, le=1e6)] | None = None
+    sense_s: Seconds = 0.001
+    act_s: Seconds = 0.01
+    latency_s: Seconds = 0.001
+    jitter_s: Seconds = 0.0
+    task_s: Seconds = 0.001
+    sensing_s: Seconds = 0.003
+    launch_s: Seconds = 0.15
+    workers: Annotated[int, msgspec.Meta(ge=1, le=64)] = 2
+    sessions_kept: Annotated[int, msgspec.Meta(ge=1)] = 100
+    answers_kept: Annotated[int, msgspec.Meta(ge=1)] = 8
+    certificates: bool = False
+    forgets_after_s: Seconds = 600.0
+    environment: Literal["simulated", "counting", "not_counting"] = "counting"
+    journal_survives: Literal["process_crash", "power_cut"] = "process_crash"
+    lease_s: Annotated[float, msgspec.Meta(gt=0.0, le=3600.0)] = 0.4
+    bytes_per_s: Annotated[float, msgspec.Meta(ge=1000.0, le=1e12)] | None = None
+    lost_in_cut: bool = True
+    robot_clock_offset_s: Offset = 0.0
+    robot_clock_rate: Annotated[float, msgspec.Meta(ge=0.1, le=10.0)] = 1.0
+    services_clock_offset_s: Offset = 0.0
+    services_clock_rate: Annotated[float, msgspec.Meta(ge=0.1, le=10.0)] = 1.0
+
+    @property
+    def services(self) -> tuple[str, ...]:
+        """The cloud's services in order of preference."""
+        return tuple(cloud_service(number) for number in range(1, self.replicas + 1))
+
+
+class Crash(_Item, frozen=True, kw_only=True, tag="crash", tag_field="item"):
+    """The process of a service dies and, unless it is the local one, a new one is started.
+
+    Attributes
+    ----------
+    found_after_s : float
+        Until the robot's machine knows that the link is broken; the lease bounds it.
+    keeps_memory : bool
+        The next process is as the one before: what died is every link to it.
+    for_good : bool
+        No other is started: whoever is left has to do.
+    """
+
+    service: Service
+    at: Seconds
+    found_after_s: Seconds = 0.002
+    down_s: Seconds = 0.3
+    keeps_memory: bool = False
+    for_good: bool = False
+
+
+class Stop(_Item, frozen=True, kw_only=True, tag="stop", tag_field="item"):
+    """A process is stopped (SIGSTOP) and goes on later (SIGCONT)."""
+
+    node: Node
+    at: Seconds
+    for_s: Seconds
+
+
+class Slow(_Item, frozen=True, kw_only=True, tag="slow", tag_field="item"):
+    """A service computes more slowly, by a factor, for a while."""
+
+    service: Service
+    at: Seconds
+    for_s: Seconds
+    factor: Annotated[float, msgspec.Meta(ge=1.0, le=2000.0)]
+
+
+class OutOfMemory(_Item, frozen=True, kw_only=True, tag="out_of_memory", tag_field="item"):
+    """A service has no memory for one part of an answer, for a while.
+
+    It is told in stories and never drawn: for long enough it ends a run whose services have none.
+    """
+
+    service: Service
+    at: Seconds
+    for_s: Seconds
+    part: Literal["task", "sensing"] = "sensing"
+
+
+class Cut(_Item, frozen=True, kw_only=True, tag="cut", tag_field="item"):
+    """Nothing gets through between the robot and a service, in one direction or both."""
+
+    service: Service
+    at: Seconds
+    for_s: Seconds
+    direction: Direction = "both"
+
+
+class MessageFault(_Item, frozen=True, kw_only=True, tag="message", tag_field="item"):
+    """What happens to one message.
+
+    Attributes
+    ----------
+    service : str
+        From or to which it goes.
+    direction : {"to", "from"}
+        As the service sees it, "to" it are requests, "from" it are replies and the ends of calls.
+    number : int
+        Of the messages of that service and direction, from 0.
+    what : {"drop", "delay", "duplicate", "corrupt", "misroute"}
+        A delayed one is overtaken by those that come after it; a misrouted reply comes to the
+        newest call of the same service, even if another process of the robot has made it.
+    seconds : float
+        By which it, or its copy, is late.
+    bit : int
+        Which one is flipped, modulo the size.
+    """
+
+    service: Service
+    direction: Literal["to", "from"]
+    number: Count
+    what: Literal["drop", "delay", "duplicate", "corrupt", "misroute"]
+    seconds: Seconds = 0.0
+    bit: Annotated[int, msgspec.Meta(ge=0)] = 0
+
+    def __post_init__(self) -> None:
+        if self.what == "misroute" and self.direction == "to":
+            raise ValueError("a misrouted message must be a reply (direction=from)")
+
+    @property
+    def kind(self) -> str:
+        """What happens to it."""
+        return f"message {self.what}"
+
+
+class Crowd(_Item, frozen=True, kw_only=True, tag="crowd", tag_field="item"):
+    """Other robots ask a service, all at once, each for the first sensing action of a trial."""
+
+    service: Service
+    at: Seconds
+    robots: Annotated[int, msgspec.Meta(ge=1, le=1000)]
+
+
+class KillRobot(_Item, frozen=True, kw_only=True, tag="kill_robot", tag_field="item"):
+    """The robot's process dies, between two of its effects or at any moment, and is started again.
+
+    Attributes
+    ----------
+    boundary : int
+        Effects that have been carried out in the run, by all of its processes.
+    at : float or None
+        Instead of the boundary: the time; the process may be waiting for anything then.
+    before : {"anything", "journal", "send", "sense", "act"}
+        The next effect of this kind is what it dies before: some moments are worse than others.
+    power_cut : bool
+        The whole machine dies: what of the journal was not on the disk is gone.
+    lost_appends : int
+        So many of the last appends, at most.
+    body_goes_on : bool
+        What the body was ordered to do it does all the same.
+    """
+
+    boundary: Count = 0
+    at: Seconds | None = None
+    before: Literal["anything", "journal", "send", "sense", "act"] = "anything"
+    down_s: Seconds = 0.2
+    power_cut: bool = False
+    lost_appends: Count = 0
+    body_goes_on: bool = False
+
+
+class PauseRobot(_Item, frozen=True, kw_only=True, tag="pause_robot", tag_field="item"):
+    """The robot's process is asked to end in order (SIGINT), and is started again."""
+
+    at: Seconds
+    down_s: Seconds = 0.2
+
+
+class DiskStall(_Item, frozen=True, kw_only=True, tag="disk_stall", tag_field="item"):
+    """The next write to the journal takes long, and the robot's process with it."""
+
+    at: Seconds
+    for_s: Seconds
+
+
+class LaunchFault(_Item, frozen=True, kw_only=True, tag="launch", tag_field="item"):
+    """What becomes of one launch of the local service.
+
+    Attributes
+    ----------
+    number : int
+        Of all launches of the run, from 1.
+    what : {"late", "fails", "silent"}
+        It takes longer; its process ends; or it lives and is never seen.
+    seconds : float
+        Until then.
+    """
+
+    number: Annotated[int, msgspec.Meta(ge=1, le=1000)]
+    what: Literal["late", "fails", "silent"]
+    seconds: Seconds = 0.1
+
+
+SimulatedFault: TypeAlias = (
+    Crash
+    | Stop
+    | Slow
+    | OutOfMemory
+    | Cut
+    | Crowd
+    | MessageFault
+    | KillRobot
+    | PauseRobot
+    | DiskStall
+    | LaunchFault
+)
+
+_ITEM: TypeAlias = RunSettings | SimulatedFault
+
+
+class SimulationSchedule(msgspec.Struct, frozen=True):
+    """A run and its faults."""
+
+    run: RunSettings
+    faults: tuple[SimulatedFault, ...] = ()
+
+    def text(self) -> str:
+        """Return it as lines of text; :func:`parse_schedule` reads them."""
+        return "".join(f"{line_of(item)}\n" for item in (self.run, *self.faults))
+
+
+# -- text ------------------------------------------------------------------------------------------
+
+_WORDS = {"true": True, "false": False, "none": None}
+
+
+def line_of(item: RunSettings | SimulatedFault) -> str:
+    """Return an item as one line of a schedule."""
+    words = [str(item.__struct_config__.tag)]
+    for field in msgspec.structs.fields(type(item)):
+        value = getattr(item, field.name)
+        if field.required or value != field.default:
+            words.append(f"{field.name}={_written(value)}")
+    return " ".join(words)
+
+
+def _written(value: object) -> str:
+    if isinstance(value, bool) or value is None:
+        return str(value).lower()
+    return f"{value:.17g}" if isinstance(value, float) and value != round(value, 9) else str(value)
+
+
+_NAMES = frozenset(str(kind.__struct_config__.tag) for kind in get_args(_ITEM))
+
+
+def parse_item(line: str) -> RunSettings | SimulatedFault:
+    """Read one line of a schedule.
+
+    Raises
+    ------
+    ScheduleError
+        If it is none; the message repeats it.
+    """
+    name, *words = line.split()
+    if name not in _NAMES:
+        raise ScheduleError(f"{line!r}: {name!r} is none of {', '.join(sorted(_NAMES))}")
+    fields: dict[str, object] = {"item": name}
+    for word in words:
+        key, equals, text = word.partition("=")
+        if not equals or key in fields:
+            raise ScheduleError(f"{line!r}: {word!r} is not one value of the form key=value")
+        fields[key] = _WORDS.get(text, text)
+    try:
+        item: RunSettings | SimulatedFault = msgspec.convert(fields, _ITEM, strict=False)
+    except msgspec.ValidationError as error:
+        raise ScheduleError(f"{line!r}: {error}") from error
+    return item
+
+
+def parse_schedule(text: str) -> SimulationSchedule:
+    """Read a schedule; empty lines and those that begin with ``#`` are left out.
+
+    Raises
+    ------
+    ScheduleError
+        If a line is no item of a schedule, or there is more than one ``run``.
+    """
+    lines = [line.strip() for line in text.splitlines()]
+    items = [parse_item(line) for line in lines if line and not line.startswith("#")]
+    runs = [item for item in items if isinstance(item, RunSettings)]
+    if len(runs) > 1:
+        raise ScheduleError(f"{len(runs)} lines begin with 'run': allowed is 1")
+    faults = tuple(item for item in items if not isinstance(item, RunSettings))
+    run = runs[0] if runs else RunSettings()
+    named = {*run.services, LOCAL_SERVICE, "robot"}
+    for fault in faults:
+        node = getattr(fault, "service", getattr(fault, "node", "robot"))
+        if node not in named:
+            raise ScheduleError(
+                f"{line_of(fault)!r}: there is no {node} in a run with {run.replicas} replicas"
+            )
+    return SimulationSchedule(run, faults)

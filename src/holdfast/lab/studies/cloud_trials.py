@@ -1,0 +1,393 @@
+"""Robots whose cloud service is far away, is killed, and comes back: real processes, real times.
+
+As in the thesis, a robot inserts its peg while the service that decides for it dies. It starts with
+the cloud service, which is killed at a random step; the robot detects that, launches its local
+service and goes on with it; after some decisions the cloud is started again and used again. In the
+end every decision is compared with the reference run.
+"""
+
+from __future__ import annotations
+
+import os
+import random
+import shutil
+import tempfile
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pandas as pd
+
+from holdfast.files import write_atomically
+from holdfast.lab.errors import NoProgressError, ProcessEndedError, TaskError
+from holdfast.lab.studies.tables import Cell
+from holdfast.lab.testbed.driver import Script, Testbed, after
+from holdfast.lab.testbed.fault_times import FaultTimes, times_of_faults
+from holdfast.lab.testbed.records import DecisionTable
+from holdfast.lab.testbed.reference_run import make_reference_run
+from holdfast.lab.testbed.wide_area import Route, Transport, lay_route
+from holdfast.lab.testbed.world import (
+    Performance,
+    difference_of_performances,
+    performances,
+    witnessed_by,
+)
+from holdfast.recording.compare import compare_runs
+from holdfast.robot.links import RECOVERY_SERVICE
+
+__all__ = ["COLUMNS", "CloudTrials", "rows_of_run", "run_cloud_trials"]
+
+COLUMNS = (
+    "run",
+    "what",
+    "at_s",
+    "trial",
+    "step",
+    "service",
+    "status",
+    "waited_ms",
+    "round_trip_ms",
+    "computed_ms",
+    "found_ms",
+    "first_local_ms",
+    "launch_ms",
+    "away_ms",
+    "failback_ms",
+    "identical",
+    "emulated_by",
+    "load",
+    "rate_hz",
+    "carried_bytes",
+)
+"""Of the table of such trials: a row for each decision, each kill and, if wanted, each task action.
+
+``at_s`` counts from the run's first decision. A decision has what the robot's ``timings.csv`` has.
+A kill has, in milliseconds: ``found_ms``, from the kill until the robot logs the loss of the
+cloud; ``first_local_ms``, from then until it carries out a decision of the local service;
+``launch_ms``, from the start of that service's process until the robot sees it (nothing, if it ran
+before); ``away_ms``, from the kill until the ready line of the cloud that was started again;
+``failback_ms``, from that line until the robot carries out a decision of it; and ``waited_ms``, the
+longest time that it stood still for a decision until then. ``load`` is how many processes wanted a
+core when the run began, over the minute before: times on a busy machine say little. ``rate_hz`` is
+at how many task actions a second the robot really ran, ``carried_bytes`` the bytes of all packets
+that were sent between robot and cloud from the start of the robot to its end, where packets are
+seen.
+"""
+
+_PROBLEM = "peg_in_hole_2d"
+_USUAL_START_S = 1.0
+_MAX_SLOWNESS = 3.0
+
+_EARLIEST_KILL, _LATEST_KILL = 0.15, 0.3
+"""As fractions of the run's steps; the rest is for the local service and for the return."""
+
+_CONFIGURATION_NAME = "trials.yaml"
+_REFERENCE, _WITH_KILL = "undisturbed", "disturbed"
+_STALL_S = 60.0
+
+
+class CloudTrials(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Runs of one robot each, with the same settings.
+
+    Attributes
+    ----------
+    transport : {"tcp", "tls", "udp"}
+    round_trip_ms : float
+        Of the emulated path; 0 is the machine's own loopback.
+    loss : float
+        Share of packets that the path loses, each way.
+    first_run, runs : int
+        Their numbers; each has worlds of its own.
+    min_steps : int
+        Trials are added to a run until it has as many task actions.
+    rate_hz : float
+        Task actions a second. On a machine where services start slowly it is less, down to a third,
+        or the run would be over before all has happened.
+    local_decisions : int
+        Sensing actions that the local service chooses before the cloud is started again.
+    max_steps, sensing_interval, num_observation_samples, num_nearest_neighbors : int
+        The thesis's.
+    num_cores : int
+        Threads of a decision, at most.
+    packets : bool
+        Whether the path may be one for packets; see :mod:`holdfast.lab.testbed.wide_area`.
+    actions : bool
+        Whether there is a row for each task action that was performed, too.
+    kills : bool
+        Whether the cloud is killed.
+    """
+
+    particles: int
+    transport: Transport = "tcp"
+    round_trip_ms: float = 0.0
+    loss: float = 0.0
+    first_run: int = 0
+    runs: int = 1
+    seed: int = 0
+    min_steps: int = 400
+    rate_hz: float = 100.0
+    local_decisions: int = 8
+    max_steps: int = 700
+    sensing_interval: int = 8
+    num_observation_samples: int = 10
+    num_nearest_neighbors: int = 5
+    num_cores: int = 8
+    packets: bool = True
+    actions: bool = False
+    kills: bool = True
+
+
+def run_cloud_trials(**trials: Any) -> pd.DataFrame:
+    """Run them; the function of tasks of the kind ``cloud_trials``.
+
+    Parameters
+    ----------
+    **trials
+        The fields of :class:`CloudTrials`.
+
+    Returns
+    -------
+    DataFrame
+        With the columns of :data:`COLUMNS`.
+
+    Raises
+    ------
+    TaskError
+        If a process ends that should not, or nothing goes on any more.
+    HoldfastError
+        If a process or the path cannot be had.
+    """
+    wanted = msgspec.convert(trials, CloudTrials)
+    seed = f"cloud trials {wanted.seed} {wanted.first_run}"
+    try:
+        with (
+            tempfile.TemporaryDirectory(prefix="holdfast-") as directory,
+            lay_route(
+                wanted.transport, wanted.round_trip_ms, wanted.loss, seed, packets=wanted.packets
+            ) as path,
+            Testbed(Path(directory)) as testbed,
+        ):
+            series = _Series(wanted, testbed, path)
+            runs = range(wanted.first_run, wanted.first_run + wanted.runs)
+            return pd.concat([series.run(run) for run in runs], ignore_index=True)
+    except (NoProgressError, ProcessEndedError) as error:
+        raise TaskError(
+            f"cloud trials with {wanted.particles} particles over {wanted.transport}, "
+            f"{wanted.round_trip_ms:g} ms, loss {wanted.loss:g}, seed {wanted.seed}: {error}"
+        ) from error
+
+
+def rows_of_run(
+    run: int,
+    table: DecisionTable,
+    fault: FaultTimes | None,
+    killed_at: float | None,
+    *,
+    identical: bool,
+    emulated_by: str,
+    load: float | None = None,
+    rate_hz: float | None = None,
+    carried_bytes: int | None = None,
+    performed: Iterable[Performance] = (),
+) -> pd.DataFrame:
+    """Return the rows of a run: its decisions, its kill, if there was one, and its actions.
+
+    Parameters
+    ----------
+    table : DecisionTable
+        The robot's.
+    killed_at : float or None
+        When the cloud was killed, in seconds since the epoch.
+    identical : bool
+        Whether all decisions and actions are those of the reference run.
+    load : float or None
+        Of the machine.
+    rate_hz : float or None
+        Of the robot.
+    carried_bytes : int or None
+        Between the robot and the cloud.
+    performed : iterable of Performance
+        Task actions to be listed.
+    """
+    began = table.rows[0].at
+    ends: dict[str, Cell] = {
+        "identical": identical,
+        "emulated_by": emulated_by,
+        "load": load,
+        "rate_hz": rate_hz,
+        "carried_bytes": carried_bytes,
+    }
+    rows: list[dict[str, Cell]] = [
+        {
+            "run": run,
+            "what": each.kind,
+            "at_s": round(each.at - began, 6),
+            "trial": each.trial,
+            "step": each.step,
+            "service": "local" if each.service == RECOVERY_SERVICE else "cloud",
+            "status": each.status,
+            "waited_ms": each.waited_ms,
+            "round_trip_ms": each.round_trip_ms,
+            "computed_ms": each.computed_ms,
+            **ends,
+        }
+        for each in table.rows
+    ]
+    if fault is not None and killed_at is not None:
+        decided_ms = None
+        if fault.recovery_ms is not None and fault.detection_ms is not None:
+            decided_ms = round(max(0.0, fault.recovery_ms - fault.detection_ms), 3)
+        rows.append(
+            {
+                "run": run,
+                "what": "kill",
+                "at_s": round(killed_at - began, 6),
+                "waited_ms": fault.longest_wait_ms,
+                "found_ms": fault.detection_ms,
+                "first_local_ms": decided_ms,
+                "launch_ms": fault.launch_ms,
+                "away_ms": fault.away_ms,
+                "failback_ms": fault.failback_ms,
+                **ends,
+            }
+        )
+    rows += [
+        {
+            "run": run,
+            "what": "action",
+            "at_s": round(each.at - began, 6),
+            "trial": each.trial,
+            "step": each.step,
+            **ends,
+        }
+        for each in performed
+    ]
+    return pd.DataFrame(rows, columns=list(COLUMNS))
+
+
+class _Series:
+    """A cloud service on a testbed, and one robot after another."""
+
+    def __init__(self, wanted: CloudTrials, testbed: Testbed, path: Route) -> None:
+        self._wanted = wanted
+        self._testbed = testbed
+        self._path = path
+        self._keys: Path | None = None
+        options: list[str] = []
+        if wanted.transport != "tcp":
+            from holdfast.transport.key_ring import make_credentials
+
+            self._keys = testbed.temporary / "keys"
+            make_credentials(self._keys, hosts=[path.host])
+            options = ["--tls", str(self._keys / "service")]
+        elif path.service_prefix:
+            options = ["--insecure"]  # that network has no other members
+        self._cloud = testbed.add_service(
+            path.listen, *options, endpoint=path.connect, prefix=path.service_prefix
+        )
+
+    def run(self, run: int) -> pd.DataFrame:
+        """Run one robot, and return the rows of its run."""
+        wanted, testbed = self._wanted, self._testbed
+        directory = testbed.directory / f"run-{run}"
+        directory.mkdir()
+        performed = {name: directory / f"{name}.txt" for name in (_REFERENCE, _WITH_KILL)}
+        load = os.getloadavg()[0]
+        reference = make_reference_run(
+            directory / _REFERENCE,
+            lambda num_trials: self._write_configuration(directory, run, num_trials),
+            wanted.min_steps,
+            performed[_REFERENCE],
+        )
+        if self._cloud.is_away:
+            testbed.start_services()
+        slowness = min(_MAX_SLOWNESS, max(1.0, self._cloud.start_s / _USUAL_START_S))
+        rate_hz = wanted.rate_hz / slowness
+        carried_before = self._carried_bytes()
+        robot = testbed.start_robot(
+            directory / _CONFIGURATION_NAME,
+            directory / _WITH_KILL,
+            reference.steps_of_trials,
+            rate_hz,
+            prefix=self._path.robot_prefix,
+        )
+        testbed.faults.clear()
+        if wanted.kills:
+            testbed.run_script(self._kill_and_restart(random.Random(f"kill {wanted.seed} {run}")))
+        testbed.wait_for_end_of_run(_STALL_S)
+        comparison = compare_runs(directory / _REFERENCE, directory / _WITH_KILL)
+        difference = difference_of_performances(*performed.values())
+        times = times_of_faults(testbed.faults, robot.events, robot.decisions)
+        rows = rows_of_run(
+            run,
+            robot.table,
+            times[0] if times else None,
+            testbed.faults[0].injected_at if times else None,
+            identical=comparison.identical and difference is None,
+            emulated_by=self._path.emulated_by,
+            load=round(load, 2),
+            rate_hz=round(rate_hz, 2),
+            carried_bytes=self._carried_bytes(since=carried_before),
+            performed=list(performances(performed[_WITH_KILL])) if wanted.actions else (),
+        )
+        shutil.rmtree(directory)
+        return rows
+
+    def _kill_and_restart(self, chance: random.Random) -> Script:
+        """Kill the cloud; start it again once the local service has decided for a while."""
+        testbed, cloud, robot = self._testbed, self._cloud, self._testbed.robot
+        kill_step = int(chance.uniform(_EARLIEST_KILL, _LATEST_KILL) * robot.steps)
+        turn_s = (self._wanted.sensing_interval + 1) / robot.rate_hz
+        pause_s = chance.uniform(0.0, turn_s)
+        yield (
+            lambda: robot.steps_done >= kill_step and robot.decisions[-1].service == cloud.endpoint
+        )
+        # The table grows when the robot gets an answer; a service may die at any other moment too.
+        yield after(pause_s)
+        fault = testbed.note_fault("cloud_killed", cloud.endpoint, cloud.process.kill())
+
+        def local_decisions() -> int:
+            return sum(
+                each.kind == "sensing"
+                and each.service == RECOVERY_SERVICE
+                and each.at > fault.injected_at
+                for each in robot.decisions
+            )
+
+        yield lambda: local_decisions() >= self._wanted.local_decisions
+        cloud.start()
+        yield lambda: cloud.ready_at is not None
+        fault.usable_at = cloud.ready_at
+
+    def _carried_bytes(self, *, since: int | None = 0) -> int | None:
+        carried = self._path.carried_bytes
+        return None if carried is None or since is None else carried() - since
+
+    def _write_configuration(self, directory: Path, run: int, num_trials: int) -> Path:
+        wanted = self._wanted
+        offload: dict[str, Any] = {"services": [self._path.connect]}
+        if self._keys is not None:
+            offload["tls"] = str(self._keys / "robot")
+        document = {
+            "problem": _PROBLEM,
+            "particle_filter": {"num_particles": wanted.particles},
+            "active_sensing": {
+                "num_observation_samples": wanted.num_observation_samples,
+                "num_nearest_neighbors": wanted.num_nearest_neighbors,
+                "num_cores": wanted.num_cores,
+            },
+            "selector": {"estimator": "nearest_neighbor"},  # the thesis's
+            "simulator": {
+                "num_trials": num_trials,
+                "max_steps": wanted.max_steps,
+                "sensing_intervals": wanted.sensing_interval,
+                "seed": wanted.seed + run,
+            },
+            "offload": offload,
+            "environment": witnessed_by(directory / f"{_WITH_KILL}.txt"),
+        }
+        path = directory / _CONFIGURATION_NAME
+        # JSON is YAML as well.
+        write_atomically(path, msgspec.json.encode(document) + b"\n")
+        return path

@@ -1,0 +1,222 @@
+"""``holdfast experiment``: the tables and figures behind what the project claims."""
+
+from __future__ import annotations
+
+import contextlib
+import shlex
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from holdfast.cli.exit_codes import ended_by_signals, interrupted_by
+from holdfast.errors import HoldfastError, InvalidValueError, OptionError, RunError
+from holdfast.runtime.command_line import (
+    MAX_JOBS,
+    MAX_SEED,
+    Options,
+    argument,
+    flag,
+    location,
+    option,
+    whole_number,
+)
+
+if TYPE_CHECKING:
+    from holdfast.lab.studies.executors import Executor
+    from holdfast.lab.studies.running import Workload
+    from holdfast.lab.studies.study import Report, Scale, Study
+
+__all__ = ["main"]
+
+_DEFAULT_DIRECTORY = Path("runs") / "experiments"
+
+_MOST_NUMBERS = 20
+"""Of a study, that are printed; numbers.csv has all."""
+
+_NOTE = "all kept"
+"""The note of the progress bar."""
+
+
+class ExperimentOptions(Options):
+    """Regenerate tables and figures: run what is not known yet, and draw.
+
+    Results are kept in DIR/cache under the digest of everything that they depend on, code included.
+    So the same command goes on after Ctrl-C, and draws at once what is complete. Each experiment
+    has a directory in DIR with its tables (CSV), figures (PNG and SVG), every trial (CSV or
+    Parquet), and the origin of all of it.
+    """
+
+    needs_arguments = True
+
+    names: tuple[str, ...] = argument(
+        "NAME", "Names that --list shows, or all.", many=True, required=False
+    )
+    quick: bool = flag(
+        "--quick", help="Few trials: minutes, to see that everything works. No evidence."
+    )
+    out: Path = option(
+        "--out",
+        "-o",
+        metavar="DIR",
+        read=location,
+        default=_DEFAULT_DIRECTORY,
+        help="Directory for the results.",
+    )
+    seed: int = option(
+        "--seed",
+        metavar="S",
+        read=whole_number(0, MAX_SEED),
+        default=2017,
+        help="Seed of all trials. Where something is chosen (selectors, parameters), the trials "
+        "that judge the choice have the next seed.",
+    )
+    jobs: int = option(
+        "--jobs",
+        "-j",
+        metavar="N",
+        read=whole_number(0, MAX_JOBS),
+        default=0,
+        help="Processes; 0: one for each core. Changes time only.",
+    )
+    executor: str = option(
+        "--executor",
+        metavar="WHERE",
+        default="local",
+        help="Where it runs: local (processes of this machine), ray (the Ray cluster of this "
+        "machine; extra cluster) or ray://HOST:PORT (the cluster whose client server listens "
+        "there). Every node needs the same holdfast. Measurements of times stay here. Changes time "
+        "only.",
+    )
+    source: Path | None = option(
+        "--from",
+        metavar="FILE",
+        read=location,
+        help="Run nothing: make the tables and figures of selectors or parameters anew from their "
+        "trials in FILE (trials.parquet).",
+    )
+    list: bool = flag("--list", help="List the experiments and end.")
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Run the experiments and return the exit code."""
+    options = ExperimentOptions.parse("experiment", arguments)
+    from holdfast.lab.studies.registry import studies_of
+    from holdfast.lab.studies.study import Scale
+
+    if options.list:
+        if options.names:
+            raise OptionError(f"--list shows all; leave {' '.join(options.names)} out")
+        for study in studies_of(["all"]):
+            sys.stdout.write(f"{study.name:18} {study.title}\n")
+        return 0
+    if not options.names:
+        raise OptionError("NAME is missing; give all, or names that --list shows")
+    studies = studies_of(options.names)
+    if options.source is not None:
+        if options.quick:
+            raise OptionError("--quick has no effect with --from, which runs nothing")
+        _make_anew(studies, options.source, options.out)
+        return 0
+    out = options.table()["out"].words(options.out)
+    again = shlex.join(["holdfast", "experiment", *options.words("out"), *out])
+    scale = Scale(quick=options.quick, seed=options.seed)
+    executor = _executor_of(options.executor, options.jobs)
+    # One signal is enough: another would cut short what ends the processes.
+    with ended_by_signals(once=True):
+        _run(studies, scale, options.out, executor, again)
+    return 0
+
+
+def _make_anew(studies: list[Study], source: Path, directory: Path) -> None:
+    from holdfast.lab.studies.running import write_report
+    from holdfast.lab.studies.study import TrialStudy
+    from holdfast.lab.studies.trial_files import read_trials
+
+    kept = read_trials(source)
+    if [study.name for study in studies] != [kept.study]:
+        raise InvalidValueError(
+            f"--from {source}: has the trials of {kept.study}, not of "
+            f"{', '.join(study.name for study in studies)}"
+        )
+    study = studies[0]
+    if not isinstance(study, TrialStudy):
+        raise InvalidValueError(f"--from {source}: {study.name} makes nothing of trials in a file")
+    report = study.report_of(kept.trials)
+    place = directory / study.name
+    _show(study, report, write_report(study, kept.scale, report, place, kept.machine), place)
+
+
+def _executor_of(place: str, jobs: int) -> Executor:
+    from holdfast.lab.studies.executors import LocalExecutor
+    from holdfast.lab.studies.ray_executor import RayExecutor
+    from holdfast.robot.trials import available_cores
+
+    if place == "local":
+        return LocalExecutor(jobs or available_cores())
+    executor = RayExecutor.of(place)
+    if jobs:
+        raise InvalidValueError(
+            f"--jobs {jobs}: has no effect with --executor {place}, where the cluster's cores say "
+            "how many tasks there are at a time; leave it out"
+        )
+    return executor
+
+
+def _run(
+    studies: list[Study], scale: Scale, directory: Path, executor: Executor, again: str
+) -> None:
+    from holdfast.lab.studies.running import Workload
+
+    workload: Workload | None = None
+    try:
+        workload = Workload(studies, scale, directory)
+        _compute(workload, directory, executor)
+        for study in studies:
+            _report(study, scale, workload, directory / study.name)
+    except KeyboardInterrupt as interruption:
+        how = interrupted_by(interruption)
+        with contextlib.suppress(OSError):
+            kept = "all that was finished is kept"
+            if workload is not None:
+                kept = f"{workload.finished_units:,} of {workload.units:,} trials are kept"
+            sys.stderr.write(f"\n{how}; {kept}.\nGo on with: {again}\n")
+        raise
+    except HoldfastError as error:
+        raise RunError(error, again) from error
+
+
+def _compute(workload: Workload, directory: Path, executor: Executor) -> None:
+    from holdfast.cli.terminal import counted, progress_line
+    from holdfast.lab.studies.running import compute
+
+    if not workload.pending:
+        return
+    line = progress_line(workload.units, quiet=False)
+    title = f"{counted(workload.units, 'trial')} in {executor.description}"
+    if workload.finished_units:
+        title += f", {workload.finished_units:,} known before"
+    line.start(f"{title}; results in {directory}", workload.finished_units, _NOTE)
+    try:
+        compute(workload, executor, lambda finished: line.show(finished, _NOTE))
+    finally:
+        with contextlib.suppress(OSError):
+            line.stop()
+
+
+def _report(study: Study, scale: Scale, workload: Workload, directory: Path) -> None:
+    from holdfast.lab.studies.running import write_report
+
+    report = study.report(scale, workload.results)
+    _show(study, report, write_report(study, scale, report, directory), directory)
+
+
+def _show(study: Study, report: Report, names: list[str], directory: Path) -> None:
+    sys.stdout.write(f"\n{study.title}\n\n")
+    for number in report.numbers[:_MOST_NUMBERS]:
+        sys.stdout.write(f"- {number}\n")
+    if len(report.numbers) > _MOST_NUMBERS:
+        others = len(report.numbers) - _MOST_NUMBERS
+        sys.stdout.write(f"- {others} more: {directory / 'numbers.csv'}\n")
+    sys.stdout.write(f"\n{directory}/\n  {'  '.join(names)}\n")
+    sys.stdout.flush()

@@ -1,0 +1,152 @@
+"""Where tasks are computed: in this process, or in others.
+
+All places give the same results, since a task is a function of its parameters; only times differ.
+The tasks of a killed process are computed again elsewhere. A task is given up when its process has
+died several times.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Callable, Sequence
+from multiprocessing.connection import Connection, wait
+from typing import TYPE_CHECKING, Protocol
+
+from holdfast.errors import InvalidValueError
+from holdfast.lab.errors import TaskError
+from holdfast.lab.studies.task_messages import compute_encoded, encode_task, table_of
+from holdfast.lab.studies.tasks import Task, code_of, run_task
+from holdfast.runtime.command_line import MAX_JOBS
+from holdfast.runtime.workers import WorkerProcess, end_workers
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+__all__ = ["MOST_ATTEMPTS", "Executor", "LocalExecutor"]
+
+
+MOST_ATTEMPTS = 3
+"""A task that is lost with its process this often is given up."""
+
+
+class Executor(Protocol):
+    """Computes tasks somewhere."""
+
+    @property
+    def description(self) -> str:
+        """Where, for people."""
+        ...
+
+    def run(self, tasks: Sequence[Task], on_result: Callable[[Task, pd.DataFrame], None]) -> None:
+        """Compute tasks.
+
+        Parameters
+        ----------
+        tasks : sequence of Task
+            Begun in this order.
+        on_result : callable
+            Called in this process with each task and its result, in any order.
+
+        Raises
+        ------
+        TaskError
+            If a task cannot be computed, or was lost with its process several times.
+        HoldfastError
+            If the function of a task refuses its parameters, or nothing can be computed there.
+        TaskCrashError
+            If anything else went wrong in another process.
+        KeyboardInterrupt
+            After everything that it started has been ended.
+        """
+        ...
+
+
+class LocalExecutor:
+    """Computes tasks in processes of this machine.
+
+    Parameters
+    ----------
+    processes : int
+        1 computes all of them in this one.
+    """
+
+    def __init__(self, processes: int) -> None:
+        if not 1 <= processes <= MAX_JOBS:
+            raise InvalidValueError(f"--jobs {processes}: must be from 1 to {MAX_JOBS}")
+        self._processes = processes
+
+    @property
+    def description(self) -> str:
+        """Where, for people."""
+        return "this process" if self._processes == 1 else f"{self._processes} processes"
+
+    def run(self, tasks: Sequence[Task], on_result: Callable[[Task, pd.DataFrame], None]) -> None:
+        """Compute tasks; see :meth:`Executor.run`."""
+        if self._processes == 1 or len(tasks) <= 1:
+            for task in tasks:
+                on_result(task, run_task(task))
+            return
+        pending = deque(enumerate(tasks))
+        losses: Counter[int] = Counter()
+        workers: list[_Worker] = []
+        try:
+            while pending or workers:
+                while pending and len(workers) < self._processes:
+                    workers.append(_Worker())
+                    workers[-1].start()
+                    workers[-1].give(*pending.popleft())
+                for worker in _ready(workers):
+                    number, task = worker.number, worker.task
+                    answer = worker.receive()
+                    if answer is None:
+                        losses[number] += 1
+                        if losses[number] == MOST_ATTEMPTS:
+                            raise _given_up(worker)
+                        pending.appendleft((number, task))
+                    if answer is None or not pending:
+                        end_workers([worker])
+                        workers.remove(worker)
+                    else:
+                        # Before its answer is dealt with, so that it is never idle.
+                        worker.give(*pending.popleft())
+                    if answer is not None:
+                        on_result(task, table_of(answer))
+        finally:
+            end_workers(workers)
+
+
+class _Worker(WorkerProcess):
+    """A worker, and the task that it has."""
+
+    number: int
+    task: Task
+
+    def __init__(self) -> None:
+        # One thread each: there are enough of them.
+        super().__init__("holdfast-experiment", _work, (), 1)
+
+    def give(self, number: int, task: Task) -> None:
+        self.number, self.task = number, task
+        # A worker imports what is on the disk by then: somebody may have edited it.
+        self.send(encode_task(task, code_of(task)))
+
+
+def _work(connection: Connection) -> None:
+    """Compute tasks until the parent closes the pipe."""
+    while True:
+        connection.send_bytes(compute_encoded(connection.recv_bytes()))
+
+
+def _ready(workers: Sequence[_Worker]) -> list[_Worker]:
+    """Wait until there are workers that have answered or ended, and return them."""
+    ready = wait([worker.connection for worker in workers])
+    return [worker for worker in workers if worker.connection in ready]
+
+
+def _given_up(worker: _Worker) -> TaskError:
+    how, killed = worker.how_it_ended()
+    advice = "; often the machine is out of memory: fewer processes (--jobs) need less"
+    return TaskError(
+        f"{MOST_ATTEMPTS} processes were lost with {worker.task.kind} {worker.task.parameters}, "
+        f"and the last one {how}{advice if killed else ''}"
+    )

@@ -1,0 +1,469 @@
+"""What the parameters do: each of them changed alone, on the same worlds.
+
+No difference found does not mean that there is none: the interval says how large one could be.
+Where it excludes all that would matter, the cheapest value will do. Each change is also compared
+with random sensing with as many particles.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
+
+import msgspec
+import numpy as np
+import pandas as pd
+
+from holdfast.config.settings import ActiveSensingSettings, ParticleFilterSettings, SelectorSettings
+from holdfast.lab.studies import statistics
+from holdfast.lab.studies.cases import CASES
+from holdfast.lab.studies.judged_study import (
+    JudgedStudy,
+    compared,
+    outcome_cells,
+    steps_and_success,
+)
+from holdfast.lab.studies.statistics import interval_in
+from holdfast.lab.studies.study import CHOICE, CLAIM, Number, Report, Scale
+from holdfast.lab.studies.tables import Cell
+from holdfast.lab.studies.trial_batches import TrialSeries, problem_of
+from holdfast.lab.studies.trial_files import cells_of_trials, require_cells
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+__all__ = ["Parameters", "Variant", "variants"]
+
+_MOST_QUICK_PARTICLES = 3.0
+"""In a quick run, as a multiple of a problem's."""
+
+_INTERVALS: Mapping[str, int] = {
+    "tight hole": 8,
+    "three plates": 8,
+    "peg in space": 4,
+    "light and dark": 4,
+    "passer-by": 8,
+}
+"""Steps between two sensing actions, in the problems whose outcome depends on sensing."""
+
+METHOD: Literal["action_entropy"] = "action_entropy"
+"""The method whose parameters are changed."""
+
+_CASES = {case.name: case for case in CASES if case.name in _INTERVALS}
+
+_TOGETHER = "all five problems (mean)"
+
+Way = Literal["neighbours", "path, prior neighbours", "mixture", "random"]
+
+_WAYS: Mapping[Way, SelectorSettings] = {
+    "neighbours": SelectorSettings(method=METHOD, estimator="nearest_neighbor"),
+    "path, prior neighbours": SelectorSettings(method="path_entropy", estimator="prior_neighbors"),
+    "mixture": SelectorSettings(method=METHOD, estimator="gaussian_mixture_upper"),
+    "random": SelectorSettings(method="random"),
+}
+"""Ways of estimating an entropy (of actions, if not of paths), and one that estimates nothing."""
+
+_FIRST: Way = "neighbours"
+_RANDOM: Way = "random"
+
+
+class Variant(NamedTuple):
+    """Settings of which one differs from those of the way's reference.
+
+    Attributes
+    ----------
+    parameter, value : str
+        What differs, and how; empty for the reference itself.
+    way : {"neighbours", "path, prior neighbours", "mixture", "random"}
+    resolution : float, optional
+        In units of the problem's own; None for that, and for a mixture the motion noise.
+    times_the_particles : float
+        As many as the problem has.
+    """
+
+    parameter: str = ""
+    value: str = ""
+    way: Way = _FIRST
+    active_sensing: ActiveSensingSettings = ActiveSensingSettings()
+    particle_filter: ParticleFilterSettings = ParticleFilterSettings()
+    resolution: float | None = None
+    times_the_particles: float = 1.0
+
+    def names(self) -> dict[str, Cell]:
+        """Return the cells of a table that name it."""
+        return {"way": self.way, "parameter": self.parameter, "value": self.value}
+
+
+def variants() -> list[Variant]:
+    """Return each way's reference, followed by all that differ from it."""
+    found = [Variant(), *_numbers_of_particles("neighbours")]
+    for samples in (1, 3, 30, 100):
+        sensing = ActiveSensingSettings(num_observation_samples=samples)
+        found.append(Variant("M", str(samples), active_sensing=sensing))
+    for horizon in (2, 3):
+        sensing = ActiveSensingSettings(horizon=horizon)
+        found.append(Variant("horizon", str(horizon), active_sensing=sensing))
+    found += [
+        Variant("resampling", f"below {threshold:g} N", particle_filter=filtering)
+        for threshold in (0.25, 0.5)
+        for filtering in [ParticleFilterSettings(resampling_threshold=threshold)]
+    ]
+    found += [
+        Variant("estimate", value, particle_filter=filtering)
+        for threshold, value in (
+            (0.5, "most likely, resampling below 0.5 N"),
+            (1.0, "most likely"),
+        )
+        for filtering in [
+            ParticleFilterSettings(estimate="most_likely", resampling_threshold=threshold)
+        ]
+    ]
+    for neighbors in (1, 3, 10, 20):
+        sensing = ActiveSensingSettings(num_nearest_neighbors=neighbors)
+        found.append(Variant("k", str(neighbors), active_sensing=sensing))
+    found += _resolutions("neighbours", (0.1, 0.3, 3.0, 10.0))
+    found += _of_paths("path, prior neighbours")
+    found += [Variant(way="mixture"), *_numbers_of_particles("mixture")]
+    # The same in all directions, as the motion noise itself need not be: so 1 is another, too.
+    found += _resolutions("mixture", (0.1, 0.3, 1.0, 3.0, 10.0))
+    return [*found, Variant(way=_RANDOM), *_numbers_of_particles(_RANDOM)]
+
+
+def _numbers_of_particles(way: Way) -> list[Variant]:
+    return [
+        Variant("particles", f"x {times:g}", way=way, times_the_particles=times)
+        for times in (0.5, 3.0, 10.0)
+    ]
+
+
+def _of_paths(way: Way) -> list[Variant]:
+    found = [Variant(way=way), *_numbers_of_particles(way)[:2]]
+    for samples in (3, 30):
+        sensing = ActiveSensingSettings(num_observation_samples=samples)
+        found.append(Variant("M", str(samples), way=way, active_sensing=sensing))
+    for neighbors in (3, 10):
+        sensing = ActiveSensingSettings(num_nearest_neighbors=neighbors)
+        found.append(Variant("k", str(neighbors), way=way, active_sensing=sensing))
+    return found
+
+
+def _resolutions(way: Way, factors: Sequence[float]) -> list[Variant]:
+    return [
+        Variant("resolution", f"x {factor:g}", way=way, resolution=factor) for factor in factors
+    ]
+
+
+class Parameters(JudgedStudy):
+    """The study ``parameters``."""
+
+    name = "parameters"
+    title = "What the parameters do: particles, M, k, resolution, horizon, estimate, resampling"
+    num_trials: ClassVar = {CHOICE: 10, CLAIM: 60}
+
+    def cells(self, scale: Scale) -> Iterator[tuple[str, Variant]]:
+        """Return all cells, in the order of the tables."""
+        for case in _CASES:
+            for variant in variants():
+                # Ten times the particles alone would take as long as all the rest.
+                if not scale.quick or variant.times_the_particles <= _MOST_QUICK_PARTICLES:
+                    yield case, variant
+
+    def names(self, cell: tuple[str, Variant]) -> dict[str, Cell]:
+        """Return the columns that name a cell."""
+        case, variant = cell
+        return {"problem": case, "sensing_interval": _INTERVALS[case], **variant.names()}
+
+    def series(
+        self, cell: tuple[str, Variant], purpose: str, scale: Scale, num_trials: int
+    ) -> TrialSeries:
+        """Return the trials of a cell for a purpose."""
+        name, variant = cell
+        case = _CASES[name]
+        case = msgspec.structs.replace(
+            case, num_particles=round(variant.times_the_particles * case.num_particles)
+        )
+        selector = _WAYS[variant.way]
+        if variant.resolution is not None:
+            own = problem_of(case.problem, case.model, {}).resolution
+            resolution = np.multiply(variant.resolution, own).tolist()
+            if isinstance(resolution, list):
+                resolution = tuple(resolution)
+            selector = msgspec.structs.replace(selector, resolution=resolution)
+        return case.series(
+            selector,
+            _INTERVALS[name],
+            seed=scale.seed_of(purpose),
+            num_trials=num_trials,
+            active_sensing=variant.active_sensing,
+            particle_filter=variant.particle_filter,
+        )
+
+    def report_of(self, trials: pd.DataFrame) -> Report:
+        """Return the report on all trials.
+
+        Raises
+        ------
+        InvalidValueError
+            If they are not those of this study.
+        """
+        found = cells_of_trials(trials, ("purpose", "problem", "way", "parameter", "value"))
+        # A quick run leaves some out.
+        tried = {cell[2:] for cell in found}
+        known = [each for each in variants() if tuple(each.names().values()) in tried]
+        expected = {
+            (purpose, case, *variant.names().values()): (purpose, case, variant)
+            for purpose in (CHOICE, CLAIM)
+            for case in _CASES
+            for variant in known
+        }
+        require_cells(self.name, found, expected)
+        choosing: dict[tuple[str, Variant], pd.DataFrame] = {}
+        claim: dict[tuple[str, Variant], pd.DataFrame] = {}
+        for cell, (purpose, case, variant) in expected.items():
+            (claim if purpose == CLAIM else choosing)[case, variant] = found[cell]
+        summary, together = _alone(claim), _together(claim)
+        return Report(
+            trials=trials,
+            summary={
+                "parameters": summary,
+                "together": together,
+                "more_particles": _more_particles(claim),
+                "over_problems": _over_problems(claim),
+                "chosen_values": _chosen_values(choosing, claim),
+            },
+            figures={"parameters": partial(_draw, summary, together)},
+            numbers=_numbers(together),
+        )
+
+
+_Tables = Mapping[tuple[str, Variant], pd.DataFrame]
+
+_P_VALUES = ("success_p_value", "steps_p_value")
+
+_OVER_RANDOM = "_over_random"
+"""Ends the names of columns of a comparison with random."""
+
+
+def _varied(tables: _Tables) -> list[Variant]:
+    return list(dict.fromkeys(variant for _, variant in tables))
+
+
+def _random_rival(variant: Variant) -> Variant:
+    """Return random sensing with as many particles."""
+    own = [each for each in variants() if each.way == _RANDOM]
+    return next(each for each in own if each.times_the_particles == variant.times_the_particles)
+
+
+def _paired(table: pd.DataFrame, reference: pd.DataFrame) -> dict[str, Cell]:
+    """Return how the trials of one problem differ from those of a reference."""
+    return compared(steps_and_success([table]), steps_and_success([reference]))
+
+
+def _paired_together(tables: _Tables, variant: Variant, reference: Variant) -> dict[str, Cell]:
+    """Return how a variant differs from another over all problems, each with the same weight.
+
+    The number of a trial is the mean over the problems, of the trials that all have.
+    """
+    own, other = (
+        steps_and_success([tables[case, each] for case in _CASES]) for each in (variant, reference)
+    )
+    fewest = min(map(len, tables.values()))
+    return {
+        "trials": fewest,
+        **compared(
+            (own[0][:fewest], own[1][:fewest]),
+            (other[0][:fewest], other[1][:fewest]),
+        ),
+    }
+
+
+def _alone(tables: _Tables) -> pd.DataFrame:
+    """Return how each variant differs from its way's reference and from random, in each problem."""
+    rows: list[dict[str, Cell]] = []
+    for (case, variant), table in tables.items():
+        rival = _paired(table, tables[case, _random_rival(variant)])
+        rows.append(
+            {
+                "problem": case,
+                **variant.names(),
+                **outcome_cells(table),
+                **_paired(table, tables[case, Variant(way=variant.way)]),
+                **{f"{name}{_OVER_RANDOM}": cell for name, cell in rival.items()},
+            }
+        )
+    summary = pd.DataFrame(rows)
+    statistics.add_adjusted(summary, *_P_VALUES, compared=summary["parameter"] != "")
+    over_random = (f"{name}{_OVER_RANDOM}" for name in _P_VALUES)
+    statistics.add_adjusted(summary, *over_random, compared=summary["way"] != _RANDOM)
+    return summary
+
+
+def _pairs(tables: _Tables) -> Iterator[tuple[Variant, Variant]]:
+    """Yield the comparisons over several problems.
+
+    Each variant with its way's reference and with random with as many particles, and the references
+    of the other ways also with the first one's.
+    """
+    for variant in _varied(tables):
+        rivals = [Variant(way=variant.way)]
+        if variant.way not in (_FIRST, _RANDOM):
+            rivals.append(Variant())
+        rivals.append(_random_rival(variant))
+        for rival in dict.fromkeys(rivals):
+            if rival != variant:
+                yield variant, rival
+
+
+def _together(tables: _Tables) -> pd.DataFrame:
+    """Return how variants differ over all problems."""
+    table = pd.DataFrame(
+        {
+            **variant.names(),
+            "reference": rival.way,
+            **_paired_together(tables, variant, rival),
+        }
+        for variant, rival in _pairs(tables)
+    )
+    statistics.add_adjusted(table, *_P_VALUES)
+    return table
+
+
+def _over_problems(tables: _Tables) -> pd.DataFrame:
+    """Return how variants differ over these problems, and over all problems like them."""
+    rows: list[dict[str, Cell]] = []
+    measures: tuple[tuple[str, int, float, dict[str, Any]], ...] = (
+        ("steps_ratio", 0, 0.01, {"shown": statistics.ratio_of}),
+        ("success_gain", 1, 1.0, {}),
+    )
+    numbers = {cell: steps_and_success([table]) for cell, table in tables.items()}
+    for measure, part, least, shown in measures:
+        for variant, rival in _pairs(tables):
+            pairs = [
+                (
+                    numbers[case, variant][part].astype(float),
+                    numbers[case, rival][part].astype(float),
+                )
+                for case in _CASES
+            ]
+            rows.append(
+                {
+                    "measure": measure,
+                    **variant.names(),
+                    "reference": rival.way,
+                    **statistics.cells_across_problems(pairs, least, **shown),
+                }
+            )
+    table = pd.DataFrame(rows)
+    statistics.add_adjusted(table, "mean_p_value", "expected_p_value")
+    return table
+
+
+def _chosen_values(choosing: _Tables, tables: _Tables) -> pd.DataFrame:
+    """Return the value of each parameter that the trials for choosing choose.
+
+    It takes the fewest steps over all problems; the reference has a value, too. It is judged by the
+    other trials, against the reference and against random.
+    """
+    rows: list[dict[str, Cell]] = []
+    varied = _varied(tables)
+    for way, parameter in dict.fromkeys((v.way, v.parameter) for v in varied if v.parameter):
+        reference = Variant(way=way)
+        values = [each for each in varied if (each.way, each.parameter) == (way, parameter)]
+        ratios = {
+            each: _paired_together(choosing, each, reference)["steps_ratio"]
+            for each in (reference, *values)
+        }
+        best = min(ratios, key=lambda each: float(ratios[each] or 0.0))
+        rows += [
+            {
+                "way": way,
+                "parameter": parameter,
+                "chosen": best.value or _AS_IT_IS,
+                "reference": rival.way,
+                "steps_ratio_when_chosen": _paired_together(choosing, best, rival)["steps_ratio"],
+                **_paired_together(tables, best, rival),
+            }
+            for rival in dict.fromkeys((reference, _random_rival(best)))
+        ]
+    table = pd.DataFrame(rows)
+    changed = (table["chosen"] != _AS_IT_IS) | (table["reference"] != table["way"])
+    statistics.add_adjusted(table, *_P_VALUES, compared=changed)
+    return table
+
+
+_AS_IT_IS = "as it is"
+
+
+def _more_particles(tables: _Tables) -> pd.DataFrame:
+    """Return the gain of the last multiplication of the particles, for two ways.
+
+    The default has more particles than the reference, so the gain beyond the reference is not the
+    gain beyond the default.
+    """
+    rows: list[dict[str, Cell]] = []
+    for way in (_FIRST, _RANDOM):
+        numbers = [
+            each
+            for each in _varied(tables)
+            if each.way == way and each.parameter in ("", "particles")
+        ]
+        fewer, more = sorted(numbers, key=lambda each: each.times_the_particles)[-2:]
+        names: dict[str, Cell] = {
+            "way": way,
+            "from": f"x {fewer.times_the_particles:g}",
+            "to": f"x {more.times_the_particles:g}",
+        }
+        rows += [
+            {
+                "problem": case,
+                **names,
+                "trials": len(tables[case, more]),
+                **_paired(tables[case, more], tables[case, fewer]),
+            }
+            for case in _CASES
+        ]
+        rows.append({"problem": _TOGETHER, **names, **_paired_together(tables, more, fewer)})
+    table = pd.DataFrame(rows)
+    statistics.add_adjusted(table, *_P_VALUES)
+    return table
+
+
+def _numbers(together: pd.DataFrame) -> list[Number]:
+    """Return what the number of particles does, over all problems."""
+    return [
+        Number(
+            f"{row['way']}, particles {row['value']} against "
+            f"{'the same way' if row['reference'] == row['way'] else row['reference']}",
+            interval_in(row, "steps_ratio"),
+            "times the steps",
+            row["trials"],
+        )
+        for row in together.to_dict("records")
+        if row["parameter"] == "particles"
+    ]
+
+
+def _draw(summary: pd.DataFrame, together: pd.DataFrame) -> Figure:
+    from holdfast.lab.studies import plots
+
+    figure, panels = plots.grid_of_panels(
+        [*_CASES, _TOGETHER],
+        columns=len(_CASES) + 1,
+        title="Steps, against each way's reference (95 % intervals)",
+        width=12.0,
+        row_height=9.2,
+        same_rows=True,
+    )
+    for name, panel in panels.items():
+        rows = summary[(summary["problem"] == name) & (summary["parameter"] != "")]
+        if name == _TOGETHER:
+            rows = together[(together["reference"] == together["way"])]
+        labels = (rows["way"] + ": " + rows["parameter"] + " " + rows["value"]).tolist()
+        plots.dot_rows(panel, labels, [plots.dots_of("", rows, "steps_ratio")])
+    plots.ratio_axes(panels.values())
+    panels[_TOGETHER].set_title("mean of all five", loc="left")
+    plots.label_grid(figure, panels, "", "")
+    figure.supxlabel("steps, relative to the reference")
+    return figure

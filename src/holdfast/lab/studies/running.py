@@ -1,0 +1,208 @@
+"""Running studies: load known results, compute the others, write the report."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import msgspec
+import pandas as pd
+
+from holdfast import __version__
+from holdfast.errors import OutputError
+from holdfast.files import remove_unfinished, write_atomically
+from holdfast.lab.errors import TaskError
+from holdfast.lab.studies.executors import Executor, LocalExecutor
+from holdfast.lab.studies.result_cache import ResultCache
+from holdfast.lab.studies.study import Report, Results, Scale, Study
+from holdfast.lab.studies.tables import to_csv
+from holdfast.lab.studies.tasks import Task, task_key
+from holdfast.lab.studies.trial_files import TRIALS_NAME, TrialFile
+from holdfast.recording.machine import describe
+
+__all__ = ["Workload", "compute", "write_report"]
+
+_CACHE = "cache"
+
+
+class Workload:
+    """The tasks of some studies, with the results that are known already.
+
+    Parameters
+    ----------
+    directory : Path
+        Where results are kept.
+
+    Attributes
+    ----------
+    tasks : list of Task
+        Each once, although several studies may have it.
+    pending : list of Task
+        Of these, those that are still to be computed.
+    units, finished_units : int
+        How much work they are, and how much of it is done.
+    """
+
+    def __init__(self, studies: Sequence[Study], scale: Scale, directory: Path) -> None:
+        self._cache = ResultCache(directory / _CACHE)
+        self._tables: dict[str, pd.DataFrame] = {}
+        # Only where this program alone writes: the directory itself may have other files.
+        remove_unfinished(directory / _CACHE, below=True)
+        for study in studies:
+            remove_unfinished(directory / study.name)
+        tasks = {task_key(task): task for study in studies for task in study.tasks(scale)}
+        self.tasks = list(tasks.values())
+        self._keys = frozenset(tasks)
+        self.pending: list[Task] = []
+        for key, task in tasks.items():
+            table = self._cache.load(task)
+            if table is None:
+                self.pending.append(task)
+            else:
+                self._tables[key] = table
+        self.units = sum(task.units for task in self.tasks)
+        self.finished_units = self.units - sum(task.units for task in self.pending)
+        if self.pending:
+            _check_room(directory)
+
+    def keep(self, task: Task, table: pd.DataFrame) -> None:
+        """Keep the result of a task.
+
+        Raises
+        ------
+        TaskError
+            If its code was edited since this was made: it came of one or the other.
+        OutputError
+            If it cannot be kept.
+        """
+        key = task_key(task)
+        if key not in self._keys:
+            raise TaskError(
+                f"the code of tasks of the kind {task.kind!r} was edited while they were computed, "
+                "so it is not known which code this result is of; it is not kept. Edit nothing "
+                "meanwhile"
+            )
+        self._cache.store(task, table)
+        self._tables[key] = table
+        self.finished_units += task.units
+
+    @property
+    def results(self) -> Results:
+        """The results of all tasks, once none is pending."""
+        return Results(self._tables, task_key)
+
+
+def compute(workload: Workload, executor: Executor, on_progress: Callable[[int], None]) -> None:
+    """Compute the pending tasks and keep their results.
+
+    Parameters
+    ----------
+    on_progress : callable
+        Gets how many units of work are finished.
+
+    Raises
+    ------
+    HoldfastError
+        If a task fails; what was finished before is kept.
+    KeyboardInterrupt
+        After everything that was started has been ended; what was finished is kept.
+    """
+
+    def keep(task: Task, table: pd.DataFrame) -> None:
+        workload.keep(task, table)
+        on_progress(workload.finished_units)
+
+    executor.run([task for task in workload.pending if not task.exclusive], keep)
+    # What measures times has this machine to itself.
+    LocalExecutor(1).run([task for task in workload.pending if task.exclusive], keep)
+
+
+class _Origin(msgspec.Struct, kw_only=True, omit_defaults=True):
+    """The origin of the numbers; the content of ``origin.json``."""
+
+    study: str
+    quick: bool
+    seed: int
+    holdfast_version: str
+    machine: dict[str, str]
+    claim_seed: int | None = None
+
+
+def write_report(
+    study: Study,
+    scale: Scale,
+    report: Report,
+    directory: Path,
+    machine: dict[str, str] | None = None,
+) -> list[str]:
+    """Write a study's tables and figures.
+
+    ``origin.json`` comes last: where it is not there, the rest may be of two runs.
+
+    Parameters
+    ----------
+    directory : Path
+        Of this study; made if it is not there.
+    machine : dict, optional
+        On which its trials were run; this one by default.
+
+    Returns
+    -------
+    list of str
+        The names of the files.
+
+    Raises
+    ------
+    OutputError
+        If one cannot be written.
+    """
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"{directory}: cannot be made: {error.strerror}") from error
+    origin_path = directory / "origin.json"
+    try:
+        origin_path.unlink(missing_ok=True)
+    except OSError as error:
+        raise OutputError(f"{origin_path}: cannot be replaced: {error.strerror}") from error
+    machine = describe() if machine is None else machine
+    names = []
+    for name, table in report.tables.items():
+        write_atomically(directory / f"{name}.csv", to_csv(table).encode())
+        names.append(f"{name}.csv")
+    for name, table in report.raw.items():
+        write_atomically(directory / f"{name}_trials.csv", to_csv(table).encode())
+        names.append(f"{name}_trials.csv")
+    if report.trials is not None:
+        kept = TrialFile(study=study.name, scale=scale, machine=machine, trials=report.trials)
+        write_atomically(directory / TRIALS_NAME, kept.encoded())
+        names.append(TRIALS_NAME)
+    if report.figures:
+        from holdfast.lab.studies import plots
+    for name, draw in report.figures.items():
+        figure = draw()
+        if scale.quick:
+            plots.mark(figure, "quick: few trials, no evidence")
+        names += plots.save(figure, directory, name)
+    origin = _Origin(
+        study=study.name,
+        quick=scale.quick,
+        seed=scale.seed,
+        holdfast_version=__version__,
+        machine=machine,
+        claim_seed=None if report.trials is None else scale.claim_seed,
+    )
+    text = msgspec.json.format(msgspec.json.encode(origin), indent=2)
+    write_atomically(origin_path, text + b"\n")
+    names.append("origin.json")
+    return names
+
+
+def _check_room(directory: Path) -> None:
+    """Make sure that results can be kept, before there are any."""
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=directory).close()
+    except OSError as error:
+        raise OutputError(f"{directory}: cannot be written in: {error.strerror}") from error

@@ -1,0 +1,573 @@
+"""What is really best: twelve ways of choosing a sensing action, on eight problems.
+
+All ways see the same worlds: trial i starts in the same state and meets the same noise, whatever is
+sensed. So ways are compared trial by trial: by success, by steps (a failure counts as the limit)
+and by reward. Steps are compared as ratios, so that a tenth fewer counts the same where a task
+takes fifty or five hundred.
+
+Some trials are cut off at the limit. Those of the main ways are continued, to tell the slow from
+the stuck.
+
+The mean over these eight problems says nothing about a ninth. For that, the problems are taken as a
+sample of all problems (a random effect).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from functools import partial
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+import pandas as pd
+
+from holdfast.arrays import BoolArray, FloatArray
+from holdfast.config.settings import SelectorSettings
+from holdfast.lab.studies import statistics
+from holdfast.lab.studies.cases import CASES, Case
+from holdfast.lab.studies.judged_study import (
+    MEASURES,
+    JudgedStudy,
+    compared,
+    outcome_cells,
+    steps_and_success,
+)
+from holdfast.lab.studies.statistics import Interval, cells_of, interval_in
+from holdfast.lab.studies.study import CHOICE, CLAIM, Number, Report, Scale
+from holdfast.lab.studies.tables import Cell
+from holdfast.lab.studies.trial_batches import TrialSeries, problem_of
+from holdfast.lab.studies.trial_files import cells_of_trials, require_cells
+from holdfast.recording.tables import wilson_interval
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["COSTS", "GROUPS", "INTERVALS", "SHOWN", "WAYS", "Selectors"]
+
+INTERVALS = (0, 4, 8, 14)
+"""Steps between two sensing steps."""
+
+LEVEL = 0.01
+"""Of a family of tests: the probability of claiming any difference where there is none."""
+
+LEVEL_OF_VERDICT = 0.05
+"""Of the tests whether a candidate is beaten: less strict, to the candidate's disadvantage."""
+
+WAYS: Mapping[str, SelectorSettings] = {
+    "random": SelectorSettings(method="random"),
+    "fixed": SelectorSettings(method="fixed"),
+    "state entropy, neighbours": SelectorSettings(
+        method="state_entropy", estimator="nearest_neighbor"
+    ),
+    "state entropy, mixture": SelectorSettings(
+        method="state_entropy", estimator="gaussian_mixture_upper"
+    ),
+    "action entropy, neighbours": SelectorSettings(
+        method="action_entropy", estimator="nearest_neighbor"
+    ),
+    "action entropy, neighbours, executed": SelectorSettings(
+        method="action_entropy", estimator="nearest_neighbor", actions="executed"
+    ),
+    "action entropy, mixture": SelectorSettings(
+        method="action_entropy", estimator="gaussian_mixture_upper"
+    ),
+    "action entropy, mixture, executed": SelectorSettings(
+        method="action_entropy", estimator="gaussian_mixture_upper", actions="executed"
+    ),
+    "action covariance": SelectorSettings(method="action_covariance"),
+    "path entropy, neighbours": SelectorSettings(
+        method="path_entropy", estimator="nearest_neighbor"
+    ),
+    "action entropy, prior neighbours": SelectorSettings(
+        method="action_entropy", estimator="prior_neighbors"
+    ),
+    "path entropy, prior neighbours": SelectorSettings(
+        method="path_entropy", estimator="prior_neighbors"
+    ),
+}
+"""By their names in tables and figures. Actions are the commanded ones, unless named executed."""
+
+BASELINE = "random"
+
+DEFAULT = "path entropy, prior neighbours"
+"""The project's default."""
+
+_CANDIDATES = (
+    "path entropy, neighbours",
+    "action entropy, prior neighbours",
+    "path entropy, prior neighbours",
+)
+"""Candidates for the default, of which the trials for choosing choose one."""
+
+BEFORE = "action entropy, neighbours"
+"""The default before, with which the candidates are compared."""
+
+_DISTRACTING = ("busy room", "passer-by")
+"""Problems made so that state entropy and action entropy differ."""
+
+GROUPS: Mapping[str, tuple[str, ...]] = {
+    "all problems": tuple(case.name for case in CASES),
+    "without distractions": tuple(case.name for case in CASES if case.name not in _DISTRACTING),
+}
+"""Problems that are taken together, each with the same weight."""
+
+SHOWN = {
+    "random": "random",
+    "fixed": "fixed",
+    "state entropy, neighbours": "state entropy",
+    "action entropy, neighbours": "action entropy",
+    "path entropy, prior neighbours": "path entropy",
+}
+"""Ways in the first figures, with their labels there."""
+
+_CONTINUED = tuple(way for way in SHOWN if way != "fixed")
+"""Ways whose trials are continued where they are cut off."""
+
+_CONTINUED_TRIALS = 60
+"""Of these, at each interval: a stuck trial takes twenty times as long as one that is cut off."""
+
+COSTS = (0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
+"""Of a sensing action, in units of reward (the length of the way, in most problems)."""
+
+_MEAN = "mean"
+"""In place of an interval: the mean over all of them."""
+
+_CASES: Mapping[str, Case] = {case.name: case for case in CASES}
+
+_Cell = tuple[str, int, str]
+"""Names of a case, an interval and a way."""
+
+_Cells = Mapping[_Cell, pd.DataFrame]
+
+_Trials = tuple[FloatArray, FloatArray]
+"""The logarithm of steps and the success of each trial."""
+
+
+class Selectors(JudgedStudy):
+    """The study ``selectors``."""
+
+    name = "selectors"
+    title = "What is really best: choosing what to sense, on eight problems"
+    num_trials: ClassVar = {CHOICE: 20, CLAIM: 120}
+
+    def cells(self, scale: Scale | None = None) -> Iterator[_Cell]:
+        """Return all cells, in the order of the tables."""
+        del scale
+        return ((case, interval, way) for case in _CASES for interval in INTERVALS for way in WAYS)
+
+    def names(self, cell: _Cell) -> dict[str, Cell]:
+        """Return the columns that name a cell."""
+        return dict(zip(("problem", "sensing_interval", "way"), cell, strict=True))
+
+    def series(self, cell: _Cell, purpose: str, scale: Scale, num_trials: int) -> TrialSeries:
+        """Return the trials of a cell for a purpose."""
+        case, interval, way = cell
+        return _CASES[case].series(
+            WAYS[way],
+            interval,
+            seed=scale.seed_of(purpose),
+            num_trials=num_trials,
+            continued_trials=_CONTINUED_TRIALS if purpose == CLAIM and way in _CONTINUED else 0,
+        )
+
+    def report_of(self, trials: pd.DataFrame) -> Report:
+        """Return the report on all trials.
+
+        Raises
+        ------
+        InvalidValueError
+            If they are not those of this study.
+        """
+        found = cells_of_trials(trials, ("purpose", "problem", "sensing_interval", "way"))
+        every = list(self.cells())
+        require_cells(
+            self.name, found, {(purpose, *cell) for purpose in _PURPOSES for cell in every}
+        )
+        choosing, cells = ({cell: found[each, *cell] for cell in every} for each in _PURPOSES)
+        of_choosing, of_claim = _over_intervals(choosing), _over_intervals(cells)
+        summary = _summary(cells)
+        relative_steps, costs = _relative_steps(of_claim), _costs(choosing, cells)
+        rivals = {measure: _rivals(of_claim, measure) for measure in MEASURES}
+        report = Report(trials=trials)
+        report.summary = {
+            "cases": _cases_table(cells, choosing),
+            "selectors": summary,
+            "relative_steps": relative_steps,
+            "rivals": rivals["steps_ratio"],
+            "rivals_in_success": rivals["success_gain"],
+            "over_problems": _over_problems(of_claim),
+            "chosen_ways": _chosen_ways(of_choosing, of_claim),
+            "default_candidates": _default_candidates(of_choosing, cells),
+            "stuck": _stuck(cells),
+            "costs_of_looks": costs,
+        }
+        drawn = {"choice_of_sensing": summary, "selectors": relative_steps, "costs_of_looks": costs}
+        report.figures = {name: partial(_draw, name, table) for name, table in drawn.items()}
+        report.numbers = _numbers(rivals)
+        return report
+
+
+def _draw(name: str, table: pd.DataFrame) -> Figure:
+    # Imports matplotlib, so only when a figure is wanted.
+    from holdfast.lab.studies import selectors_figures
+
+    figure: Figure = getattr(selectors_figures, name)(table)
+    return figure
+
+
+_PURPOSES = (CHOICE, CLAIM)
+
+
+def _over_intervals(cells: _Cells) -> dict[tuple[str, str], _Trials]:
+    """Return steps and success by place and way: the mean over the intervals, trial by trial.
+
+    A place is a problem, or a group of problems: their mean over the trials that all have.
+    """
+    found = {
+        (case, way): steps_and_success([cells[case, interval, way] for interval in INTERVALS])
+        for case in _CASES
+        for way in WAYS
+    }
+    fewest = min(steps.size for steps, _ in found.values())
+    for group, cases in GROUPS.items():
+        for way in WAYS:
+            steps, success = (
+                np.mean([found[case, way][part][:fewest] for case in cases], axis=0)
+                for part in (0, 1)
+            )
+            found[group, way] = steps, success
+    return found
+
+
+def _cases_table(cells: _Cells, choosing: _Cells) -> pd.DataFrame:
+    """Return how each problem is posed, so that others can pose it."""
+    rows: list[dict[str, Cell]] = []
+    for name, case in _CASES.items():
+        series = case.series(WAYS[DEFAULT], INTERVALS[0], seed=0, num_trials=2)
+        sensing = series.planning.active_sensing
+        rows.append(
+            {
+                "problem": name,
+                "class": case.problem,
+                "model": ", ".join(f"{key} {value}" for key, value in case.model.items()),
+                "particles": series.planning.particle_filter.num_particles,
+                "resampling_threshold": series.planning.particle_filter.resampling_threshold,
+                "M": sensing.num_observation_samples,
+                "k": sensing.num_nearest_neighbors,
+                "horizon": sensing.horizon,
+                "resolution": _resolution(case),
+                "max_steps": case.max_steps,
+                "trials": len(cells[name, INTERVALS[0], DEFAULT]),
+                "trials_for_choosing": len(choosing[name, INTERVALS[0], DEFAULT]),
+            }
+        )
+    return pd.DataFrame(rows)
+
+
+def _resolution(case: Case) -> Cell:
+    """Return a problem's resolution, or as a text those of all coordinates."""
+    own = problem_of(case.problem, case.model, {}).resolution
+    rounded = [f"{each:.4g}" for each in np.atleast_1d(own)]
+    return float(rounded[0]) if isinstance(own, (int, float)) else ", ".join(rounded)
+
+
+def _summary(cells: _Cells) -> pd.DataFrame:
+    """Return a row for each cell, with its paired differences from the baseline."""
+    rows: list[dict[str, Cell]] = []
+    for (case, interval, way), table in cells.items():
+        baseline = cells[case, interval, BASELINE]
+        reward, p_value = statistics.paired_difference(
+            table["reward"].to_numpy(), baseline["reward"].to_numpy()
+        )
+        rows.append(
+            {
+                "problem": case,
+                "sensing_interval": interval,
+                "way": way,
+                **outcome_cells(table),
+                **compared(steps_and_success([table]), steps_and_success([baseline])),
+                **cells_of("reward_gain", reward),
+                "reward_p_value": p_value,
+            }
+        )
+    summary = pd.DataFrame(rows)
+    p_values = ("success_p_value", "reward_p_value", "steps_p_value")
+    statistics.add_adjusted(summary, *p_values, compared=summary["way"] != BASELINE)
+    return summary
+
+
+def _pairs() -> list[tuple[str, str]]:
+    """Return each way that chooses, with the baseline and with each such way before it."""
+    choosing = [way for way in WAYS if WAYS[way].method not in ("random", "fixed")]
+    return [
+        (way, rival)
+        for number, way in enumerate(choosing)
+        for rival in (BASELINE, *choosing[:number])
+    ]
+
+
+def _relative_steps(trials: Mapping[tuple[str, str], _Trials]) -> pd.DataFrame:
+    """Return the steps of each way relative to the baseline."""
+    table = pd.DataFrame(
+        {"problem": case, "way": way, **_difference("steps_ratio", own, trials[case, BASELINE])}
+        for (case, way), own in trials.items()
+        if way != BASELINE
+    )
+    statistics.add_adjusted(table, "p_value")
+    return table
+
+
+def _rivals(trials: Mapping[tuple[str, str], _Trials], measure: str) -> pd.DataFrame:
+    """Return how the first way of each pair differs from the second, everywhere."""
+    table = pd.DataFrame(
+        {
+            "problem": place,
+            "way": way,
+            "rival": rival,
+            **_difference(measure, trials[place, way], trials[place, rival]),
+        }
+        for place in (*_CASES, *GROUPS)
+        for way, rival in _pairs()
+    )
+    statistics.add_adjusted(table, "p_value")
+    return table
+
+
+def _difference(measure: str, own: _Trials, other: _Trials) -> dict[str, Cell]:
+    part = MEASURES.index(measure)
+    difference, p_value = statistics.paired_difference(own[part], other[part])
+    shown = statistics.ratio_of(difference) if measure == "steps_ratio" else difference
+    count = int(np.count_nonzero(~np.isnan(own[part])))
+    return {"trials": count, **cells_of(measure, shown), "p_value": p_value}
+
+
+def _over_problems(trials: Mapping[tuple[str, str], _Trials]) -> pd.DataFrame:
+    """Return how ways differ over these problems, and over all problems like them."""
+    rows: list[dict[str, Cell]] = []
+    # The smallest difference of two trials' means over the intervals; of steps, one in a hundred.
+    for part, (measure, least) in enumerate(
+        zip(MEASURES, (0.01, 1.0 / len(INTERVALS)), strict=True)
+    ):
+        shown = {"shown": statistics.ratio_of} if measure == "steps_ratio" else {}
+        rows += [
+            {
+                "measure": measure,
+                "way": way,
+                "rival": rival,
+                **statistics.cells_across_problems(
+                    [(trials[case, way][part], trials[case, rival][part]) for case in _CASES],
+                    least,
+                    **shown,
+                ),
+            }
+            for way, rival in _pairs()
+        ]
+    table = pd.DataFrame(rows)
+    statistics.add_adjusted(table, "mean_p_value", "expected_p_value")
+    return table
+
+
+def _fewest_steps(
+    choosing: Mapping[tuple[str, str], _Trials], place: str, ways: Iterable[str]
+) -> str:
+    """Return the way with the fewest steps on the trials for choosing."""
+    return min(ways, key=lambda way: float(np.nanmean(choosing[place, way][0])))
+
+
+def _chosen_ways(
+    choosing: Mapping[tuple[str, str], _Trials], trials: Mapping[tuple[str, str], _Trials]
+) -> pd.DataFrame:
+    """Return the way that the trials for choosing choose, compared on the others.
+
+    For each problem and group, against the baseline and the default.
+    """
+    rows: list[dict[str, Cell]] = []
+    for place in (*_CASES, *GROUPS):
+        way = _fewest_steps(choosing, place, WAYS)
+        rows += [
+            {
+                "problem": place,
+                "chosen": way,
+                "rival": rival,
+                "steps_ratio_when_chosen": compared(choosing[place, way], choosing[place, rival])[
+                    "steps_ratio"
+                ],
+                "trials": trials[place, way][0].size,
+                **compared(trials[place, way], trials[place, rival]),
+            }
+            for rival in (BASELINE, DEFAULT)
+        ]
+    table = pd.DataFrame(rows)
+    statistics.add_adjusted(
+        table, "steps_p_value", "success_p_value", compared=table["chosen"] != table["rival"]
+    )
+    return table
+
+
+def _default_candidates(choosing: Mapping[tuple[str, str], _Trials], cells: _Cells) -> pd.DataFrame:
+    """Return the comparisons that decide whether a candidate becomes the default.
+
+    It does not if the baseline or the default before beats it beyond noise, in steps or success, in
+    any row. The p-values of a candidate are adjusted for all its comparisons of both measures.
+    """
+    chosen = _fewest_steps(choosing, next(iter(GROUPS)), _CANDIDATES)
+    return pd.concat(
+        [_candidate(way, cells).assign(chosen=way == chosen) for way in _CANDIDATES],
+        ignore_index=True,
+    )
+
+
+def _candidate(candidate: str, cells: _Cells) -> pd.DataFrame:
+    table = pd.DataFrame(
+        {
+            "candidate": candidate,
+            "problem": case,
+            "sensing_interval": name,
+            "rival": rival,
+            "trials": len(cells[case, INTERVALS[0], candidate]),
+            **compared(
+                *(
+                    steps_and_success([cells[case, each, way] for each in intervals])
+                    for way in (candidate, rival)
+                )
+            ),
+        }
+        for case in _CASES
+        for name, intervals in _intervals()
+        for rival in (BASELINE, BEFORE)
+    )
+    levels = statistics.holm(np.concatenate([table["steps_p_value"], table["success_p_value"]]))
+    table["steps_adjusted_p_value"], table["success_adjusted_p_value"] = np.split(levels, 2)
+    slower = (table["steps_ratio"] > 1.0) & (table["steps_adjusted_p_value"] < LEVEL_OF_VERDICT)
+    worse = (table["success_gain"] < 0.0) & (table["success_adjusted_p_value"] < LEVEL_OF_VERDICT)
+    table["beaten_in"] = [
+        " and ".join(name for name, so in (("steps", a), ("success", b)) if so)
+        for a, b in zip(slower, worse, strict=True)
+    ]
+    return table
+
+
+def _intervals() -> list[tuple[Cell, tuple[int, ...]]]:
+    """Return each interval alone, and all of them together, with their names."""
+    return [*((interval, (interval,)) for interval in INTERVALS), (_MEAN, INTERVALS)]
+
+
+def _stuck(cells: _Cells) -> pd.DataFrame:
+    """Return how many trials were cut off, and how many of these never reached the goal."""
+    rows: list[dict[str, Cell]] = []
+    for name, case in _CASES.items():
+        continued = {
+            (interval, way): _continued(cells[name, interval, way])
+            for interval in INTERVALS
+            for way in _CONTINUED
+        }
+        for label, intervals in _intervals():
+            others = np.array([_is_stuck(continued[each, BASELINE]) for each in intervals])
+            for way in _CONTINUED:
+                found = [continued[each, way] for each in intervals]
+                cut = np.array([~table["success"].to_numpy(bool) for table in found])
+                stuck = np.array([_is_stuck(table) for table in found])
+                if len(intervals) == 1:
+                    difference, p_value = statistics.paired_rates(stuck[0], others[0])
+                else:
+                    difference, p_value = statistics.paired_difference(
+                        stuck.mean(axis=0), others.mean(axis=0)
+                    )
+                rows.append(
+                    {
+                        "problem": name,
+                        "sensing_interval": label,
+                        "way": way,
+                        "trials": stuck.size,
+                        "max_steps": case.max_steps,
+                        "cut_off": int(cut.sum()),
+                        "continued_to": int(found[0]["step_limit"].iloc[0]),
+                        "stuck": int(stuck.sum()),
+                        **cells_of("cut_off_share", _share(cut)),
+                        **cells_of("stuck_share", _share(stuck)),
+                        **cells_of("stuck_beyond_random", difference),
+                        "p_value": p_value,
+                    }
+                )
+    table = pd.DataFrame(rows)
+    statistics.add_adjusted(table, "p_value", compared=table["way"] != BASELINE)
+    return table
+
+
+def _share(trials: BoolArray) -> Interval:
+    """Return the share of trials, shape (intervals, worlds), in which something is so.
+
+    The trials of one world are not independent: over several intervals the interval is Student's,
+    of the worlds' shares; and Wilson's where these are all 0 or all 1, which do not scatter.
+    """
+    whole = trials.all() or not trials.any()
+    if trials.shape[0] > 1 and not whole:
+        value, low, high = statistics.mean_interval(trials.mean(axis=0))
+        return Interval(value, max(low, 0.0), min(high, 1.0))
+    successes, count = int(trials[0].sum()), trials.shape[1]
+    return Interval(successes / count, *wilson_interval(successes, count))
+
+
+def _continued(table: pd.DataFrame) -> pd.DataFrame:
+    """Return the trials that are continued if they are cut off: those with the highest limit."""
+    return table[table["step_limit"] == table["step_limit"].max()]
+
+
+def _is_stuck(table: pd.DataFrame) -> BoolArray:
+    return np.asarray(table["steps_to_goal"].isna())
+
+
+def _costs(choosing: _Cells, cells: _Cells) -> pd.DataFrame:
+    """Return the net reward where sensing has a price, at the interval that is best then.
+
+    The trials for choosing choose the interval.
+    """
+    rows: list[dict[str, Cell]] = []
+    for case in _CASES:
+        for cost in COSTS:
+            best = {
+                way: max(
+                    INTERVALS,
+                    key=lambda interval: float(_net(choosing[case, interval, way], cost).mean()),
+                )
+                for way in SHOWN
+            }
+            nets = {way: _net(cells[case, best[way], way], cost) for way in SHOWN}
+            for way, net in nets.items():
+                gain, p_value = statistics.paired_difference(net, nets[BASELINE])
+                rows.append(
+                    {
+                        "problem": case,
+                        "way": way,
+                        "cost_of_a_look": cost,
+                        "best_interval": best[way],
+                        "trials": net.size,
+                        **cells_of("net_reward", statistics.mean_interval(net)),
+                        **cells_of("gain", gain),
+                        "p_value": p_value,
+                    }
+                )
+    table = pd.DataFrame(rows)
+    statistics.add_adjusted(table, "p_value", compared=table["way"] != BASELINE)
+    return table
+
+
+def _net(table: pd.DataFrame, cost: float) -> FloatArray:
+    """Return the reward of each trial less the price of its sensing."""
+    return np.asarray(table["reward"] - cost * table["sensing_decisions"])
+
+
+def _numbers(rivals: Mapping[str, pd.DataFrame]) -> list[Number]:
+    """Return how the default compares with random sensing, everywhere."""
+    units = {"steps_ratio": (1.0, "times the steps"), "success_gain": (100.0, "points of success")}
+    return [
+        Number(
+            f"{row['problem']}, the default against random",
+            interval_in(row, measure, factor),
+            unit,
+            row["trials"],
+        )
+        for measure, (factor, unit) in units.items()
+        for row in rivals[measure].to_dict("records")
+        if (row["way"], row["rival"]) == (DEFAULT, BASELINE)
+    ]

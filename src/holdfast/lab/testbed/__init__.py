@@ -1,0 +1,1 @@
+"""Real processes of holdfast, the networks between them, and the faults that are injected there."""

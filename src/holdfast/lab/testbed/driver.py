@@ -1,0 +1,478 @@
+"""One robot, its services, and the faults injected into them: real processes in one loop.
+
+A script over a :class:`Testbed` adds services, starts a robot, injects faults, waits for what it
+wants to see, and compares in the end. One loop, :meth:`Testbed.wait_until`, reads what the
+processes log, advances all injected faults, and notices a process that ends too early. Whatever
+happens, no process is left when the ``with`` statement ends.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import secrets
+import shutil
+import signal
+import tempfile
+import time
+from collections.abc import Callable, Generator, Sequence
+from pathlib import Path
+from queue import Empty, SimpleQueue
+from typing import Self, TypeAlias
+
+from holdfast.lab.errors import NoProgressError, ProcessEndedError
+from holdfast.lab.testbed.fault_times import InjectedFault
+from holdfast.lab.testbed.namespace import NetworkNamespace
+from holdfast.lab.testbed.processes import HOLDFAST, Ended, Process, end_marked_processes
+from holdfast.lab.testbed.proxy import Proxy
+from holdfast.lab.testbed.records import Decision, DecisionTable, LogEvent
+from holdfast.recording.run_directory import TIMINGS_NAME
+from holdfast.runtime.parent_death import parent_death_prefix
+
+__all__ = ["RobotCommand", "Script", "ServiceCommand", "Testbed", "after"]
+
+Script: TypeAlias = Generator[Callable[[], bool], None, None]
+"""Yields what it waits for, and goes on once that is true."""
+
+_MARK = "HOLDFAST_TESTBED"
+
+_TURN_S = 0.008
+"""How long the loop may sleep, so how late a fault may be injected."""
+
+_READY_S = 60.0
+_LONGEST_S = 600.0
+_END_S = 5.0
+
+ROBOT_LOG_NAME = "robot.log"
+
+
+class ServiceCommand:
+    """``holdfast serve`` at one endpoint; it may be killed and started again there.
+
+    Parameters
+    ----------
+    start : callable
+        Starts a process.
+    endpoint : str
+        How the robot reaches it.
+    port : int or None
+        Where it listens, if at a port.
+    proxy, namespace
+        What impairs the line to it; None where nothing does.
+
+    Attributes
+    ----------
+    ready_at : float or None
+        When the current process was ready, in seconds since the epoch.
+    """
+
+    def __init__(
+        self,
+        start: Callable[[], Process],
+        endpoint: str,
+        port: int | None = None,
+        proxy: Proxy | None = None,
+        namespace: NetworkNamespace | None = None,
+    ) -> None:
+        self._start = start
+        self._process: Process | None = None
+        self.endpoint = endpoint
+        self.port = port
+        self.proxy = proxy
+        self.namespace = namespace
+
+    @property
+    def process(self) -> Process:
+        """The process that was started last."""
+        assert self._process is not None, "the service was never started"
+        return self._process
+
+    @property
+    def is_away(self) -> bool:
+        """Whether it was never started, or was killed and not started again."""
+        return self._process is None or self._process.killed
+
+    @property
+    def ready_at(self) -> float | None:
+        """When its process became ready, in seconds since the epoch; None before."""
+        ready = self.process.matching("ready")
+        return ready[0].at if ready else None
+
+    @property
+    def start_s(self) -> float:
+        """How long its process took until it was ready."""
+        assert self.ready_at is not None
+        return self.ready_at - self.process.spawned_at
+
+    def start(self) -> Self:
+        """Start it; return at once."""
+        self._process = self._start()
+        return self
+
+
+class RobotCommand:
+    """``holdfast run`` into one directory: one process, or several that resume the run.
+
+    Parameters
+    ----------
+    start : callable
+        Starts a process, given further options.
+    out : Path
+        The directory of the run.
+    steps_of_trials : sequence of int
+        Task actions of each trial, as the reference run has them.
+    rate_hz : float
+        Task actions per second.
+
+    Attributes
+    ----------
+    events : list of LogEvent
+        Of all its processes, in order.
+    is_done : bool
+        Whether the run has ended well.
+    """
+
+    def __init__(
+        self,
+        start: Callable[[Sequence[str]], Process],
+        out: Path,
+        steps_of_trials: Sequence[int],
+        rate_hz: float,
+    ) -> None:
+        self._start = start
+        self._steps_of_trials = steps_of_trials
+        self.rate_hz = rate_hz
+        self.out = out
+        self.table = DecisionTable(out / TIMINGS_NAME)
+        self.events: list[LogEvent] = []
+        self.is_done = False
+        self._processes = [start(())]
+
+    @property
+    def process(self) -> Process:
+        """The process that was started last."""
+        return self._processes[-1]
+
+    @property
+    def num_processes(self) -> int:
+        """How many processes were started."""
+        return len(self._processes)
+
+    def has(self, process: Process) -> bool:
+        """Tell whether a process is or was one of this robot's."""
+        return process in self._processes
+
+    @property
+    def decisions(self) -> list[Decision]:
+        """The rows of its table that have been read."""
+        return self.table.rows
+
+    @property
+    def num_trials(self) -> int:
+        """The number of trials of the whole run."""
+        return len(self._steps_of_trials)
+
+    @property
+    def steps(self) -> int:
+        """The number of task actions of the whole run."""
+        return sum(self._steps_of_trials)
+
+    @property
+    def steps_done(self) -> int:
+        """How far the run is, in task actions; -1 before its first decision."""
+        if not self.decisions:
+            return -1
+        last = self.decisions[-1]
+        return sum(self._steps_of_trials[: last.trial]) + last.step
+
+    def resume(self) -> None:
+        """Start a process that resumes the run of one that was killed."""
+        # Before that its journal is not free, and its events are not all read.
+        self.process.close(_END_S)
+        self._processes.append(self._start(("--resume",)))
+
+
+class Testbed:
+    """Starts, watches and ends the processes of a run; to be used in a ``with`` statement.
+
+    Parameters
+    ----------
+    directory : Path
+        Gets the logs of all processes.
+    on_turn : callable
+        Called in each turn of the loop; what it raises ends the waiting.
+    prefix : sequence of str
+        A command that runs another one, in a network namespace say; for all processes.
+    orderly_end_s : float
+        How long processes have to end after SIGTERM; at 0 they are killed at once.
+
+    Attributes
+    ----------
+    temporary : Path
+        A directory for as long as the testbed lasts, also the processes' own for temporary files.
+        Its path is short, because local sockets lie there.
+    robot_or_none : RobotCommand or None
+        The robot that was started last.
+    faults : list of InjectedFault
+        In order of time.
+    left_behind : list of int
+        Processes that had not ended by themselves after all was over, and were killed.
+    """
+
+    __test__ = False  # the name is no test's
+
+    def __init__(
+        self,
+        directory: Path,
+        *,
+        on_turn: Callable[[], None] = lambda: None,
+        prefix: Sequence[str] = (),
+        orderly_end_s: float = 0.0,
+    ) -> None:
+        self.directory = directory
+        self.on_turn = on_turn
+        self._prefix = tuple(prefix)
+        self._orderly_end_s = orderly_end_s
+        self._happened: SimpleQueue[tuple[Process, LogEvent | Ended]] = SimpleQueue()
+        self._scripts: list[_RunningScript] = []
+        self._processes: list[Process] = []
+        self.robot_or_none: RobotCommand | None = None
+        self._mark = secrets.token_hex(16)
+        self.temporary = Path(tempfile.mkdtemp(prefix="holdfast-"))
+        self.services: list[ServiceCommand] = []
+        self.faults: list[InjectedFault] = []
+        self.left_behind: list[int] = []
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End all processes; an exception meanwhile kills them at once."""
+        try:
+            if self._orderly_end_s > 0.0:
+                for process in self._processes:
+                    process.process.terminate()
+                for process in self._processes:
+                    process.close(self._orderly_end_s)
+        finally:
+            for process in self._processes:
+                process.process.kill()
+            for process in self._processes:
+                process.close(0.0)
+            self._processes.clear()
+            # Local services end with their robot.
+            self.left_behind = end_marked_processes(_MARK, self._mark, _END_S)
+            if self.robot_or_none is not None:
+                self.robot_or_none.table.close()
+            shutil.rmtree(self.temporary, ignore_errors=True)
+
+    # -- processes -----------------------------------------------------------------------------
+
+    def add_service(
+        self,
+        listen: str,
+        *options: str,
+        endpoint: str | None = None,
+        log_name: str = "cloud.log",
+        prefix: Sequence[str] = (),
+        proxy: Proxy | None = None,
+        namespace: NetworkNamespace | None = None,
+    ) -> ServiceCommand:
+        """Add a service, which is not started yet.
+
+        Parameters
+        ----------
+        options
+            Of ``holdfast serve``.
+        endpoint : str, optional
+            How the robot reaches it, if not where it listens.
+        """
+        arguments = ("serve", "--listen", listen, "--log", "json", "--until-stdin-closes", *options)
+        port = listen.rpartition(":")[2]
+        service = ServiceCommand(
+            lambda: self._start(arguments, log_name, prefix),
+            endpoint or listen,
+            int(port) if port.isdigit() else None,
+            proxy,
+            namespace,
+        )
+        self.services.append(service)
+        return service
+
+    def start_services(self) -> float:
+        """Start all services and wait until they are ready; return the slowest start in s."""
+        for service in self.services:
+            service.start()
+        self.wait_until(
+            lambda: all(service.ready_at is not None for service in self.services),
+            "all cloud services being ready",
+            _READY_S,
+        )
+        return max(service.start_s for service in self.services)
+
+    def start_robot(
+        self,
+        configuration: Path,
+        out: Path,
+        steps_of_trials: Sequence[int],
+        rate_hz: float,
+        *options: str,
+        prefix: Sequence[str] = (),
+    ) -> RobotCommand:
+        """Start the robot of a new run; one robot at a time.
+
+        Parameters
+        ----------
+        options
+            Of ``holdfast run``.
+        """
+        if self.robot_or_none is not None:
+            self.robot_or_none.process.close(_END_S)
+            self.robot_or_none.table.close()
+            self._scripts.clear()
+        arguments = ["run", str(configuration), *options, "--rate", f"{rate_hz:g}"]
+        arguments += ["--log", "json", "--out", str(out)]
+        # The robot ends with this process, however that ends.
+        self.robot_or_none = RobotCommand(
+            lambda more: self._start(
+                [*arguments, *more], ROBOT_LOG_NAME, (*prefix, *parent_death_prefix())
+            ),
+            out,
+            steps_of_trials,
+            rate_hz,
+        )
+        return self.robot_or_none
+
+    @property
+    def robot(self) -> RobotCommand:
+        """The robot that was started last."""
+        assert self.robot_or_none is not None, "no robot was started"
+        return self.robot_or_none
+
+    def _start(self, arguments: Sequence[str], log_name: str, prefix: Sequence[str]) -> Process:
+        environment = {**os.environ, _MARK: self._mark, "TMPDIR": str(self.temporary)}
+        process = Process(
+            (*self._prefix, *prefix, *HOLDFAST, *arguments),
+            environment,
+            log_path=self.directory / log_name,
+            deliver=lambda process, happened: self._happened.put((process, happened)),
+        )
+        self._processes.append(process)
+        return process
+
+    # -- faults --------------------------------------------------------------------------------
+
+    def run_script(self, script: Script) -> None:
+        """Advance a script in each turn of the loop, beside all others."""
+        self._scripts.append(_RunningScript(script))
+
+    def note_fault(self, kind: str, target: str, injected_at: float) -> InjectedFault:
+        """Note that a fault was injected."""
+        fault = InjectedFault(kind=kind, target=target, injected_at=injected_at)
+        self.faults.append(fault)
+        return fault
+
+    # -- the loop ------------------------------------------------------------------------------
+
+    def wait_until(
+        self,
+        done: Callable[[], bool],
+        what: str,
+        limit_s: float,
+        progress: Callable[[], object] = lambda: None,
+    ) -> None:
+        """Run the loop until something is so.
+
+        Parameters
+        ----------
+        what : str
+            Names it in messages.
+        limit_s : float
+            How long to wait; begins anew whenever the progress changes.
+
+        Raises
+        ------
+        NoProgressError
+            If it does not happen in time.
+        ProcessEndedError
+            If a process ends that was not killed.
+        """
+        began = moved_at = time.monotonic()
+        seen = progress()
+        while True:
+            if self.robot_or_none is not None:
+                self.robot_or_none.table.read()
+            self._scripts = [script for script in self._scripts if script.advance()]
+            self.on_turn()
+            if done():
+                return
+            now = time.monotonic()
+            if progress() != seen:
+                seen, moved_at = progress(), now
+            if now - moved_at > limit_s:
+                raise NoProgressError(f"waited {limit_s:.0f} s in vain for {what}")
+            if now - began > _LONGEST_S:
+                raise NoProgressError(f"waited {_LONGEST_S:.0f} s in vain for {what}")
+            self._take_what_happened()
+
+    def wait_for_end_of_run(self, limit_s: float) -> None:
+        """Wait until the robot's run has ended; the limit begins anew with each decision."""
+        robot = self.robot
+        self.wait_until(
+            lambda: robot.is_done,
+            f"the next of {robot.steps} steps",
+            limit_s,
+            lambda: (robot.num_processes, len(robot.decisions)),
+        )
+        robot.table.read()
+
+    def _take_what_happened(self) -> None:
+        with contextlib.suppress(Empty):
+            process, happened = self._happened.get(timeout=_TURN_S)
+            while True:
+                if isinstance(happened, Ended):
+                    self._note_end(process, happened.code)
+                elif self._is_robot(process):
+                    self.robot.events.append(happened)
+                process, happened = self._happened.get_nowait()
+
+    def _is_robot(self, process: Process) -> bool:
+        return self.robot_or_none is not None and self.robot_or_none.has(process)
+
+    def _note_end(self, process: Process, code: int) -> None:
+        if code == 0 and self._is_robot(process):
+            self.robot.is_done = True
+        elif not process.killed:
+            name = "robot" if self._is_robot(process) else "cloud service"
+            how = f"exit code {code}" if code >= 0 else signal.Signals(-code).name
+            last = process.last_line()
+            raise ProcessEndedError(
+                f"the {name} ended with {how}; see {process.log_path}"
+                + (f"; its last line: {last}" if last else "")
+            )
+
+
+class _RunningScript:
+    """A script and what it waits for."""
+
+    def __init__(self, script: Script) -> None:
+        self._script = script
+        self._is_ready: Callable[[], bool] = lambda: True
+
+    def advance(self) -> bool:
+        """Go on as far as possible; False at the end."""
+        try:
+            while self._is_ready():
+                self._is_ready = next(self._script)
+        except StopIteration:
+            return False
+        return True
+
+
+def after(duration_s: float) -> Callable[[], bool]:
+    """Return a condition that becomes true some time after this call."""
+    due = time.monotonic() + duration_s
+    return lambda: time.monotonic() >= due

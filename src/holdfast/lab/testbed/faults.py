@@ -1,0 +1,225 @@
+"""Kinds of fault, and what injecting each of them does to a testbed.
+
+Each fault is a script that waits for its step, does something, waits, and undoes it. Scripts run
+beside each other, so faults may overlap in any way.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import time
+from collections.abc import Callable
+from enum import StrEnum
+
+import msgspec
+
+from holdfast.lab.testbed.driver import Script, Testbed, after
+from holdfast.lab.testbed.fault_times import ROBOT
+from holdfast.lab.testbed.processes import local_services_of
+from holdfast.lab.testbed.proxy import Direction, Impairment
+from holdfast.robot.links import RECOVERY_SERVICE
+
+__all__ = ["DESCRIPTIONS", "NEEDS_NAMESPACE", "NEEDS_PROXY", "Fault", "FaultKind", "inject"]
+
+_LOCAL_DECIDES_S = 5.0
+"""How long the script that kills the local service waits for a decision of it."""
+
+
+class FaultKind(StrEnum):
+    """Kinds of fault, and of trials."""
+
+    CLOUD_KILLED = "cloud_killed"
+    CLOUD_STOPPED = "cloud_stopped"
+    LOCAL_KILLED = "local_killed"
+    ROBOT_KILLED = "robot_killed"
+    ROBOT_STOPPED = "robot_stopped"
+    REPLICAS_KILLED = "replicas_killed"
+    LINK_DELAYED = "link_delayed"
+    LINK_LOSSY = "link_lossy"
+    LINK_SILENT = "link_silent"
+    LINK_SILENT_ONE_WAY = "link_silent_one_way"
+    LINK_CUT = "link_cut"
+    PACKETS_LOST = "packets_lost"
+    PACKETS_DROPPED = "packets_dropped"
+    PACKETS_DROPPED_ONE_WAY = "packets_dropped_one_way"
+    COMBINATION = "combination"
+
+
+DESCRIPTIONS = {
+    FaultKind.CLOUD_KILLED: "the cloud service is killed (SIGKILL) and started again",
+    FaultKind.CLOUD_STOPPED: "the cloud service is stopped for a while (SIGSTOP, SIGCONT)",
+    FaultKind.LOCAL_KILLED: "the local service is killed while the cloud is away",
+    FaultKind.ROBOT_KILLED: "the robot's process is killed and resumed",
+    FaultKind.ROBOT_STOPPED: "the robot's process is stopped for a while",
+    FaultKind.REPLICAS_KILLED: "of two cloud services, one after the other is killed",
+    FaultKind.LINK_DELAYED: "a proxy adds latency and jitter",
+    FaultKind.LINK_LOSSY: "a proxy delivers late, as after lost packets",
+    FaultKind.LINK_SILENT: "a proxy lets nothing through, and breaks no connection",
+    FaultKind.LINK_SILENT_ONE_WAY: "a proxy lets nothing through in one direction",
+    FaultKind.LINK_CUT: "a proxy resets all connections and refuses new ones",
+    FaultKind.PACKETS_LOST: "nftables drops some packets, at random",
+    FaultKind.PACKETS_DROPPED: "nftables drops all packets",
+    FaultKind.PACKETS_DROPPED_ONE_WAY: "nftables drops all packets in one direction",
+    FaultKind.COMBINATION: "several of these at once",
+}
+
+NEEDS_NAMESPACE = frozenset(
+    {FaultKind.PACKETS_LOST, FaultKind.PACKETS_DROPPED, FaultKind.PACKETS_DROPPED_ONE_WAY}
+)
+"""Kinds that need nftables and a network namespace."""
+
+NEEDS_PROXY = frozenset(
+    {
+        FaultKind.LINK_DELAYED,
+        FaultKind.LINK_LOSSY,
+        FaultKind.LINK_SILENT,
+        FaultKind.LINK_SILENT_ONE_WAY,
+        FaultKind.LINK_CUT,
+    }
+)
+
+
+class Fault(msgspec.Struct, frozen=True, kw_only=True):
+    """One fault.
+
+    Attributes
+    ----------
+    at : float
+        When, as a fraction of the run's steps.
+    duration_s : float
+        How long until the killed process is started again, the stopped one resumed, or the line
+        healed.
+    cloud : int
+        Which cloud service, or the line to which one.
+    direction : {"both", "to_service", "to_robot"}
+    loss : float
+        Share of packets, or of the pieces that a proxy carries.
+    """
+
+    kind: FaultKind
+    at: float
+    duration_s: float
+    cloud: int = 0
+    direction: Direction = "both"
+    latency_ms: float = 0.0
+    jitter_ms: float = 0.0
+    loss: float = 0.0
+
+
+def inject(testbed: Testbed, fault: Fault) -> None:
+    """Have the testbed inject a fault once its robot has come to the fault's step."""
+    testbed.run_script(_at_its_step(testbed, fault))
+
+
+def _at_its_step(testbed: Testbed, fault: Fault) -> Script:
+    step = int(fault.at * testbed.robot.steps)
+    yield lambda: testbed.robot.steps_done >= step
+    scripts: dict[FaultKind, Callable[[Testbed, Fault], Script]] = {
+        FaultKind.CLOUD_KILLED: _kill_cloud,
+        FaultKind.REPLICAS_KILLED: _kill_cloud,
+        FaultKind.CLOUD_STOPPED: _stop_cloud,
+        FaultKind.LOCAL_KILLED: _kill_local,
+        FaultKind.ROBOT_KILLED: _kill_robot,
+        FaultKind.ROBOT_STOPPED: _stop_robot,
+    }
+    yield from scripts.get(fault.kind, _impair)(testbed, fault)
+
+
+def _kill_cloud(testbed: Testbed, fault: Fault) -> Script:
+    cloud = testbed.services[fault.cloud]
+    if cloud.is_away:
+        return  # the fault that killed it starts it again
+    injected = testbed.note_fault(fault.kind.value, cloud.endpoint, cloud.process.kill())
+    yield after(fault.duration_s)
+    cloud.start()
+    yield lambda: cloud.ready_at is not None
+    injected.usable_at = cloud.ready_at
+
+
+def _stop_cloud(testbed: Testbed, fault: Fault) -> Script:
+    cloud = testbed.services[fault.cloud]
+    if cloud.is_away:
+        return
+    process = cloud.process
+    injected = testbed.note_fault(fault.kind.value, cloud.endpoint, process.stop())
+    yield after(fault.duration_s)
+    if not process.killed:
+        injected.usable_at = process.resume()
+
+
+def _kill_local(testbed: Testbed, fault: Fault) -> Script:
+    """Kill all cloud services, and the local one once it decides."""
+    away = [cloud for cloud in testbed.services if not cloud.is_away]
+    for cloud in away:
+        cloud.process.kill()
+    killed_at = time.time()
+    back = after(fault.duration_s)
+    given_up = after(_LOCAL_DECIDES_S)
+
+    def local_decides() -> bool:
+        return any(
+            each.service == RECOVERY_SERVICE and each.at >= killed_at
+            for each in testbed.robot.decisions
+        )
+
+    yield lambda: given_up() or local_decides()
+    robot = testbed.robot.process
+    if not robot.killed:
+        for pid in local_services_of(robot.pid):
+            injected_at = time.time()
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+                testbed.note_fault(fault.kind.value, RECOVERY_SERVICE, injected_at)
+    yield back
+    for cloud in away:
+        cloud.start()
+
+
+def _kill_robot(testbed: Testbed, fault: Fault) -> Script:
+    process = testbed.robot.process
+    if process.killed:
+        return
+    injected_at = process.kill()
+    yield lambda: process.process.poll() is not None
+    if process.process.returncode == 0:
+        return  # the run had ended
+    injected = testbed.note_fault(fault.kind.value, ROBOT, injected_at)
+    yield after(fault.duration_s)
+    testbed.robot.resume()
+    injected.usable_at = testbed.robot.process.spawned_at
+
+
+def _stop_robot(testbed: Testbed, fault: Fault) -> Script:
+    process = testbed.robot.process
+    if process.killed:
+        return
+    injected = testbed.note_fault(fault.kind.value, ROBOT, process.stop())
+    yield after(fault.duration_s)
+    if not process.killed:
+        injected.usable_at = process.resume()
+
+
+def _impair(testbed: Testbed, fault: Fault) -> Script:
+    cloud = testbed.services[fault.cloud]
+    injected = testbed.note_fault(fault.kind.value, cloud.endpoint, time.time())
+    if fault.kind in NEEDS_NAMESPACE:
+        assert cloud.namespace is not None and cloud.port is not None
+        share = fault.loss if fault.kind is FaultKind.PACKETS_LOST else 1.0
+        heal = cloud.namespace.drop(cloud.port, fault.direction, share)
+    else:
+        assert cloud.proxy is not None
+        heal = cloud.proxy.impair(
+            Impairment(
+                direction=fault.direction,
+                latency_s=1e-3 * fault.latency_ms,
+                jitter_s=1e-3 * fault.jitter_ms,
+                loss=fault.loss,
+                silent=fault.kind in (FaultKind.LINK_SILENT, FaultKind.LINK_SILENT_ONE_WAY),
+                cut=fault.kind is FaultKind.LINK_CUT,
+            )
+        )
+    yield after(fault.duration_s)
+    injected.usable_at = time.time()
+    heal()

@@ -1,0 +1,406 @@
+"""A bad line on demand: a proxy that delays, loses, falls silent and cuts.
+
+It stands between one robot and one service. Like TCP, it never changes, reorders or drops a byte of
+an open stream. On a real line a lost packet is sent again after a timeout, and everything behind it
+waits; so here loss makes a piece late. On a silent line all pieces, and the ends of connections,
+are late until it is healed. Only a cut breaks connections: it resets both ends and refuses new
+ones.
+
+It may carry datagrams beside streams, at the same port. Loss and silence drop datagrams, and jitter
+reorders them.
+
+Several impairments may be active at the same time; a piece suffers from all of them. The queue of
+pieces is bounded: when it is full, the proxy stops reading, as with a full TCP window.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import random
+import socket
+import struct
+import threading
+from collections.abc import Callable, Coroutine
+from concurrent.futures import Future
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Literal, Self, TypeAlias
+
+from holdfast.lab.errors import CannotStartError
+
+__all__ = ["Direction", "Impairment", "Place", "Proxy"]
+
+Direction: TypeAlias = Literal["both", "to_service", "to_robot"]
+
+Place: TypeAlias = int | Path
+"""A port of 127.0.0.1, or the path of a local socket."""
+
+_PIECE_BYTES = 65_536
+_PIECES_WAITING = 64
+_START_TIMEOUT_S = 10.0
+_RETRANSMISSION_S = 0.2
+"""Linux sends a lost packet again after this time or longer, on a line that is short."""
+
+_RESET_ON_CLOSE = struct.pack("ii", 1, 0)
+_BACKLOG = 16
+_LARGEST_DATAGRAM = 65_536
+_MOST_CLIENTS = 64
+
+
+@dataclass(frozen=True, kw_only=True)
+class Impairment:
+    """An impairment of the line.
+
+    Attributes
+    ----------
+    direction : {"both", "to_service", "to_robot"}
+        Which pieces it affects. A cut has no direction.
+    latency_s, jitter_s : float
+        Each piece is late by the latency and up to the jitter.
+    loss : float
+        Share of pieces that are late by TCP's retransmission timeout, and of datagrams that are
+        dropped.
+    silent : bool
+        Nothing gets through.
+    cut : bool
+        Connections are reset and refused.
+    """
+
+    direction: Direction = "both"
+    latency_s: float = 0.0
+    jitter_s: float = 0.0
+    loss: float = 0.0
+    silent: bool = False
+    cut: bool = False
+
+
+class Proxy:
+    """A line to a service on this machine; to be used in a ``with`` statement.
+
+    Parameters
+    ----------
+    place : int or Path
+        Where it listens.
+    target : int or Path
+        Where the service listens. If nothing does, connections are closed at once.
+    seed : str
+        Of the jitter and the losses.
+    datagrams : bool
+        Whether it carries datagrams between the same ports, too.
+
+    Raises
+    ------
+    CannotStartError
+        If it cannot listen.
+    """
+
+    def __init__(self, place: Place, target: Place, seed: str, *, datagrams: bool = False) -> None:
+        self._place = place
+        self._target = target
+        self._chance = random.Random(seed)
+        self._impairments: dict[int, Impairment] = {}
+        self._numbers = 0
+        self._listener: socket.socket | None = None
+        self._datagrams: socket.socket | None = None
+        self._carries_datagrams = datagrams
+        self._clients: dict[Any, socket.socket] = {}
+        self._connections: set[asyncio.Task[None]] = set()
+        self._sockets: set[socket.socket] = set()
+        self._loop = asyncio.new_event_loop()
+        self._changed = asyncio.Event()
+        self._thread = threading.Thread(target=self._run, name=f"proxy-{place}", daemon=True)
+        self._thread.start()
+        try:
+            self._call(self._listen())
+        except OSError as error:
+            self.close()
+            named = place if isinstance(place, Path) else f"127.0.0.1:{place}"
+            raise CannotStartError(
+                f"the proxy cannot listen on {named}: {error.strerror}"
+            ) from error
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def impair(self, impairment: Impairment) -> Callable[[], None]:
+        """Put an impairment on the line.
+
+        Returns
+        -------
+        callable
+            Takes it away again; may be called more than once.
+        """
+        number = self._numbers
+        self._numbers += 1
+        self._call(self._add(number, impairment))
+        return lambda: self._call(self._remove(number))
+
+    def close(self) -> None:
+        """Reset all connections, and listen no more; may be repeated."""
+        if not self._thread.is_alive():
+            return
+        self._call(self._end())
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join()
+        self._loop.close()
+
+    # -- on the thread of the loop -------------------------------------------------------------
+
+    def _run(self) -> None:
+        asyncio.set_event_loop(self._loop)
+        self._loop.run_forever()
+
+    def _call(self, coroutine: Coroutine[Any, Any, None]) -> None:
+        if self._loop.is_closed():
+            coroutine.close()
+            return
+        future: Future[None] = asyncio.run_coroutine_threadsafe(coroutine, self._loop)
+        future.result(_START_TIMEOUT_S)
+
+    async def _listen(self) -> None:
+        self._listener = self._bound()
+        self._open(self._listener)
+        self._open_datagrams()
+
+    def _open(self, listener: socket.socket) -> None:
+        listener.listen(_BACKLOG)
+        self._loop.add_reader(listener, self._accept, listener)
+
+    def _bound(self, kind: socket.SocketKind = socket.SOCK_STREAM) -> socket.socket:
+        place = self._place
+        if isinstance(place, Path):
+            place.unlink(missing_ok=True)
+        bound = socket.socket(_family(place), kind)
+        try:
+            if kind == socket.SOCK_STREAM:
+                bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            bound.bind(_address(place))
+            bound.setblocking(False)
+        except BaseException:
+            bound.close()
+            raise
+        return bound
+
+    async def _add(self, number: int, impairment: Impairment) -> None:
+        was_cut = self._is_cut()
+        self._impairments[number] = impairment
+        self._tell()
+        if impairment.cut and not was_cut:
+            await self._hang_up()
+            # A port that is bound but not listened on refuses connections, and stays reserved.
+            self._listener = self._bound()
+            if self._carries_datagrams:
+                # Connected to itself, it refuses all other senders.
+                self._datagrams = self._bound(socket.SOCK_DGRAM)
+                self._datagrams.connect(_address(self._place))
+
+    async def _remove(self, number: int) -> None:
+        was_cut = self._is_cut()
+        self._impairments.pop(number, None)
+        self._tell()
+        if was_cut and not self._is_cut():
+            assert self._listener is not None
+            self._open(self._listener)
+            self._close_datagrams()
+            self._open_datagrams()
+
+    async def _end(self) -> None:
+        self._impairments.clear()
+        self._tell()
+        await self._hang_up()
+
+    async def _hang_up(self) -> None:
+        """Stop listening, and reset all connections."""
+        if self._listener is not None:
+            self._loop.remove_reader(self._listener)
+        tasks = list(self._connections)
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+        for each in self._sockets:
+            each.close()
+        self._sockets.clear()
+        if self._listener is not None:
+            self._listener.close()
+            self._listener = None
+        self._close_datagrams()
+
+    def _tell(self) -> None:
+        """Wake the tasks that wait for a change of the line."""
+        self._changed.set()
+        self._changed = asyncio.Event()
+
+    def _is_cut(self) -> bool:
+        return any(each.cut for each in self._impairments.values())
+
+    def _is_silent(self, direction: Direction) -> bool:
+        return any(
+            each.silent and each.direction in ("both", direction)
+            for each in self._impairments.values()
+        )
+
+    def _fate(self, direction: Direction) -> tuple[float, int]:
+        """Return by how much something comes later, and how often it is lost."""
+        delay_s, losses = 0.0, 0
+        for each in self._impairments.values():
+            if each.direction in ("both", direction):
+                delay_s += each.latency_s + each.jitter_s * self._chance.random()
+                losses += each.loss > 0.0 and self._chance.random() < each.loss
+        return delay_s, losses
+
+    def _delay_s(self, direction: Direction) -> float:
+        delay_s, losses = self._fate(direction)
+        return delay_s + losses * _RETRANSMISSION_S
+
+    async def _until_heard(self, direction: Direction) -> None:
+        while self._is_silent(direction):
+            await self._changed.wait()
+
+    def _accept(self, listener: socket.socket) -> None:
+        try:
+            robot, _ = listener.accept()
+        except OSError:
+            return  # the client has gone again
+        self._take(robot)
+        task = self._loop.create_task(self._connect(robot))
+        self._connections.add(task)
+        task.add_done_callback(self._connections.discard)
+
+    def _take(self, each: socket.socket) -> None:
+        each.setblocking(False)
+        if each.family != socket.AF_UNIX:
+            each.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            # Until an end comes in order, whatever closes it resets it.
+            each.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET_ON_CLOSE)
+        self._sockets.add(each)
+
+    async def _connect(self, robot: socket.socket) -> None:
+        """Carry one connection from its beginning to its end."""
+        service = socket.socket(_family(self._target))
+        try:
+            self._take(service)
+            # On a silent line not even the first packet of a connection comes through.
+            await self._until_heard("to_service")
+            await self._until_heard("to_robot")
+            await self._loop.sock_connect(service, _address(self._target))
+            async with asyncio.TaskGroup() as group:
+                group.create_task(self._carry(robot, service, "to_service"))
+                group.create_task(self._carry(service, robot, "to_robot"))
+        except* OSError:
+            pass  # reset by one end: so the other is reset as well, now
+        finally:
+            for each in (robot, service):
+                self._sockets.discard(each)
+                each.close()
+
+    async def _carry(
+        self, source: socket.socket, sink: socket.socket, direction: Direction
+    ) -> None:
+        pieces: asyncio.Queue[tuple[float, bytes]] = asyncio.Queue(_PIECES_WAITING)
+        reader = self._loop.create_task(self._read(source, pieces, direction))
+        try:
+            while True:
+                due, piece = await pieces.get()
+                await asyncio.sleep(max(0.0, due - self._loop.time()))
+                await self._until_heard(direction)
+                if not piece:
+                    break
+                await self._loop.sock_sendall(sink, piece)
+            with contextlib.suppress(OSError):
+                sink.shutdown(socket.SHUT_WR)
+        finally:
+            reader.cancel()
+        await reader
+
+    async def _read(
+        self,
+        source: socket.socket,
+        pieces: asyncio.Queue[tuple[float, bytes]],
+        direction: Direction,
+    ) -> None:
+        """Queue what comes, with the time at which it is due; the last piece is empty."""
+        due = 0.0
+        while True:
+            try:
+                piece = await self._loop.sock_recv(source, _PIECE_BYTES)
+            except OSError:
+                piece = b""
+            # No piece overtakes another.
+            due = max(due, self._loop.time() + self._delay_s(direction))
+            await pieces.put((due, piece))
+            if not piece:
+                return
+
+    # -- datagrams -------------------------------------------------------------------------------
+
+    def _open_datagrams(self) -> None:
+        if self._carries_datagrams:
+            self._datagrams = self._bound(socket.SOCK_DGRAM)
+            self._loop.add_reader(self._datagrams, self._questions_come, self._datagrams)
+
+    def _close_datagrams(self) -> None:
+        for each in (*self._clients.values(), *([self._datagrams] if self._datagrams else [])):
+            self._loop.remove_reader(each)
+            each.close()
+        self._clients.clear()
+        self._datagrams = None
+
+    def _questions_come(self, listener: socket.socket) -> None:
+        with contextlib.suppress(OSError):  # no more of them, or an earlier one went nowhere
+            while True:
+                content, address = listener.recvfrom(_LARGEST_DATAGRAM)
+                client = self._clients.pop(address, None) or self._new_client(address)
+                self._clients[address] = client  # now the last of all
+                self._carry_datagram(content, "to_service", client, None)
+
+    def _new_client(self, address: Any) -> socket.socket:
+        """Give a client a socket of its own, so that the service's answers find it."""
+        while len(self._clients) >= _MOST_CLIENTS:
+            oldest = self._clients.pop(next(iter(self._clients)))
+            self._loop.remove_reader(oldest)
+            oldest.close()
+        client = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        client.setblocking(False)
+        client.connect(_address(self._target))
+        self._loop.add_reader(client, self._answers_come, client, address)
+        return client
+
+    def _answers_come(self, client: socket.socket, address: Any) -> None:
+        with contextlib.suppress(OSError):
+            while True:
+                content = client.recv(_LARGEST_DATAGRAM)
+                if self._datagrams is not None:
+                    self._carry_datagram(content, "to_robot", self._datagrams, address)
+
+    def _carry_datagram(
+        self, content: bytes, direction: Direction, sender: socket.socket, address: Any
+    ) -> None:
+        delay_s, losses = self._fate(direction)
+        if not losses and not self._is_silent(direction):
+            self._loop.call_later(delay_s, self._send_datagram, content, sender, address)
+
+    @staticmethod
+    def _send_datagram(content: bytes, sender: socket.socket, address: Any) -> None:
+        with contextlib.suppress(OSError):  # no room, no receiver, or a cut line
+            if address is None:
+                sender.send(content)
+            else:
+                sender.sendto(content, address)
+
+
+def _family(place: Place) -> socket.AddressFamily:
+    return socket.AF_UNIX if isinstance(place, Path) else socket.AF_INET
+
+
+def _address(place: Place) -> Any:
+    return str(place) if isinstance(place, Path) else ("127.0.0.1", place)

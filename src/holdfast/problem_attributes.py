@@ -1,0 +1,292 @@
+"""What a problem declares about itself: its sizes, sensing actions, resolution and prices.
+
+A problem is a user's own code, and NumPy forgives much: an array that does not fit broadcasts, and
+the decisions are quietly wrong. So its attributes are checked before the first step, and
+:mod:`holdfast.checked` checks what its functions return. Here a problem is any object, which may
+or may not have the members of :class:`holdfast.problems.problem.Problem`.
+"""
+
+from __future__ import annotations
+
+import functools
+import inspect
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from holdfast.arrays import FloatArray, in_brief
+from holdfast.errors import InvalidValueError, ProblemError
+
+__all__ = [
+    "check_problem",
+    "check_sizes",
+    "first_reward",
+    "has_general_observations",
+    "has_own",
+    "name_of",
+    "resolution_of",
+    "sensing_costs",
+]
+
+
+MAX_SENSING_COST = 1e150
+"""So that no sum of prices, and no square of one, is too large for a float."""
+
+PARAMETERS: Mapping[str, tuple[str, ...]] = {
+    "initial_states": ("stream", "count"),
+    "move": ("states", "actions", "stream"),
+    "expected_move": ("states", "actions"),
+    "expected_path": ("states", "stage", "offsets", "threads"),
+    "observation_mean": ("states", "sensing_action"),
+    "observation_variance": ("states", "sensing_action"),
+    "policy": ("states", "stage"),
+    "next_stage": ("estimates", "stage"),
+    "execute": ("actions",),
+    "reward": ("states", "actions"),
+    "is_goal": ("states",),
+    "scene": (),
+    "log_likelihood": ("states", "sensing_action", "observation"),
+    "sample_observation": ("state", "sensing_action", "stream"),
+    "known_state_return": ("states", "stages"),
+    "move_each": ("states", "actions", "streams", "threads"),
+}
+"""Arguments of a problem's functions, by position."""
+
+GAUSSIAN_OBSERVATIONS = ("observation_mean", "observation_variance")
+"""Functions that a problem with a likelihood of its own need not have."""
+
+
+def check_problem(problem: Any) -> None:
+    """Check all that can be checked without calling a function of the problem.
+
+    Raises
+    ------
+    ProblemError
+        If an attribute is missing or out of bounds, a function cannot be called as it will be, or
+        only one of ``log_likelihood`` and ``sample_observation`` is there.
+    """
+    check_sizes(problem)
+    name = problem.name
+    actions = getattr(problem, "sensing_actions", ())
+    if isinstance(actions, str) or not isinstance(actions, Sequence) or not actions:
+        raise ProblemError(
+            f"sensing_actions of {name} is {actions!r:.80}: must be a sequence of labels, not empty"
+        )
+    for label in actions:
+        if not isinstance(label, str):
+            raise ProblemError(f"sensing_actions of {name} has {label!r:.80}: labels must be text")
+    sensing_costs(problem)
+    labels = getattr(problem, "state_labels", ())
+    if labels and len(labels) != problem.state_size:
+        raise ProblemError(
+            f"state_labels of {name} has {len(labels)} labels: must have {problem.state_size} or "
+            "none"
+        )
+    _check_resolution(problem, "resolution", "an action", problem.action_size)
+    if getattr(problem, "state_resolution", None) is not None:
+        _check_resolution(problem, "state_resolution", "a state", problem.state_size)
+    variance = getattr(problem, "motion_variance", ())
+    numbers = _numbers(variance)
+    fits = numbers is not None and numbers.shape == (problem.action_size,)
+    if numbers is None or not fits or not (numbers >= 0.0).all():
+        raise ProblemError(
+            f"motion_variance of {name} is {in_brief(variance)}: must be {problem.action_size} "
+            "numbers >= 0"
+        )
+    given = [
+        function
+        for function in ("log_likelihood", "sample_observation")
+        if hasattr(problem, function)
+    ]
+    if len(given) == 1:
+        raise ProblemError(
+            f"{name} has {given[0]} alone: log_likelihood and sample_observation go together"
+        )
+    for function, parameters in PARAMETERS.items():
+        if hasattr(problem, function):
+            _check_parameters(name, function, getattr(problem, function), parameters)
+
+
+def check_sizes(problem: Any) -> None:
+    """Check the name and the sizes, which every use of a problem needs.
+
+    Raises
+    ------
+    ProblemError
+        If one of them is missing or out of bounds.
+    """
+    kind = type(problem).__name__
+    name = getattr(problem, "name", "")
+    if not isinstance(name, str) or not name:
+        raise ProblemError(f"name of {kind} is {name!r}: must be a text, not empty")
+    for attribute in ("state_size", "action_size", "num_stages"):
+        size = getattr(problem, attribute, None)
+        if not isinstance(size, int) or size < 1:
+            raise ProblemError(f"{attribute} of {name} is {size!r}: must be a whole number >= 1")
+
+
+def _check_resolution(problem: Any, attribute: str, of_what: str, size: int) -> None:
+    value = getattr(problem, attribute, None)
+    numbers = _numbers(value)
+    # A comparison with NaN is false.
+    usable = numbers is not None and ((numbers > 0.0) & (numbers < np.inf)).all()
+    if numbers is not None and numbers.ndim == 0 and not usable:
+        raise ProblemError(
+            f"{attribute} of {problem.name} is {numbers.item()!r}: must be positive and finite"
+        )
+    if numbers is None or not usable or numbers.shape not in ((), (size,)):
+        raise ProblemError(
+            f"{attribute} of {problem.name} is {in_brief(value)}: must be one number or {size}, "
+            f"one for each coordinate of {of_what}, positive and finite"
+        )
+
+
+def _numbers(value: object) -> npt.NDArray[Any] | None:
+    """Return an array of a number or of numbers; None for anything else, truth values included."""
+    try:
+        numbers = np.asarray(value)
+    except (TypeError, ValueError):
+        return None  # A ragged list.
+    return numbers if numbers.dtype.kind in "fiu" else None
+
+
+def resolution_of(
+    problem: Any, given: float | Sequence[float] | None, *, of_states: bool
+) -> float | FloatArray:
+    """Return the resolution of the points whose entropy counts.
+
+    Parameters
+    ----------
+    given : float or sequence of float, optional
+        ``selector.resolution``; None for the problem's own.
+    of_states : bool
+        Whether the points are states instead of actions.
+
+    Returns
+    -------
+    float or array
+        One number for all coordinates, or one for each.
+
+    Raises
+    ------
+    InvalidValueError
+        If the numbers are not as many as the coordinates.
+    """
+    of_what, size = ("a state", "state_size") if of_states else ("an action", "action_size")
+    if given is not None:
+        if isinstance(given, (int, float)):
+            return given
+        count = getattr(problem, size)
+        if len(given) != count:
+            raise InvalidValueError(
+                f"selector.resolution is {list(given)}, {len(given)} numbers; need one number, or "
+                f"{count} for {name_of(problem)}, one for each coordinate of {of_what}"
+            )
+        return np.array(given, dtype=np.float64)
+    attribute = "resolution"
+    if of_states and getattr(problem, "state_resolution", None) is not None:
+        attribute = "state_resolution"
+    own = getattr(problem, attribute)
+    # A configuration asks before check_problem has.
+    numbers = _numbers(own)
+    if numbers is None:
+        raise ProblemError(f"{attribute} of {name_of(problem)} is {own!r:.80}: must be numbers")
+    if numbers.ndim == 0:
+        return own if isinstance(own, (int, float)) else float(numbers)
+    if of_states and attribute == "resolution" and problem.state_size != problem.action_size:
+        raise InvalidValueError(
+            f"selector.method is state_entropy, but the resolution of {name_of(problem)} has "
+            f"{numbers.size} numbers, for the coordinates of an action, and a state has "
+            f"{problem.state_size}; give the problem a state_resolution, one number or "
+            f"{problem.state_size}, or write selector.resolution"
+        )
+    return numbers.astype(np.float64)
+
+
+def _check_parameters(name: str, function: str, own: Any, parameters: tuple[str, ...]) -> None:
+    wanted = f"{function}({', '.join(parameters)})"
+    if not callable(own):
+        raise ProblemError(f"{function} of {name} is {own!r}: must be a function, {wanted}")
+    # The result for a class is kept: each trial checks its problem.
+    if inspect.ismethod(own):
+        takes = _takes(own.__func__, (None, *parameters))
+    else:
+        takes = _takes.__wrapped__(own, parameters)
+    if takes is not None:
+        raise ProblemError(f"{function} of {name} takes {takes}: it is called as {wanted}")
+
+
+@functools.lru_cache(maxsize=1000)
+def _takes(function: Any, arguments: tuple[str | None, ...]) -> str | None:
+    """Return what a function takes, if it cannot be called with so many arguments."""
+    try:
+        signature = inspect.signature(function)
+    except (TypeError, ValueError):
+        return None  # Some compiled functions have no signature.
+    try:
+        signature.bind(*arguments)
+    except TypeError:
+        return str(signature)
+    return None
+
+
+def sensing_costs(problem: Any) -> FloatArray:
+    """Return the checked price of each sensing action, shape ``(J,)``; zeros if there is none."""
+    count = len(problem.sensing_actions)
+    given = getattr(problem, "sensing_costs", None)
+    if given is None:
+        return np.zeros(count)
+    costs = _numbers(given)
+    # A comparison with NaN is false.
+    if (
+        costs is None
+        or costs.shape != (count,)
+        or not ((costs >= 0.0) & (costs <= MAX_SENSING_COST)).all()
+    ):
+        raise ProblemError(
+            f"sensing_costs of {name_of(problem)} is {in_brief(given)}: must be {count} "
+            f"numbers from 0 to {MAX_SENSING_COST:g}, one for each sensing action"
+        )
+    return costs.astype(np.float64)
+
+
+def first_reward(problem: Any) -> float | None:
+    """Return a trial's reward before its first step: 0.0 if sensing has prices, else None."""
+    return None if getattr(problem, "sensing_costs", None) is None else 0.0
+
+
+def has_general_observations(problem: object) -> bool:
+    """Tell whether a problem gives a likelihood of its own instead of a Gaussian one."""
+    return hasattr(problem, "log_likelihood")
+
+
+def has_own(problem: Any, function: str, stands_for: tuple[str, ...]) -> bool:
+    """Tell whether a problem's function agrees with those that it stands for.
+
+    It does not if a subclass or instance replaces one of ``stands_for`` and inherits ``function``:
+    an inherited ``expected_path`` does not follow a new ``policy``.
+    """
+    if not hasattr(problem, function):
+        return False
+    own = getattr(problem, "__dict__", {})
+    if any(name in own for name in (function, *stands_for)):
+        return function in own
+    kind: type = type(problem)
+    return _agrees(kind, function, stands_for)
+
+
+@functools.lru_cache(maxsize=1000)
+def _agrees(kind: type, function: str, stands_for: tuple[str, ...]) -> bool:
+    for base in kind.__mro__:
+        if function in vars(base):
+            return True
+        if any(name in vars(base) for name in stands_for):
+            return False
+    return True
+
+
+def name_of(problem: Any) -> str:
+    """Return what messages call a problem, even one without a name."""
+    return getattr(problem, "name", "") or type(problem).__name__

@@ -1,0 +1,578 @@
+"""Chooses the service that answers the robot's current question.
+
+All services give the same answer, because a decision is a function of the state in the question. So
+the choice affects only time, and a wrong choice costs only time:
+
+- The configured services, together *the cloud*, are tried in their order of preference.
+- If none of them is usable, the local service decides (status *local recovery*) and is launched if
+  it does not run. Each question still goes to the cloud as well; its first answer ends the recovery
+  (status *keep alive*).
+- A late decision may also be requested from a running local service (hedging, within a budget).
+- If no service is usable, the robot holds still, reports that, and keeps trying all of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+
+from holdfast.config.settings import OffloadSettings, RecoverySettings
+from holdfast.errors import HoldfastError, OwnDecisionError, ServiceRefusedError, StaleEpochError
+from holdfast.problems.problem import Problem
+from holdfast.protocol.events import (
+    CallEnded,
+    Effects,
+    Halt,
+    Launch,
+    OwnAnswer,
+    Planned,
+    ReplyReceived,
+    RobotEffect,
+    ServiceAppeared,
+    ServiceVanished,
+    TransportEvent,
+)
+from holdfast.protocol.hedging import HedgingBudget
+from holdfast.protocol.messages import SessionConfiguration
+from holdfast.protocol.question import Question
+from holdfast.protocol.replica_set import Replica, ReplicaSet
+from holdfast.protocol.requests import OpenRequest, OpenRequests, ReplyHandler, ReplyOutcome
+from holdfast.protocol.restart_policy import RestartPolicy
+from holdfast.protocol.stall_reporter import StallReporter
+from holdfast.protocol.status import Cause, Status, StatusTracker
+from holdfast.protocol.verification import Verification
+
+__all__ = [
+    "Dispatcher",
+]
+
+
+class Dispatcher:
+    """Gets one question at a time answered by the services.
+
+    It lives as long as the run. See :class:`~holdfast.protocol.decision_source.DecisionSource`.
+
+    Parameters
+    ----------
+    services : sequence of str
+        The cloud's services in order of preference, at least one.
+    local_service_name : str or None
+        Name of the local service; None if there is none.
+    problem : Problem
+        To check answers.
+    secret : bytes
+        Known only to this robot; selects the answers that are recomputed.
+    distrusted : collection of str
+        Services that answered wrongly earlier in this run.
+    """
+
+    def __init__(
+        self,
+        services: Sequence[str],
+        local_service_name: str | None,
+        offload: OffloadSettings,
+        recovery_settings: RecoverySettings,
+        session: bytes,
+        epoch: int,
+        session_configuration: SessionConfiguration,
+        problem: Problem,
+        secret: bytes,
+        distrusted: Collection[str] = (),
+    ) -> None:
+        timeout_s = 1e-3 * offload.detection_timeout_ms
+        wanted = recovery_settings.launch != "never"
+        self._timeout_s = timeout_s
+        self._limit_s = 1e-3 * offload.decision_timeout_ms
+        self._launch_at_start = recovery_settings.launch == "at_start"
+        self.effects: Effects[RobotEffect] = Effects()
+        self._services = ReplicaSet(
+            services,
+            local_service_name if wanted else None,
+            timeout_s,
+            1e-3 * offload.startup_timeout_ms,
+            distrusted,
+        )
+        self._calls = OpenRequests(session, epoch, session_configuration, timeout_s, self.effects)
+        self._verification = Verification(
+            offload.verify_share, secret, local_service_name, problem, self.effects
+        )
+        self._replies = ReplyHandler(self._calls, problem, self._verification, self.effects)
+        self._launches = RestartPolicy(recovery_settings)
+        self._hedging = HedgingBudget(offload)
+        self._stalls = StallReporter(timeout_s, self.effects)
+        self._woke_at = float("-inf")
+        self.stopped = False
+        self.question: Question | None = None
+        self._tracker = StatusTracker()
+
+    # -- what the robot's loop asks for ----------------------------------------------------------
+
+    def start(self, now: float) -> None:
+        """Begin the run."""
+        self._services.start(now)
+        for replica in self._services:
+            if replica.distrusted is not None:
+                self.effects.report("distrusted", service=replica.name, reason=replica.distrusted)
+        if self._services.local is not None and self._launch_at_start:
+            self._launches.want(now)
+            self.wake(now)
+
+    def ask(self, question: Question, now: float) -> None:
+        """Replace the question."""
+        self.question = question
+        self._hedging.earn()
+        for call in self._calls:
+            # A service that has not answered yet may still do so, and is then known to live; but
+            # one that already gave a part has shown that.
+            if call.answered:
+                self._calls.abandon(call)
+        self.wake(now)
+        self._try_others(now)
+
+    def drop(self) -> None:
+        """Drop the question: the trial has ended, or its answer is of no use."""
+        self.question = None
+        for call in self._calls:
+            if call.answered or call.replica is self._services.local:
+                self._calls.abandon(call)
+        self._stalls.forget()
+
+    def need(self, now: float) -> None:
+        """Note that the robot waits for the rest of the answer."""
+        if self.question is not None and self.question.needed_at is None:
+            self.question.wait(now)
+            self.wake(now)
+
+    def go_on(self) -> None:
+        """Note that the robot no longer waits."""
+        if self.question is not None:
+            self.question.stop_waiting()
+
+    # -- what happens ----------------------------------------------------------------------------
+
+    def handle(self, event: TransportEvent | Planned, now: float) -> None:
+        """Handle an event of the transport."""
+        if isinstance(event, ReplyReceived):
+            call = self._calls.get(event.call)
+            if call is not None:
+                self._replied(call, event.payload, now)
+        elif isinstance(event, CallEnded):
+            call = self._calls.get(event.call)
+            if call is not None:
+                self._ended(call, now)
+        elif isinstance(event, ServiceAppeared):
+            self._appeared(self._services.get(event.service), event.incarnation, now)
+        elif isinstance(event, ServiceVanished):
+            self._vanished(self._services.get(event.service), event.incarnation, now)
+        self.wake(now)
+
+    def decided(self, event: OwnAnswer, performed: int, now: float) -> None:
+        """Take the answer of the robot's own planner.
+
+        Parameters
+        ----------
+        performed : int
+            Task actions of the current question that are performed or ordered.
+        """
+        try:
+            usable = self._verification.decided(event, self.question, performed)
+        except OwnDecisionError as error:
+            self._stop(error)
+            return
+        if not usable:
+            # What was done cannot be undone; from where it led, a new question is asked.
+            self.drop()
+        self._drop_wrong_services()
+        self.wake(now)
+
+    def check(self) -> None:
+        """Have the own planner recompute the answer, because it did not fit the robot's state."""
+        question = self.question
+        if question is not None and question.parts:
+            self._verification.check(question, question.parts[0].service)
+
+    def dispute(self) -> None:
+        """Have the own planner answer before the robot acts."""
+        question = self.question
+        if question is not None and question.parts:
+            self._verification.dispute(question, question.parts[0].service)
+
+    @property
+    def status(self) -> Status:
+        """Which service decides."""
+        return self._tracker.status
+
+    @property
+    def recoveries(self) -> int:
+        """Times that the local service took over."""
+        return self._tracker.recoveries
+
+    @property
+    def limits_are_reliable(self) -> bool:
+        """Whether an action that the problem's ``execute`` would change must be wrong."""
+        return self._verification.limits_are_reliable
+
+    @property
+    def is_holding(self) -> bool:
+        """Whether the robot holds still because no service is usable."""
+        return self._stalls.is_holding
+
+    @property
+    def num_unverified(self) -> int:
+        """Questions that the own planner still has to answer."""
+        return len(self._verification)
+
+    def recovery_exited(self, launch: int, reason: str, now: float) -> None:
+        """Handle the end of a local service's process, or its failure to start."""
+        local, launches = self._services.local, self._launches
+        if local is None:
+            return
+        self.effects.report("recovery_exited", reason=reason)
+        if launch != launches.number or launches.pending:
+            return  # It was seen to be gone before; only the reason is new.
+        if local.detector.incarnation is not None:
+            self._vanished(local, local.detector.incarnation, now)
+        else:
+            launches.failed(now)
+        self.wake(now)
+
+    def next_wakeup(self) -> float | None:
+        """Return when :meth:`wake` is due if nothing happens before; None if never."""
+        if self.stopped:
+            return None
+        services, question = self._services, self.question
+        due: list[float | None] = []
+        if self._calls:
+            due += [replica.detector.deadline() for replica in services]
+            due.append(self._calls.first_sent_at() + self._limit_s)
+        if question is not None and question.disputed and question.needed_at is not None:
+            due.append(question.needed_at + self._limit_s)
+        if question is not None and question.is_open:
+            if not self._is_being_asked(question, self._woke_at):
+                due += [
+                    self._calls.retry_at(replica, question)
+                    for replica in services
+                    if replica.detector.present and replica.refusal is None
+                ]
+                if services.is_starting(self._woke_at):
+                    due.append(services.startup_until)
+            elif question.needed_at is not None:
+                due += [self._calls.probe_at(replica, question) for replica in services.cloud]
+                due.append(question.needed_at + self._timeout_s)
+            due.append(self._stalls.waiting_at(question))
+            due.append(self._hedge_at(question))
+        local = services.local
+        if local is not None:
+            due.append(self._launches.next_wakeup(present=local.detector.present))
+        # What was due when we worked last has been looked at; only something new can change it.
+        later = [at for at in due if at is not None and at > self._woke_at]
+        return min(later, default=None)
+
+    def event_loop_stalled(self, seconds: float) -> None:
+        """Excuse the services: for so long the robot's process could not receive."""
+        for replica in self._services:
+            replica.detector.excuse(seconds)
+
+    # -- presence --------------------------------------------------------------------------------
+
+    def _appeared(self, replica: Replica | None, incarnation: str, now: float) -> None:
+        if replica is None or not replica.detector.appeared(incarnation):
+            return
+        self._calls.abandon_all(replica)
+        if incarnation != replica.last_incarnation:
+            replica.forget()
+            replica.last_incarnation = incarnation
+        if replica is self._services.local:
+            launched_s = self._launches.since_launch_s(now)
+            if launched_s is not None:
+                self.effects.report("launched", launch_ms=1e3 * launched_s)
+            return
+        self.effects.report("service_appeared", service=replica.name)
+        question = self.question
+        if self._tracker.is_recovering and question is not None and replica.refusal is None:
+            # It need not wait for the next turn: with an answer to this one it holds the state.
+            self._calls.send(replica, question, now, is_retry=False)
+
+    def _vanished(self, replica: Replica | None, incarnation: str, now: float) -> None:
+        if replica is None or not replica.detector.vanished(incarnation):
+            return
+        self._calls.abandon_all(replica)
+        self.effects.report("service_vanished", service=replica.name)
+        if replica is self._services.local:
+            self._launches.ended(now)
+
+    def _replied(self, call: OpenRequest, payload: bytes, now: float) -> None:
+        replica, question = call.replica, call.question
+        try:
+            outcome = self._replies.take(call, payload, now)
+        except StaleEpochError as error:
+            self._stop(error)
+            return
+        self._drop_wrong_services()
+        if question is self.question:
+            if outcome.shows_work and not question.disputed:
+                self._stalls.let_go(now)
+            elif outcome in (ReplyOutcome.LACKS_OBSERVATIONS, ReplyOutcome.LACKS_STATE):
+                self._calls.send(
+                    replica,
+                    question,
+                    now,
+                    whole_state=outcome is ReplyOutcome.LACKS_STATE,
+                    is_retry=False,
+                )
+        if (
+            outcome in (ReplyOutcome.ANSWERED, ReplyOutcome.ANSWERED_MORE)
+            and replica is self._services.local
+        ):
+            self._launches.succeeded()
+        elif outcome is ReplyOutcome.ANSWERED and self._tracker.is_recovering:
+            reason = f"{replica.name} has answered"
+            self.effects.report("status", **self._tracker.change(Cause.CLOUD_ANSWERED, reason, now))
+
+    def _ended(self, call: OpenRequest, now: float) -> None:
+        self._calls.settle(call)
+        question = call.question
+        if question is not self.question or question.complete:
+            return
+        # The service is gone; if only this call was lost, the service's next answer
+        # clears it.
+        replica = call.replica
+        replica.delay(now)
+        if replica.detector.suspicion is None:
+            replica.detector.suspect("a call ended without the answer")
+            self._report_suspected(replica)
+
+    def _drop_wrong_services(self) -> None:
+        """Stop using services whose answers differ from the own planner's."""
+        for wrong in self._verification.take_wrong():
+            replica = self._services.get(wrong.service)
+            if replica is None:
+                continue
+            replica.distrust(
+                f"answered otherwise than the robot's own planner in step {wrong.step}"
+            )
+            self._calls.abandon_all(replica)
+            self.effects.report(
+                "wrong_answer",
+                service=replica.name,
+                step=wrong.step,
+                kind=wrong.kind,
+                reason="not what the robot's own planner decides in the same state; it is not "
+                "asked again in this run",
+            )
+            question = self.question
+            if question is not None and any(
+                part.service == wrong.service for part in question.parts
+            ):
+                # What it said last was perhaps not looked at yet.
+                self._verification.dispute(question, wrong.service)
+
+    # -- deciding whom to ask --------------------------------------------------------------------
+
+    def wake(self, now: float) -> None:
+        """Do what is due now; every event is followed by it."""
+        if self.stopped:
+            return
+        self._woke_at = now
+        self._suspect_silent(now)
+        self._enforce_decision_timeout(now)
+        self._tend_recovery(now)
+        question = self.question
+        if question is None:
+            self._note_lost_cloud(now)
+            return
+        if question.disputed:
+            self._wait_for_own_planner(question, now)
+            return
+        if question.complete:
+            self._stalls.let_go(now)
+            self._note_lost_cloud(now)
+            return
+        if self._is_being_asked(question, now):
+            self._hedge(question, now)
+            if question.needed_at is not None:
+                # The service that has the question may be silent for long while the robot waits.
+                self._try_others(now)
+            if self._stalls.waits_long(question, now):
+                asked = {call.replica.name for call in self._calls.about(question)}
+                self._stalls.tell_waiting(question, asked, now)
+            self._note_lost_cloud(now)
+        else:
+            self._ask_or_hold(question, now)
+
+    def _wait_for_own_planner(self, question: Question, now: float) -> None:
+        self._stalls.hold(question, "the robot's own planner decides", now)
+        needed_at = question.needed_at
+        if needed_at is not None and now >= needed_at + self._limit_s:
+            state = question.state
+            self._stop(
+                OwnDecisionError(
+                    f"trial {state.trial}, step {state.step}: services answer differently, or "
+                    "outside the problem's limits, and the robot's own planner has not decided "
+                    f"within {1e3 * self._limit_s:g} ms, which is offload.decision_timeout_ms"
+                )
+            )
+
+    def _suspect_silent(self, now: float) -> None:
+        for replica in self._services:
+            if replica.detector.suspect_if_silent(now):
+                self._report_suspected(replica)
+                if replica is self._services.local:
+                    # It runs but does nothing: another one is started in its place, and is given
+                    # more time, for it may be that its decisions simply take long.
+                    replica.detector.extend_patience(2.0, self._limit_s)
+                    self._launches.failed(now)
+
+    def _enforce_decision_timeout(self, now: float) -> None:
+        for call in self._calls:
+            if now >= call.sent_at + self._limit_s:
+                replica = call.replica
+                self._calls.abandon(call)
+                replica.delay(now)
+                replica.detector.suspect(
+                    f"a decision took longer than {1e3 * self._limit_s:.0f} ms"
+                )
+                self._report_suspected(replica)
+
+    def _is_being_asked(self, question: Question, now: float) -> bool:
+        """Return whether a usable service has the question."""
+        calls = self._calls.about(question)
+        if self._tracker.is_recovering and self._services.local_usable(now):
+            # The cloud is only tried: it may say for long that it is at work.
+            return any(call.replica is self._services.local for call in calls)
+        return any(call.replica.detector.trusted for call in calls)
+
+    def _ask_or_hold(self, question: Question, now: float) -> None:
+        """Send the question to the best usable service; without one, start the recovery or hold."""
+        services = self._services
+        if not self._tracker.is_recovering:
+            for replica in services.cloud:
+                if replica.usable(now) and not self._calls.is_asked(replica, question):
+                    self._calls.send(replica, question, now)
+                    return
+            if self._services.is_starting(now):
+                return
+            busy_until = services.busy_until(now)
+            if busy_until is not None:
+                since = now if question.needed_at is None else question.needed_at
+                if busy_until - since <= self._timeout_s and not self._services.local_usable(now):
+                    return
+        if services.local is None:
+            self._hold_and_retry(question, now)
+            return
+        if not self._tracker.is_recovering:
+            self._lose_cloud(now)
+            self._tend_recovery(now)
+        if self._services.local_usable(now):
+            if not self._calls.is_asked(services.local, question):
+                self._calls.send(services.local, question, now)
+            return
+        self._hold_and_retry(question, now)
+
+    def _hold_and_retry(self, question: Question, now: float) -> None:
+        """Ask any present service, suspected or not, at growing intervals."""
+        services = self._services
+        for replica in services:
+            if (
+                replica.detector.present
+                and replica.refusal is None
+                and self._calls.retry_at(replica, question) <= now
+            ):
+                replica.delay(now)
+                self._calls.send(replica, question, now)
+                if replica.detector.trusted:
+                    return
+        if services.hopeless():
+            self._stop(ServiceRefusedError(f"no service will decide: {services.why_nobody()}"))
+            return
+        self._stalls.hold(question, services.why_nobody(), now)
+
+    def _try_others(self, now: float) -> None:
+        """Probe suspected services with this question too: an answer brings them back."""
+        question = self.question
+        if question is None:
+            return
+        needed_at = question.needed_at
+        is_late = needed_at is not None and now >= needed_at + self._timeout_s
+        for replica in self._services.cloud:
+            if replica.usable(now) and not self._tracker.is_recovering:
+                if is_late and not self._calls.is_asked(replica, question):
+                    # It has come back while one that is less preferred takes its time.
+                    self._calls.send(replica, question, now, is_retry=False)
+                break
+            at = self._calls.probe_at(replica, question)
+            if at is not None and at <= now:
+                if self._calls.is_asked(replica, question):
+                    replica.delay(now)
+                self._calls.send(replica, question, now, is_retry=False)
+
+    def _note_lost_cloud(self, now: float) -> None:
+        """Start the recovery if the cloud was lost while nothing was asked of it."""
+        if (
+            self._services.local is not None
+            and not self._tracker.is_recovering
+            and not self._services.is_starting(now)
+            and not self._services.any_reliable()
+        ):
+            self._lose_cloud(now)
+            self._tend_recovery(now)
+
+    def _lose_cloud(self, now: float) -> None:
+        reason, silence_s = self._services.why_lost(), self._services.silence_s(now)
+        self.effects.report(
+            "status", **self._tracker.change(Cause.CLOUD_LOST, reason, now, silence_s)
+        )
+
+    # -- the local service -----------------------------------------------------------------------
+
+    def _tend_recovery(self, now: float) -> None:
+        """Launch the local service when it is wanted, and again if it does not come up."""
+        local, launches = self._services.local, self._launches
+        if local is None:
+            return
+        if self._tracker.is_recovering:
+            launches.want(now)
+        waited_s = launches.overdue_launch_age_s(now, present=local.detector.present)
+        if waited_s is not None:
+            self.effects.report("launch_failed", reason=f"not seen after {1e3 * waited_s:.0f} ms")
+            launches.failed(now, late=True)
+        if launches.is_due(now):
+            if local.detector.incarnation is not None:
+                local.detector.vanished(local.detector.incarnation)
+            self._calls.abandon_all(local)
+            local.forget()
+            number = launches.begin(now)
+            self.effects.report("launch", service=local.name)
+            self.effects.append(Launch(number))
+
+    def _hedge_at(self, question: Question) -> float | None:
+        """Return when the local service is asked as well; None if it is not."""
+        local, due = self._services.local, self._hedging.due_at(question)
+        if (
+            due is None
+            or local is None
+            or not local.reliable
+            or self._calls.is_asked(local, question)
+        ):
+            return None
+        return max(due, local.retry_at)
+
+    def _hedge(self, question: Question, now: float) -> None:
+        local, due = self._services.local, self._hedge_at(question)
+        if local is None or due is None or now < due:
+            return
+        self._hedging.spend()
+        assert question.needed_at is not None
+        self.effects.report(
+            "hedge", step=question.state.step, waited_ms=1e3 * (now - question.needed_at)
+        )
+        self._calls.send(local, question, now, is_retry=False)
+
+    def _report_suspected(self, replica: Replica) -> None:
+        self.effects.report(
+            "service_suspected", service=replica.name, reason=replica.detector.suspicion
+        )
+
+    def _stop(self, error: HoldfastError) -> None:
+        if not self.stopped:
+            self.stopped = True
+            self.effects.append(Halt(error))

@@ -1,0 +1,410 @@
+"""The robot's end: events in, effects out.
+
+Events tell what happened on the wire and in the environment. A call is one request with any number
+of replies, and always ends; one that ends without the answer shows that the service is gone. An
+order to the environment ends in one event, which may be a failure.
+
+Effects are orders to the shell. It carries out each before it begins the next, and
+:class:`WriteRecords` is done only when the records are as safe as the settings ask. So nothing is
+sent or performed that a restarted robot would not know of.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Generic, NamedTuple, TypeAlias, TypeVar
+
+from holdfast.arrays import FloatArray
+from holdfast.errors import HoldfastError
+from holdfast.outcome import Done, TrialResult
+from holdfast.planning import PlanningState
+from holdfast.protocol.records import Record
+
+__all__ = [
+    "Abandon",
+    "Act",
+    "Acted",
+    "CallEnded",
+    "ComputeOwnAnswer",
+    "Effects",
+    "EndTrial",
+    "EnvironmentEvent",
+    "EnvironmentFailed",
+    "EnvironmentReady",
+    "Halt",
+    "Launch",
+    "LogEvent",
+    "OwnAnswer",
+    "Paused",
+    "Plan",
+    "Planned",
+    "ReplyReceived",
+    "RobotEffect",
+    "Send",
+    "Sense",
+    "Sensed",
+    "ServiceAppeared",
+    "ServiceVanished",
+    "Timing",
+    "TransportEvent",
+    "VerificationNoted",
+    "WriteRecords",
+]
+
+
+class ServiceAppeared(NamedTuple):
+    """A service can be asked.
+
+    Attributes
+    ----------
+    incarnation : str
+        Of the service's process: another value is another process, with another memory.
+    """
+
+    service: str
+    incarnation: str
+
+
+class ServiceVanished(NamedTuple):
+    """A service closed, its process died, or its link broke."""
+
+    service: str
+    incarnation: str
+
+
+class ReplyReceived(NamedTuple):
+    """A reply to a call."""
+
+    call: int
+    payload: bytes
+
+
+class CallEnded(NamedTuple):
+    """No more replies come to a call."""
+
+    call: int
+
+
+TransportEvent: TypeAlias = ServiceAppeared | ServiceVanished | ReplyReceived | CallEnded
+
+
+class EnvironmentReady(NamedTuple):
+    """The environment of a trial was made.
+
+    Attributes
+    ----------
+    done : bool or "failed"
+        Whether the task is done already, or has failed.
+    steps_performed : int or None
+        Task actions performed in this trial, counted by the environment; None if it does not count.
+    """
+
+    done: Done
+    steps_performed: int | None
+
+
+class Sensed(NamedTuple):
+    """A sensing action was performed.
+
+    Attributes
+    ----------
+    observation : array of shape (observation_size,)
+        Finite, read-only.
+    """
+
+    step: int
+    observation: FloatArray
+
+
+class Acted(NamedTuple):
+    """A task action was performed.
+
+    Attributes
+    ----------
+    reward : float or None
+        Finite; None if the environment gives none.
+    done : bool or "failed"
+        Whether the task is done, or has failed.
+    """
+
+    step: int
+    reward: float | None
+    done: Done
+
+
+class EnvironmentFailed(NamedTuple):
+    """The environment raised, returned something invalid, or timed out; it cannot be used again.
+
+    Attributes
+    ----------
+    what : str
+        The method, or the environment's name if it could not be made.
+    text : str
+        What happened, and where in the environment's code.
+    action_in_doubt : bool
+        Whether the step's task action was begun without an :class:`Acted`.
+    performed : bool
+        Whether the step's task action was performed and something after it failed.
+    reward : float or None
+        Of that task action.
+    counts_steps : bool
+        Whether the environment counts its steps, so that it can be asked later.
+    """
+
+    step: int
+    what: str
+    text: str
+    action_in_doubt: bool
+    performed: bool = False
+    reward: float | None = None
+    counts_steps: bool = True
+
+
+EnvironmentEvent: TypeAlias = EnvironmentReady | Sensed | Acted | EnvironmentFailed
+
+
+class OwnAnswer(NamedTuple):
+    """The robot's own planner has answered a question to verify services, or failed.
+
+    Attributes
+    ----------
+    number : int
+        Of its :class:`ComputeOwnAnswer`.
+    actions : tuple of array
+        Task actions up to the next sensing step.
+    sensing_action : int or None
+        Of that step; None if it is too far away.
+    ahead_digest : bytes
+        Of the state in which the sensing action was chosen.
+    failure : str or None
+        Why there is no answer; None if there is one.
+    """
+
+    number: int
+    actions: tuple[FloatArray, ...] = ()
+    sensing_action: int | None = None
+    ahead_digest: bytes = b""
+    computed_s: float = 0.0
+    failure: str | None = None
+
+
+class Planned(NamedTuple):
+    """The planner of a robot without services has computed a part of an answer.
+
+    Attributes
+    ----------
+    number : int
+        Of its :class:`Plan`.
+    ahead : PlanningState
+        To which the task actions lead, or in which the sensing action was chosen.
+    actions : sequence of array
+        Task actions up to the next sensing step.
+    ahead_digest : bytes
+        Of the state in which the sensing action was chosen.
+    sensing_action : int or None
+        None for a task part.
+    error : HoldfastError or None
+        Why there is no answer.
+    """
+
+    number: int
+    ahead: PlanningState
+    actions: Sequence[FloatArray] = ()
+    ahead_digest: bytes = b""
+    sensing_action: int | None = None
+    computed_s: float = 0.0
+    error: HoldfastError | None = None
+
+
+class WriteRecords(NamedTuple):
+    """Append records of a trial to the journal, all or none."""
+
+    trial: int
+    records: tuple[Record, ...]
+
+
+class Send(NamedTuple):
+    """Send a request; ``call`` names it in later events."""
+
+    service: str
+    call: int
+    payload: bytes
+
+
+class Abandon(NamedTuple):
+    """Drop a call; its events are no longer wanted."""
+
+    call: int
+
+
+class Sense(NamedTuple):
+    """Perform a sensing action and deliver the observation."""
+
+    step: int
+    sensing_action: int
+
+
+class Act(NamedTuple):
+    """Perform a task action; deliver its reward and whether the task is done."""
+
+    step: int
+    action: FloatArray
+
+
+class ComputeOwnAnswer(NamedTuple):
+    """Have the robot's own planner answer a question in the background.
+
+    Attributes
+    ----------
+    number : int
+        Repeated by the :class:`OwnAnswer`.
+    urgent : bool
+        Whether the robot waits for it; it then goes first. It may repeat an earlier number.
+    again : bool
+        Whether it was answered before; it is then computed with a new instance of the problem.
+    """
+
+    number: int
+    state: PlanningState
+    urgent: bool
+    again: bool
+
+
+class Plan(NamedTuple):
+    """Have the planner of a robot without services compute a part of an answer.
+
+    Attributes
+    ----------
+    number : int
+        Of the question. Results with an older number are of no use.
+    sensing : bool
+        Whether to choose this state's sensing action; else the task actions from there.
+    """
+
+    number: int
+    state: PlanningState
+    sensing: bool
+
+
+class VerificationNoted(NamedTuple):
+    """A part of an answer was compared with the own planner's; for the tables only.
+
+    Attributes
+    ----------
+    trial, step : int
+        Of the question.
+    service : str
+        That gave the answer.
+    kind : {"question", "task", "sensing"}
+    verdict : {"asked", "left_out", "same", "different", "not_deterministic", "failed"}
+        Of a question: whether it will be recomputed, or too many wait. Of a part: the comparison;
+        the last two mean that the own planner disagrees with itself, or failed.
+    """
+
+    trial: int
+    step: int
+    service: str
+    kind: str
+    verdict: str
+
+
+class Launch(NamedTuple):
+    """Start the local service, and end its previous process if there is one.
+
+    Attributes
+    ----------
+    number : int
+        Of the launch; reported with the end of its process.
+    """
+
+    number: int
+
+
+class LogEvent(NamedTuple):
+    """One line of the log of a robot or a service.
+
+    Attributes
+    ----------
+    fields : dict
+        Plain data; durations end in ``_ms``.
+    """
+
+    name: str
+    fields: dict[str, object]
+
+
+class Timing(NamedTuple):
+    """How long a decision took; for the tables only.
+
+    Attributes
+    ----------
+    kind : str
+        ``sensing`` or ``task``.
+    service : str
+        Whose answer is used.
+    waited_ms : float
+        How long the robot stood still for it.
+    round_trip_ms : float
+        From the request to the answer.
+    computed_ms : float
+        The service's part of that.
+    """
+
+    trial: int
+    step: int
+    kind: str
+    service: str
+    status: str
+    waited_ms: float
+    round_trip_ms: float
+    computed_ms: float
+
+
+class EndTrial(NamedTuple):
+    """The trial has ended: keep its result instead of its records."""
+
+    result: TrialResult
+
+
+class Paused(NamedTuple):
+    """The robot stands still; the process may exit."""
+
+
+class Halt(NamedTuple):
+    """The robot holds still for good; the run can be resumed once the cause is removed."""
+
+    error: HoldfastError
+
+
+RobotEffect: TypeAlias = (
+    WriteRecords
+    | Send
+    | Abandon
+    | Sense
+    | Act
+    | ComputeOwnAnswer
+    | Plan
+    | Launch
+    | LogEvent
+    | Timing
+    | VerificationNoted
+    | EndTrial
+    | Paused
+    | Halt
+)
+
+_Effect = TypeVar("_Effect")
+
+
+class Effects(list[_Effect | LogEvent], Generic[_Effect]):
+    """The effects of one end so far; its parts share this list, since their order counts."""
+
+    def report(self, name: str, **fields: object) -> None:
+        """Append a line of the log."""
+        self.append(LogEvent(name, fields))
+
+    def take(self) -> list[_Effect | LogEvent]:
+        """Return the effects so far, and clear them."""
+        effects = self.copy()
+        self.clear()
+        return effects

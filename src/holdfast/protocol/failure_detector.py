@@ -1,0 +1,129 @@
+"""Is a service dead, or only slow? Evidence from what is seen of it.
+
+Nobody can know for certain, so errors are made cheap: a suspected service is no longer preferred,
+but any sign of life clears it, and two services that decide the same question decide alike. There
+are four kinds of evidence:
+
+- *presence*: the link breaks when the process dies. This finds a killed service in milliseconds,
+  but a hung one keeps its link for a while;
+- *signs of life*: every reply is one. While a request waits or is computed, the service sends a
+  ``Progress`` reply every few tens of milliseconds, so silence means that its process hangs, is
+  stopped or is cut off. (A transport's own heartbeat only keeps a link; it counts as presence.)
+- *calls that end without an answer*: the process is gone;
+- *deadlines*: a decision that takes too long is of no use even with signs of life.
+
+A service of which nothing is awaited may be silent for any time.
+"""
+
+from __future__ import annotations
+
+__all__ = ["FailureDetector"]
+
+
+class FailureDetector:
+    """What a robot believes about one service.
+
+    Parameters
+    ----------
+    detection_timeout_s : float
+        Longest accepted silence while something is awaited.
+
+    Attributes
+    ----------
+    incarnation : str or None
+        Of the present process; None if the service is absent.
+    suspicion : str or None
+        Why the service is not trusted; None if it is.
+    seen : bool
+        Whether it was ever present.
+    """
+
+    def __init__(self, detection_timeout_s: float) -> None:
+        self._usual_timeout_s = detection_timeout_s
+        self._timeout_s = detection_timeout_s
+        self._longest_silence_s = 0.0
+        self._awaited = 0
+        self._last_sign = 0.0
+        self.incarnation: str | None = None
+        self.suspicion: str | None = None
+        self.seen = False
+
+    @property
+    def present(self) -> bool:
+        """Whether its process is there."""
+        return self.incarnation is not None
+
+    @property
+    def trusted(self) -> bool:
+        """Whether it is present and not suspected."""
+        return self.incarnation is not None and self.suspicion is None
+
+    def appeared(self, incarnation: str) -> bool:
+        """Note the presence of a process; return whether it is new."""
+        fresh = incarnation != self.incarnation
+        self.incarnation = incarnation
+        self.seen = True
+        if fresh:
+            self.suspicion = None
+        return fresh
+
+    def vanished(self, incarnation: str) -> bool:
+        """Note the end of a process; return whether it was the present one."""
+        if incarnation != self.incarnation:
+            return False
+        self.incarnation = None
+        return True
+
+    def asked(self, now: float) -> None:
+        """Note that a request was sent."""
+        if self._awaited == 0:
+            self._last_sign = now
+        self._awaited += 1
+
+    def settled(self) -> None:
+        """Note that one request is no longer awaited."""
+        self._awaited = max(0, self._awaited - 1)
+
+    def heard(self, now: float) -> None:
+        """Note a sign of life."""
+        if self._awaited:
+            self._longest_silence_s = max(self._longest_silence_s, now - self._last_sign)
+        self._last_sign = now
+        self.suspicion = None
+
+    def extend_patience(self, factor: float, limit_s: float) -> None:
+        """Accept a longer silence, up to a limit."""
+        self._timeout_s = min(factor * self._timeout_s, max(limit_s, self._timeout_s))
+
+    def answered(self) -> None:
+        """Note a complete answer, and shorten an extended timeout to what this answer needed."""
+        needed_s = 2.0 * self._longest_silence_s
+        shorter_s = max(0.5 * self._timeout_s, needed_s, self._usual_timeout_s)
+        self._timeout_s = min(self._timeout_s, shorter_s)
+        self._longest_silence_s = 0.0
+
+    def excuse(self, seconds: float) -> None:
+        """Disregard a time in which the robot could not receive."""
+        self._last_sign += seconds
+
+    def silence_s(self, now: float) -> float:
+        """Return how long nothing has been received."""
+        return max(0.0, now - self._last_sign)
+
+    def suspect(self, reason: str) -> None:
+        """Distrust it until it is heard or another process takes its place."""
+        self.suspicion = reason
+
+    def suspect_if_silent(self, now: float) -> bool:
+        """Suspect it if its silence is too long; return whether that is new."""
+        deadline = self.deadline()
+        if deadline is None or now < deadline:
+            return False
+        self.suspicion = f"no sign of progress for {1e3 * (now - self._last_sign):.0f} ms"
+        return True
+
+    def deadline(self) -> float | None:
+        """Return when it becomes suspected if nothing comes; None if nothing is awaited."""
+        if self._awaited == 0 or self.suspicion is not None:
+            return None
+        return self._last_sign + self._timeout_s

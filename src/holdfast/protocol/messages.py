@@ -1,0 +1,564 @@
+"""Messages between robot and service: one kind of request, a few kinds of reply, in MessagePack.
+
+A robot always asks the same: *this is my state; what do I do until I have sensed again?* The answer
+has up to two parts: the task actions up to the next sensing step, which need no new observation and
+are known at once, and the sensing action of that step, which takes longer and is computed while the
+robot moves. A service that holds the robot's state needs only the observations since; the digest
+shows whether both hold the same state, bit for bit. A service without it replies so and is sent the
+state.
+
+Every request may be sent twice, to two services, or late: a decision is a function of the state
+that the digest names.
+
+A message ends with a checksum. One bit of it decides what a robot does, and over long distances
+about one damaged segment in ten thousand passes TCP's own check (Stone and Partridge, SIGCOMM
+2000).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import zlib
+from typing import Annotated, TypeAlias
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from holdfast import numerics
+from holdfast.arrays import FloatArray
+from holdfast.config.settings import PlanningSettings
+from holdfast.errors import MessageError
+
+__all__ = [
+    "CHECKSUM_SIZE",
+    "DIGEST_SIZE",
+    "MAX_ACTION_SIZE",
+    "MAX_CONFIGURATION_BYTES",
+    "MAX_CONFIGURATION_VALUES",
+    "MAX_OBSERVATIONS",
+    "MAX_TASK_ACTIONS",
+    "MAX_TEXT",
+    "MAX_WORD",
+    "PROTOCOL_VERSION",
+    "Busy",
+    "NeedState",
+    "Observed",
+    "Progress",
+    "Refused",
+    "Reply",
+    "Request",
+    "SensingAnswer",
+    "SessionConfiguration",
+    "TaskAnswer",
+    "decode_floats",
+    "decode_reply",
+    "decode_request",
+    "encode",
+    "encode_floats",
+    "pack_configuration",
+    "settings_digest",
+    "unpack_configuration",
+    "with_checksum",
+]
+
+
+PROTOCOL_VERSION = 4
+"""Raised when a message changes its form or meaning. All versions have the same checksum."""
+
+CHECKSUM_SIZE = 4
+"""Bytes at the end of each message: CRC-32 of those before them, little-endian."""
+
+MAX_TASK_ACTIONS = 64
+"""Bound on the task actions of one answer; a robot that senses more rarely asks again."""
+
+MAX_ACTION_SIZE = 4096
+"""Bound on the numbers of one task action, and of one observation."""
+
+MAX_WORD = 2**32 - 1
+"""Largest integer in a message."""
+
+MAX_TEXT = 4000
+"""Bound on the characters of a refusal's text."""
+
+MAX_OBSERVATIONS = 64
+"""Bound on the observations of one request; a service further behind is sent the state."""
+
+MAX_CONFIGURATION_BYTES = 256 * 1024
+"""Bound on a session configuration, encoded."""
+
+MAX_CONFIGURATION_VALUES = 10_000
+"""Bound on its values: the smallest take one byte each when encoded, and sixty in memory."""
+
+DIGEST_SIZE = 16
+"""Bytes sent of a state's digest: the first of :func:`holdfast.planning.digest`."""
+
+Word = Annotated[int, msgspec.Meta(ge=0, le=MAX_WORD)]
+Name = Annotated[str, msgspec.Meta(min_length=1, max_length=200)]
+Session = Annotated[bytes, msgspec.Meta(min_length=16, max_length=16)]
+Digest = Annotated[bytes, msgspec.Meta(min_length=DIGEST_SIZE, max_length=DIGEST_SIZE)]
+Numbers = Annotated[bytes, msgspec.Meta(max_length=8 * MAX_ACTION_SIZE * MAX_TASK_ACTIONS)]
+
+
+class Observed(msgspec.Struct, array_like=True, frozen=True, forbid_unknown_fields=True):
+    """An observation that is part of the robot's belief.
+
+    Attributes
+    ----------
+    step : int
+        It belongs to the state of that step, before its task action.
+    observation : bytes
+        Little-endian float64.
+    """
+
+    step: Word
+    sensing_action: Word
+    observation: Annotated[bytes, msgspec.Meta(max_length=8 * MAX_ACTION_SIZE)]
+
+
+class SessionConfiguration(msgspec.Struct, array_like=True, frozen=True):
+    """What a service must know of a robot's run: names and plain data, never code.
+
+    The settings are complete, and their digest is sent with them (:func:`settings_digest`), so a
+    service to which they mean something else refuses. Code is named by its digest, so a service
+    with other code refuses.
+
+    Attributes
+    ----------
+    problem : str
+        Registered name.
+    model, state_space_planner : dict
+        The problem's two sections of the configuration.
+    core_version : str
+        Of the robot's holdfast (:func:`holdfast.source_digest.core_version`).
+    problem_digest : str
+        Of the problem's code beyond that (:func:`holdfast.source_digest.problem_digest`).
+    """
+
+    problem: Name
+    model: dict[str, object]
+    state_space_planner: dict[str, object]
+    planning: PlanningSettings
+    seed: Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
+    core_version: Annotated[str, msgspec.Meta(max_length=200)] = ""
+    problem_digest: Annotated[str, msgspec.Meta(max_length=200)] = ""
+
+
+class Request(msgspec.Struct, array_like=True, frozen=True):
+    """A robot's question: what to do from this state until it has sensed again.
+
+    Encode it with :func:`encode` only: on the wire the session configuration has another form.
+
+    Attributes
+    ----------
+    version : int
+        :data:`PROTOCOL_VERSION`.
+    session : bytes
+        16 random bytes, drawn once per run.
+    epoch : int
+        Raised by each restart of the robot; a service refuses a lower one than it has seen.
+    number : int
+        Increases within an epoch, and is unique among epochs. Every reply repeats it.
+    trial, step : int
+        Of the state.
+    sensed : bool
+        Whether the step's observation is part of the state.
+    digest : bytes
+        Of the state.
+    observations : tuple of Observed
+        Of this trial, in order, since the state that this service acknowledged last; all of them if
+        it acknowledged none.
+    session_configuration : SessionConfiguration or None
+        For a service that may not know the session.
+    checkpoint : bytes, memoryview or None
+        The state (:func:`holdfast.planning.encode_checkpoint`); then ``observations`` is empty. A
+        decoded one is a view of the message.
+    """
+
+    version: int
+    session: Session
+    epoch: Word
+    number: Word
+    trial: Word
+    step: Word
+    sensed: bool
+    digest: Digest
+    observations: Annotated[tuple[Observed, ...], msgspec.Meta(max_length=MAX_OBSERVATIONS)] = ()
+    session_configuration: SessionConfiguration | None = None
+    checkpoint: bytes | memoryview | None = None
+
+
+class _SentRequest(msgspec.Struct, array_like=True, frozen=True, forbid_unknown_fields=True):
+    """A request on the wire.
+
+    Its session configuration is bytes inside the message, so each field's length precedes the field
+    and is checked before any of it is decoded: bytes that are no request are refused at once,
+    whatever their size.
+    """
+
+    version: int
+    session: Session
+    epoch: Word
+    number: Word
+    trial: Word
+    step: Word
+    sensed: bool
+    digest: Digest
+    observations: Annotated[tuple[Observed, ...], msgspec.Meta(max_length=MAX_OBSERVATIONS)] = ()
+    # Larger than allowed, so that the refusal can name the size.
+    session_configuration: (
+        Annotated[bytes, msgspec.Meta(max_length=16 * MAX_CONFIGURATION_BYTES)] | None
+    ) = None
+    # Not copied: that would hold up all other threads, 40 ms for 60 MB.
+    checkpoint: memoryview | None = None
+    # Digest of the settings, as the robot understands them.
+    settings: Digest | None = None
+
+
+class TaskAnswer(msgspec.Struct, array_like=True, frozen=True, tag=1):
+    """The task actions from the state on, up to the next sensing step.
+
+    Attributes
+    ----------
+    number : int
+        Of the request.
+    count : int
+        Task actions, for the request's step and those that follow.
+    actions : bytes
+        Executed actions in order, little-endian float64.
+    computed_us : int
+        Computing time.
+    """
+
+    number: Word
+    count: Annotated[int, msgspec.Meta(ge=1, le=MAX_TASK_ACTIONS)]
+    actions: Numbers
+    computed_us: Word
+
+
+class SensingAnswer(msgspec.Struct, array_like=True, frozen=True, tag=2):
+    """The sensing action of the next sensing step.
+
+    Attributes
+    ----------
+    number : int
+        Of the request.
+    step : int
+        The sensing step: the request's own if its state must still sense, else that after the task
+        actions.
+    digest : bytes
+        Of the state in which it was chosen; the robot follows it only in exactly that state.
+    computed_us : int
+        Computing time.
+    """
+
+    number: Word
+    step: Word
+    sensing_action: Word
+    digest: Digest
+    computed_us: Word
+
+
+class Progress(msgspec.Struct, array_like=True, frozen=True, tag=3):
+    """A sign of life: the request is in work.
+
+    Attributes
+    ----------
+    number : int
+        Of the request.
+    waiting : bool
+        Whether it still waits for a worker.
+    """
+
+    number: Word
+    waiting: bool
+
+
+class NeedState(msgspec.Struct, array_like=True, frozen=True, tag=4):
+    """The service lacks the state: send the session configuration and the checkpoint.
+
+    Attributes
+    ----------
+    number : int
+        Of the request.
+    differs : bool
+        Whether the service holds a state of the trial that does not lead to the robot's; then only
+        the checkpoint helps.
+    diverged : bool
+        Whether it reached that step with all observations, but another digest.
+    """
+
+    number: Word
+    differs: bool
+    diverged: bool = False
+
+
+class Busy(msgspec.Struct, array_like=True, frozen=True, tag=5):
+    """The service has too much work: ask another, or again later.
+
+    Attributes
+    ----------
+    number : int
+        Of the request; 0 if it was turned away unread.
+    """
+
+    number: Word
+    retry_after_ms: Word
+
+
+class Refused(msgspec.Struct, array_like=True, frozen=True, tag=6):
+    """The request can never be answered as it is.
+
+    Attributes
+    ----------
+    number : int
+        Of the request; 0 if it could not be read.
+    code : str
+        ``damaged`` (in transit: it may be sent again), ``malformed``, ``too_large``, ``version``,
+        ``stale_epoch``, ``unknown_problem``, ``other_code`` (the service's holdfast or problem
+        is not the robot's), ``invalid`` (settings or state out of bounds),
+        ``out_of_memory`` (it may be asked again) or ``failed`` (the problem's own functions failed
+        in this state).
+    text : str
+        An explanation.
+    """
+
+    number: Word
+    code: Annotated[str, msgspec.Meta(max_length=40)]
+    text: Annotated[str, msgspec.Meta(max_length=MAX_TEXT)]
+
+
+Reply: TypeAlias = TaskAnswer | SensingAnswer | Progress | NeedState | Busy | Refused
+
+_ENCODER = msgspec.msgpack.Encoder()
+_REQUEST_DECODER = msgspec.msgpack.Decoder(_SentRequest)
+_CONFIGURATION_DECODER = msgspec.msgpack.Decoder(SessionConfiguration)
+_REPLY_DECODER: msgspec.msgpack.Decoder[Reply] = msgspec.msgpack.Decoder(Reply)
+
+_CONTAINERS = (dict, list, tuple)
+"""Values of a configuration that contain others."""
+
+_ARRAY_HEADERS = {0xDC: 3, 0xDD: 5}
+"""Sizes in bytes of the longer array headers of MessagePack, by their first byte."""
+
+_WORDS = {0xCC: 1, 0xCD: 2, 0xCE: 4}
+"""Sizes in bytes of the longer unsigned integers of MessagePack, by their first byte."""
+
+
+def encode(message: Request | Reply) -> bytes:
+    """Encode a message."""
+    if isinstance(message, Request) and message.session_configuration is not None:
+        # Without a session configuration both forms are the same bytes.
+        return with_checksum(
+            _ENCODER.encode(_sent(message, pack_configuration(message.session_configuration)))
+        )
+    return with_checksum(_ENCODER.encode(message))
+
+
+def pack_configuration(session_configuration: SessionConfiguration) -> bytes:
+    """Encode a session configuration: decoded it takes twenty times the memory."""
+    return _ENCODER.encode(session_configuration)
+
+
+def settings_digest(session_configuration: SessionConfiguration) -> bytes:
+    """Return the digest of what decides: the problem, its settings, the planning's and the seed."""
+    decide = (
+        session_configuration.problem,
+        session_configuration.model,
+        session_configuration.state_space_planner,
+        session_configuration.planning,
+        session_configuration.seed,
+    )
+    return hashlib.blake2b(_ENCODER.encode(decide), digest_size=DIGEST_SIZE).digest()
+
+
+def unpack_configuration(packed: bytes) -> SessionConfiguration:
+    """Decode a session configuration that was packed here, after it was checked."""
+    return _CONFIGURATION_DECODER.decode(packed)
+
+
+def with_checksum(content: bytes) -> bytes:
+    """Append the checksum."""
+    return content + zlib.crc32(content).to_bytes(CHECKSUM_SIZE, "little")
+
+
+def _checked_content(payload: bytes) -> memoryview:
+    """Return what a message contains, without a copy of it."""
+    content = memoryview(payload)[:-CHECKSUM_SIZE]
+    if zlib.crc32(content) != int.from_bytes(payload[-CHECKSUM_SIZE:], "little") or not content:
+        raise MessageError(
+            "damaged", f"{len(payload)} bytes do not have the checksum that they end with"
+        )
+    return content
+
+
+def decode_request(payload: bytes) -> Request:
+    """Decode a request and check all of it that can be checked by itself.
+
+    A large message that is no request takes no more memory than a small one, and no more time than
+    to look at each of its bytes once.
+
+    Raises
+    ------
+    MessageError
+        ``damaged``: the checksum is wrong. ``malformed``: not a request. ``version``: another
+        protocol version. ``too_large``: the session configuration has more than
+        :data:`MAX_CONFIGURATION_BYTES` or :data:`MAX_CONFIGURATION_VALUES`. ``other_code``: its
+        settings mean something else here than on the robot.
+    """
+    content = _checked_content(payload)
+    # Other versions may have other fields.
+    version = _version_of(content)
+    if version is not None and version != PROTOCOL_VERSION:
+        raise _other_version(version)
+    try:
+        sent = _REQUEST_DECODER.decode(content)
+        session_configuration = (
+            None
+            if sent.session_configuration is None
+            else _session_configuration_of(sent.session_configuration, sent.settings)
+        )
+    except (msgspec.DecodeError, RecursionError, UnicodeDecodeError) as error:
+        raise MessageError("malformed", f"{len(payload)} bytes are no request: {error}") from error
+    if sent.version != PROTOCOL_VERSION:
+        raise _other_version(sent.version)
+    if sent.checkpoint is not None and sent.observations:
+        raise MessageError("malformed", "a request has a checkpoint and observations as well")
+    return Request(
+        sent.version,
+        sent.session,
+        sent.epoch,
+        sent.number,
+        sent.trial,
+        sent.step,
+        sent.sensed,
+        sent.digest,
+        sent.observations,
+        session_configuration,
+        sent.checkpoint,
+    )
+
+
+def decode_reply(payload: bytes) -> Reply:
+    """Decode a reply.
+
+    Raises
+    ------
+    MessageError
+        If it was changed in transit, or is no reply.
+    """
+    content = _checked_content(payload)
+    try:
+        return _REPLY_DECODER.decode(content)
+    except (msgspec.DecodeError, RecursionError, UnicodeDecodeError) as error:
+        raise MessageError("malformed", f"{len(payload)} bytes are no reply: {error}") from error
+
+
+def encode_floats(array: npt.ArrayLike) -> bytes:
+    """Encode numbers as little-endian float64."""
+    return np.ascontiguousarray(array, dtype="<f8").tobytes()
+
+
+def decode_floats(data: bytes, size: int) -> FloatArray:
+    """Decode ``size`` numbers.
+
+    Raises
+    ------
+    MessageError
+        If their number differs, or one is not finite.
+    """
+    if len(data) != 8 * size:
+        raise MessageError("malformed", f"{len(data)} bytes are not {size} numbers")
+    numbers = np.frombuffer(data, dtype="<f8").astype(np.float64)
+    if not numerics.all_finite(numbers):
+        raise MessageError("malformed", f"{numbers} are not all finite")
+    return numbers
+
+
+def _sent(request: Request, session_configuration: bytes) -> _SentRequest:
+    return _SentRequest(
+        request.version,
+        request.session,
+        request.epoch,
+        request.number,
+        request.trial,
+        request.step,
+        request.sensed,
+        request.digest,
+        request.observations,
+        session_configuration,
+        None if request.checkpoint is None else memoryview(request.checkpoint),
+        # What a service will make of them, not what they were before: an int where a float belongs.
+        settings_digest(unpack_configuration(session_configuration)),
+    )
+
+
+def _version_of(content: memoryview) -> int | None:
+    """Return the version of what looks like a request of ours, from its first bytes alone."""
+    first = content[0]
+    start = 1 if first & 0xF0 == 0x90 else _ARRAY_HEADERS.get(first)
+    if start is None or len(content) <= start:
+        return None
+    word = content[start]
+    if word < 0x80:
+        return word
+    size = _WORDS.get(word)
+    if size is None or len(content) <= start + size:
+        return None
+    return int.from_bytes(content[start + 1 : start + 1 + size], "big")
+
+
+def _session_configuration_of(data: bytes, settings: bytes | None) -> SessionConfiguration:
+    if len(data) > MAX_CONFIGURATION_BYTES:
+        raise MessageError(
+            "too_large",
+            f"{len(data)} bytes of problem and settings, the sections model and "
+            f"state_space_planner among them: at most {MAX_CONFIGURATION_BYTES} are allowed",
+        )
+    session_configuration = _CONFIGURATION_DECODER.decode(data)
+    if _count_values(session_configuration) > MAX_CONFIGURATION_VALUES:
+        raise MessageError(
+            "too_large",
+            f"problem {session_configuration.problem}: more than {MAX_CONFIGURATION_VALUES} values "
+            "in the sections model and state_space_planner",
+        )
+    understood = settings_digest(session_configuration)
+    if settings != understood:
+        raise MessageError(
+            "other_code",
+            f"problem {session_configuration.problem}: the digest of the settings is "
+            f"{understood.hex()} as this service understands them, "
+            f"{settings.hex() if settings else 'not told'} on the robot; "
+            "they may decide differently, so deploy the same version on both",
+        )
+    return session_configuration
+
+
+def _count_values(session_configuration: SessionConfiguration) -> int:
+    """Count the values in the problem's sections, however they are nested.
+
+    Returns
+    -------
+    int
+        Of one that has more than :data:`MAX_CONFIGURATION_VALUES`, some number above that.
+    """
+    containers: list[object] = [
+        session_configuration.model,
+        session_configuration.state_space_planner,
+    ]
+    count = 0
+    while containers:
+        container = containers.pop()
+        assert isinstance(container, _CONTAINERS)
+        count += len(container) * (2 if isinstance(container, dict) else 1)
+        if count > MAX_CONFIGURATION_VALUES:
+            break
+        parts = (*container, *container.values()) if isinstance(container, dict) else container
+        containers += [part for part in parts if isinstance(part, _CONTAINERS)]
+    return count
+
+
+def _other_version(version: int) -> MessageError:
+    return MessageError(
+        "version", f"protocol version {version}: this holdfast speaks version {PROTOCOL_VERSION}"
+    )

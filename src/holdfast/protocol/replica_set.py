@@ -1,0 +1,419 @@
+"""What a robot knows of the services: which can be asked, when again, and what each must be sent.
+
+All services answer alike, so they are replicas of one another. Known of a replica are its presence
+and silence (the failure detector), how it last answered (well, busy, refusing) and which of the
+robot's states it holds. The last determines what a request carries: only the latest observations
+for a replica that holds the previous state, else the whole state. Nothing here sends anything.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterator, Sequence
+from typing import NamedTuple
+
+from holdfast.protocol.failure_detector import FailureDetector
+from holdfast.protocol.messages import Observed
+from holdfast.protocol.question import Question
+
+__all__ = ["CatchUp", "Replica", "ReplicaSet"]
+
+_LATE_IN_A_ROW = 3
+"""After so many late replies in a row, the service is further away than the timeout."""
+
+_FIRST_RETRY_S = 0.02
+_LONGEST_RETRY_S = 1.0
+_MAX_BUSY_S = 5.0
+"""A busy service is asked again after this time at the latest; its own estimate may be wrong."""
+
+_MAX_REFUSALS = 3
+
+_OUT_OF_MEMORY = "out_of_memory"
+_MAX_OUT_OF_MEMORY = 5
+_OUT_OF_MEMORY_RETRY_S = 0.1
+"""The memory for another robot's decision is soon free: more tries, further apart."""
+
+_MAX_REPLAYED_STEPS = 1024
+"""In a longer trial a service without any state of it is sent the state."""
+
+_LARGE_CHECKPOINT = 1 << 20
+"""From this size in bytes on, a service replays the trial instead of being sent the state."""
+
+_MAX_TIMES_DIFFERED = 2
+"""A service that has reached another state so often in a row is sent the state each time."""
+
+_LOCAL_PATIENCE = 4.0
+"""Factor on the local service's timeout: replacing it costs more than waiting."""
+
+_WRONG_ANSWER = "wrong_answer"
+
+_FINAL_REFUSALS = frozenset({"unknown_problem", "other_code", "version", "too_large"})
+_REFUSED_BY_ALL = frozenset({"invalid", "failed"})
+"""Refusals caused by the question itself; any service would refuse."""
+
+
+class CatchUp(NamedTuple):
+    """What a request must carry for a service to reach the question's state.
+
+    Attributes
+    ----------
+    needs_session_configuration : bool
+        Whether it does not know the session.
+    fresh : bool
+        Whether the trial has only begun, so nothing else is missing.
+    observations : tuple of Observed
+        From the state that it holds to the question's.
+    checkpoint : bytes or None
+        The whole state, where that is better.
+    """
+
+    needs_session_configuration: bool
+    fresh: bool
+    observations: tuple[Observed, ...]
+    checkpoint: bytes | None
+
+
+class Replica:
+    """One service, as far as the robot knows it.
+
+    Parameters
+    ----------
+    late_after_s : float
+        The first reply to a request is late after this time.
+
+    Attributes
+    ----------
+    last_incarnation : str or None
+        Of the process seen last.
+    opened : bool
+        Whether it knows the session.
+    acknowledged : tuple of int or None
+        Trial and number of observations of the latest state that it is known to hold.
+    times_differed : int
+        Times in a row that it reached another state than the robot.
+    task_refusals, sensing_refusals : int
+        Of each part since it last gave that part. A problem's code can fail in one part only.
+    complaint : str or None
+        Text of the last refusal since it last answered.
+    refusal, refusal_code : str or None, str
+        Why it is no longer asked.
+    distrusted : str or None
+        Why it is no longer asked, not even after a restart.
+    retry_at : float
+        It is not asked before.
+    backoff_s : float
+        The next delay.
+    """
+
+    __slots__ = (
+        "acknowledged",
+        "backoff_s",
+        "complaint",
+        "detector",
+        "distrusted",
+        "last_incarnation",
+        "late_after_s",
+        "late_at",
+        "late_soonest_s",
+        "late_times",
+        "name",
+        "num_busy",
+        "opened",
+        "refusal",
+        "refusal_code",
+        "retry_at",
+        "sensing_refusals",
+        "task_refusals",
+        "times_differed",
+    )
+
+    def __init__(
+        self, name: str, detection_timeout_s: float, late_after_s: float = math.inf
+    ) -> None:
+        self.name = name
+        self.detector = FailureDetector(detection_timeout_s)
+        self.last_incarnation: str | None = None
+        self.late_after_s = late_after_s
+        self.late_at = -math.inf
+        self.late_soonest_s = math.inf
+        self.late_times = 0
+        self.distrusted: str | None = None
+        self.forget()
+
+    def forget(self) -> None:
+        """Reset what was known of the previous process."""
+        self.opened = False
+        self.acknowledged: tuple[int, int] | None = None
+        self.times_differed = 0
+        self.task_refusals = self.sensing_refusals = 0
+        self.complaint: str | None = None
+        self.refusal = self.distrusted
+        self.refusal_code = "" if self.refusal is None else _WRONG_ANSWER
+        self.retry_at = 0.0
+        self.backoff_s = _FIRST_RETRY_S
+        self.num_busy = 0
+
+    @property
+    def reliable(self) -> bool:
+        """Whether it is trusted and does not refuse; it may still ask for a pause."""
+        return self.detector.trusted and self.refusal is None
+
+    def usable(self, now: float) -> bool:
+        """Return whether it can be expected to answer now."""
+        return self.reliable and self.retry_at <= now
+
+    def delay(self, now: float) -> None:
+        """Do not ask it for a while, longer each time."""
+        self.retry_at = now + self.backoff_s
+        self.backoff_s = min(2.0 * self.backoff_s, _LONGEST_RETRY_S)
+
+    # -- what it says ----------------------------------------------------------------------------
+
+    def note_first_reply(self, sent_at: float, now: float) -> float | None:
+        """Record the time to the first reply of a request.
+
+        Returns
+        -------
+        float or None
+            The shortest of these times in seconds, once, when several in a row were late.
+        """
+        after_s = now - sent_at
+        if self.late_times >= _LATE_IN_A_ROW:
+            return None
+        if after_s <= self.late_after_s:
+            self.late_times, self.late_soonest_s = 0, math.inf
+        elif sent_at >= self.late_at:
+            # Calls that were sent meanwhile have waited for the same thing, such as a process that
+            # stood still.
+            self.late_at = now
+            self.late_times += 1
+            self.late_soonest_s = min(self.late_soonest_s, after_s)
+            if self.late_times == _LATE_IN_A_ROW:
+                return self.late_soonest_s
+        return None
+
+    def note_answer(self, question: Question, now: float, *, sensing: bool, restored: bool) -> None:
+        """Record a part of an answer: it lives and holds the question's state.
+
+        Parameters
+        ----------
+        sensing : bool
+            Whether it is the sensing part.
+        restored : bool
+            Whether the request carried the state.
+        """
+        self.detector.heard(now)
+        self.opened = True
+        if sensing:
+            self.sensing_refusals = 0
+        else:
+            self.task_refusals = 0
+        self.retry_at = 0.0
+        if not self.task_refusals and not self.sensing_refusals:
+            self.backoff_s = _FIRST_RETRY_S
+            self.complaint = None
+        if not restored:
+            self.times_differed = 0
+        holds = (question.state.trial, question.num_observations)
+        self.acknowledged = max(self.acknowledged or holds, holds)
+
+    def note_busy(self, retry_after_s: float, now: float) -> float:
+        """Record that it is busy; return for how long it is left alone, in seconds."""
+        # Its own estimate, but never as often as it can answer.
+        after_s = max(min(retry_after_s, _MAX_BUSY_S), self.backoff_s)
+        self.delay(now)
+        self.retry_at = now + after_s
+        self.num_busy += 1
+        return after_s
+
+    def note_lost_state(self, *, differs: bool) -> None:
+        """Record that it lacks the robot's state."""
+        self.opened = False
+        self.acknowledged = None
+        if differs:
+            self.times_differed += 1
+
+    def note_refusal(self, code: str, text: str, now: float, *, sensing: bool) -> bool:
+        """Record a refusal, which delays it; return whether it is no longer asked.
+
+        Parameters
+        ----------
+        sensing : bool
+            Whether it refuses the sensing part.
+        """
+        most = _MAX_REFUSALS
+        if code == _OUT_OF_MEMORY:
+            most = _MAX_OUT_OF_MEMORY
+            self.backoff_s = max(self.backoff_s, _OUT_OF_MEMORY_RETRY_S)
+        self.delay(now)
+        if sensing:
+            self.sensing_refusals += 1
+        else:
+            self.task_refusals += 1
+        self.complaint = f"{code}: {text}"
+        refusals = self.sensing_refusals if sensing else self.task_refusals
+        final = code in _FINAL_REFUSALS or refusals >= most
+        if final:
+            self.refusal = text
+            self.refusal_code = code
+        return final
+
+    def distrust(self, text: str) -> None:
+        """Stop asking it in this run, because it was wrong."""
+        self.distrusted = self.refusal = text
+        self.refusal_code = _WRONG_ANSWER
+
+    # -- what it needs ---------------------------------------------------------------------------
+
+    def catch_up(self, question: Question, *, whole_state: bool) -> CatchUp:
+        """Return what a request must carry.
+
+        Parameters
+        ----------
+        whole_state : bool
+            Whether it needs the whole state in any case.
+        """
+        state = question.state
+        known = self.acknowledged
+        start = known[1] if known is not None and known[0] == state.trial else 0
+        missing = question.num_observations - start
+        fresh = state.step == 0 and missing == 0
+        if missing > 1 or not (self.opened or fresh):
+            # It knows nothing, or others have decided since. Replaying takes time that other robots
+            # need, so it is sent the state, unless that is large.
+            whole_state |= (
+                8 * state.belief.states.size <= _LARGE_CHECKPOINT
+                or state.step > _MAX_REPLAYED_STEPS
+            )
+        if self.times_differed >= _MAX_TIMES_DIFFERED or missing > len(question.observations):
+            whole_state = True
+        if whole_state:
+            return CatchUp(not self.opened, fresh, (), question.checkpoint())
+        observations = question.observations[-missing:] if missing > 0 else ()
+        return CatchUp(not self.opened, fresh, observations, None)
+
+
+class ReplicaSet:
+    """All services that a robot may ask.
+
+    Parameters
+    ----------
+    cloud : sequence of str
+        Names in order of preference.
+    local : str or None
+        Name of the local service.
+    startup_timeout_s : float
+        For so long after :meth:`start`, absent services may be coming up.
+    distrusted : collection of str
+        Services that answered wrongly earlier in this run.
+
+    Attributes
+    ----------
+    startup_until : float or None
+        When the services must have come up.
+    """
+
+    def __init__(
+        self,
+        cloud: Sequence[str],
+        local: str | None,
+        detection_timeout_s: float,
+        startup_timeout_s: float = 0.0,
+        distrusted: Collection[str] = (),
+    ) -> None:
+        timeout_s = detection_timeout_s
+        self.cloud = [Replica(name, timeout_s, late_after_s=timeout_s) for name in cloud]
+        self.local = None if local is None else Replica(local, _LOCAL_PATIENCE * timeout_s)
+        self._by_name = {replica.name: replica for replica in self.cloud}
+        if self.local is not None:
+            self._by_name[self.local.name] = self.local
+        for name in distrusted:
+            if name in self._by_name:
+                self._by_name[name].distrust(
+                    "answered otherwise than the robot's own planner in an earlier part of this "
+                    "run; name another service, or begin anew in another directory"
+                )
+        self._startup_timeout_s = startup_timeout_s
+        self.startup_until: float | None = None
+
+    def __iter__(self) -> Iterator[Replica]:
+        return iter(self._by_name.values())
+
+    def get(self, name: str) -> Replica | None:
+        """Return the service of a name; None if there is none."""
+        return self._by_name.get(name)
+
+    def all_to_come(self) -> bool:
+        """Return whether no cloud service was ever present, not counting those that refuse.
+
+        False if all refuse.
+        """
+        seen = [each.detector.seen for each in self.cloud if each.refusal is None]
+        return bool(seen) and not any(seen)
+
+    def start(self, now: float) -> None:
+        """Give the services time to come up."""
+        self.startup_until = now + self._startup_timeout_s
+
+    def is_starting(self, now: float) -> bool:
+        """Return whether services may still be coming up."""
+        until = self.startup_until
+        return until is not None and now < until and self.all_to_come()
+
+    def local_usable(self, now: float) -> bool:
+        """Return whether the local service can be expected to answer now."""
+        return self.local is not None and self.local.usable(now)
+
+    def any_reliable(self) -> bool:
+        """Return whether a cloud service is reliable."""
+        return any(replica.reliable for replica in self.cloud)
+
+    def busy_until(self, now: float) -> float | None:
+        """Return when the first busy cloud service may be asked again; None if none is busy."""
+        times = [
+            replica.retry_at
+            for replica in self.cloud
+            if replica.reliable and replica.retry_at > now
+        ]
+        return min(times, default=None)
+
+    def hopeless(self) -> bool:
+        """Return whether no service will ever answer."""
+        if self.local is not None and self.local.refusal_code in _REFUSED_BY_ALL:
+            return True
+        return all(replica.refusal is not None for replica in self)
+
+    def silence_s(self, now: float) -> float | None:
+        """Return how long the cloud has been silent; None if it was never present."""
+        silences = [each.detector.silence_s(now) for each in self.cloud if each.detector.seen]
+        return min(silences, default=None)
+
+    # -- in words --------------------------------------------------------------------------------
+
+    def why_nobody(self) -> str:
+        """Explain why no service decides."""
+        reasons = []
+        for replica in self:
+            if replica.refusal is not None:
+                why = f"{replica.refusal_code}: {replica.refusal}"
+            elif not replica.detector.present:
+                absent = "is not there" if replica.detector.seen else "has not appeared"
+                why = "is being launched" if replica is self.local else absent
+            else:
+                why = replica.detector.suspicion or replica.complaint or "is busy"
+            reasons.append(f"{replica.name}: {why}")
+        return "; ".join(reasons)
+
+    def why_lost(self) -> str:
+        """Explain why no cloud service is usable."""
+        return "; ".join(
+            f"{replica.name} "
+            + (
+                replica.refusal
+                or replica.detector.suspicion
+                or replica.complaint
+                or ("is busy" if replica.detector.present else None)
+                or ("is gone" if replica.detector.seen else "has not appeared")
+            )
+            for replica in self.cloud
+        )

@@ -1,0 +1,476 @@
+"""Requests in flight, and what their replies say.
+
+A question may be sent to several services, and a service may have several requests in flight: a
+late answer still shows that it lives. A request is open until its answer is complete, its call has
+ended or the robot abandons it; while it is open, its service owes a sign of life.
+
+Every reply shows that its service lives. Most say more: it holds the robot's state, has lost it, is
+busy, or refuses. The handler records that in the request, the question and the replica, after
+checking all of the reply against the question: it may be corrupted, or the service wrong. Which
+service is asked next is decided by the dispatcher, from the :class:`ReplyOutcome`.
+"""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Iterator
+
+from holdfast.errors import MessageError, StaleEpochError
+from holdfast.problems.problem import Problem
+from holdfast.protocol.events import Abandon, Effects, RobotEffect, Send
+from holdfast.protocol.messages import (
+    PROTOCOL_VERSION,
+    Busy,
+    NeedState,
+    Progress,
+    Refused,
+    Reply,
+    Request,
+    SensingAnswer,
+    SessionConfiguration,
+    TaskAnswer,
+    decode_reply,
+    encode,
+)
+from holdfast.protocol.question import Provenance, Question
+from holdfast.protocol.replica_set import Replica
+from holdfast.protocol.verification import Verification
+
+__all__ = ["OpenRequest", "OpenRequests", "ReplyHandler", "ReplyOutcome"]
+
+
+_MAX_CALLS = 4
+"""Bound on the open requests to one service."""
+
+_NUMBERS_OF_EPOCH = 1 << 20
+_EPOCHS = 1 << 11
+"""Request numbers of one epoch, and epochs after which the numbers repeat. A number fits into 32
+bits even if a process makes two thousand times as many requests."""
+
+
+class OpenRequest:
+    """A request in flight.
+
+    Attributes
+    ----------
+    call_number : int
+        Of its call, in effects and events.
+    number : int
+        In the message, repeated by each reply. It is unique in the run, across all processes of the
+        robot, so a reply that arrives late in another call is recognized.
+    heard : bool
+        Whether any reply has come.
+    opens, restores : bool
+        Whether it carries the session configuration, and the state.
+    has_task_part, has_sensing_part : bool
+        Whether that part of the answer has come.
+    """
+
+    __slots__ = (
+        "call_number",
+        "has_sensing_part",
+        "has_task_part",
+        "heard",
+        "number",
+        "opens",
+        "question",
+        "replica",
+        "restores",
+        "sent_at",
+    )
+
+    def __init__(
+        self,
+        call_number: int,
+        number: int,
+        replica: Replica,
+        question: Question,
+        sent_at: float,
+        *,
+        opens: bool,
+        restores: bool,
+    ) -> None:
+        self.call_number = call_number
+        self.number = number
+        self.replica = replica
+        self.question = question
+        self.sent_at = sent_at
+        self.heard = False
+        self.opens = opens
+        self.restores = restores
+        self.has_task_part = False
+        self.has_sensing_part = False
+
+    @property
+    def answered(self) -> bool:
+        """Whether a part of the answer has come."""
+        return self.has_task_part or self.has_sensing_part
+
+    @property
+    def lacks_sensing(self) -> bool:
+        """Whether the sensing part is the next to come."""
+        return self.has_task_part or self.question.task_count == 0
+
+    @property
+    def finished(self) -> bool:
+        """Whether the whole answer has come."""
+        question = self.question
+        return self.lacks_sensing and (self.has_sensing_part or question.sensing_step is None)
+
+
+class OpenRequests:
+    """The requests in flight, in the order in which they were sent.
+
+    Parameters
+    ----------
+    timeout_s : float
+        From one request to the next of a service that may not hear the robot.
+    effects : Effects
+        Receives what is to be sent, abandoned and logged.
+    """
+
+    def __init__(
+        self,
+        session: bytes,
+        epoch: int,
+        session_configuration: SessionConfiguration,
+        timeout_s: float,
+        effects: Effects[RobotEffect],
+    ) -> None:
+        self._timeout_s = timeout_s
+        self._session = session
+        self._epoch = epoch
+        self._session_configuration = session_configuration
+        self._effects = effects
+        self._open: dict[int, OpenRequest] = {}
+        self._asked: Question | None = None
+        self._attempts = 0
+        self._number = 0
+        self._first_request = epoch % _EPOCHS * _NUMBERS_OF_EPOCH
+
+    def __iter__(self) -> Iterator[OpenRequest]:
+        # Of a copy, so that they can be given up on the way.
+        return iter(list(self._open.values()))
+
+    def __len__(self) -> int:
+        return len(self._open)
+
+    def get(self, number: int) -> OpenRequest | None:
+        """Return an open request; None if it is not open."""
+        return self._open.get(number)
+
+    def to(self, replica: Replica) -> list[OpenRequest]:
+        """Return the requests to a service."""
+        return [call for call in self._open.values() if call.replica is replica]
+
+    def about(self, question: Question) -> list[OpenRequest]:
+        """Return the requests with a question."""
+        return [call for call in self._open.values() if call.question is question]
+
+    def is_asked(self, replica: Replica, question: Question) -> bool:
+        """Return whether a service has the question."""
+        return any(call.replica is replica for call in self.about(question))
+
+    def retry_at(self, replica: Replica, question: Question) -> float:
+        """Return when a service that may not hear the robot is sent the question again."""
+        sent_at = [call.sent_at for call in self.about(question) if call.replica is replica]
+        return max([replica.retry_at, *(at + self._timeout_s for at in sent_at)])
+
+    def probe_at(self, replica: Replica, question: Question) -> float | None:
+        """Return when a suspected service may be sent the question; None if it need not be."""
+        if not replica.detector.present or replica.refusal is not None:
+            return None
+        if replica.detector.trusted and self.is_asked(replica, question):
+            return None  # it is at work, and says so
+        # One probe at a time, so that a service further away than a turn is long can answer.
+        probes = [call.sent_at for call in self.to(replica) if not call.answered]
+        return max(replica.retry_at, max(probes, default=-1e9) + self._timeout_s)
+
+    def first_sent_at(self) -> float:
+        """Return when the oldest open request was sent."""
+        return min(call.sent_at for call in self._open.values())
+
+    def settle(self, call: OpenRequest) -> None:
+        """Close a request from which nothing is awaited."""
+        if self._open.pop(call.call_number, None) is not None:
+            call.replica.detector.settled()
+
+    def abandon(self, call: OpenRequest) -> None:
+        """Close a request and tell the transport."""
+        self.settle(call)
+        self._effects.append(Abandon(call.call_number))
+
+    def abandon_all(self, replica: Replica) -> None:
+        """Close all requests to a service."""
+        for call in self.to(replica):
+            self.abandon(call)
+
+    def send(
+        self,
+        replica: Replica,
+        question: Question,
+        now: float,
+        *,
+        whole_state: bool = False,
+        is_retry: bool = True,
+    ) -> None:
+        """Send a question to a service, with the state information that the service lacks.
+
+        Parameters
+        ----------
+        whole_state : bool
+            Whether the service needs the whole state.
+        is_retry : bool
+            Whether another attempt at a question is reported; not if other services have it too.
+        """
+        open_calls = self.to(replica)
+        for call in open_calls[: max(0, len(open_calls) - _MAX_CALLS + 1)]:
+            self.abandon(call)
+        state = question.state
+        catch_up = replica.catch_up(question, whole_state=whole_state)
+        self._number += 1
+        call_number = self._number
+        number = self._first_request + call_number
+        request = Request(
+            PROTOCOL_VERSION,
+            self._session,
+            self._epoch,
+            number,
+            state.trial,
+            state.step,
+            state.sensed,
+            question.digest,
+            catch_up.observations,
+            self._session_configuration if catch_up.needs_session_configuration else None,
+            catch_up.checkpoint,
+        )
+        self._open[call_number] = OpenRequest(
+            call_number,
+            number,
+            replica,
+            question,
+            now,
+            opens=catch_up.needs_session_configuration,
+            restores=catch_up.checkpoint is not None,
+        )
+        replica.detector.asked(now)
+        payload = encode(request)
+        if catch_up.needs_session_configuration and not catch_up.fresh:
+            self._effects.report(
+                "restore", service=replica.name, step=state.step, bytes=len(payload)
+            )
+        self._attempts = self._attempts + 1 if question is self._asked else 1
+        self._asked = question
+        if self._attempts > 1 and is_retry:
+            waited_s = 0.0 if question.needed_at is None else now - question.needed_at
+            self._effects.report(
+                "retry",
+                service=replica.name,
+                step=state.step,
+                attempt=self._attempts,
+                waited_ms=1e3 * waited_s,
+            )
+        self._effects.append(Send(replica.name, call_number, payload))
+
+
+class ReplyOutcome(enum.Enum):
+    """What a reply means for its question."""
+
+    NOTHING = enum.auto()
+    """This request brings no answer: the service is busy, refuses, or its reply is invalid."""
+
+    AT_WORK = enum.auto()
+    """The service works on the answer."""
+
+    ANSWERED = enum.auto()
+    """The first part of the answer has come."""
+
+    ANSWERED_MORE = enum.auto()
+    """The second part has come."""
+
+    LACKS_OBSERVATIONS = enum.auto()
+    """The service needs the observations that it has missed."""
+
+    LACKS_STATE = enum.auto()
+    """The service needs the whole state."""
+
+    @property
+    def shows_work(self) -> bool:
+        """Whether the service works, or has worked, on the question."""
+        return self in (ReplyOutcome.AT_WORK, ReplyOutcome.ANSWERED, ReplyOutcome.ANSWERED_MORE)
+
+
+class ReplyHandler:
+    """Records what replies say.
+
+    Parameters
+    ----------
+    problem : Problem
+        To check answers.
+    verification : Verification
+        Takes each part of an answer.
+    effects : Effects
+        Receives log events.
+    """
+
+    def __init__(
+        self,
+        calls: OpenRequests,
+        problem: Problem,
+        verification: Verification,
+        effects: Effects[RobotEffect],
+    ) -> None:
+        self._calls = calls
+        self._verification = verification
+        self._action_size = problem.action_size
+        self._num_sensing_actions = len(problem.sensing_actions)
+        self._effects = effects
+
+    def take(self, call: OpenRequest, payload: bytes, now: float) -> ReplyOutcome:
+        """Handle a reply to an open request.
+
+        Raises
+        ------
+        StaleEpochError
+            If another process of the robot has taken over.
+        """
+        replica = call.replica
+        try:
+            reply = decode_reply(payload)
+            _check_number(reply, call.number)
+            self._note_lateness(call, now)
+            if isinstance(reply, TaskAnswer | SensingAnswer):
+                self._take_answer(call, reply, now)
+                return self._was_answered(call, reply, now)
+        except MessageError as error:
+            # Spoilt on its way, or by a service that errs: the answer is asked for again.
+            self._effects.report("malformed_reply", service=replica.name, reason=str(error))
+            self._calls.abandon(call)
+            replica.delay(now)
+            return ReplyOutcome.NOTHING
+        replica.detector.heard(now)
+        if isinstance(reply, Progress):
+            return ReplyOutcome.AT_WORK
+        self._calls.abandon(call)
+        if isinstance(reply, NeedState):
+            return self._need_state(call, reply, now)
+        if isinstance(reply, Busy):
+            self._was_busy(replica, reply, now)
+        else:
+            self._was_refused(call, reply, now)
+        return ReplyOutcome.NOTHING
+
+    def _note_lateness(self, call: OpenRequest, now: float) -> None:
+        """Report a service whose first replies always take longer than the timeout.
+
+        It is given up after each question and tried again with the next one.
+        """
+        if call.heard:
+            return
+        call.heard = True
+        replica = call.replica
+        soonest_s = replica.note_first_reply(call.sent_at, now)
+        if soonest_s is not None:
+            self._effects.report(
+                "late_replies",
+                service=replica.name,
+                soonest_ms=1e3 * soonest_s,
+                reason="several in a row took longer than offload.detection_timeout_ms "
+                f"({1e3 * replica.late_after_s:g}), so it is given up and tried again with each "
+                "turn; if it is that far away, raise the setting above the way there and back",
+            )
+
+    # -- answers ---------------------------------------------------------------------------------
+
+    def _take_answer(
+        self, call: OpenRequest, reply: TaskAnswer | SensingAnswer, now: float
+    ) -> None:
+        question, name = call.question, call.replica.name
+        if isinstance(reply, TaskAnswer):
+            part = question.read_tasks(reply, self._action_size, name)
+        else:
+            part = question.read_sensing(reply, self._num_sensing_actions, name)
+        provenance = Provenance(name, now - call.sent_at, 1e-6 * reply.computed_us)
+        self._verification.take(question, part, provenance)
+
+    def _was_answered(
+        self, call: OpenRequest, reply: TaskAnswer | SensingAnswer, now: float
+    ) -> ReplyOutcome:
+        replica, question = call.replica, call.question
+        first = not call.answered
+        if isinstance(reply, TaskAnswer):
+            call.has_task_part = True
+        else:
+            call.has_sensing_part = True
+        sensing = isinstance(reply, SensingAnswer)
+        replica.note_answer(question, now, sensing=sensing, restored=call.restores)
+        for earlier in self._calls.to(replica):
+            if earlier.call_number < call.call_number:
+                # Whatever became of it, nothing is awaited of it any more.
+                self._calls.abandon(earlier)
+        if first and call.opens and (call.restores or question.state.step > 0):
+            restore_ms = 1e3 * (now - call.sent_at)
+            self._effects.report(
+                "restored", service=replica.name, step=question.state.step, restore_ms=restore_ms
+            )
+        if call.finished:
+            replica.detector.answered()
+            self._calls.settle(call)
+        return ReplyOutcome.ANSWERED if first else ReplyOutcome.ANSWERED_MORE
+
+    # -- anything else ---------------------------------------------------------------------------
+
+    def _need_state(self, call: OpenRequest, reply: NeedState, now: float) -> ReplyOutcome:
+        replica = call.replica
+        replica.note_lost_state(differs=reply.differs)
+        if reply.diverged:
+            self._effects.report(
+                "state_diverged",
+                service=replica.name,
+                trial=call.question.state.trial,
+                step=call.question.state.step,
+                reason="the service came to another state than the robot from the same "
+                "observations, so it is handed the robot's",
+            )
+        if call.opens and call.restores:
+            # It was handed everything and asks for it again.
+            self._refusal(call, "need_state", "asks again for a state that it was sent", now)
+            return ReplyOutcome.NOTHING
+        # Told everything but the state, it came to another one: only the state will do.
+        return (
+            ReplyOutcome.LACKS_STATE
+            if reply.differs or call.opens
+            else ReplyOutcome.LACKS_OBSERVATIONS
+        )
+
+    def _was_busy(self, replica: Replica, reply: Busy, now: float) -> None:
+        after_s = replica.note_busy(1e-3 * reply.retry_after_ms, now)
+        # However often: the writer of the log limits repetitions.
+        self._effects.report(
+            "busy", service=replica.name, retry_after_ms=1e3 * after_s, times=replica.num_busy
+        )
+
+    def _was_refused(self, call: OpenRequest, reply: Refused, now: float) -> None:
+        replica = call.replica
+        if reply.code == "stale_epoch":
+            raise StaleEpochError(
+                f"{replica.name}: {reply.text}; another process has resumed this run, "
+                "so this one stops"
+            )
+        if reply.code == "damaged":
+            replica.delay(now)
+            self._effects.report("damaged_request", service=replica.name, reason=reply.text)
+            return
+        replica.note_lost_state(differs=False)
+        self._refusal(call, reply.code, reply.text, now)
+
+    def _refusal(self, call: OpenRequest, code: str, text: str, now: float) -> None:
+        replica = call.replica
+        final = replica.note_refusal(code, text, now, sensing=call.lacks_sensing)
+        self._effects.report("refused", service=replica.name, code=code, reason=text, final=final)
+
+
+def _check_number(reply: Reply, asked: int) -> None:
+    unread = reply.number == 0 and isinstance(reply, Busy | Refused)
+    if reply.number != asked and not unread:
+        raise MessageError("malformed", f"reply to request {reply.number}, asked was {asked}")

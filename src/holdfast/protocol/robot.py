@@ -1,0 +1,592 @@
+"""The robot's loop as a state machine: sense, decide, write down, act, once and in order.
+
+The robot holds the true state: its belief, folded from what it sensed and did. Services only
+compute what follows from it. Each turn takes the next decision from the current answer, journals
+it, orders it from the environment and folds in the result. When the answer is used up, the robot
+asks a new question.
+
+While the robot performs the task actions of an answer, the next sensing action is already being
+computed. It is used only if the state in which it was chosen is, bit for bit, the one in which the
+robot arrives.
+
+The machine touches nothing. Methods take an event and the time and return effects
+(:mod:`holdfast.protocol.events`), to be carried out in order. If nothing happens before
+:meth:`Robot.next_wakeup`, the shell calls :meth:`Robot.wake`.
+"""
+
+from __future__ import annotations
+
+from holdfast.arrays import FloatArray
+from holdfast.belief import VALIDATION_GATE_SQUARED
+from holdfast.config.settings import SimulatorSettings
+from holdfast.errors import (
+    HeldError,
+    HoldfastError,
+    UnknownPerformanceError,
+)
+from holdfast.outcome import Done
+from holdfast.planning import ObservationInfo, Planner, PlanningState
+from holdfast.protocol.decision_source import DecisionSource
+from holdfast.protocol.events import (
+    Act,
+    Acted,
+    EndTrial,
+    EnvironmentEvent,
+    EnvironmentFailed,
+    EnvironmentReady,
+    Halt,
+    OwnAnswer,
+    Paused,
+    Planned,
+    RobotEffect,
+    Sense,
+    Sensed,
+    Timing,
+    TransportEvent,
+    WriteRecords,
+)
+from holdfast.protocol.messages import (
+    DIGEST_SIZE,
+    encode_floats,
+)
+from holdfast.protocol.question import Provenance, Question, same_actions
+from holdfast.protocol.records import (
+    DIVERGENCE_RUN,
+    ActingRecord,
+    LocalTookOverRecord,
+    ObservedRecord,
+    PausedRecord,
+    PerformedRecord,
+    Record,
+    TrialHistory,
+)
+from holdfast.protocol.status import Status
+
+__all__ = ["Robot"]
+
+
+_FROM_ENVIRONMENT = (Sensed, Acted, EnvironmentFailed)
+"""Events that complete an order to the environment."""
+
+_TICKS_INTERVAL_S = 1.0
+"""Missed ticks are reported at most this often."""
+
+
+_MAX_REPORTS = 10
+"""Bound on reports of each kind about unexplained observations per trial; all are counted."""
+
+
+class Robot:
+    """The loop of one robot over the trials of a run.
+
+    Parameters
+    ----------
+    simulator : SimulatorSettings
+        Seed and maximum number of steps.
+    source : DecisionSource
+        Answers the questions of this robot.
+    rate_hz : float or None
+        Task actions per second; None for as soon as possible.
+
+    Attributes
+    ----------
+    missed_ticks : int
+        Ticks of ``rate_hz`` at which the robot was not ready.
+    has_decided : bool
+        Whether this process has used an answer.
+    """
+
+    def __init__(
+        self,
+        planner: Planner,
+        simulator: SimulatorSettings,
+        source: DecisionSource,
+        rate_hz: float | None = None,
+    ) -> None:
+        self._planner = planner
+        self._simulator = simulator
+        self._source = source
+        self._period_s = None if rate_hz is None else 1.0 / rate_hz
+        # One list for both, because the order of all effects counts.
+        self._effects = source.effects
+        self._history: TrialHistory | None = None
+        self._trial = 0
+        self._done: Done = False
+        self._awaits_environment = False
+        self._sensing_action = 0
+        self._computed_ms = 0.0
+        self._timed_provenance: Provenance | None = None
+        self._unwritten: list[Record] = []
+        self._pausing = False
+        self._stopped = False
+        self._next_tick: float | None = None
+        self._asleep_until: float | None = None
+        self._recoveries_counted = 0
+        self._reported_ticks = 0
+        self._report_ticks_at = 0.0
+        self.missed_ticks = 0
+        self.has_decided = False
+
+    @property
+    def status(self) -> Status:
+        """Which service decides."""
+        return self._source.status
+
+    @property
+    def is_holding(self) -> bool:
+        """Whether the robot holds still because no service is usable."""
+        return self._source.is_holding
+
+    @property
+    def num_unverified(self) -> int:
+        """Questions that the own planner still has to recompute."""
+        return self._source.num_unverified
+
+    @property
+    def trial(self) -> int | None:
+        """The current trial; None between trials."""
+        return None if self._history is None else self._trial
+
+    @property
+    def step(self) -> int | None:
+        """The current step; None between trials."""
+        return None if self._history is None else self._history.state.step
+
+    @property
+    def state(self) -> PlanningState | None:
+        """The current state; None between trials."""
+        return None if self._history is None else self._history.state
+
+    @property
+    def unexplained_observations(self) -> int:
+        """Of the current trial; 0 between trials."""
+        return 0 if self._history is None else self._history.num_unexplained
+
+    @property
+    def _current_history(self) -> TrialHistory:
+        assert self._history is not None, "between trials"
+        return self._history
+
+    def start(self, now: float) -> list[RobotEffect]:
+        """Begin the run: start looking for services."""
+        self._source.start(now)
+        return self._take()
+
+    def begin_trial(
+        self,
+        trial: int,
+        history: TrialHistory,
+        begun: EnvironmentReady,
+        now: float,
+        *,
+        tail_is_certain: bool,
+    ) -> list[RobotEffect]:
+        """Begin or resume a trial.
+
+        Parameters
+        ----------
+        history : TrialHistory
+            From :func:`~holdfast.protocol.records.replay`; of no records for a new trial.
+        begun : EnvironmentReady
+            State of the environment.
+        tail_is_certain : bool
+            Whether no record can be missing: no power was cut and no file removed since the last.
+        """
+        self._trial = trial
+        self._history = history
+        self._done = begun.done
+        self._awaits_environment = False
+        self._unwritten = []
+        self._next_tick = None
+        resumed = history.begun
+        if resumed:
+            self._effects.report("resumed_trial", trial=trial, step=history.state.step)
+        try:
+            again = self._settle_pending_action(begun.steps_performed, resumed, tail_is_certain)
+        except UnknownPerformanceError as error:
+            self._stop(error)
+            return self._take()
+        if again is not None:
+            # It is in the journal already, and the environment says that it was not performed.
+            self._awaits_environment = True
+            self._effects.append(Act(history.state.step, again))
+        else:
+            self._go_on(now)
+        return self._take()
+
+    def _settle_pending_action(
+        self, performed: int | None, resumed: bool, tail_is_certain: bool
+    ) -> FloatArray | None:
+        """Return the pending task action if it was not performed and must be performed now."""
+        history = self._current_history
+        known = history.state.step
+        where = f"trial {self._trial}, step {history.state.step}"
+        if performed is None:
+            if not resumed or (history.pending is None and (history.paused or tail_is_certain)):
+                return None
+            what = (
+                "the journal ends with a task action and does not say whether it was performed"
+                if history.pending is not None
+                else "the journal may lack its last records (the machine was restarted, or a file "
+                "of the journal removed or cut)"
+            )
+            raise UnknownPerformanceError(
+                f"{where}: {what}, and the environment has no method steps_performed that could "
+                "tell; nothing is performed, because it must never be performed twice. Begin that "
+                "trial anew in another directory (--out)"
+            )
+        if history.pending is not None and performed == known + 1:
+            self._unwritten.append(PerformedRecord(known, None))
+            self._effects.report("performed_unseen", trial=self._trial, step=known)
+            history.performed(self._planner, None)
+            return None
+        if performed != known:
+            raise UnknownPerformanceError(
+                f"{where}: the environment says that {performed} task actions were performed in "
+                f"this trial, the journal has {known}"
+                f"{' and one that may have been' if history.pending is not None else ''}; "
+                "they do not belong together, so nothing is performed"
+            )
+        return history.pending
+
+    # -- what happens ----------------------------------------------------------------------------
+
+    def handle(
+        self, event: TransportEvent | EnvironmentEvent | OwnAnswer | Planned, now: float
+    ) -> list[RobotEffect]:
+        """Handle an event of the transport, the environment or a planner."""
+        if isinstance(event, OwnAnswer):
+            self._source.decided(event, self._num_ordered(), now)
+        elif isinstance(event, _FROM_ENVIRONMENT):
+            # Between trials, or after a stop, whatever comes late is of no use.
+            if self._history is not None and self._awaits_environment and not self._stopped:
+                self._awaits_environment = False
+                if event.step != self._history.state.step:
+                    self._stop(
+                        HeldError(
+                            f"the environment answered for step {event.step} where step "
+                            f"{self._history.state.step} was asked of it; the robot holds still"
+                        )
+                    )
+                elif isinstance(event, Sensed):
+                    self._sensed(event, now)
+                elif isinstance(event, Acted):
+                    self._done = event.done
+                    self._performed(event.reward)
+                else:
+                    self._failed(event)
+        elif not isinstance(event, EnvironmentReady):
+            self._source.handle(event, now)
+        self._go_on(now)
+        return self._take()
+
+    def _num_ordered(self) -> int:
+        """Return how many task actions of the current answer are performed or ordered."""
+        question, history = self._source.question, self._history
+        if question is None or history is None:
+            return 0
+        return history.state.step - question.state.step + (history.pending is not None)
+
+    def recovery_exited(self, launch: int, reason: str, now: float) -> list[RobotEffect]:
+        """Handle the end of a local service's process, or its failure to start."""
+        self._source.recovery_exited(launch, reason, now)
+        self._go_on(now)
+        return self._take()
+
+    def wake(self, now: float) -> list[RobotEffect]:
+        """Handle the passing of time."""
+        self._source.wake(now)
+        self._go_on(now)
+        return self._take()
+
+    def event_loop_stalled(self, seconds: float) -> None:
+        """Note that for so long the process could not receive, as during a slow write."""
+        self._source.event_loop_stalled(seconds)
+
+    def pause(self, now: float) -> list[RobotEffect]:
+        """End in order: complete the current action, write everything down and stand still.
+
+        If that action ends the trial, :class:`EndTrial` comes instead of :class:`Paused`; no other
+        trial must be begun.
+        """
+        self._pausing = True
+        self._go_on(now)
+        return self._take()
+
+    def salvage(self) -> list[WriteRecords]:
+        """Return the records still to be written, after a method has raised."""
+        self._write()
+        return [effect for effect in self._effects.take() if isinstance(effect, WriteRecords)]
+
+    def next_wakeup(self) -> float | None:
+        """Return when :meth:`wake` is due if nothing happens before; None if never."""
+        asleep_until, due = self._asleep_until, self._source.next_wakeup()
+        if asleep_until is None or due is None:
+            return due if asleep_until is None else asleep_until
+        return min(asleep_until, due)
+
+    # -- the environment -------------------------------------------------------------------------
+
+    def _sensed(self, event: Sensed, now: float) -> None:
+        history = self._current_history
+        state = history.state
+        try:
+            after, info = self._planner.observe(state, self._sensing_action, event.observation)
+        except HoldfastError as error:
+            self._stop(error)
+            return
+        reached = self._planner.digest(after)
+        shown = encode_floats(event.observation)
+        record = ObservedRecord(state.step, self._sensing_action, shown, reached, self._computed_ms)
+        history.observed(record, after, explained=info.explained)
+        self._write(record)
+        if not info.explained:
+            self._report_unexplained(state.step, info)
+        if not self._pausing:
+            self._ask(reached, now)
+
+    def _report_unexplained(self, step: int, info: ObservationInfo) -> None:
+        """Report an observation outside the validation gate, and a run of these."""
+        history = self._current_history
+        gate = f"{VALIDATION_GATE_SQUARED**0.5:g} standard deviations"
+        if history.num_unexplained <= _MAX_REPORTS:
+            distance = info.mahalanobis_distance
+            fields: dict[str, object] = {} if distance is None else {"deviations": distance}
+            more = history.num_unexplained == _MAX_REPORTS
+            self._effects.report(
+                "unexplained",
+                trial=self._trial,
+                step=step,
+                sensing_action=self._sensing_action,
+                **fields,
+                reason=(
+                    "no particle can have made it"
+                    if distance is None
+                    else f"outside the validation gate of every particle ({gate})"
+                )
+                + ("; further ones of this trial are counted only" if more else ""),
+            )
+        if (
+            history.unexplained_in_a_row == DIVERGENCE_RUN
+            and history.num_divergences <= _MAX_REPORTS
+        ):
+            self._effects.report(
+                "filter_diverged",
+                trial=self._trial,
+                step=step,
+                reason=f"the last {DIVERGENCE_RUN} observations were unexplained: the belief has "
+                "lost the state, or the problem's model is wrong; the robot goes on",
+            )
+
+    def _performed(self, reward: float | None) -> None:
+        history = self._current_history
+        self._unwritten.append(PerformedRecord(history.state.step, reward))
+        try:
+            history.performed(self._planner, reward)
+        except HoldfastError as error:
+            self._stop(error)
+
+    def _failed(self, event: EnvironmentFailed) -> None:
+        where = f"the robot holds still in trial {self._trial}, step {event.step}"
+        if event.performed:
+            # What is written down now needs no environment that counts when the run goes on.
+            self._performed(event.reward)
+            if self._stopped:
+                return
+            where += ", whose task action was performed"
+        # The account of the failure comes last: it may have many lines.
+        if not event.action_in_doubt:
+            self._stop(HeldError(f"{where}: {event.text}"))
+        elif event.counts_steps:
+            self._stop(
+                HeldError(
+                    f"{where}, and whether its task action was performed is not known: {event.text}"
+                )
+            )
+        else:
+            self._stop(
+                UnknownPerformanceError(
+                    f"{where}, and nobody can say whether its task action was performed, because "
+                    "the environment has no method steps_performed; this trial cannot be gone on "
+                    f"with, since no action must be performed twice: {event.text}"
+                )
+            )
+
+    # -- the loop --------------------------------------------------------------------------------
+
+    def _go_on(self, now: float) -> None:
+        """Do the next thing, if nothing is awaited."""
+        self._asleep_until = None
+        history = self._history
+        self._stopped = self._stopped or self._source.stopped
+        if history is None or self._awaits_environment or self._stopped:
+            if self._pausing and history is None:
+                self._effects.append(Paused())
+            return
+        state = history.state
+        if self._done or state.step >= self._simulator.max_steps:
+            # Before a pause: that the task is done, and how it ended, is in no other record.
+            self._end_trial(now)
+            return
+        if self._pausing:
+            self._write(PausedRecord())
+            self._history = None
+            self._source.drop()
+            self._effects.append(Paused())
+            return
+        if self._planner.needs_sensing(state):
+            self._next_sensing(state, now)
+        else:
+            self._next_action(state, now)
+
+    def _next_sensing(self, state: PlanningState, now: float) -> None:
+        question = self._source.question
+        if question is None or question.sensing_step != state.step:
+            self._ask(self._planner.digest(state), now)
+            question = self._source.question
+            assert question is not None
+        answer = question.sensing
+        if answer is None or question.disputed:
+            self._source.need(now)
+            return
+        if (
+            question.state is not state
+            and answer.digest != self._planner.digest(state)[:DIGEST_SIZE]
+        ):
+            # Chosen for another state than this: the service's belief has drifted from ours.
+            self._effects.report("prefetch_unused", trial=self._trial, step=state.step)
+            self._source.check()
+            self._ask(self._planner.digest(state), now)
+            self._source.need(now)
+            return
+        provenance = question.sensing_provenance
+        assert provenance is not None
+        self._computed_ms = 1e3 * provenance.computed_s
+        self._timed("sensing", question, provenance, now)
+        self._sensing_action = answer.sensing_action
+        self._awaits_environment = True
+        self._write()
+        self._effects.append(Sense(state.step, answer.sensing_action))
+
+    def _next_action(self, state: PlanningState, now: float) -> None:
+        question = self._source.question
+        offset = -1 if question is None else state.step - question.state.step
+        if question is None or question.task_count == 0 or not 0 <= offset < question.task_count:
+            self._ask(self._planner.digest(state), now)
+            question = self._source.question
+            assert question is not None
+            offset = 0
+        if question.task_actions is None or question.disputed:
+            self._source.need(now)
+            return
+        provenance = question.task_provenance
+        if offset == 0 and provenance is not None and provenance is not self._timed_provenance:
+            self._timed_provenance = provenance
+            self._timed("task", question, provenance, now)
+            self._source.go_on()
+        if not self._take_tick(now):
+            return
+        action = question.task_actions[offset]
+        if not self._source.limits_are_reliable and question.own is None:
+            own, _ = self._planner.choose_task_action(state)
+            if not same_actions([own], [action]):
+                self._source.dispute()
+                self._source.need(now)
+                return
+        self._write(ActingRecord(state.step, encode_floats(action)))
+        history = self._current_history
+        history.acting(action)
+        self._awaits_environment = True
+        self._effects.append(Act(state.step, action))
+
+    def _ask(self, state_digest: bytes, now: float) -> None:
+        history = self._current_history
+        self._write()
+        observations, num_observations = history.observations, history.num_observations
+        question = Question(
+            self._planner.settings, history.state, state_digest, observations, num_observations
+        )
+        self._source.ask(question, now)
+
+    def _take_tick(self, now: float) -> bool:
+        """Return whether the next task action is due, and take its tick; else set the wakeup."""
+        if self._period_s is None:
+            return True
+        tick = now if self._next_tick is None else self._next_tick
+        if now < tick:
+            self._asleep_until = tick
+            return False
+        missed = int((now - tick) / self._period_s)
+        if missed:
+            self.missed_ticks += missed
+            if now >= self._report_ticks_at:
+                self._report_ticks(now)
+        self._next_tick = tick + (missed + 1) * self._period_s
+        return True
+
+    def _report_ticks(self, now: float) -> None:
+        """Report ticks missed since the last report."""
+        missed = self.missed_ticks - self._reported_ticks
+        if missed:
+            self._reported_ticks = self.missed_ticks
+            self._report_ticks_at = now + _TICKS_INTERVAL_S
+            self._effects.report("missed_ticks", missed=missed, total=self.missed_ticks)
+
+    def _end_trial(self, now: float) -> None:
+        history = self._current_history
+        self._report_ticks(now)
+        self._count_recoveries()
+        result = history.result(self._planner, self._done)
+        self._history = None
+        self._unwritten = []  # the result says all of it
+        self._source.drop()
+        self._effects.append(EndTrial(result))
+
+    # -- effects ---------------------------------------------------------------------------------
+
+    def _write(self, *records: Record) -> None:
+        history = self._history
+        if history is not None and (records or self._unwritten or history.begun):
+            # A recovery alone does not begin a trial.
+            self._count_recoveries()
+        self._unwritten += records
+        if self._unwritten:
+            # The effects that follow may rest on these records.
+            self._effects.append(WriteRecords(self._trial, tuple(self._unwritten)))
+            self._unwritten = []
+
+    def _count_recoveries(self) -> None:
+        """Count and record recoveries. Those between two trials belong to the second."""
+        history = self._current_history
+        times = self._source.recoveries - self._recoveries_counted
+        if times:
+            self._recoveries_counted = self._source.recoveries
+            history.recovered(times)
+            self._unwritten.append(LocalTookOverRecord(times))
+
+    def _timed(self, kind: str, question: Question, provenance: Provenance, now: float) -> None:
+        self.has_decided = True
+        waited_s = 0.0 if question.needed_at is None else now - question.needed_at
+        step = question.state.step if kind == "task" else question.sensing_step
+        self._effects.append(
+            Timing(
+                self._trial,
+                step if step is not None else question.state.step,
+                kind,
+                provenance.service,
+                self._source.status.value,
+                1e3 * waited_s,
+                1e3 * provenance.round_trip_s,
+                1e3 * provenance.computed_s,
+            )
+        )
+
+    def _stop(self, error: HoldfastError) -> None:
+        self._stopped = True
+        self._write()
+        self._effects.append(Halt(error))
+
+    def _take(self) -> list[RobotEffect]:
+        # Before the robot waits for whatever comes next: it may be killed while it waits.
+        self._write()
+        return self._effects.take()

@@ -1,0 +1,581 @@
+"""The service's end: it answers many robots, each of which holds its own true state.
+
+What a service remembers of a robot only saves work: the last requested state, the state at the next
+sensing step and the last answers. It may forget any of it at any time; it then replies that it
+needs the state. An answer is a function of the state that the request's digest names, so the same
+request is computed once, however often it comes.
+
+A request is answered in two parts. The *task* part reaches the requested state and chooses the task
+actions up to the next sensing step; it is short, and the robot waits for it. The *sensing* part is
+chosen in the state that those actions lead to; it is long, and needed only after they are
+performed. So the task part is sent before the sensing part is begun, and other robots' task parts
+go first, within limits.
+
+The machine computes nothing itself and has no clock, thread or socket. Methods take an event and
+the time and return effects, to be carried out in order. The caller runs each :class:`Job` that it
+is handed (at most ``workers`` at a time) anywhere, and returns its :class:`JobResult` with
+:meth:`Service.finished`.
+
+This module decides what requests and results mean. Memory is in
+:mod:`~holdfast.protocol.service_sessions`, the order of work in
+:mod:`~holdfast.protocol.request_queue`, replies in :mod:`~holdfast.protocol.service_calls` and
+computation in :mod:`~holdfast.protocol.service_jobs`.
+"""
+
+from __future__ import annotations
+
+import enum
+import math
+from collections.abc import Callable
+
+import msgspec
+
+from holdfast.errors import InvalidValueError, MessageError
+from holdfast.planning import needs_sensing
+from holdfast.problems.problem import Problem
+from holdfast.protocol.events import Effects
+from holdfast.protocol.expected_time import ExpectedTimes
+from holdfast.protocol.messages import (
+    MAX_WORD,
+    Request,
+    SessionConfiguration,
+    decode_request,
+    pack_configuration,
+)
+from holdfast.protocol.request_queue import RequestQueue
+from holdfast.protocol.service_calls import WaitingCalls
+from holdfast.protocol.service_jobs import (
+    Computed,
+    EndCall,
+    Job,
+    JobResult,
+    ProblemPool,
+    ServiceEffect,
+    StartJob,
+)
+from holdfast.protocol.service_limits import ServiceLimits
+from holdfast.protocol.service_sessions import (
+    REQUESTED,
+    CachedAnswer,
+    Owner,
+    PendingTask,
+    Session,
+    SessionKey,
+    SessionTable,
+)
+from holdfast.protocol.service_statistics import ServiceStatistics
+
+__all__ = ["Service"]
+
+_NO_ROOM_RETRY_MS = 100.0
+"""Shortest retry time for a robot that finds no free session."""
+
+_INERTIA_OF_ONE = 4.0
+_INERTIA_OF_ALL = 8.0
+"""The expectation for all robots moves more slowly than that for one."""
+
+
+class _Disposition(enum.Enum):
+    """How a request was handled that does not wait for a task."""
+
+    UNKNOWN = enum.auto()
+    """The cache has no answer."""
+
+    ANSWERED = enum.auto()
+    """All of the answer came from the cache."""
+
+    REJECTED = enum.auto()
+    """The request was refused, or turned away as busy."""
+
+
+class Service:
+    """Answers the requests of many robots.
+
+    Parameters
+    ----------
+    make_problem : callable
+        Builds the problem of a session configuration; raises the robot's mistakes as errors of
+        :mod:`holdfast.errors`. Jobs call it, several at a time.
+    workers : int
+        Jobs that may run at a time.
+    describe_error : callable, optional
+        Turns an error of a problem's code into a message.
+    """
+
+    def __init__(
+        self,
+        make_problem: Callable[[SessionConfiguration], Problem],
+        workers: int,
+        limits: ServiceLimits | None = None,
+        describe_error: Callable[[BaseException], str] | None = None,
+    ) -> None:
+        if workers < 1:
+            raise InvalidValueError(f"workers {workers}: a service needs at least 1")
+        self._make_problem = make_problem
+        self._describe_error = describe_error or _described
+        self._limits = limits or ServiceLimits()
+        self._statistics = ServiceStatistics()
+        self._effects: Effects[ServiceEffect] = Effects()
+        self._sessions = SessionTable(self._limits)
+        self._problems = ProblemPool(self._limits.max_problems)
+        self._queue = RequestQueue(workers, self._limits)
+        self._calls = WaitingCalls(self._limits, self._statistics, self._effects)
+        self._times = ExpectedTimes(_INERTIA_OF_ALL, task_s=1e-3, sensing_s=1e-3)
+
+    @property
+    def statistics(self) -> ServiceStatistics:
+        """Counters, and what is held now."""
+        statistics = self._statistics
+        statistics.sessions = len(self._sessions)
+        statistics.state_bytes = self._sessions.state_bytes
+        statistics.waiting = self._queue.num_waiting
+        statistics.running = self._queue.num_running
+        statistics.calls = len(self._calls)
+        return statistics
+
+    # -- what happens ----------------------------------------------------------------------------
+
+    def receive(
+        self, call: int, payload: bytes, now: float, owner: Owner = None
+    ) -> list[ServiceEffect]:
+        """Handle a request.
+
+        Parameters
+        ----------
+        call : int
+            Unique number of the call, used in effects.
+        now : float
+            Seconds of any monotonic clock.
+        owner : str or None, optional
+            Name in the robot's verified certificate; None without one. The request reaches only
+            sessions of this owner.
+        """
+        request: Request | MessageError
+        try:
+            request = decode_request(payload)
+        except MessageError as error:
+            request = error.without_traceback()
+        return self.receive_request(call, request, len(payload), now, owner)
+
+    def receive_request(
+        self,
+        call: int,
+        request: Request | MessageError,
+        size: int,
+        now: float,
+        owner: Owner = None,
+    ) -> list[ServiceEffect]:
+        """Handle a request that is already decoded, so that callers can decode outside their lock.
+
+        Parameters
+        ----------
+        request : Request or MessageError
+            What :func:`~holdfast.protocol.messages.decode_request` returned or raised.
+        size : int
+            Bytes of the message.
+        call, now, owner
+            As for :meth:`receive`.
+        """
+        if isinstance(request, MessageError):
+            self._calls.send_refused(call, 0, request.code, str(request))
+            return self._effects.take()
+        self._handle(call, request, (owner, request.session), size, now)
+        self._dispatch(now)
+        return self._effects.take()
+
+    def started(self, job: Job, now: float) -> None:
+        """Note that a job that was handed out starts only now."""
+        self._queue.started(job, now)
+
+    def finished(self, job: Job, outcome: JobResult, now: float) -> list[ServiceEffect]:
+        """Handle the result of a job that was handed out."""
+        task = self._queue.end(job)
+        session = task.session
+        session.remove_task(task)
+        self._problems.release(session.problem_key, outcome.problem)
+        if not session.closed:
+            self._sessions.use(session, now)
+            # The first job of a problem also imports and builds it: no measure of the next ones.
+            typical = session.built
+            session.built = session.built or outcome.problem is not None
+            if outcome.failure is not None or outcome.lacks_state:
+                self._failed(task, outcome)
+            else:
+                if typical:
+                    computed_s = now - task.started_at
+                    self._times.learn(computed_s, sensing=task.sensing)
+                    session.times.learn(computed_s, sensing=task.sensing)
+                self._succeeded(task, outcome, now)
+            self._queue.release_held(session)
+        self._dispatch(now)
+        return self._effects.take()
+
+    def tick(self, now: float) -> list[ServiceEffect]:
+        """Handle the passing of time."""
+        self._calls.send_progress(now)
+        while (session := self._sessions.idle(now)) is not None:
+            self._forget(session, "idle")
+        return self._effects.take()
+
+    def next_wakeup(self) -> float | None:
+        """Return when :meth:`tick` is due if nothing happens before; None if never."""
+        due = (self._calls.progress_at(), self._sessions.idle_at())
+        return min((at for at in due if at is not None), default=None)
+
+    # -- requests --------------------------------------------------------------------------------
+
+    def _handle(self, call: int, request: Request, key: SessionKey, size: int, now: float) -> None:
+        session = self._sessions.get(key)
+        epoch = self._sessions.epoch_of(key)
+        if request.epoch < epoch:
+            text = f"epoch {request.epoch}: a robot of epoch {epoch} has taken this session over"
+            self._calls.send_refused(call, request.number, "stale_epoch", text)
+            return
+        configuration = request.session_configuration
+        if session is not None:
+            if request.epoch > epoch:
+                self._take_over(session, request.epoch, now)
+            if (
+                configuration is not None
+                and pack_configuration(configuration) != session.configuration
+            ):
+                if request.epoch == epoch:
+                    text = "this session was opened with another problem, settings or seed"
+                    self._calls.send_refused(call, request.number, "invalid", text)
+                    return
+                self._forget(session, "opened anew")
+                session = None
+        if session is None:
+            if configuration is None:
+                self._calls.send_need_state(call, request.number, differs=False)
+                return
+            session = self._open_session(call, request, key, configuration, now)
+            if session is None:
+                return
+        else:
+            self._sessions.use(session, now)
+        newest = session.accept(request.number)
+        task = self._answer_from_cache(session, call, request, now, newest=newest)
+        if not newest:
+            if task is _Disposition.UNKNOWN:
+                # A later request of this robot came before: this one is superseded.
+                self._statistics.superseded += 1
+                self._effects.append(EndCall(call))
+            return
+        if task is _Disposition.UNKNOWN:
+            task = self._enqueue(session, call, request, size, now)
+        if isinstance(task, PendingTask):
+            self._supersede(session, task)
+        elif task is _Disposition.ANSWERED:
+            self._supersede(session, None)
+
+    def _open_session(
+        self,
+        call: int,
+        request: Request,
+        key: SessionKey,
+        configuration: SessionConfiguration,
+        now: float,
+    ) -> Session | None:
+        """Open a session; None if the robot was turned away."""
+        limits = self._limits
+        count = configuration.planning.particle_filter.num_particles
+        if count > limits.max_particles:
+            text = (
+                f"particle_filter.num_particles {count}: this service takes at most "
+                f"{limits.max_particles} (max_particles)"
+            )
+            self._calls.send_refused(call, request.number, "invalid", text)
+            return None
+        newcomer = self._sessions.is_newcomer(key[0])
+        if self._queue.is_overloaded(now, key[0], newcomer=newcomer):
+            self._sessions.note_epoch(key, request.epoch)
+            self._reject_busy(call, request.number, key, now, newcomer=newcomer)
+            return None
+        times = ExpectedTimes(_INERTIA_OF_ONE, self._times.task_s, self._times.sensing_s)
+        session = Session(key, request, configuration, limits.max_threads, times)
+        session.used_at = now
+        while not self._sessions.has_room_for(session):
+            unused = self._sessions.evictable_for(session)
+            if unused is None:
+                # It is free once another robot has left, not once the next decision is computed.
+                self._sessions.note_epoch(key, request.epoch)
+                least_ms = _NO_ROOM_RETRY_MS
+                self._reject_busy(
+                    call, request.number, key, now, newcomer=newcomer, least_ms=least_ms
+                )
+                return None
+            self._forget(unused, "room needed")
+        self._sessions.add(session)
+        self._statistics.sessions_opened += 1
+        named = {"problem": configuration.problem, "particles": count, "epoch": request.epoch}
+        self._note("session_opened", session, **named)
+        return session
+
+    def _take_over(self, session: Session, epoch: int, now: float) -> None:
+        """Continue a session with the robot's next process; nothing waits for the previous one."""
+        self._note("session_taken_over", session, epoch=epoch, previous_epoch=session.epoch)
+        self._statistics.sessions_taken_over += 1
+        session.take_over(epoch)
+        self._sessions.use(session, now)
+        self._supersede(session, None)
+
+    def _answer_from_cache(
+        self, session: Session, call: int, request: Request, now: float, *, newest: bool
+    ) -> PendingTask | _Disposition:
+        """Answer as far as the cache goes; return the task that the rest waits for."""
+        task = session.pending.get(request.digest)
+        if task is not None:
+            if task.request is None and not task.running:
+                self._queue.promote(task)
+            self._statistics.attached += 1
+            self._calls.attach(task, call, request.number, now)
+            return task
+        answer = session.answers.get(request.digest)
+        if answer is None:
+            return _Disposition.UNKNOWN
+        asked = (request.trial, request.step, request.sensed)
+        if (answer.trial, answer.step, answer.sensed) != asked:
+            text = (
+                f"trial {request.trial}, step {request.step}, sensed {request.sensed}: the state "
+                f"of this digest has {answer.trial}, {answer.step}, {answer.sensed}"
+            )
+            self._calls.send_refused(call, request.number, "invalid", text)
+            return _Disposition.REJECTED
+        following = answer.following
+        rest = None if following is None else session.pending.get(following)
+        if following is not None and rest is None and following not in session.answers:
+            if not newest or session.ahead is None or session.ahead_digest != following:
+                session.forget_answer(request.digest)
+                return _Disposition.UNKNOWN
+            rest = self._prefetch(session, now)
+        self._statistics.cache_hits += 1
+        if answer.num_actions:
+            self._calls.send_task(call, request.number, answer)
+        if rest is not None:
+            self._calls.attach(rest, call, request.number, now)
+            return rest
+        sensing = answer if following is None else session.answers[following]
+        if sensing.sensing_action >= 0:
+            digest = request.digest if following is None else following
+            self._calls.send_sensing(call, request.number, digest, sensing)
+        else:
+            self._effects.append(EndCall(call))
+        return _Disposition.ANSWERED
+
+    def _enqueue(
+        self, session: Session, call: int, request: Request, size: int, now: float
+    ) -> PendingTask | _Disposition:
+        """Queue a task for a request, or turn it away."""
+        if request.session_configuration is not None:
+            # The session has it; one copy for each request that waits would count nowhere.
+            request = msgspec.structs.replace(request, session_configuration=None)
+        interval = session.planning.sensing_interval + 1
+        sensing = not request.sensed and request.step % interval == 0
+        waiting = next(
+            (
+                task
+                for task in session.pending.values()
+                if task.slot == REQUESTED and not task.running
+            ),
+            None,
+        )
+        newcomer = session.newcomer
+        if waiting is None and self._queue.is_overloaded(now, session.owner, newcomer=newcomer):
+            self._reject_busy(call, request.number, session.key, now, newcomer=newcomer)
+            return _Disposition.REJECTED
+        if waiting is not None:
+            # It keeps the turn of the request that it replaces, and adds nothing to the backlog.
+            self._calls.end(waiting)
+            self._statistics.superseded += 1
+            session.remove_task(waiting)
+            self._queue.replace(waiting, request, sensing=sensing, size=size)
+            task = waiting
+        else:
+            task = PendingTask(
+                session,
+                request.digest,
+                sensing=sensing,
+                request=request,
+                state=None,
+                size=size,
+                since=now,
+            )
+            self._queue.enqueue(task)
+        session.add_task(task)
+        self._calls.attach(task, call, request.number, now)
+        return task
+
+    def _supersede(self, session: Session, keep: PendingTask | None) -> None:
+        """Drop everything the robot waits for, except ``keep``."""
+        for task in list(session.pending.values()):
+            if task is not keep:
+                self._calls.end(task)
+                if not task.running:
+                    self._statistics.superseded += 1
+                    session.remove_task(task)
+                    self._queue.remove(task)
+
+    # -- work ------------------------------------------------------------------------------------
+
+    def _prefetch(self, session: Session, now: float) -> PendingTask:
+        """Queue the sensing part of the state ahead."""
+        digest, state = session.ahead_digest, session.ahead
+        task = PendingTask(
+            session, digest, sensing=True, request=None, state=state, size=0, since=now
+        )
+        session.add_task(task)
+        self._queue.enqueue(task)
+        return task
+
+    def _dispatch(self, now: float) -> None:
+        """Hand out jobs while workers are free."""
+        while (task := self._queue.take(now)) is not None:
+            self._start_job(task, now)
+
+    def _start_job(self, task: PendingTask, now: float) -> None:
+        session, request = task.session, task.request
+        state = task.state
+        if request is not None and request.checkpoint is None:
+            state = session.state_before(request)
+            if state is None and session.knows_trial(request.trial):
+                # The robot is behind what is remembered, or was elsewhere meanwhile.
+                session.remove_task(task)
+                for record in self._calls.detach(task):
+                    self._calls.send_need_state(record.call, record.number, differs=True)
+                return
+        alone = self._queue.num_running == 0 and self._queue.num_waiting == 0
+        problem = self._problems.acquire(session.problem_key)
+        job = Job(
+            "sensing" if task.sensing else "task",
+            problem,
+            self._make_problem,
+            self._describe_error,
+            session.configuration,
+            session.planning if alone else session.planning_single,
+            session.seed,
+            self._limits,
+            request,
+            state,
+        )
+        self._queue.handed_out(task, job, now)
+        expected_s = math.inf
+        if problem is not None and task.is_typical(state):
+            times = session.times
+            expected_s = (times.typical_sensing if task.sensing else times.typical_task).seconds
+        self._effects.append(StartJob(job, expected_s))
+
+    # -- outcomes --------------------------------------------------------------------------------
+
+    def _failed(self, task: PendingTask, outcome: JobResult) -> None:
+        session, request = task.session, task.request
+        if outcome.diverged and request is not None:
+            self._statistics.states_diverged += 1
+            self._note("state_diverged", session, trial=request.trial, step=request.step)
+        for record in self._calls.detach(task):
+            if outcome.failure is None:
+                self._calls.send_need_state(
+                    record.call,
+                    record.number,
+                    differs=outcome.differs,
+                    diverged=outcome.diverged,
+                )
+            else:
+                self._calls.send_refused(record.call, record.number, *outcome.failure)
+        if not session.built:
+            # Nothing can ever come of it.
+            self._forget(session, "refused")
+
+    def _succeeded(self, task: PendingTask, outcome: JobResult, now: float) -> None:
+        session, statistics = task.session, self._statistics
+        self._sessions.mark_served(session)
+        most = self._limits.answers_per_session
+        computed_s = now - task.started_at
+        computed_us = min(MAX_WORD, max(0, round(1e6 * computed_s)))
+        if outcome.state is not None:
+            session.hold(outcome.state, outcome.ahead, outcome.ahead_digest)
+        if outcome.restored:
+            statistics.restores += 1
+            assert outcome.state is not None
+            self._note("restored", session, trial=outcome.state.trial, step=outcome.state.step)
+        state = task.state if outcome.state is None else outcome.state
+        assert state is not None
+        where = (state.trial, state.step, state.sensed, computed_us)
+        if task.sensing:
+            statistics.sensing_parts += 1
+            self._effects.append(Computed("sensing", computed_s, task.started_at - task.since))
+            answer = CachedAnswer(*where, sensing_action=outcome.sensing_action)
+            session.remember(task.digest, answer, most)
+            self._send_sensing(task, task.digest, answer)
+        else:
+            statistics.task_parts += 1
+            self._effects.append(Computed("task", computed_s, task.started_at - task.since))
+            ahead = outcome.ahead
+            assert ahead is not None
+            following = outcome.ahead_digest if needs_sensing(session.planning, ahead) else None
+            answer = CachedAnswer(*where, outcome.num_actions, outcome.actions, following)
+            session.remember(task.digest, answer, most)
+            self._send_task(task, answer, now)
+        self._limit_memory(session)
+
+    def _send_task(self, task: PendingTask, answer: CachedAnswer, now: float) -> None:
+        """Send the task part, and let the calls wait for the sensing part that follows."""
+        session, following = task.session, answer.following
+        self._calls.send_task_to_all(task, answer, now)
+        if following is None:
+            self._calls.end(task)
+        elif following in session.answers:
+            self._send_sensing(task, following, session.answers[following])
+        elif task.calls:
+            # Without a waiting call the robot has moved on.
+            rest = session.pending.get(following) or self._prefetch(session, now)
+            self._calls.move(task, rest)
+
+    def _send_sensing(self, task: PendingTask, digest: bytes, answer: CachedAnswer) -> None:
+        for record in self._calls.detach(task):
+            self._calls.send_sensing(record.call, record.number, digest, answer)
+
+    def _reject_busy(
+        self,
+        call: int,
+        number: int,
+        key: SessionKey,
+        now: float,
+        *,
+        newcomer: bool,
+        least_ms: float = 1.0,
+    ) -> None:
+        queue = self._queue
+        owner, session = key
+        wait_ms = max(least_ms, 1e3 * queue.wait_s(now, owner, newcomer=newcomer))
+        self._calls.send_busy(call, number, session, wait_ms, queue.num_waiting)
+
+    # -- sessions --------------------------------------------------------------------------------
+
+    def _limit_memory(self, session: Session) -> None:
+        """Count a session's memory; if all take too much, forget others, or its states."""
+        sessions = self._sessions
+        sessions.update_size(session)
+        while sessions.over_budget:
+            unused = sessions.largest_evictable()
+            if unused is None or unused is session:
+                break
+            self._forget(unused, "room needed")
+        if sessions.over_budget:
+            # The others are all in use: this robot sends its state each time.
+            sessions.drop_states(session)
+
+    def _forget(self, session: Session, reason: str) -> None:
+        self._supersede(session, None)
+        self._sessions.forget(session)
+        self._statistics.sessions_evicted += 1
+        self._note("evicted", session, reason=reason)
+
+    def _note(self, event: str, session: Session, **fields: object) -> None:
+        owner, key = session.key
+        named = {} if owner is None else {"robot": owner}
+        self._effects.report(event, **named, session=key[:4].hex(), **fields)
+
+
+def _described(error: BaseException) -> str:
+    return f"{type(error).__name__}: {error}"

@@ -1,0 +1,408 @@
+"""A service's computations, each a pure function of its inputs, and the effects that start them.
+
+A job rolls the robot's state forward or restores it from a checkpoint, verifies by the digest that
+it is the requested state, and decides in it. It belongs to no session while it runs, so any thread
+can run it, and nothing is kept before its result is handed in.
+
+Problems are other people's code. Whatever goes wrong in one becomes a refusal with an explanation,
+never an error of the service, and each instance is lent to one job at a time
+(:class:`ProblemPool`).
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable
+from typing import Literal, NamedTuple, TypeAlias
+
+from holdfast.config.settings import PlanningSettings
+from holdfast.errors import (
+    CheckpointError,
+    ConfigurationError,
+    HoldfastError,
+    InvalidValueError,
+    MessageError,
+    OtherCodeError,
+    UnknownProblemError,
+)
+from holdfast.planning import Planner, PlanningState
+from holdfast.problems.problem import Problem
+from holdfast.protocol.events import LogEvent
+from holdfast.protocol.messages import (
+    DIGEST_SIZE,
+    MAX_ACTION_SIZE,
+    MAX_TASK_ACTIONS,
+    Request,
+    SessionConfiguration,
+    decode_floats,
+    encode_floats,
+    unpack_configuration,
+)
+from holdfast.protocol.service_limits import ServiceLimits
+
+__all__ = [
+    "Computed",
+    "EndCall",
+    "Job",
+    "JobResult",
+    "ProblemPool",
+    "SendReply",
+    "ServiceEffect",
+    "StartJob",
+]
+
+
+class JobResult(NamedTuple):
+    """The result of a job.
+
+    Attributes
+    ----------
+    failure : tuple of str or None
+        Code and text of the refusal; None if it succeeded or lacks the state.
+    lacks_state : bool
+        The requested state does not follow from what the service holds.
+    differs : bool
+        The service held a state of this trial that leads elsewhere.
+    diverged : bool
+        The requested step was reached with another digest.
+    problem : Problem or None
+        To be reused, as far as it could be built.
+    state : PlanningState or None
+        The requested state, verified.
+    restored : bool
+        It came from a checkpoint.
+    num_actions : int
+        Task actions.
+    actions : bytes
+        Encoded task actions.
+    ahead : PlanningState or None
+        The state that they lead to.
+    ahead_digest : bytes
+        As it is sent.
+    sensing_action : int
+        The chosen one; -1 if none was to be chosen.
+    """
+
+    failure: tuple[str, str] | None = None
+    lacks_state: bool = False
+    differs: bool = False
+    diverged: bool = False
+    problem: Problem | None = None
+    state: PlanningState | None = None
+    restored: bool = False
+    num_actions: int = 0
+    actions: bytes = b""
+    ahead: PlanningState | None = None
+    ahead_digest: bytes = b""
+    sensing_action: int = -1
+
+
+class _LacksStateError(Exception):
+    """The request's events do not connect to the held state, or lead to another one."""
+
+    def __init__(self, *, differs: bool = False, diverged: bool = False) -> None:
+        super().__init__()
+        self.differs = differs
+        self.diverged = diverged
+
+
+class Job:
+    """A part of an answer to be computed.
+
+    Parameters
+    ----------
+    kind : {"task", "sensing"}
+    problem : Problem or None
+        None if it must be built.
+    configuration : bytes
+        Packed (:func:`~holdfast.protocol.messages.pack_configuration`).
+    request : Request or None
+        Names the state; None if ``state`` is that state.
+    state : PlanningState or None
+        Where to start; None for the trial's beginning.
+    """
+
+    __slots__ = (
+        "_configuration",
+        "_describe_error",
+        "_limits",
+        "_make_problem",
+        "_planning",
+        "_problem",
+        "_request",
+        "_seed",
+        "_state",
+        "kind",
+    )
+
+    def __init__(
+        self,
+        kind: Literal["task", "sensing"],
+        problem: Problem | None,
+        make_problem: Callable[[SessionConfiguration], Problem],
+        describe_error: Callable[[BaseException], str],
+        configuration: bytes,
+        planning: PlanningSettings,
+        seed: int,
+        limits: ServiceLimits,
+        request: Request | None,
+        state: PlanningState | None,
+    ) -> None:
+        self.kind = kind
+        self._problem = problem
+        self._make_problem = make_problem
+        self._describe_error = describe_error
+        self._configuration = configuration
+        self._planning = planning
+        self._seed = seed
+        self._limits = limits
+        self._request = request
+        self._state = state
+
+    @property
+    def state(self) -> PlanningState | None:
+        """Where it starts."""
+        return self._state
+
+    @property
+    def identity(self) -> tuple[object, ...]:
+        """What the result depends on, besides that state, the problem and the settings."""
+        request = self._request
+        named = None
+        if request is not None:
+            named = (
+                request.trial,
+                request.step,
+                request.sensed,
+                request.digest,
+                request.observations,
+                request.checkpoint,
+            )
+        return self.kind, self._seed, named
+
+    def run(self) -> JobResult:
+        """Compute. Anything that the problem's functions raise becomes part of the result.
+
+        That includes ``KeyboardInterrupt``: on a worker's thread it can only come from them.
+        """
+        # Kept as it becomes known, for it is worth keeping if the rest fails.
+        problem = self._problem
+        try:
+            if problem is None:
+                problem = self._make_problem(unpack_configuration(self._configuration))
+            _check_work(problem, self._planning, self._limits)
+            return self._computed(problem)
+        except _LacksStateError as lack:
+            differs = lack.differs or self._state is not None
+            return JobResult(
+                lacks_state=True, differs=differs, diverged=lack.diverged, problem=problem
+            )
+        except MemoryError as error:
+            text = _account(error, self._describe_error)
+            asked = _work_in_words(problem, self._planning)
+            text = f"out of memory for a decision of {asked}: {text}"
+            return JobResult(failure=("out_of_memory", text), problem=problem)
+        except MessageError as error:
+            return JobResult(failure=(error.code, str(error)), problem=problem)
+        except HoldfastError as error:
+            return JobResult(failure=(_code_of(error), _account(error, str)), problem=problem)
+        except BaseException as error:  # noqa: BLE001 - the problem is anybody's code
+            text = _account(error, self._describe_error)
+            return JobResult(failure=("failed", text), problem=problem)
+
+    def _computed(self, problem: Problem) -> JobResult:
+        planning, request = self._planning, self._request
+        planner = Planner(problem, planning)
+        if request is None:
+            assert self._state is not None
+            index, _ = planner.choose_sensing_action(self._state)
+            return JobResult(problem=problem, sensing_action=index)
+        state = self._reached(planner, request)
+        restored = request.checkpoint is not None
+        if planner.needs_sensing(state):
+            index, _ = planner.choose_sensing_action(state)
+            return JobResult(problem=problem, state=state, restored=restored, sensing_action=index)
+        actions, ahead = planner.plan_until_sensing(state, MAX_TASK_ACTIONS)
+        return JobResult(
+            problem=problem,
+            state=state,
+            restored=restored,
+            num_actions=len(actions),
+            actions=encode_floats(actions),
+            ahead=ahead,
+            ahead_digest=planner.digest(ahead)[:DIGEST_SIZE],
+        )
+
+    def _reached(self, planner: Planner, request: Request) -> PlanningState:
+        """Return the requested state."""
+        if request.checkpoint is not None:
+            return self._restored(planner, request, request.checkpoint)
+        state = self._state
+        if state is None:
+            state = planner.init(self._seed, request.trial)
+        most = state.step + self._limits.max_steps
+        for observed in request.observations:
+            if (observed.step, True) <= (state.step, state.sensed):
+                continue  # part of the state already
+            state = self._rolled(planner, state, observed.step, most)
+            if not planner.needs_sensing(state):
+                raise _LacksStateError
+            observation = decode_floats(observed.observation, len(observed.observation) // 8)
+            state, _ = planner.observe(state, observed.sensing_action, observation)
+        state = self._rolled(planner, state, request.step, most)
+        if state.sensed != request.sensed:
+            raise _LacksStateError(differs=True)
+        if planner.digest(state)[:DIGEST_SIZE] != request.digest:
+            raise _LacksStateError(differs=True, diverged=True)
+        return state
+
+    def _rolled(
+        self, planner: Planner, state: PlanningState, step: int, most: int
+    ) -> PlanningState:
+        """Return the state at a later step, reached by task actions alone."""
+        if not state.step <= step <= most:
+            raise _LacksStateError
+        while state.step < step:
+            if planner.needs_sensing(state):
+                raise _LacksStateError
+            state = planner.advance(state, planner.choose_task_action(state)[0])
+        return state
+
+    def _restored(
+        self, planner: Planner, request: Request, checkpoint: bytes | memoryview
+    ) -> PlanningState:
+        state = planner.decode(checkpoint)
+        for name, came, asked in (
+            ("seed", state.seed, self._seed),
+            ("trial", state.trial, request.trial),
+            ("step", state.step, request.step),
+            ("sensed", state.sensed, request.sensed),
+        ):
+            if came != asked:
+                raise CheckpointError(f"checkpoint with {name} {came}: the request says {asked}")
+        if planner.digest(state)[:DIGEST_SIZE] != request.digest:
+            raise CheckpointError("checkpoint of a state that has another digest than the request")
+        return state
+
+
+def _check_work(problem: Problem, planning: PlanningSettings, limits: ServiceLimits) -> None:
+    """Check that a decision's size is within the limits."""
+    count = planning.particle_filter.num_particles
+    sensing = planning.active_sensing
+    actions = len(problem.sensing_actions)
+    work = count * sensing.num_observation_samples * actions * sensing.horizon
+    if work > limits.max_work:
+        raise InvalidValueError(
+            f"a decision of {work} units of work ({_work_in_words(problem, planning)}): this "
+            f"service takes at most {limits.max_work} (max_work)"
+        )
+    if problem.action_size > MAX_ACTION_SIZE:
+        raise InvalidValueError(
+            f"action_size of {problem.name} is {problem.action_size}: a service takes at most "
+            f"{MAX_ACTION_SIZE}"
+        )
+
+
+def _work_in_words(problem: Problem | None, planning: PlanningSettings) -> str:
+    """Describe a decision's size by the keys of the configuration."""
+    sensing = planning.active_sensing
+    actions = "" if problem is None else f"{len(problem.sensing_actions)} sensing actions x "
+    return (
+        f"particle_filter.num_particles {planning.particle_filter.num_particles} x "
+        f"active_sensing.num_observation_samples {sensing.num_observation_samples} x "
+        f"{actions}active_sensing.horizon {sensing.horizon}"
+    )
+
+
+def _account(error: BaseException, describe: Callable[[BaseException], str]) -> str:
+    """Describe an error of a problem, even one whose description fails."""
+    try:
+        return describe(error)
+    except BaseException:  # noqa: BLE001 - the error, too, may be the problem's code
+        return f"{type(error).__name__}, which cannot be put into words"
+
+
+def _code_of(error: HoldfastError) -> str:
+    if isinstance(error, UnknownProblemError):
+        return "unknown_problem"
+    if isinstance(error, OtherCodeError):
+        return "other_code"
+    if isinstance(error, InvalidValueError | CheckpointError | ConfigurationError):
+        return "invalid"
+    # ProblemError, and whatever a problem raises of ours for reasons of its own.
+    return "failed"
+
+
+class ProblemPool:
+    """Problem instances that no job is using.
+
+    Each instance is used by one job at a time, since it may keep buffers.
+
+    Parameters
+    ----------
+    max_problems : int
+        Problems kept; the least recently released goes first.
+    """
+
+    def __init__(self, max_problems: int) -> None:
+        self._max_problems = max_problems
+        self._idle: OrderedDict[bytes, list[Problem]] = OrderedDict()
+
+    def acquire(self, key: bytes) -> Problem | None:
+        """Take an unused instance; None if one must be built."""
+        idle = self._idle.get(key)
+        return idle.pop() if idle else None
+
+    def release(self, key: bytes, problem: Problem | None) -> None:
+        """Keep an instance for the next job."""
+        if problem is None:
+            return
+        self._idle.setdefault(key, []).append(problem)
+        self._idle.move_to_end(key)
+        while len(self._idle) > self._max_problems:
+            self._idle.popitem(last=False)
+
+
+class SendReply(NamedTuple):
+    """Send a reply to a call."""
+
+    call: int
+    payload: bytes
+
+
+class EndCall(NamedTuple):
+    """End a call; no reply follows."""
+
+    call: int
+
+
+class StartJob(NamedTuple):
+    """Run a job anywhere, and hand its result to the machine's ``finished``.
+
+    Attributes
+    ----------
+    expected_s : float
+        Typical time of the robot's earlier jobs; infinite if that predicts nothing: the first job,
+        a problem that is not built in, or an unusual request.
+    """
+
+    job: Job
+    expected_s: float
+
+
+class Computed(NamedTuple):
+    """Time that a part of an answer took; for metrics only.
+
+    Attributes
+    ----------
+    kind : {"task", "sensing"}
+    waited_s : float
+        Before it was begun.
+    """
+
+    kind: Literal["task", "sensing"]
+    computed_s: float
+    waited_s: float
+
+
+ServiceEffect: TypeAlias = SendReply | EndCall | StartJob | Computed | LogEvent

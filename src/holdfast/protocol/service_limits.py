@@ -1,0 +1,75 @@
+"""What a service accepts before it says that it is busy."""
+
+from __future__ import annotations
+
+import msgspec
+
+from holdfast.protocol.messages import MAX_OBSERVATIONS
+
+__all__ = ["ServiceLimits"]
+
+
+class ServiceLimits(msgspec.Struct, frozen=True, kw_only=True):
+    """Limits of a service, beyond which robots are turned away or their sessions dropped.
+
+    Attributes
+    ----------
+    max_sessions : int
+        Sessions held. The least recently used is dropped first, of the owners with the most; for
+        newcomers one never served, if such sessions are half of all.
+    max_sessions_per_robot : int or None
+        Sessions of one certificate; a further one replaces its least recently used. None: no limit.
+    max_state_bytes : int
+        Bytes of all states held.
+    max_configuration_bytes : int
+        Bytes of all session configurations held, packed.
+    max_idle_s : float
+        A session unused for this long is dropped.
+    max_waiting : int
+        Tasks that wait for a worker. Newcomers have half of it at most. (A service always queues as
+        many tasks of each kind as it has workers.)
+    max_waiting_per_robot : int
+        Tasks of one certificate that wait.
+    max_waiting_bytes : int
+        Bytes of all waiting requests. Newcomers together, and each certificate, have half at most.
+    max_wait_ms : float
+        A request with a longer expected wait is turned away, unless fewer wait than there are
+        workers.
+    max_calls_per_request : int
+        Calls that wait for the same answer; the oldest is ended.
+    progress_interval_ms : float
+        From one progress reply to the next; twice that where many calls wait.
+    prefetch_patience_ms : float
+        Time for which a prefetch lets urgent tasks go first.
+    max_particles : int
+        Particles of one robot.
+    max_work : int
+        Size of one decision: particles x observation samples x sensing actions x horizon.
+    max_steps : int
+        Steps by which a state is rolled forward for one request.
+    max_threads : int
+        Threads of one decision, whatever the robot's settings say; one while several are computed.
+    max_problems : int
+        Problems kept for reuse.
+    answers_per_session : int
+        Cached parts of answers.
+    """
+
+    max_sessions: int = 1000
+    max_sessions_per_robot: int | None = None
+    max_state_bytes: int = 256 << 20
+    max_configuration_bytes: int = 64 << 20
+    max_idle_s: float = 600.0
+    max_waiting: int = 1000
+    max_waiting_per_robot: int = 500
+    max_waiting_bytes: int = 64 << 20
+    max_wait_ms: float = 100.0
+    max_calls_per_request: int = 8
+    progress_interval_ms: float = 50.0
+    prefetch_patience_ms: float = 20.0
+    max_particles: int = 1_000_000
+    max_work: int = 10**9
+    max_steps: int = 16 * MAX_OBSERVATIONS
+    max_threads: int = 64
+    max_problems: int = 32
+    answers_per_session: int = 8

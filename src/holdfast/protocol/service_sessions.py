@@ -1,0 +1,587 @@
+"""What a service remembers of each robot. It only saves work, and may be forgotten at any time.
+
+A session holds two of the robot's states, the last requested one and the one at the next sensing
+step, and the last few answers. A robot that was forgotten is asked for its state. Only the
+robot's epoch outlives the session, so a process that was replaced stays replaced.
+
+A session belongs to an *owner*: the name in the robot's verified certificate, None for all robots
+without one. Sessions are found by owner and session id together, so the same id from another owner
+is another session, and nothing is revealed. If room is short, the largest owners lose sessions.
+
+A session also lists its pending tasks: parts of answers that wait or run, with their waiting
+calls. A part is identified by the digest of its state, so equal questions share one task.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections import OrderedDict
+from collections.abc import Callable
+from functools import lru_cache
+from typing import NamedTuple
+
+import msgspec
+
+from holdfast.config.settings import PlanningSettings
+from holdfast.planning import PlanningState
+from holdfast.problems.registry import BUILT_IN
+from holdfast.protocol.expected_time import ExpectedTimes
+from holdfast.protocol.forgotten_epochs import ForgottenEpochs, Owner, SessionKey
+from holdfast.protocol.messages import Request, SessionConfiguration, pack_configuration
+from holdfast.protocol.service_limits import ServiceLimits
+
+__all__ = [
+    "PREFETCHED",
+    "REQUESTED",
+    "CachedAnswer",
+    "Owner",
+    "PendingTask",
+    "Session",
+    "SessionKey",
+    "SessionTable",
+    "WaitingCall",
+]
+
+_LEAST_EPOCHS = 4096
+"""Epochs of forgotten sessions are remembered at least for so many."""
+
+_TYPICAL_STEPS = 32
+"""Bound on the steps of a task whose time earlier tasks predict."""
+
+_SETTINGS_KEPT = 128
+"""Bound on the settings that are shared between sessions."""
+
+REQUESTED, PREFETCHED = 0, 1
+"""A session's slots: the robot waits for the first kind of task; the second is ahead of it."""
+
+
+class CachedAnswer(NamedTuple):
+    """A part of an answer, kept under the digest of its state."""
+
+    trial: int
+    step: int
+    sensed: bool
+    computed_us: int
+    # Of a task part; ``following`` is the digest of the state whose sensing part comes after it.
+    num_actions: int = 0
+    actions: bytes = b""
+    following: bytes | None = None
+    # Of a sensing part.
+    sensing_action: int = -1
+
+
+class WaitingCall:
+    """A call that waits for a task."""
+
+    __slots__ = ("call", "last_sign_at", "number", "task")
+
+    def __init__(self, call: int, number: int, task: PendingTask, last_sign_at: float) -> None:
+        self.call = call
+        self.number = number
+        self.task = task
+        self.last_sign_at = last_sign_at
+
+
+class PendingTask:
+    """A part of an answer to be computed, and the calls that wait for it.
+
+    Service and session create and drop tasks; :class:`RequestQueue` writes ``urgent``, ``running``
+    and ``started_at``, :class:`WaitingCalls` writes ``calls``.
+
+    Parameters
+    ----------
+    digest : bytes
+        Of the part's state.
+    sensing : bool
+        Whether it is a sensing part.
+    request : Request or None
+        Names the state; None if it is computed before the robot asks.
+    state : PlanningState or None
+        The state, where no request names it.
+    size : int
+        Bytes of the request.
+    since : float
+        When it was queued.
+    """
+
+    __slots__ = (
+        "calls",
+        "cost_s",
+        "digest",
+        "newcomer",
+        "request",
+        "running",
+        "sensing",
+        "session",
+        "since",
+        "size",
+        "slot",
+        "started_at",
+        "state",
+        "urgent",
+    )
+
+    def __init__(
+        self,
+        session: Session,
+        digest: bytes,
+        *,
+        sensing: bool,
+        request: Request | None,
+        state: PlanningState | None,
+        size: int,
+        since: float,
+    ) -> None:
+        self.session = session
+        self.digest = digest
+        self.sensing = sensing
+        self.request = request
+        self.state = state
+        self.size = size
+        self.since = since
+        self.slot = PREFETCHED if request is None else REQUESTED
+        self.urgent = request is not None
+        self.newcomer = session.newcomer
+        self.calls: dict[int, WaitingCall] = {}
+        self.cost_s = session.expected_s(sensing=sensing)
+        self.running = False
+        self.started_at = since
+
+    def is_typical(self, state: PlanningState | None) -> bool:
+        """Return whether earlier times predict this task's, if it starts at ``state``.
+
+        It must follow the previous observation, or start a trial, and span few steps, since a robot
+        may choose their number. Its problem must be built in: other code may take any time.
+        """
+        request = self.request
+        if not self.session.built_in:
+            return False
+        if request is None:
+            return True
+        if request.checkpoint is not None or len(request.observations) > 1:
+            return False
+        num_steps = request.step - (0 if state is None else state.step)
+        if not self.sensing:
+            num_steps += self.session.planning.sensing_interval
+        return num_steps <= _TYPICAL_STEPS
+
+    def become(self, request: Request, *, sensing: bool, size: int) -> None:
+        """Take the place of a superseded request of the same robot."""
+        self.digest, self.request = request.digest, request
+        self.sensing, self.size = sensing, size
+        self.cost_s = self.session.expected_s(sensing=sensing)
+
+
+class Session:
+    """What is remembered of one robot.
+
+    Its methods change its states, answers, tasks, epoch and number; :class:`SessionTable` writes
+    ``served``, ``newcomer``, ``closed``, ``used_at`` and ``num_bytes``.
+
+    Parameters
+    ----------
+    request : Request
+        The request that opens it.
+    max_threads : int
+        Per decision.
+    times : ExpectedTimes
+        Of this robot's parts.
+
+    Attributes
+    ----------
+    number : int
+        Of the newest request in this epoch; -1 before the first.
+    configuration : bytes
+        Packed session configuration.
+    problem_key : bytes
+        Digest that identifies the problem among those kept for reuse.
+    built : bool
+        Whether the problem was built.
+    built_in : bool
+        Whether the problem is part of holdfast.
+    planning, planning_single : PlanningSettings
+        With the threads for a decision alone, and with one thread.
+    served : bool
+        Whether the robot got an answer.
+    newcomer : bool
+        Whether it ranks with unknown robots.
+    acknowledged, ahead : PlanningState or None
+        The state last asked about, and that at the next sensing step.
+    answers : dict
+        Cached parts of answers by the digest of their state, oldest first.
+    pending : dict
+        Tasks that wait or run, by the digest of their state.
+    num_bytes : int
+        Counted size of states and answers.
+    used_at : float
+        Time of the last request or result.
+    closed : bool
+        Whether the session was dropped.
+    """
+
+    __slots__ = (
+        "acknowledged",
+        "ahead",
+        "ahead_digest",
+        "answers",
+        "built",
+        "built_in",
+        "closed",
+        "configuration",
+        "epoch",
+        "key",
+        "newcomer",
+        "num_bytes",
+        "number",
+        "pending",
+        "planning",
+        "planning_single",
+        "problem_key",
+        "seed",
+        "served",
+        "times",
+        "used_at",
+    )
+
+    def __init__(
+        self,
+        key: SessionKey,
+        request: Request,
+        configuration: SessionConfiguration,
+        max_threads: int,
+        times: ExpectedTimes,
+    ) -> None:
+        self.key = key
+        self.epoch = request.epoch
+        self.number = -1
+        # Packed, it is one object instead of thousands, all of which the collector would look at
+        # again and again while nobody else has the interpreter.
+        self.configuration = pack_configuration(configuration)
+        # With its code's digests: a robot with other code must be refused.
+        named = (
+            configuration.problem,
+            configuration.core_version,
+            configuration.problem_digest,
+        )
+        self.problem_key = _digest_of(
+            (named, configuration.model, configuration.state_space_planner)
+        )
+        self.built = False
+        self.built_in = configuration.problem in BUILT_IN
+        # The number of threads changes no result, so the service may choose it.
+        most = min(configuration.planning.active_sensing.num_cores, max_threads)
+        self.planning = _with_cores(configuration.planning, most)
+        self.planning_single = _with_cores(configuration.planning, 1)
+        self.seed = configuration.seed
+        self.served = False
+        self.newcomer = True
+        self.acknowledged: PlanningState | None = None
+        self.ahead: PlanningState | None = None
+        self.ahead_digest = b""
+        self.answers: OrderedDict[bytes, CachedAnswer] = OrderedDict()
+        self.pending: dict[bytes, PendingTask] = {}
+        self.times = times
+        self.num_bytes = 0
+        self.used_at = 0.0
+        self.closed = False
+
+    @property
+    def owner(self) -> Owner:
+        """Name in its certificate, or None."""
+        return self.key[0]
+
+    def expected_s(self, *, sensing: bool) -> float:
+        """Return how long a task may take, including the sensing part that follows a task part."""
+        times = self.times
+        return times.sensing_s if sensing else times.task_s + times.sensing_s
+
+    def take_over(self, epoch: int) -> None:
+        """Begin the epoch of the robot's next process, whose requests are numbered anew."""
+        self.epoch = epoch
+        self.number = -1
+
+    def accept(self, number: int) -> bool:
+        """Note a request's number; return whether no newer request came before."""
+        newest = number >= self.number
+        if newest:
+            self.number = number
+        return newest
+
+    def add_task(self, task: PendingTask) -> None:
+        """Note a task to be computed."""
+        self.pending[task.digest] = task
+
+    def remove_task(self, task: PendingTask) -> None:
+        """Remove a task, unless another has taken its place."""
+        if self.pending.get(task.digest) is task:
+            del self.pending[task.digest]
+
+    def hold(self, state: PlanningState, ahead: PlanningState | None, ahead_digest: bytes) -> None:
+        """Keep the state last asked about, and the one ahead of it."""
+        self.acknowledged = state
+        self.ahead, self.ahead_digest = ahead, ahead_digest
+
+    def drop_states(self) -> None:
+        """Drop the states and the answers."""
+        self.acknowledged = self.ahead = None
+        self.answers.clear()
+
+    def remember(self, digest: bytes, answer: CachedAnswer, most: int) -> None:
+        """Cache a part of an answer, and drop the oldest beyond ``most``."""
+        answers = self.answers
+        answers[digest] = answer
+        answers.move_to_end(digest)
+        while len(answers) > most:
+            answers.popitem(last=False)
+
+    def forget_answer(self, digest: bytes) -> None:
+        """Drop a cached part of an answer."""
+        del self.answers[digest]
+
+    def state_before(self, request: Request) -> PlanningState | None:
+        """Return the nearest state before the request's; None if there is none."""
+        held = (self.ahead, self.acknowledged)
+        return next((known for known in held if _connects(known, request)), None)
+
+    def knows_trial(self, trial: int) -> bool:
+        """Return whether a state of the trial is held."""
+        return any(
+            known is not None and known.trial == trial for known in (self.ahead, self.acknowledged)
+        )
+
+    def size(self) -> int:
+        """Return the bytes of its states and answers."""
+        answers = sum(len(answer.actions) for answer in self.answers.values())
+        return _size_of(self.acknowledged) + _size_of(self.ahead) + answers
+
+
+class _Holding:
+    """What all sessions of one owner take."""
+
+    __slots__ = ("configuration_bytes", "sessions", "state_bytes", "unserved")
+
+    def __init__(self) -> None:
+        self.sessions = 0
+        self.unserved = 0
+        self.state_bytes = 0
+        self.configuration_bytes = 0
+
+
+class SessionTable:
+    """All sessions, least recently used first.
+
+    Attributes
+    ----------
+    state_bytes : int
+        Of all states and answers, as counted by :meth:`update_size`.
+    configuration_bytes : int
+        Of all packed session configurations.
+    """
+
+    def __init__(self, limits: ServiceLimits) -> None:
+        self._limits = limits
+        self._sessions: OrderedDict[SessionKey, Session] = OrderedDict()
+        self._holdings: dict[Owner, _Holding] = {}
+        self._epochs = ForgottenEpochs(max(4 * limits.max_sessions, _LEAST_EPOCHS))
+        self._num_unserved = 0
+        self.state_bytes = 0
+        self.configuration_bytes = 0
+
+    def __len__(self) -> int:
+        return len(self._sessions)
+
+    def get(self, key: SessionKey) -> Session | None:
+        """Return a session; None if it is not held."""
+        return self._sessions.get(key)
+
+    def epoch_of(self, key: SessionKey) -> int:
+        """Return a session's epoch, held or not; 0 if unknown."""
+        session = self._sessions.get(key)
+        return session.epoch if session is not None else self._epochs.get(key)
+
+    def is_newcomer(self, owner: Owner) -> bool:
+        """Return whether a new session of this owner has the rank of an unknown robot.
+
+        A new identity costs nothing without a certificate. With one, each owner may have one
+        session that was never served and still ranks with the known robots.
+        """
+        holding = self._holdings.get(owner)
+        return owner is None or (holding is not None and holding.unserved > 0)
+
+    def mark_served(self, session: Session) -> None:
+        """Note that a robot got an answer."""
+        if not session.served:
+            self._num_unserved -= 1
+            self._holdings[session.owner].unserved -= 1
+        session.served = True
+        session.newcomer = False
+
+    def add(self, session: Session) -> None:
+        """Add a session."""
+        session.newcomer = self.is_newcomer(session.owner)
+        self._sessions[session.key] = session
+        holding = self._holdings.setdefault(session.owner, _Holding())
+        holding.sessions += 1
+        holding.unserved += 1
+        holding.configuration_bytes += len(session.configuration)
+        self._num_unserved += 1
+        self.configuration_bytes += len(session.configuration)
+        self._epochs.forget(session.key)
+
+    def use(self, session: Session, now: float) -> None:
+        """Make a session the most recently used."""
+        session.used_at = now
+        self._sessions.move_to_end(session.key)
+
+    def forget(self, session: Session) -> None:
+        """Drop all of a session but its epoch. Nothing may wait for it."""
+        session.closed = True
+        del self._sessions[session.key]
+        holding = self._holdings[session.owner]
+        holding.sessions -= 1
+        holding.unserved -= not session.served
+        holding.configuration_bytes -= len(session.configuration)
+        self._num_unserved -= not session.served
+        self.configuration_bytes -= len(session.configuration)
+        self._count_state(session, 0)
+        if not holding.sessions:
+            del self._holdings[session.owner]
+        self.note_epoch(session.key, session.epoch)
+
+    def note_epoch(self, key: SessionKey, epoch: int) -> None:
+        """Remember the epoch of a robot without a session."""
+        self._epochs.note(key, epoch)
+
+    # -- room for one more -----------------------------------------------------------------------
+
+    def has_room_for(self, session: Session) -> bool:
+        """Return whether a session fits without dropping another; the only one always fits."""
+        return not self._sessions or not (
+            self._is_full_for(session.owner)
+            or self._is_full
+            or self._lacks_room_for_configuration(session)
+        )
+
+    def evictable_for(self, session: Session) -> Session | None:
+        """Return the session without tasks to be dropped for a new one; None if there is none.
+
+        If the owner has its maximum, one of its own. Else the least recently used of the owners
+        that hold the most; and of these one never served, if such sessions fill half of the room
+        already.
+        """
+        if self._is_full_for(session.owner):
+            owner = session.owner
+            return self._first_unused(lambda each: each.owner == owner)
+        only_unserved = 2 * self._num_unserved >= self._limits.max_sessions
+        if self._is_full:
+            return self._unused_of_most(
+                lambda holding: holding.sessions, only_unserved=only_unserved
+            )
+        return self._unused_of_most(
+            lambda holding: holding.configuration_bytes, only_unserved=only_unserved
+        )
+
+    def _is_full_for(self, owner: Owner) -> bool:
+        most, holding = self._limits.max_sessions_per_robot, self._holdings.get(owner)
+        if owner is None or most is None or holding is None:
+            return False
+        return holding.sessions >= most
+
+    @property
+    def _is_full(self) -> bool:
+        return len(self._sessions) >= self._limits.max_sessions
+
+    def _lacks_room_for_configuration(self, session: Session) -> bool:
+        return (
+            self.configuration_bytes + len(session.configuration)
+            > self._limits.max_configuration_bytes
+        )
+
+    def _unused_of_most(
+        self, amount: Callable[[_Holding], int], *, only_unserved: bool
+    ) -> Session | None:
+        """Return the least recently used session without tasks, of the owners that hold the most.
+
+        These hold at least half of the largest holding: among near equals the same one is not
+        dropped each time. If all of these have tasks, it is one of the others.
+        """
+        holdings = self._holdings
+        if len(holdings) > 1:
+            least = max(map(amount, holdings.values())) / 2
+            found = self._first_unused(
+                lambda each: (
+                    amount(holdings[each.owner]) >= least and not (only_unserved and each.served)
+                )
+            )
+            if found is not None:
+                return found
+        return self._first_unused(lambda each: not (only_unserved and each.served))
+
+    def _first_unused(self, fits: Callable[[Session], bool]) -> Session | None:
+        return next(
+            (each for each in self._sessions.values() if not each.pending and fits(each)), None
+        )
+
+    # -- what was not heard for long -------------------------------------------------------------
+
+    def idle(self, now: float) -> Session | None:
+        """Return the least recently used session if its time is over; else None."""
+        due = self.idle_at()
+        return None if due is None or due > now else next(iter(self._sessions.values()))
+
+    def idle_at(self) -> float | None:
+        """Return when the least recently used session is to be dropped; None if it has tasks."""
+        session = next(iter(self._sessions.values()), None)
+        if session is None or session.pending:
+            return None
+        return session.used_at + self._limits.max_idle_s
+
+    # -- what takes too much ---------------------------------------------------------------------
+
+    def update_size(self, session: Session) -> None:
+        """Count what a session's states and answers take now."""
+        self._count_state(session, session.size())
+
+    @property
+    def over_budget(self) -> bool:
+        """Whether all states take more than they may."""
+        return self.state_bytes > self._limits.max_state_bytes
+
+    def largest_evictable(self) -> Session | None:
+        """Return the session without tasks to be dropped for its memory; None if there is none."""
+        return self._unused_of_most(lambda holding: holding.state_bytes, only_unserved=False)
+
+    def drop_states(self, session: Session) -> None:
+        """Drop a session's states and answers; the robot will send its state each time."""
+        session.drop_states()
+        self._count_state(session, 0)
+
+    def _count_state(self, session: Session, num_bytes: int) -> None:
+        self.state_bytes += num_bytes - session.num_bytes
+        self._holdings[session.owner].state_bytes += num_bytes - session.num_bytes
+        session.num_bytes = num_bytes
+
+
+def _digest_of(data: object) -> bytes:
+    """Return a short digest of plain data."""
+    return hashlib.blake2b(msgspec.msgpack.encode(data), digest_size=16).digest()
+
+
+@lru_cache(maxsize=_SETTINGS_KEPT)
+def _with_cores(planning: PlanningSettings, num_cores: int) -> PlanningSettings:
+    """Return the settings with another number of threads; equal ones share a copy."""
+    sensing = msgspec.structs.replace(planning.active_sensing, num_cores=num_cores)
+    return msgspec.structs.replace(planning, active_sensing=sensing)
+
+
+def _size_of(state: PlanningState | None) -> int:
+    return 0 if state is None else state.belief.states.nbytes + state.belief.weights.nbytes
+
+
+def _connects(state: PlanningState | None, request: Request) -> bool:
+    """Return whether a state is of the request's trial and not after the request's."""
+    return (
+        state is not None
+        and state.trial == request.trial
+        and (state.step, state.sensed) <= (request.step, request.sensed)
+    )

@@ -1,0 +1,174 @@
+"""What happened in a recorded run, as a stream of facts in the order of their times.
+
+:class:`holdfast.recording.replay.RecordedRun` produces them, and a :class:`FactSink` writes them as
+tables, ROS messages or arrays. All times are on one clock.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple, Protocol
+
+from holdfast.arrays import FloatArray
+from holdfast.belief import Belief
+from holdfast.outcome import TrialResult
+
+__all__ = [
+    "Decider",
+    "EventFact",
+    "FactSink",
+    "SensingFact",
+    "TaskFact",
+    "TrialBeginFact",
+    "TrialEndFact",
+]
+
+
+class Decider(NamedTuple):
+    """Who made a decision, and how long it took; from ``timings.csv``.
+
+    Attributes
+    ----------
+    waited_ms : float
+        How long the robot stood still for it.
+    round_trip_ms, computed_ms : float or None
+        None for an action that came in the answer to an earlier request.
+    """
+
+    service: str
+    status: str
+    waited_ms: float
+    round_trip_ms: float | None
+    computed_ms: float | None
+
+
+class TrialBeginFact(NamedTuple):
+    """A trial begins.
+
+    Attributes
+    ----------
+    time_ns : int
+        On the clock of the export.
+    beliefs_known : bool
+        Whether the facts of this trial have beliefs.
+    """
+
+    trial: int
+    time_ns: int
+    beliefs_known: bool
+
+
+class SensingFact(NamedTuple):
+    """A sensing action and its observation.
+
+    Attributes
+    ----------
+    decided_ns, observed_ns : int
+        When it was chosen, and when its observation was part of the belief.
+    state_digest : bytes
+        Of the planning state after the observation.
+    before, after : Belief or None
+        The beliefs before and after the observation.
+    entropies : array of shape (num_sensing_actions,) or None
+        What was minimised, in nats; None if nothing was.
+    observation : array or None
+    """
+
+    trial: int
+    step: int
+    decided_ns: int
+    observed_ns: int
+    sensing_action: int
+    state_digest: bytes
+    decider: Decider | None
+    before: Belief | None = None
+    after: Belief | None = None
+    stage: int | None = None
+    entropies: FloatArray | None = None
+    observation: FloatArray | None = None
+    explained: bool | None = None
+    resampled: bool | None = None
+    effective_sample_size: float | None = None
+    mahalanobis_distance: float | None = None
+
+
+class TaskFact(NamedTuple):
+    """A task action that was performed.
+
+    Attributes
+    ----------
+    action : array of shape (action_size,)
+        As it was executed.
+    belief : Belief or None
+        From which it was chosen.
+    estimate : array of shape (state_size,) or None
+        The state with which the policy was evaluated.
+    true_state : array of shape (state_size,) or None
+        Before the action.
+    """
+
+    trial: int
+    step: int
+    time_ns: int
+    action: FloatArray
+    decider: Decider | None
+    belief: Belief | None = None
+    stage: int | None = None
+    estimate: FloatArray | None = None
+    true_state: FloatArray | None = None
+    reward: float | None = None
+
+
+class TrialEndFact(NamedTuple):
+    """A trial ends, or its records do.
+
+    Attributes
+    ----------
+    result : TrialResult or None
+        None if the trial is not finished.
+    belief, estimate, true_state
+        As in :class:`TaskFact`, after the last action.
+    """
+
+    trial: int
+    time_ns: int
+    steps: int
+    result: TrialResult | None
+    belief: Belief | None = None
+    estimate: FloatArray | None = None
+    true_state: FloatArray | None = None
+
+
+class EventFact(NamedTuple):
+    """A line of ``events.jsonl``.
+
+    Attributes
+    ----------
+    name : str
+        Such as ``status``.
+    fields : mapping
+        The other fields of the line.
+    """
+
+    time_ns: int
+    name: str
+    fields: Mapping[str, Any]
+
+
+class FactSink(Protocol):
+    """Writes facts in the order in which they come. They are read-only and need no copy."""
+
+    def trial_begins(self, fact: TrialBeginFact) -> None:
+        """Write that a trial begins."""
+
+    def sensed(self, fact: SensingFact) -> None:
+        """Write a sensing step."""
+
+    def acted(self, fact: TaskFact) -> None:
+        """Write a task action."""
+
+    def trial_ends(self, fact: TrialEndFact) -> None:
+        """Write the end of a trial."""
+
+    def happened(self, fact: EventFact) -> None:
+        """Write an event of the services."""

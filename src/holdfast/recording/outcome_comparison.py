@@ -1,0 +1,459 @@
+"""Which of several runs is better: their outcomes, compared on the same worlds.
+
+In a simulated run, seed and trial name every random number, so trial 7 of two runs of one problem
+and seed happens in the same world. Such trials are compared in pairs: the effect of a setting shows
+within a pair, and the differences between worlds cancel. An interval is the percentile bootstrap
+over trials; it needs no assumption about the distribution of steps, rewards or times.
+
+SciPy takes a second to import, so only this comparison imports it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, TypeAlias
+
+import msgspec
+import numpy as np
+
+from holdfast.arrays import FloatArray
+from holdfast.errors import HoldfastError, OutputError
+from holdfast.outcome import TrialResult
+from holdfast.recording.journal_file import find_journal
+from holdfast.recording.journal_reader import JournalReader
+from holdfast.recording.run_directory import first_difference
+
+__all__ = ["OutcomeComparison", "OutcomeEffect", "RunOutcomes", "compare_outcomes", "effects_of"]
+
+LEVEL = 0.95
+RESAMPLES = 9_999
+_SEED = 0
+_LEAST_TRIALS = 2
+_LEAST_FOR_A_VERDICT = 10
+"""With 2 trials half of all intervals miss the truth, with 5 every eighth, as their resamples are
+too few."""
+
+_NUMBERS_IN_MEMORY = 10_000_000
+
+Verdict: TypeAlias = Literal["better", "worse", "no difference found", "too few trials"]
+
+
+class OutcomeEffect(msgspec.Struct, frozen=True, kw_only=True):
+    """How one measure of a run compares with the baseline's.
+
+    Attributes
+    ----------
+    measure : {"success_rate", "steps", "reward", "decision_ms"}
+    kind : {"difference", "ratio"}
+        Of the run's value to the baseline's.
+    trials : int
+        Of the run, in the comparison.
+    baseline, run : float
+        Rate of success, geometric mean of the steps, mean reward, median of the decision times.
+    effect : float
+    interval : tuple of float, or None
+        For ``effect``; None if no two trials differ in it, so nothing is known of its scatter.
+    verdict : {"better", "worse", "no difference found", "too few trials"}
+        Of the run, by whether the interval has the value of no difference. With fewer than ten
+        trials an interval is too short to say so.
+    """
+
+    measure: str
+    kind: Literal["difference", "ratio"]
+    trials: int
+    baseline: float
+    run: float
+    effect: float
+    interval: tuple[float, float] | None
+    verdict: Verdict
+
+
+class RunOutcomes(msgspec.Struct, frozen=True, kw_only=True):
+    """A run, compared with the baseline.
+
+    Attributes
+    ----------
+    run : str
+        As it was named.
+    trials : int
+        Compared trials: of pairs, or of this run alone.
+    effects : tuple of OutcomeEffect
+    notes : tuple of str
+        What else a person should know: trials left out, other versions of the code.
+    """
+
+    run: str
+    trials: int
+    effects: tuple[OutcomeEffect, ...]
+    notes: tuple[str, ...]
+
+
+class OutcomeComparison(msgspec.Struct, frozen=True, kw_only=True):
+    """The outcomes of runs, compared with those of the first.
+
+    Attributes
+    ----------
+    baseline : str
+        The first run, as it was named.
+    paired : bool
+        Whether trials were compared in pairs of one world.
+    step_limit : int
+        Steps that a trial counts that did not reach the goal.
+    level : float
+        Of each interval by itself.
+    method : str
+        Of the intervals.
+    runs : tuple of RunOutcomes
+        All but the first.
+    """
+
+    baseline: str
+    paired: bool
+    step_limit: int
+    level: float
+    method: str
+    runs: tuple[RunOutcomes, ...]
+
+    def describe(self) -> str:
+        """Return a table for each run, and how its numbers are defined."""
+        lines = []
+        for run in self.runs:
+            how = "paired by number" if self.paired else "not paired"
+            lines.append(f"{run.run} against {self.baseline}, {run.trials:,} trials {how}:")
+            rows: list[tuple[str, ...]] = [
+                ("", "baseline", "run", "effect", f"{self.level:.0%} interval", "")
+            ]
+            rows += [_row(effect) for effect in run.effects]
+            widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+            for row in rows:
+                cells = (f"{cell:{width}}" for cell, width in zip(row, widths, strict=True))
+                lines.append(f"  {'  '.join(cells)}".rstrip())
+            lines.append("")
+        lines.append(
+            "steps: geometric mean; a trial that did not reach the goal counts as its limit, "
+            f"{self.step_limit:,} steps."
+        )
+        lines.append(f"intervals: {self.method}, each by itself.")
+        return "\n".join(lines)
+
+    def to_json(self) -> str:
+        """Return the comparison as indented JSON."""
+        return msgspec.json.format(msgspec.json.encode(self), indent=2).decode() + "\n"
+
+
+def compare_outcomes(runs: Sequence[Path], *, paired: bool = True) -> OutcomeComparison:
+    """Compare the outcomes of runs with those of the first; none of them is changed.
+
+    Parameters
+    ----------
+    runs : sequence of Path
+        Two or more: directories of runs, or their journals. Nobody may be using them.
+    paired : bool
+        Whether trials of one number are in the same world. If False, each run is a sample of its
+        own, so that runs with other seeds can be compared.
+
+    Raises
+    ------
+    OutputError
+        If one is no run, is damaged or in use, or if the runs cannot be compared: their problems,
+        limits or (if paired) seeds differ, or they have too few trials.
+    HoldfastError
+        If SciPy is not installed.
+    """
+    _require_scipy()
+    recorded = [_read(run) for run in runs]
+    baseline = recorded[0]
+    others = []
+    for other in recorded[1:]:
+        _require_comparable(baseline, other, paired=paired)
+        others.append(_compare(baseline, other, paired=paired))
+    over = "pairs of trials" if paired else "trials"
+    return OutcomeComparison(
+        baseline=str(baseline.path),
+        paired=paired,
+        step_limit=baseline.step_limit,
+        level=LEVEL,
+        method=f"percentile bootstrap over {over}, {RESAMPLES:,} resamples, fixed seed",
+        runs=tuple(others),
+    )
+
+
+# -- reading ---------------------------------------------------------------------------------------
+
+
+class _Run(NamedTuple):
+    """What is compared of a run."""
+
+    path: Path
+    meta: Mapping[str, str]
+    configuration: Mapping[str, Any]
+    results: Mapping[int, TrialResult]
+    is_finished: bool
+
+    @property
+    def seed(self) -> Any:
+        return self.configuration["simulator"]["seed"]
+
+    @property
+    def step_limit(self) -> int:
+        return int(self.configuration["simulator"]["max_steps"])
+
+    @property
+    def world(self) -> Mapping[str, Any]:
+        """What must be the same for outcomes to be comparable."""
+        return {
+            "problem": self.configuration["problem"],
+            "model": self.configuration.get("model"),
+            "simulator": {"max_steps": self.step_limit},
+            "environment": {"object": self.environment},
+        }
+
+    @property
+    def environment(self) -> Any:
+        return (self.configuration.get("environment") or {}).get("object")
+
+
+def _read(path: Path) -> _Run:
+    from holdfast.config.yaml_document import read
+
+    journal_path = find_journal(path, "compare")
+    with JournalReader.read(journal_path) as journal:
+        meta = journal.meta()
+        results = {result.trial: result for result in journal.results()}
+        journal.require_unchanged()
+    text = meta.get("configuration", "")
+    configuration = read(text.encode(), f"the configuration in {journal_path}").data
+    asked_for = int(configuration["simulator"]["num_trials"])
+    return _Run(path, meta, configuration, results, len(results) >= asked_for)
+
+
+def _require_comparable(baseline: _Run, other: _Run, *, paired: bool) -> None:
+    found = first_difference(baseline.world, other.world)
+    if found is not None:
+        key, old, new = found
+        raise OutputError(
+            f"{other.path}: cannot be compared with {baseline.path}: {key} is {new} here and {old} "
+            "there, so the trials are of different tasks"
+        )
+    if paired and baseline.seed != other.seed:
+        raise OutputError(
+            f"{other.path}: cannot be paired with {baseline.path}: the seed is {other.seed} here "
+            f"and {baseline.seed} there, so the worlds differ; compare them as independent samples "
+            "(--unpaired), which takes more trials to find a difference"
+        )
+
+
+# -- comparing -------------------------------------------------------------------------------------
+
+
+def _compare(baseline: _Run, other: _Run, *, paired: bool) -> RunOutcomes:
+    notes = []
+    if paired:
+        trials = sorted(baseline.results.keys() & other.results.keys())
+        pairs = [[run.results[trial] for trial in trials] for run in (baseline, other)]
+        left_out = len(baseline.results.keys() ^ other.results.keys())
+        if left_out:
+            notes.append(f"trials that only one of the runs has finished, left out: {left_out:,}")
+        if other.environment is not None:
+            notes.append(
+                "the world is not simulated: trials of one number need not be in the same world"
+            )
+    else:
+        pairs = [list(run.results.values()) for run in (baseline, other)]
+    notes += [f"{run.path}: is not finished" for run in (baseline, other) if not run.is_finished]
+    if min(map(len, pairs)) < _LEAST_TRIALS:
+        raise OutputError(
+            f"{other.path}: too few trials to compare with {baseline.path}: "
+            f"{min(map(len, pairs))}; intervals need at least {_LEAST_TRIALS}"
+        )
+    if other.meta.get("problem_sources") != baseline.meta.get("problem_sources"):
+        notes.append("the source of the problem differs")
+    return RunOutcomes(
+        run=str(other.path),
+        trials=len(pairs[1]),
+        effects=effects_of(*pairs, step_limit=baseline.step_limit, paired=paired),
+        notes=tuple(notes),
+    )
+
+
+def effects_of(
+    first: Sequence[TrialResult], second: Sequence[TrialResult], *, step_limit: int, paired: bool
+) -> tuple[OutcomeEffect, ...]:
+    """Compare the results of two runs, the first the baseline.
+
+    Parameters
+    ----------
+    first, second : sequence of TrialResult
+        If paired, of the same trials in the same order.
+    step_limit : int
+        What a trial counts that did not reach the goal.
+    paired : bool
+
+    Returns
+    -------
+    tuple of OutcomeEffect
+        Of each measure that at least two trials have in either run.
+    """
+    effects = (
+        _effect_of(measure, (first, second), step_limit, paired=paired) for measure in _MEASURES
+    )
+    return tuple(effect for effect in effects if effect is not None)
+
+
+class _Measure(NamedTuple):
+    """A number of each trial, and how those of a run are summarised.
+
+    Attributes
+    ----------
+    of_trial : callable
+        Gets a result and the limit of steps; returns None for a trial that says nothing.
+    summarise : callable
+        Gets numbers and an axis.
+    """
+
+    name: str
+    kind: Literal["difference", "ratio"]
+    more_is_better: bool
+    of_trial: Callable[[TrialResult, int], float | None]
+    summarise: Callable[[FloatArray, int], Any]
+
+
+def _steps_to_goal(result: TrialResult, limit: int) -> float | None:
+    # A trial that begins in the goal does so in each run of its world, and has no ratio.
+    return float(result.steps if result.success else limit) or None
+
+
+def _decision_ms(result: TrialResult, limit: int) -> float | None:
+    del limit
+    return float(np.median(result.sensing_ms)) if result.sensing_ms else None
+
+
+def _geometric_mean(values: FloatArray, axis: int) -> Any:
+    return np.exp(np.mean(np.log(values), axis=axis))
+
+
+_MEASURES = (
+    _Measure("success_rate", "difference", True, lambda result, _: float(result.success), np.mean),
+    _Measure("steps", "ratio", False, _steps_to_goal, _geometric_mean),
+    _Measure("reward", "difference", True, lambda result, _: result.reward, np.mean),
+    _Measure("decision_ms", "ratio", False, _decision_ms, np.median),
+)
+
+
+def _effect_of(
+    measure: _Measure, pairs: Sequence[Sequence[TrialResult]], limit: int, *, paired: bool
+) -> OutcomeEffect | None:
+    """Return how the second run compares with the first, None if that is not known."""
+    numbers = [[measure.of_trial(result, limit) for result in results] for results in pairs]
+    if measure.name == "reward" and any(None in values for values in numbers):
+        return None  # a mean over the trials that have one would not be of the same trials
+    if paired:
+        known = [pair for pair in zip(*numbers, strict=True) if None not in pair]
+        numbers = [[pair[which] for pair in known] for which in (0, 1)]
+    values = [
+        np.array([number for number in each if number is not None], dtype=np.float64)
+        for each in numbers
+    ]
+    if min(map(len, values)) < _LEAST_TRIALS:
+        return None
+
+    def effect_of(first: FloatArray, second: FloatArray, axis: int) -> Any:
+        one, other = measure.summarise(first, axis), measure.summarise(second, axis)
+        return other - one if measure.kind == "difference" else other / one
+
+    interval = None
+    with np.errstate(divide="ignore", invalid="ignore"):
+        effect = float(effect_of(values[0], values[1], 0))
+        if not np.isfinite(effect):
+            return None  # a ratio to no time at all
+        one, other = values
+        scatter = one, other
+        if paired:
+            scatter = (other - one if measure.kind == "difference" else other / one,) * 2
+        if max(map(np.ptp, scatter)) > 0.0:
+            interval = _bootstrap(values, effect_of, paired=paired)
+    no_effect = 0.0 if measure.kind == "difference" else 1.0
+    verdict: Verdict = "no difference found"
+    if min(map(len, values)) < _LEAST_FOR_A_VERDICT:
+        verdict = "too few trials"
+    elif interval is not None and not interval[0] <= no_effect <= interval[1]:
+        verdict = "better" if (effect > no_effect) == measure.more_is_better else "worse"
+    return OutcomeEffect(
+        measure=measure.name,
+        kind=measure.kind,
+        trials=len(values[1]),
+        baseline=float(measure.summarise(values[0], 0)),
+        run=float(measure.summarise(values[1], 0)),
+        effect=effect,
+        interval=interval,
+        verdict=verdict,
+    )
+
+
+def _bootstrap(
+    values: Sequence[FloatArray], statistic: Callable[..., Any], *, paired: bool
+) -> tuple[float, float]:
+    from scipy import stats
+
+    found = stats.bootstrap(
+        tuple(values),
+        statistic,
+        paired=paired,
+        vectorized=True,
+        n_resamples=RESAMPLES,
+        batch=max(1, _NUMBERS_IN_MEMORY // max(map(len, values))),
+        confidence_level=LEVEL,
+        method="percentile",
+        random_state=np.random.default_rng(_SEED),
+    ).confidence_interval
+    return float(found.low), float(found.high)
+
+
+def _require_scipy() -> None:
+    try:
+        import scipy  # noqa: F401
+    except ImportError as error:
+        raise HoldfastError(
+            "comparing outcomes needs scipy, not installed here: pip install 'holdfast[lab]'"
+        ) from error
+
+
+# -- showing ---------------------------------------------------------------------------------------
+
+_TITLES = {
+    "success_rate": "success",
+    "steps": "steps",
+    "reward": "reward",
+    "decision_ms": "decision time",
+}
+
+
+def _row(effect: OutcomeEffect) -> tuple[str, ...]:
+    def of_run(value: float) -> str:
+        match effect.measure:
+            case "success_rate":
+                return f"{value:.1%}"
+            case "decision_ms":
+                return f"{value:.3g} ms"
+        return f"{value:.4g}"
+
+    def of_effect(value: float) -> str:
+        if effect.kind == "ratio":
+            return f"{value:.3g}"
+        return f"{100 * value:+.1f}" if effect.measure == "success_rate" else f"{value:+.4g}"
+
+    unit = "points" if effect.measure == "success_rate" else ""
+    if effect.kind == "ratio":
+        unit = "times"
+    low_high = "all alike"
+    if effect.interval is not None:
+        low_high = f"[{of_effect(effect.interval[0])}, {of_effect(effect.interval[1])}]"
+    return (
+        _TITLES[effect.measure],
+        of_run(effect.baseline),
+        of_run(effect.run),
+        f"{of_effect(effect.effect)} {unit}".rstrip(),
+        low_high,
+        effect.verdict,
+    )

@@ -1,0 +1,222 @@
+"""A recorded run as arrays: ``holdfast.open_run``.
+
+The journal holds decisions, not beliefs. Beliefs, estimates and entropies are a function of the
+decisions' inputs, so a trial is planned again when it is read, and must come to the same decisions.
+That takes as long as planning did. Where the world was the user's own and its observations were
+not kept, the decisions are all there is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from holdfast.arrays import FloatArray, IntArray
+from holdfast.belief import Belief
+from holdfast.config.loader import Configuration
+from holdfast.errors import OutputError
+from holdfast.outcome import TRIAL_COLUMNS, TrialResult
+from holdfast.recording.facts import (
+    EventFact,
+    SensingFact,
+    TaskFact,
+    TrialBeginFact,
+    TrialEndFact,
+)
+from holdfast.recording.journal_file import find_journal
+from holdfast.recording.journal_reader import JournalReader
+from holdfast.recording.replay import RecordedRun
+
+__all__ = ["RunArrays", "TrialArrays", "open_run"]
+
+
+@dataclass(frozen=True)
+class TrialArrays:
+    """One trial: T task actions, S of their steps with a sensing action before.
+
+    Attributes
+    ----------
+    trial : int
+        Its number.
+    result : TrialResult or None
+        None if the trial is not finished.
+    task_actions : array of shape (T, action_size)
+        Executed task actions.
+    sensing_steps, sensing_actions : array of shape (S,)
+        The steps with a sensing action, and which action it was.
+    observations : tuple of S arrays, or None
+        Each of shape ``(observation_size,)``; None, as all below, where they are not known.
+    entropies : array of shape (S, num_sensing_actions) or None
+        What was minimised, expected after each sensing action; NaN where nothing was.
+    priors : tuple of S beliefs, or None
+        Before each observation.
+    beliefs : tuple of T + 1 beliefs, or None
+        From which each task action was chosen, and the last. (A trial that is not finished may
+        lack the last.)
+    estimates : array of shape (T + 1, state_size) or None
+        The states that stood for these beliefs.
+    stages : array of shape (T,) or None
+        Of each task action.
+    rewards : array of shape (T,) or None
+        NaN for a step without one.
+    true_states : array of shape (T + 1, state_size) or None
+        Of a simulated world.
+    """
+
+    trial: int
+    result: TrialResult | None
+    task_actions: FloatArray
+    sensing_steps: IntArray
+    sensing_actions: IntArray
+    observations: tuple[FloatArray, ...] | None
+    entropies: FloatArray | None
+    priors: tuple[Belief, ...] | None
+    beliefs: tuple[Belief, ...] | None
+    estimates: FloatArray | None
+    stages: IntArray | None
+    rewards: FloatArray | None
+    true_states: FloatArray | None
+
+
+@dataclass(frozen=True)
+class RunArrays:
+    """A recorded run.
+
+    Attributes
+    ----------
+    path : Path
+        Its directory, or its journal.
+    configuration : Configuration
+        What it was run with.
+    trials : tuple of int
+        Numbers of all its trials, the one that was begun and not finished included.
+    results : dict of arrays
+        The columns of ``trials.csv``, one entry for each finished trial. A reward that there is
+        not is NaN.
+    """
+
+    path: Path
+    configuration: Configuration
+    trials: tuple[int, ...]
+    results: dict[str, npt.NDArray[Any]]
+
+    def trial(self, number: int) -> TrialArrays:
+        """Return one trial; :meth:`read` is faster for several."""
+        return next(self.read([number]))
+
+    def read(self, trials: Iterable[int] | None = None) -> Iterator[TrialArrays]:
+        """Read trials one after the other, in ascending order. Default: all.
+
+        Raises
+        ------
+        OutputError
+            If there is no such trial, or the run is damaged or in use.
+        HoldfastError
+            If a trial is decided otherwise when it is planned again.
+        """
+        chosen = sorted(set(self.trials if trials is None else trials))
+        if lacking := set(chosen).difference(self.trials):
+            raise OutputError(f"{self.path}: has no trial {min(lacking)}")
+        with RecordedRun(self.path, "open") as run:
+            sink = _Collector(len(run.configuration.problem.sensing_actions))
+            for trial in run.replay(chosen, [sink], rate_hz=1.0):
+                yield sink.collected(trial, run.configuration.problem.action_size)
+
+
+def open_run(path: str | Path) -> RunArrays:
+    """Open a recorded run to be read as arrays.
+
+    Parameters
+    ----------
+    path : str or Path
+        The run's directory, or its journal. It is not changed.
+
+    Raises
+    ------
+    OutputError
+        If it is no run, damaged, or in use.
+    HoldfastError
+        If its problem cannot be built any more.
+    """
+    run = Path(path)
+    with RecordedRun(run, "open") as recorded:
+        configuration, trials = recorded.configuration, recorded.trials
+    with JournalReader.read(find_journal(run, "open")) as journal:
+        rows = [
+            [getattr(result, column) for column in TRIAL_COLUMNS] for result in journal.results()
+        ]
+    columns = zip(*rows, strict=True) if rows else ([] for _ in TRIAL_COLUMNS)
+    results = {
+        name: np.array([np.nan if value is None else value for value in column])
+        for name, column in zip(TRIAL_COLUMNS, columns, strict=True)
+    }
+    return RunArrays(run, configuration, trials, results)
+
+
+class _Collector:
+    """Collects the facts of one trial at a time."""
+
+    def __init__(self, num_sensing_actions: int) -> None:
+        self._no_entropies = np.full(num_sensing_actions, np.nan)
+        self._beliefs_known = False
+        self._sensing: list[SensingFact] = []
+        self._tasks: list[TaskFact] = []
+        self._end: TrialEndFact | None = None
+
+    def trial_begins(self, fact: TrialBeginFact) -> None:
+        """Forget the trial before."""
+        self._beliefs_known = fact.beliefs_known
+        self._sensing, self._tasks, self._end = [], [], None
+
+    def sensed(self, fact: SensingFact) -> None:
+        """Keep a sensing action."""
+        self._sensing.append(fact)
+
+    def acted(self, fact: TaskFact) -> None:
+        """Keep a task action."""
+        self._tasks.append(fact)
+
+    def trial_ends(self, fact: TrialEndFact) -> None:
+        """Keep the end."""
+        self._end = fact
+
+    def happened(self, fact: EventFact) -> None:
+        """Leave events out."""
+
+    def collected(self, trial: int, action_size: int) -> TrialArrays:
+        """Return the trial that has just ended."""
+        sensing, tasks, end = self._sensing, self._tasks, self._end
+        assert end is not None
+        actions = np.array([task.action for task in tasks]).reshape(-1, action_size)
+        steps = np.array([each.step for each in sensing], dtype=np.int64)
+        chosen = np.array([each.sensing_action for each in sensing], dtype=np.int64)
+        if not self._beliefs_known:
+            return TrialArrays(trial, end.result, actions, steps, chosen, *[None] * 8)
+        entropies = [
+            self._no_entropies if each.entropies is None else each.entropies for each in sensing
+        ]
+        rewards = [np.nan if task.reward is None else task.reward for task in tasks]
+        ends: list[TaskFact | TrialEndFact] = [*tasks, end]
+        true_states = [each.true_state for each in ends if each.true_state is not None]
+        return TrialArrays(
+            trial,
+            end.result,
+            actions,
+            steps,
+            chosen,
+            observations=tuple(
+                each.observation for each in sensing if each.observation is not None
+            ),
+            entropies=np.array(entropies).reshape(-1, self._no_entropies.size),
+            priors=tuple(each.before for each in sensing if each.before is not None),
+            beliefs=tuple(each.belief for each in ends if each.belief is not None),
+            estimates=np.array([each.estimate for each in ends if each.estimate is not None]),
+            stages=np.array([task.stage for task in tasks], dtype=np.int64),
+            rewards=np.array(rewards, dtype=np.float64),
+            true_states=np.array(true_states) if true_states else None,
+        )

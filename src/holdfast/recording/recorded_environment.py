@@ -1,0 +1,114 @@
+"""The world of a recorded trial: it answers what its records say.
+
+A robot's own world cannot be run again. But all that the planner had of it is in the journal: the
+same observations, given to the same planner, lead to the same beliefs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from holdfast.arrays import FloatArray
+from holdfast.errors import DecidedOtherwiseError, EndOfRecordsError
+from holdfast.outcome import Done, TrialResult
+from holdfast.protocol.messages import decode_floats, encode_floats
+from holdfast.protocol.records import ActingRecord, ObservedRecord, PerformedRecord, Record
+from holdfast.robot.environment import SimulatedEnvironment
+
+__all__ = ["RecordedEnvironment"]
+
+
+class RecordedEnvironment:
+    """The world of a recorded trial.
+
+    Parameters
+    ----------
+    trial : int
+    records : sequence of Record
+        In the order in which they were written; the one of the last performance may be missing.
+    result : TrialResult or None
+        None if the trial is not finished: then EndOfRecordsError is raised after the last record.
+    simulated : SimulatedEnvironment or None
+        Performs the same task actions, so that the true state is known.
+    """
+
+    def __init__(
+        self,
+        trial: int,
+        records: Sequence[Record],
+        result: TrialResult | None = None,
+        simulated: SimulatedEnvironment | None = None,
+    ) -> None:
+        self.result = result
+        self._trial = trial
+        self._simulated = simulated
+        kinds = ObservedRecord | ActingRecord | PerformedRecord
+        self._records = [record for record in records if isinstance(record, kinds)]
+        self._next = 0
+        self._step = 0
+
+    def from_the_beginning(self) -> RecordedEnvironment:
+        """Return the same world before the trial."""
+        return RecordedEnvironment(self._trial, self._records, self.result)
+
+    @property
+    def state(self) -> FloatArray | None:
+        """The true state, where the world is simulated."""
+        return None if self._simulated is None else self._simulated.state
+
+    def perform_sensing(self, sensing_action: int) -> FloatArray:
+        """Return the recorded observation.
+
+        Raises
+        ------
+        DecidedOtherwiseError
+            If another sensing action is recorded, or none.
+        """
+        record = self._take()
+        if not isinstance(record, ObservedRecord) or record.sensing_action != sensing_action:
+            raise self._otherwise(record)
+        return decode_floats(record.observation, len(record.observation) // 8)
+
+    def perform(self, task_action: FloatArray) -> float | None:
+        """Return the recorded reward, None if there is none.
+
+        Raises
+        ------
+        DecidedOtherwiseError
+            If another task action is recorded, or none.
+        """
+        record = self._take()
+        if not isinstance(record, ActingRecord) or record.action != encode_floats(task_action):
+            raise self._otherwise(record)
+        self._step += 1
+        if self._simulated is not None:
+            self._simulated.perform(task_action)
+        if self._next < len(self._records):
+            performed = self._records[self._next]
+            if isinstance(performed, PerformedRecord):
+                self._next += 1
+                return performed.reward
+        return None
+
+    def is_done(self) -> Done:
+        """Return whether the task was done, or had failed."""
+        if self.result is None:
+            if self._next == len(self._records) and self._step:
+                raise EndOfRecordsError(self._trial)
+            return False
+        if self._step < self.result.steps:
+            return False
+        return "failed" if self.result.failed else self.result.success
+
+    def _take(self) -> Record | None:
+        if self._next == len(self._records):
+            if self.result is None:
+                raise EndOfRecordsError(self._trial)
+            return None
+        self._next += 1
+        return self._records[self._next - 1]
+
+    def _otherwise(self, record: Record | None) -> DecidedOtherwiseError:
+        kinds = {ObservedRecord: "sensing", ActingRecord: "task"}
+        kind = None if record is None else kinds.get(type(record))
+        return DecidedOtherwiseError(self._trial, self._step, kind)

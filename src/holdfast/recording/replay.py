@@ -1,0 +1,471 @@
+"""A recorded run, planned again: what was believed, sensed and done, and when.
+
+A journal holds decisions, not beliefs: those would be a thousand times larger, and decisions are a
+function of seed, trial and observations. So each trial is run again with the planner in this
+process, and every decision is compared, bit for bit, with the recorded one before it is passed on
+as a fact (:mod:`holdfast.recording.facts`).
+
+A simulated world is a function of the seed as well, so its true states are facts, too. What a
+robot's own world has shown is in the journal. Journals from before observations were kept yield the
+decisions and their times, and no beliefs.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from types import TracebackType
+from typing import Literal, Self
+
+import numpy as np
+
+from holdfast.arrays import FloatArray
+from holdfast.belief import estimate
+from holdfast.config.loader import Configuration
+from holdfast.errors import DecidedOtherwiseError, EndOfRecordsError, HoldfastError
+from holdfast.outcome import Decisions, SensingDecision, TaskDecision, TrialResult
+from holdfast.planning import Planner, PlanningState, digest
+from holdfast.protocol.messages import decode_floats
+from holdfast.protocol.records import ActingRecord, ObservedRecord
+from holdfast.recording.facts import (
+    Decider,
+    EventFact,
+    FactSink,
+    SensingFact,
+    TaskFact,
+    TrialBeginFact,
+    TrialEndFact,
+)
+from holdfast.recording.fingerprint import difference, fingerprint
+from holdfast.recording.journal_file import find_journal
+from holdfast.recording.journal_reader import JournalReader, UnfinishedTrial
+from holdfast.recording.recorded_environment import RecordedEnvironment
+from holdfast.recording.run_directory import EVENTS_NAME, TIMINGS_NAME
+from holdfast.recording.step_times import NS_PER_S, StepClock, TrialTimes, read_events, trial_ends
+from holdfast.recording.timings import rows_by_trial
+from holdfast.robot.environment import Environment, SimulatedEnvironment
+from holdfast.robot.trial import SensingStep, TaskStep, run_trial
+
+__all__ = ["RecordedRun"]
+
+
+class RecordedRun:
+    """A recorded run, open to be read; to be used in a ``with`` statement.
+
+    Parameters
+    ----------
+    run : Path
+        Its directory, or its journal. Nobody may be using it; it is not changed.
+    purpose : str
+        A verb, for messages.
+
+    Attributes
+    ----------
+    configuration : Configuration
+        The settings that decide; it names no services and no environment.
+    trials : tuple of int
+        All trials that have facts, in order: the finished ones, and the unfinished one.
+    unfinished : int or None
+        The number of the latter.
+    has_times : bool
+        Whether the facts have the robot's times.
+    untimed : tuple of int
+        Trials that the table of times lacks although it has others; then no fact has the robot's
+        times.
+
+    Raises
+    ------
+    OutputError
+        If it is no run, damaged, or in use.
+    HoldfastError
+        If its problem cannot be built any more.
+    """
+
+    def __init__(self, run: Path, purpose: str = "export") -> None:
+        self.path = run
+        path = find_journal(run, purpose)
+        directory = path.parent
+        with ExitStack() as stack:
+            self._journal = stack.enter_context(JournalReader.read(path))
+            self._meta = self._journal.meta()
+            self.configuration, self.world_is_simulated = _configuration(self._meta, path)
+            self._estimate = self.configuration.planning.particle_filter.estimate
+            self._begun = self._journal.unfinished()
+            self.unfinished = None if self._begun is None else self._begun.trial
+            trials = self._journal.finished()
+            if self.unfinished is not None:
+                trials.add(self.unfinished)
+            self.trials = tuple(sorted(trials))
+            self._rows = rows_by_trial(directory / TIMINGS_NAME)
+            self._events = read_events(directory / EVENTS_NAME)
+            self._ends = trial_ends(self._events)
+            # All facts have one clock: if one trial has no times, those of the others are of no
+            # use. A trial in which nothing was decided needs none.
+            lacking = [
+                result.trial
+                for result in self._journal.results()
+                if result.steps and result.trial not in self._rows
+            ]
+            self.has_times = bool(self._rows) and not lacking
+            self.untimed = tuple(lacking) if self._rows else ()
+            self._close = stack.pop_all()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._close.close()
+
+    def require_unchanged(self) -> None:
+        """Raise OutputError if a run has written to the journal meanwhile."""
+        self._journal.require_unchanged()
+
+    def beliefs_known(self, trial: int) -> bool:
+        """Return whether a trial can be run again: its observations are known."""
+        if self.world_is_simulated or trial == self.unfinished:
+            return True
+        return self._journal.kept_steps(trial) is not None
+
+    def replay(
+        self, trials: Sequence[int], sinks: Sequence[FactSink], rate_hz: float
+    ) -> Iterator[int]:
+        """Write the facts of some trials to each sink, and yield each trial's number at its end.
+
+        Parameters
+        ----------
+        trials : sequence of int
+            Ascending; some of :attr:`trials`.
+        rate_hz : float
+            Steps a second, for a run without times.
+
+        Raises
+        ------
+        OutputError
+            If a trial is damaged.
+        HoldfastError
+            If a trial is decided otherwise when it is run again.
+        """
+        clock = StepClock(round(NS_PER_S / rate_hz))
+        chosen = set(trials)
+        events = self._events if self.has_times else []
+        output = _Output(sinks, events, with_others=chosen.issuperset(self.trials))
+        begun = self._begun if self._begun is not None and self._begun.trial in chosen else None
+        for result in self._journal.results(with_decisions=True):
+            if begun is not None and begun.trial < result.trial:
+                yield self._replay_unfinished(begun, output, clock)
+                begun = None
+            if result.trial in chosen:
+                yield self._replay_finished(result, output, clock)
+        if begun is not None:
+            yield self._replay_unfinished(begun, output, clock)
+        output.end()
+
+    def _replay_finished(self, result: TrialResult, output: _Output, clock: StepClock) -> int:
+        trial, decisions = result.trial, result.decisions
+        assert decisions is not None
+        times = self._times(trial, result.steps, clock)
+        world: Environment | None = None
+        if self.world_is_simulated:
+            world = self._simulated_world(trial)
+        elif (records := self._journal.kept_steps(trial)) is not None:
+            world = RecordedEnvironment(trial, records, result)
+        if world is None:
+            _write_decisions(result, decisions, times, output)
+        else:
+            replay = _Replay(
+                trial, list(decisions), times, output, result, decisions, self._estimate
+            )
+            self._run_again(trial, world, replay)
+        return trial
+
+    def _replay_unfinished(self, begun: UnfinishedTrial, output: _Output, clock: StepClock) -> int:
+        trial = begun.trial
+        expected: list[SensingDecision | TaskDecision] = []
+        for record in begun.records:
+            if isinstance(record, ObservedRecord):
+                expected.append(SensingDecision(record.step, record.sensing_action, record.digest))
+            elif isinstance(record, ActingRecord):
+                action = decode_floats(record.action, self.configuration.problem.action_size)
+                expected.append(TaskDecision(record.step, tuple(action.tolist())))
+        steps = sum(isinstance(decision, TaskDecision) for decision in expected)
+        simulated = self._simulated_world(trial) if self.world_is_simulated else None
+        world = RecordedEnvironment(trial, begun.records, simulated=simulated)
+        times = self._times(trial, steps, clock)
+        replay = _Replay(trial, expected, times, output, None, None, self._estimate)
+        try:
+            self._run_again(trial, world, replay)
+        except EndOfRecordsError:
+            replay.end_here()
+        return trial
+
+    def _simulated_world(self, trial: int) -> SimulatedEnvironment:
+        configuration = self.configuration
+        return SimulatedEnvironment(configuration.problem, configuration.simulator.seed, trial)
+
+    def _run_again(self, trial: int, world: Environment, replay: _Replay) -> None:
+        configuration = self.configuration
+        planner = Planner(configuration.problem, configuration.planning)
+        try:
+            run_trial(
+                planner,
+                configuration.simulator.seed,
+                trial,
+                max_steps=configuration.simulator.max_steps,
+                environment=world,
+                observer=replay,
+            )
+        except DecidedOtherwiseError as error:
+            # Most likely the code has changed.
+            changed = difference(self._meta, fingerprint(configuration))
+            because = "" if changed is None else f" ({changed})"
+            raise HoldfastError(f"{error}{because}; --trials leaves it out") from error
+
+    def _times(self, trial: int, steps: int, clock: StepClock) -> TrialTimes:
+        rows = self._rows.get(trial, {}) if self.has_times else {}
+        times = clock.next_trial(steps, rows, self._ends.get(trial))
+        deciders = {
+            key: Decider(row.service, row.status, row.waited_ms, row.round_trip_ms, row.computed_ms)
+            for key, row in rows.items()
+        }
+        current: Decider | None = None
+        for step in range(steps):
+            asked = deciders.get((step, "task"))
+            if asked is not None:
+                # An answer has the task actions up to the next sensing step.
+                current = Decider(asked.service, asked.status, 0.0, None, None)
+            elif (step, "sensing") in deciders:
+                current = None
+            elif current is not None:
+                deciders[step, "task"] = current
+        return TrialTimes(times, deciders)
+
+
+class _Replay:
+    """Observes a trial that is run again: compares its decisions and writes its facts."""
+
+    def __init__(
+        self,
+        trial: int,
+        expected: Sequence[SensingDecision | TaskDecision],
+        times: TrialTimes,
+        output: _Output,
+        result: TrialResult | None,
+        decisions: Decisions | None,
+        estimate_kind: Literal["mean", "most_likely"],
+    ) -> None:
+        self._trial = trial
+        self._estimate = estimate_kind
+        self._expected = expected
+        self._times = times
+        self._output = output
+        self._result = result
+        self._decisions = decisions
+        self._compared = 0
+        self._steps = 0
+        self._state: PlanningState | None = None
+        self._true_state: FloatArray | None = None
+
+    def trial_began(self, environment: Environment, state: PlanningState) -> None:
+        self._state = state
+        self._true_state = _true_state(environment)
+        self._output.trial_begins(TrialBeginFact(self._trial, self._times.at(0, 0), True))
+
+    def sensed(self, step: SensingStep) -> None:
+        number, after = step.before.step, step.after
+        state_digest = digest(after)
+        self._require(SensingDecision(number, step.sensing_action, state_digest))
+        entropies = step.sensing_info.entropies
+        info = step.observation_info
+        self._output.sensed(
+            SensingFact(
+                trial=self._trial,
+                step=number,
+                decided_ns=self._times.at(number, 0),
+                observed_ns=self._times.at(number, 1),
+                sensing_action=step.sensing_action,
+                state_digest=state_digest,
+                decider=self._times.deciders.get((number, "sensing")),
+                before=step.before.belief,
+                after=after.belief,
+                stage=step.before.stage,
+                entropies=None if entropies is None else np.array(entropies, dtype=np.float64),
+                observation=np.asarray(step.observation, dtype=np.float64).reshape(-1),
+                explained=info.explained,
+                resampled=info.resampled,
+                effective_sample_size=info.effective_sample_size,
+                mahalanobis_distance=info.mahalanobis_distance,
+            )
+        )
+        self._state = after
+
+    def acted(self, step: TaskStep) -> None:
+        number = step.state.step
+        action = np.array(step.executed, dtype=np.float64)
+        self._require(TaskDecision(number, tuple(action.tolist())))
+        self._output.acted(
+            TaskFact(
+                trial=self._trial,
+                step=number,
+                time_ns=self._times.at(number, 2),
+                action=action,
+                decider=self._times.deciders.get((number, "task")),
+                belief=step.state.belief,
+                stage=step.task_info.stage,
+                estimate=np.array(step.task_info.estimate, dtype=np.float64),
+                true_state=self._true_state,
+                reward=None if step.reward is None else float(step.reward),
+            )
+        )
+        self._true_state = _true_state(step.environment)
+        self._steps = number + 1
+        self._state = None  # the next one is not known before something is done in it
+
+    def trial_ended(self, state: PlanningState, result: TrialResult) -> None:
+        if self._decisions is None or result.decisions != self._decisions:
+            raise DecidedOtherwiseError(self._trial, result.steps, None)
+        self._state = state
+        self.end_here()
+
+    def end_here(self) -> None:
+        belief = None if self._state is None else self._state.belief
+        self._output.trial_ends(
+            TrialEndFact(
+                trial=self._trial,
+                time_ns=self._times.at(self._steps, 3 if self._result is None else 0),
+                steps=self._steps,
+                result=self._result,
+                belief=belief,
+                estimate=None if belief is None else estimate(belief, self._estimate),
+                true_state=self._true_state,
+            )
+        )
+
+    def _require(self, decision: SensingDecision | TaskDecision) -> None:
+        kept = self._expected[self._compared] if self._compared < len(self._expected) else None
+        if kept is None or not _same(kept, decision):
+            kind = "sensing" if isinstance(decision, SensingDecision) else "task"
+            raise DecidedOtherwiseError(self._trial, decision.step, kind)
+        self._compared += 1
+
+
+def _same(one: SensingDecision | TaskDecision, other: SensingDecision | TaskDecision) -> bool:
+    if isinstance(one, TaskDecision) and isinstance(other, TaskDecision):
+        # By their bits: 0.0 and -0.0 are different actions.
+        return one.step == other.step and (
+            np.array(one.action).tobytes() == np.array(other.action).tobytes()
+        )
+    return type(one) is type(other) and one == other
+
+
+def _true_state(environment: Environment) -> FloatArray | None:
+    # Only a simulated world knows its own state.
+    state = getattr(environment, "state", None)
+    return None if state is None else np.array(state, dtype=np.float64)
+
+
+def _write_decisions(
+    result: TrialResult, decisions: Decisions, times: TrialTimes, output: _Output
+) -> None:
+    """Write the facts that follow from the decisions of a trial alone."""
+    trial = result.trial
+    output.trial_begins(TrialBeginFact(trial, times.at(0, 0), False))
+    for decision in decisions:
+        step = decision.step
+        if isinstance(decision, SensingDecision):
+            output.sensed(
+                SensingFact(
+                    trial=trial,
+                    step=step,
+                    decided_ns=times.at(step, 0),
+                    observed_ns=times.at(step, 1),
+                    sensing_action=decision.sensing_action,
+                    state_digest=decision.state_digest,
+                    decider=times.deciders.get((step, "sensing")),
+                )
+            )
+        else:
+            output.acted(
+                TaskFact(
+                    trial=trial,
+                    step=step,
+                    time_ns=times.at(step, 2),
+                    action=np.array(decision.action, dtype=np.float64),
+                    decider=times.deciders.get((step, "task")),
+                )
+            )
+    output.trial_ends(TrialEndFact(trial, times.at(result.steps, 0), result.steps, result))
+
+
+class _Output:
+    """Writes facts to all sinks, with the events of the services in between.
+
+    Parameters
+    ----------
+    events : sequence of EventFact
+        In order.
+    with_others : bool
+        Whether to write also the events outside of the replayed trials.
+    """
+
+    def __init__(
+        self, sinks: Sequence[FactSink], events: Sequence[EventFact], *, with_others: bool
+    ) -> None:
+        self._sinks = sinks
+        self._events = deque(events)
+        self._with_others = with_others
+
+    def trial_begins(self, fact: TrialBeginFact) -> None:
+        self._write_events(fact.time_ns, between_trials=True)
+        for sink in self._sinks:
+            sink.trial_begins(fact)
+
+    def sensed(self, fact: SensingFact) -> None:
+        self._write_events(fact.decided_ns)
+        for sink in self._sinks:
+            sink.sensed(fact)
+
+    def acted(self, fact: TaskFact) -> None:
+        self._write_events(fact.time_ns)
+        for sink in self._sinks:
+            sink.acted(fact)
+
+    def trial_ends(self, fact: TrialEndFact) -> None:
+        self._write_events(fact.time_ns)
+        for sink in self._sinks:
+            sink.trial_ends(fact)
+
+    def end(self) -> None:
+        self._write_events(None, between_trials=True)
+
+    def _write_events(self, time_ns: int | None, *, between_trials: bool = False) -> None:
+        while self._events and (time_ns is None or self._events[0].time_ns <= time_ns):
+            event = self._events.popleft()
+            if self._with_others or not between_trials:
+                for sink in self._sinks:
+                    sink.happened(event)
+
+
+def _configuration(meta: Mapping[str, str], path: Path) -> tuple[Configuration, bool]:
+    """Return the settings that decided in a run, and whether its world was simulated.
+
+    A run may have been copied from the robot, whose environment, keys and directories are not here.
+    """
+    from holdfast.config.yaml_document import read
+
+    text = meta.get("configuration", "")
+    plain = dict(read(text.encode(), f"the configuration in {path}").data)
+    environment = plain.pop("environment", None) or {}
+    plain.pop("offload", None)
+    directory = plain.get("problem_directory")
+    if directory is not None and not Path(directory).is_dir():
+        # Then its module is searched for beside the journal and in the current directory.
+        del plain["problem_directory"]
+    configuration = Configuration.from_plain({"path": str(path), "configuration": plain})
+    return configuration, environment.get("object") is None

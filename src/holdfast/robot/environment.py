@@ -1,0 +1,393 @@
+"""The robot's environment: a world that can be sensed and moved.
+
+The loop uses three methods. The simulated world is made from the problem and has its own random
+streams; a real robot is an object of a user's class with the same methods.
+
+No journal can know whether the last task action before a crash was performed. An environment that
+counts its task actions answers that, with a fourth method.
+"""
+
+from __future__ import annotations
+
+import copy
+import difflib
+import inspect
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol, Self, runtime_checkable
+
+import numpy as np
+
+from holdfast import checked
+from holdfast.arrays import FloatArray
+from holdfast.config.user_code import find_class
+from holdfast.errors import ConfigurationError, EnvironmentFailedError, InvalidValueError
+from holdfast.outcome import Done
+from holdfast.problem_attributes import check_sizes, has_general_observations
+from holdfast.problems.problem import Problem, ProblemBase
+from holdfast.randomness import Purpose, stream
+
+if TYPE_CHECKING:
+    from holdfast.config.loader import Configuration
+
+__all__ = [
+    "DONE_VALUES",
+    "CountingEnvironment",
+    "Environment",
+    "EnvironmentMaker",
+    "ObservationSizes",
+    "SimulatedEnvironment",
+    "as_done",
+    "load_environment",
+]
+
+
+GROUP = "holdfast.environments"
+"""Entry points by which packages register their environments."""
+
+DONE_VALUES = 'True, False or "failed"'
+"""What ``is_done`` may return, for messages."""
+
+_REQUIRED = ("perform_sensing", "perform", "is_done")
+
+_PROVIDED = ("problem", "seed", "trial", "resumed")
+
+
+@runtime_checkable
+class Environment(Protocol):
+    """A world that can be sensed and moved."""
+
+    def perform_sensing(self, sensing_action: int) -> FloatArray:
+        """Perform a sensing action and return the observation, shape ``(observation_size,)``."""
+        ...
+
+    def perform(self, task_action: FloatArray) -> float | None:
+        """Perform a task action and return its reward, or None where there is none."""
+        ...
+
+    def is_done(self) -> Done:
+        """Return whether the task is done.
+
+        Returns
+        -------
+        bool or "failed"
+            True if it has succeeded, False if it goes on. ``"failed"`` ends the trial as well, but
+            in failure: the robot has crashed, say, or broken what it was to handle.
+        """
+        ...
+
+
+@runtime_checkable
+class CountingEnvironment(Environment, Protocol):
+    """An environment that knows how far it is: after a crash of the robot's process it is asked."""
+
+    def steps_performed(self) -> int:
+        """Return how many task actions have been performed in this trial.
+
+        The count is the environment's own and survives the robot's process. It is right even if
+        that process died during a task action.
+        """
+        ...
+
+
+class SimulatedEnvironment:
+    """A world simulated from a problem, with its own random streams.
+
+    What happens is a function of (seed, trial) and of the task actions performed so far: sensing
+    draws from a stream of its own and so does not change how the world moves.
+
+    Parameters
+    ----------
+    seed, trial : int
+        Name the random streams; see :func:`holdfast.randomness.stream`.
+
+    Attributes
+    ----------
+    state : array of shape (state_size,)
+        The true state.
+    step : int
+        Task actions performed so far.
+    """
+
+    def __init__(self, problem: Problem, seed: int, trial: int = 0) -> None:
+        self._problem = problem
+        self._seed = seed
+        self._trial = trial
+        self.step = 0
+        check_sizes(problem)
+        initial = stream(seed, trial, 0, Purpose.WORLD_INITIAL_STATE)
+        drawn = problem.initial_states(initial, 1)
+        shape = (1, problem.state_size)
+        self.state: FloatArray = checked.states_of(problem, "initial_states", drawn, shape)[0]
+
+    @classmethod
+    def after(cls, problem: Problem, seed: int, trial: int, actions: Sequence[FloatArray]) -> Self:
+        """Return the world as it is after these task actions: they are performed again.
+
+        Parameters
+        ----------
+        actions : sequence of array of shape (action_size,)
+            Executed task actions from the beginning of the trial on.
+        """
+        environment = cls(problem, seed, trial)
+        for action in actions:
+            environment.perform(action)
+        return environment
+
+    def perform_sensing(self, sensing_action: int) -> FloatArray:
+        """Draw an observation of the true state.
+
+        Raises
+        ------
+        InvalidValueError
+            If the sensing action does not exist.
+        """
+        problem = self._problem
+        if not 0 <= sensing_action < len(problem.sensing_actions):
+            raise InvalidValueError(
+                f"sensing action {sensing_action}: {problem.name} has 0 to "
+                f"{len(problem.sensing_actions) - 1}"
+            )
+        noise = stream(self._seed, self._trial, self.step, Purpose.WORLD_OBSERVATION)
+        if hasattr(problem, "sample_observation"):
+            return checked.sample_observation(problem, self.state, sensing_action, noise)
+        mean = checked.observation_mean(problem, self.state, sensing_action)
+        variance = checked.observation_variance(problem, self.state, sensing_action, mean)
+        with np.errstate(invalid="ignore"):
+            shown: FloatArray = mean + np.sqrt(variance) * noise.normal(mean.shape)
+        if not np.isfinite(shown).all():
+            raise checked.unusable_prediction(problem, sensing_action, mean, variance)
+        return shown
+
+    def perform(self, task_action: FloatArray) -> float | None:
+        """Move the true state by an executed task action and return the reward.
+
+        None if the problem defines no reward.
+        """
+        motion = stream(self._seed, self._trial, self.step, Purpose.WORLD_MOTION)
+        problem = self._problem
+        moved = problem.move(self.state, task_action, motion)
+        self.state = checked.states_of(problem, "move", moved, self.state.shape)
+        self.step += 1
+        if getattr(type(problem), "reward", None) is ProblemBase.reward:
+            return None
+        return checked.scalar(problem, "reward", problem.reward(self.state, task_action))
+
+    def is_done(self) -> bool:
+        """Return whether the true state is a goal."""
+        problem = self._problem
+        return checked.truth(problem, "is_goal", problem.is_goal(self.state))
+
+    def steps_performed(self) -> int:
+        """Return the number of task actions performed, those of :meth:`after` included."""
+        return self.step
+
+
+def as_done(value: object) -> Done | None:
+    """Return what ``is_done`` of an environment has returned; None if it must not return that."""
+    if isinstance(value, bool | np.bool_):
+        return bool(value)
+    return "failed" if isinstance(value, str) and value == "failed" else None
+
+
+class ObservationSizes(dict[int, "int | None"]):
+    """Numbers that a problem expects of each sensing action; None where it does not say."""
+
+    def __init__(self, problem: Problem) -> None:
+        super().__init__()
+        self._problem = problem
+
+    def __missing__(self, sensing_action: int) -> int | None:
+        size = self[sensing_action] = _observation_size(self._problem, sensing_action)
+        return size
+
+
+def _observation_size(problem: Problem, sensing_action: int) -> int | None:
+    if has_general_observations(problem):
+        return None
+    drawn = problem.initial_states(stream(0, 0, 0, Purpose.INITIAL_BELIEF), 1)
+    shape = (1, problem.state_size)
+    state = checked.states_of(problem, "initial_states", drawn, shape)[0]
+    size: int = checked.observation_mean(problem, state, sensing_action).shape[-1]
+    return size
+
+
+class EnvironmentMaker:
+    """Makes the environment of each trial: a simulated one, or one of the user's.
+
+    An environment of the user's is made anew for each trial. Its constructor is given the
+    configuration's ``environment.arguments`` and, of the following, what it has named parameters
+    for:
+
+    - ``problem``: the :class:`~holdfast.problems.problem.Problem`;
+    - ``seed``, ``trial``: of the run;
+    - ``resumed``: True if the robot's process has died in the middle of this trial. The robot is
+      where it was left then, and must not be brought back to its start.
+
+    Parameters
+    ----------
+    name : str
+        For messages.
+    timeout_ms : float
+        Longest time that one call of the environment may take.
+    environment_class : type, optional
+        The user's class; None for the simulated world.
+    arguments : mapping, optional
+        Keyword arguments for the class.
+
+    Attributes
+    ----------
+    name, problem, timeout_ms
+        As passed.
+    simulated : bool
+        Whether the world is simulated from the problem.
+
+    Raises
+    ------
+    ConfigurationError
+        If the class does not take the arguments.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        problem: Problem,
+        seed: int,
+        timeout_ms: float,
+        environment_class: type[Any] | None = None,
+        arguments: Mapping[str, Any] | None = None,
+    ) -> None:
+        self.name = name
+        self.problem = problem
+        self.timeout_ms = timeout_ms
+        self.simulated = environment_class is None
+        self._seed = seed
+        self._class = environment_class
+        self._arguments = dict(arguments or {})
+        self._provided = (
+            ()
+            if environment_class is None
+            else _provided_parameters(name, environment_class, self._arguments)
+        )
+
+    def __call__(
+        self, trial: int, *, resumed: bool = False, performed: Sequence[FloatArray] = ()
+    ) -> Environment:
+        """Make the environment of a trial.
+
+        Parameters
+        ----------
+        resumed : bool, optional
+            Whether the robot's process has died in the middle of this trial.
+        performed : sequence of array, optional
+            Task actions that were performed in this trial before that. A simulated world has died
+            with the process and performs them again; a real one stands where they led to.
+
+        Raises
+        ------
+        EnvironmentFailedError
+            If the object lacks one of the three methods. Whatever the user's constructor raises is
+            passed on.
+        """
+        if self._class is None:
+            return SimulatedEnvironment.after(self.problem, self._seed, trial, performed)
+        values = {
+            "problem": self.problem,
+            "seed": self._seed,
+            "trial": trial,
+            "resumed": resumed,
+        }
+        environment = self._class(
+            # A copy: what one trial does to its arguments must not reach the next one.
+            **copy.deepcopy(self._arguments),
+            **{name: values[name] for name in self._provided},
+        )
+        missing = [name for name in _REQUIRED if not callable(getattr(environment, name, None))]
+        if missing:
+            raise EnvironmentFailedError(
+                f"{self.name} is no environment: it lacks {' and '.join(missing)}; it needs "
+                "perform_sensing(sensing_action), perform(task_action) and is_done()"
+            )
+        made: Environment = environment
+        return made
+
+
+def load_environment(configuration: Configuration) -> EnvironmentMaker:
+    """Find the environment that a configuration names.
+
+    Returns
+    -------
+    EnvironmentMaker
+        Calling it with the number of a trial makes the trial's environment.
+
+    Raises
+    ------
+    ConfigurationError
+        If the class cannot be imported or does not take the arguments.
+    """
+    settings = configuration.environment
+    problem, seed = configuration.problem, configuration.simulator.seed
+    name = settings.object
+    if name is not None:
+        # It is used by the environment's thread, while the robot's own is by the loop's.
+        problem = type(configuration).from_plain(configuration.plain()).problem
+    else:
+        return EnvironmentMaker(
+            f"the simulated {configuration.problem_name}", problem, seed, settings.timeout_ms
+        )
+    directory = None if settings.directory is None else Path(settings.directory)
+    try:
+        found = find_class(
+            name,
+            what="environment.object",
+            group=GROUP,
+            # Else, for a name without a module: where to look for what may have been meant.
+            search_directory=directory if ":" in name else configuration.path.parent,
+            error_type=ConfigurationError,
+        )
+    except ConfigurationError as error:
+        raise ConfigurationError(f"{configuration.path}: {error}") from error
+    try:
+        return EnvironmentMaker(name, problem, seed, settings.timeout_ms, found, settings.arguments)
+    except ConfigurationError as error:
+        raise ConfigurationError(f"{configuration.path}: {error}") from error
+
+
+def _provided_parameters(
+    name: str, environment_class: type[Any], arguments: Mapping[str, Any]
+) -> tuple[str, ...]:
+    """Check that the class takes the arguments, and return what else of ours it takes."""
+    reserved = [key for key in arguments if key in _PROVIDED]
+    if reserved:
+        raise ConfigurationError(
+            f"environment.arguments.{reserved[0]} cannot be set: holdfast itself passes "
+            f"{', '.join(_PROVIDED)} to a class that has parameters of these names"
+        )
+    try:
+        signature = inspect.signature(environment_class)
+    except (TypeError, ValueError):
+        return ()  # compiled code does not always tell; then its constructor complains
+    parameters = signature.parameters.values()
+    named = [
+        parameter.name
+        for parameter in parameters
+        if parameter.kind in (parameter.POSITIONAL_OR_KEYWORD, parameter.KEYWORD_ONLY)
+    ]
+    if not any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
+        allowed = [key for key in named if key not in _PROVIDED]
+        for key in arguments:
+            if key not in allowed:
+                close = difflib.get_close_matches(key, allowed, n=1)
+                suggestion = f"; did you mean {close[0]}?" if close else ""
+                raise ConfigurationError(
+                    f"environment.arguments.{key} is no argument of {name}{suggestion}\n"
+                    f"allowed: {', '.join(allowed) or 'no keys'}"
+                )
+    provided = tuple(key for key in _PROVIDED if key in named)
+    try:
+        signature.bind(**arguments, **dict.fromkeys(provided))
+    except TypeError as error:
+        raise ConfigurationError(
+            f"environment.arguments do not suit {name}{signature}: {error}"
+        ) from None
+    return provided

@@ -1,0 +1,101 @@
+"""A robot's condition for monitors: HTTP, and the service manager.
+
+The robot's own event loop answers. So an answer proves that the loop runs, and it says whether a
+service decides for the robot.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from typing import TYPE_CHECKING, NamedTuple
+
+from holdfast.runtime.events import EventSink
+from holdfast.runtime.service_manager import ServiceManager
+
+if TYPE_CHECKING:
+    from holdfast.service.health import HttpAddress, MonitoringServers
+
+__all__ = ["Condition", "RobotWatch"]
+
+
+class Condition(NamedTuple):
+    """A robot's condition.
+
+    Attributes
+    ----------
+    word : str
+        The :class:`~holdfast.protocol.status.Status` while a service decides; else
+        ``starting``, ``holding still`` or ``ending``.
+    trial : int or None
+        None between two trials.
+    """
+
+    word: str
+    is_deciding: bool
+    trial: int | None
+
+    def __str__(self) -> str:
+        return self.word if self.trial is None else f"{self.word}, trial {self.trial}"
+
+
+class RobotWatch:
+    """Reports a robot's condition.
+
+    Parameters
+    ----------
+    health : HttpAddress or None
+        Where to answer ``/livez`` and ``/readyz``.
+    events : EventSink
+        Gets the address.
+    """
+
+    def __init__(
+        self, manager: ServiceManager, health: HttpAddress | None, events: EventSink
+    ) -> None:
+        self._manager = manager
+        self._health = health
+        self._events = events
+        self._watched: MonitoringServers | None = None
+        self._has_begun = False
+
+    async def start(self, condition: Callable[[], Condition]) -> None:
+        """Answer from now on, in the running loop.
+
+        Raises
+        ------
+        HealthError
+            If it cannot listen there; the message names the address.
+        """
+        if self._health is not None:
+            from holdfast.service.health import MonitoringServers, Page
+
+            async def alive() -> Page:
+                return Page.of(None)
+
+            async def ready() -> Page:
+                now = condition()
+                return Page(200 if now.is_deciding else 503, f"{now.word}\n".encode())
+
+            self._watched = MonitoringServers()
+            self._watched.add("health", self._health, {"/livez": alive, "/readyz": ready})
+            self._events.event("offers", **await self._watched.start())
+        self._manager.watch(asyncio.get_running_loop(), lambda: str(condition()))
+
+    def begun(self) -> None:
+        """Report that a trial has begun."""
+        if not self._has_begun:
+            self._has_begun = True
+            self._manager.ready()
+
+    def ending(self) -> None:
+        """Report that the robot was asked to end."""
+        self._manager.stopping()
+
+    async def close(self) -> None:
+        """Answer no more, and report that the process ends."""
+        self._manager.stopping()
+        self._manager.close()
+        if self._watched is not None:
+            self._watched.close()
+            await asyncio.sleep(0)  # the loop lets go of the connections

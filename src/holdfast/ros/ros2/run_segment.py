@@ -1,0 +1,256 @@
+"""A segment of a run, on its own thread: from the end of the journal until all trials are done.
+
+A segment ends early when it is paused or something fails. The next segment continues there, in this
+process or another one.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import enum
+import itertools
+import threading
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from time import perf_counter
+from typing import NamedTuple
+
+from holdfast.config.loader import Configuration
+from holdfast.errors import (
+    HeldError,
+    HoldfastError,
+    LostJournalError,
+    StaleEpochError,
+    UnknownPerformanceError,
+)
+from holdfast.outcome import TrialResult
+from holdfast.planning import PlanningState
+from holdfast.protocol.events import Act, Sense, Timing
+from holdfast.recording.robot_run import RobotObserver, perform_trials
+from holdfast.recording.run_directory import RunDirectory
+from holdfast.robot.environment import EnvironmentMaker
+from holdfast.robot.health import Condition
+from holdfast.robot.process import RobotProcess
+from holdfast.ros.ros2.parameters import in_parameters
+from holdfast.runtime.events import EventSink
+
+__all__ = ["MAX_TRIALS_TOLD", "Ending", "RunSegment", "SegmentResult"]
+
+MAX_TRIALS_TOLD = 10_000
+"""Of a result; ``trials.csv`` has all."""
+
+_INTERRUPTED_S = 2.0
+"""For a call of the environment that was interrupted to end."""
+
+_CANNOT_GO_ON = (UnknownPerformanceError, LostJournalError, StaleEpochError)
+
+
+class Ending(enum.IntEnum):
+    """How a segment ended."""
+
+    FINISHED = 0
+    """All trials are finished."""
+    PAUSED = 1
+    """It was asked to pause."""
+    HELD = 2
+    """An error; the run can continue once its cause is gone."""
+    FAILED = 3
+    """An error; the run cannot continue."""
+
+
+class SegmentResult(NamedTuple):
+    """The result of a segment.
+
+    Attributes
+    ----------
+    trials : tuple of TrialResult
+        The first :data:`MAX_TRIALS_TOLD` finished ones, those of earlier segments included.
+    status : str
+        At its end; empty if the robot had not started.
+    num_finished : int
+        Trials, those of earlier segments included.
+    """
+
+    ending: Ending
+    message: str
+    trials: tuple[TrialResult, ...]
+    status: str = ""
+    num_finished: int = 0
+
+
+class RunSegment:
+    """Runs the remaining trials once :meth:`start` is called.
+
+    Parameters
+    ----------
+    path : Path
+        The run's directory.
+    sink : EventSink
+        Gets the robot's events.
+    on_order, on_timing : callable
+        As of :class:`~holdfast.recording.robot_run.RobotObserver`.
+    on_end : callable
+        Gets the result, on the segment's thread.
+    interrupt : callable
+        Ends the environment's current call where possible; given the reason.
+    interrupt_at_once : bool
+        Whether a pause interrupts without waiting for the call to end by itself. It costs nothing
+        only if an interrupted call is repeated later.
+
+    Attributes
+    ----------
+    outcome : SegmentResult or None
+        Once it has ended.
+    num_finished : int
+        Trials, those of earlier segments included.
+    """
+
+    def __init__(
+        self,
+        configuration: Configuration,
+        path: Path,
+        maker: EnvironmentMaker,
+        *,
+        rate_hz: float | None,
+        sink: EventSink,
+        on_order: Callable[[PlanningState, Act | Sense], None],
+        on_timing: Callable[[Timing], None],
+        on_end: Callable[[SegmentResult], None],
+        interrupt: Callable[[str], None],
+        interrupt_at_once: bool = False,
+    ) -> None:
+        self._configuration = configuration
+        self._path = path
+        self._maker = maker
+        self._rate_hz = rate_hz
+        self._sink = sink
+        self._on_order = on_order
+        self._on_timing = on_timing
+        self._on_end = on_end
+        self._interrupt = interrupt
+        self._interrupt_at_once = interrupt_at_once
+        self._changed = threading.Lock()
+        self._process: RobotProcess | None = None
+        self._why_paused: str | None = None
+        self._pause_within_s = 0.0
+        self._thread = threading.Thread(target=self._work, name="robot", daemon=True)
+        self.ended = threading.Event()
+        self.outcome: SegmentResult | None = None
+        self.num_finished = 0
+
+    def start(self) -> None:
+        """Begin."""
+        self._thread.start()
+
+    def condition(self) -> Condition | None:
+        """Return how the robot is doing; None before it runs."""
+        process = self._process
+        return None if process is None else process.condition()
+
+    @property
+    def status(self) -> str:
+        """Who decides."""
+        process = self._process
+        return "" if process is None else process.status.value
+
+    @property
+    def unexplained_observations(self) -> int:
+        """Those of the trial that is running."""
+        process = self._process
+        return 0 if process is None else process.unexplained_observations
+
+    def pause(self, why: str, within_s: float) -> None:
+        """End in order, from any thread: :attr:`ended` says when. Only the first call counts.
+
+        Parameters
+        ----------
+        within_s : float
+            Time for the environment to end its current call. Then the call is interrupted, and
+            abandoned if that does not help.
+        """
+        with self._changed:
+            if self._why_paused is not None:
+                return
+            self._why_paused = why
+            self._pause_within_s = within_s + _INTERRUPTED_S
+            process = self._process
+        if process is not None:
+            process.pause(self._pause_within_s)
+        if self._interrupt_at_once:
+            self._interrupt(why)
+        else:
+            threading.Thread(
+                target=self._interrupt_later, args=(why, within_s), name="pause", daemon=True
+            ).start()
+
+    def _interrupt_later(self, why: str, within_s: float) -> None:
+        if not self.ended.wait(within_s):
+            self._interrupt(why)
+
+    def _take_process(self, process: RobotProcess) -> None:
+        with self._changed:
+            self._process = process
+            if self._why_paused is not None:
+                process.pause(self._pause_within_s)
+
+    def _work(self) -> None:
+        trials: tuple[TrialResult, ...] = ()
+        try:
+            with RunDirectory.resume_if_begun(self._path, self._configuration) as directory:
+                try:
+                    self._run(directory)
+                finally:
+                    trials = tuple(itertools.islice(directory.journal.results(), MAX_TRIALS_TOLD))
+                complete = self.num_finished >= self._configuration.simulator.num_trials
+            if complete:
+                result = SegmentResult(Ending.FINISHED, f"{self.num_finished} trials", trials)
+            else:
+                result = SegmentResult(Ending.PAUSED, self._why_paused or "paused", trials)
+        except HoldfastError as error:
+            result = SegmentResult(self._ending_of(error), in_parameters(str(error)), trials)
+            if result.ending == Ending.PAUSED:
+                result = result._replace(message=self._why_paused or result.message)
+        except BaseException:  # noqa: BLE001 - waiting callers need a result
+            result = SegmentResult(Ending.FAILED, traceback.format_exc(), trials)
+        result = result._replace(status=self.status, num_finished=self.num_finished)
+        self.outcome = result
+        try:
+            self._on_end(result)
+        finally:
+            self.ended.set()
+
+    def _ending_of(self, error: HoldfastError) -> Ending:
+        if isinstance(error, _CANNOT_GO_ON):
+            return Ending.FAILED
+        # An interrupted call reports a failure.
+        paused = self._why_paused is not None and isinstance(error, HeldError)
+        return Ending.PAUSED if paused else Ending.HELD
+
+    def _run(self, directory: RunDirectory) -> None:
+        self.num_finished = directory.journal.tally().finished
+        if directory.complete_summary() is not None:
+            return
+        began = perf_counter()
+
+        def on_result(result: TrialResult) -> None:
+            directory.add(result)
+            self.num_finished += 1
+
+        observer = RobotObserver(self._take_process, self._on_order, self._on_timing)
+        try:
+            perform_trials(
+                self._configuration,
+                directory,
+                self._maker,
+                on_result,
+                rate_hz=self._rate_hz,
+                sinks=[self._sink],
+                observer=observer,
+            )
+        except BaseException:
+            # If the disk is the trouble, the first error says so.
+            with contextlib.suppress(HoldfastError):
+                directory.write_tables(perf_counter() - began)
+            raise
+        directory.write_tables(perf_counter() - began)

@@ -1,0 +1,201 @@
+"""Events: what happened in a process, as a name and a few fields.
+
+The code that reports an event does not know where it goes: :class:`~holdfast.runtime.logs.EventLog`
+writes it as a line, :class:`TeeEventLog` passes it to several sinks, :class:`BoundedEventLog`
+limits the rate of repeated ones.
+
+Events of the robot: status, launch, launched, launch_failed, recovery_exited,
+retry, hedge, restore, restored, state_diverged, service_appeared, service_vanished,
+service_suspected, unreachable, no_datagrams, insecure, credentials,
+late_replies, waiting, holding, resumed, busy, refused, malformed_reply, disagreement,
+wrong_answer, not_deterministic, verification_failed, distrusted,
+limits_unknown, verifying, prefetch_unused, unexplained, filter_diverged,
+resumed_trial, performed_unseen, trial, missed_ticks, stopped, note, interrupted, offers.
+Of a service: ready, session_opened, session_taken_over, restored, state_diverged, refused, busy,
+evicted, robot_connected, robot_disconnected, link_refused, credentials, credentials_reloaded,
+stopping, process_ended, process_started.
+Of ``holdfast ros1-guard``: ready, guarding, master_started, master_lost, master_failed,
+master_hangs, nodes_gone, journal_failed, journal_written, rosout_ended, note, stopping.
+Of ``holdfast chaos``: chaos_trial, left_out, note, interrupted. Of a command that ends with an
+error: error. These fields have a place of their own in the text form: ``from`` and ``to`` (of a
+change), ``service``, ``robot``, ``reason``, ``duration_ms``.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Callable, Hashable, Iterable, Mapping
+from typing import NamedTuple, Protocol
+
+__all__ = [
+    "BoundedEventLog",
+    "CountedEvent",
+    "EventRates",
+    "EventSink",
+    "NullEventLog",
+    "TeeEventLog",
+]
+
+_REPEAT_INTERVAL_S = 1.0
+_BURST = 20
+"""Events of one kind that pass at once: more than correct peers cause."""
+
+
+class EventSink(Protocol):
+    """Takes events."""
+
+    def event(self, name: str, /, **fields: object) -> None:
+        """Take an event; never raises."""
+        ...
+
+    def close(self) -> None:
+        """Ignore all further events; may be repeated."""
+        ...
+
+
+class NullEventLog:
+    """Drops every event."""
+
+    def event(self, name: str, /, **fields: object) -> None:
+        """Drop an event."""
+
+    def close(self) -> None:
+        """Do nothing."""
+
+
+class TeeEventLog:
+    """Passes every event to several sinks, in order."""
+
+    def __init__(self, *sinks: EventSink) -> None:
+        self._sinks = sinks
+
+    def event(self, name: str, /, **fields: object) -> None:
+        """Pass an event to all sinks."""
+        for sink in self._sinks:
+            sink.event(name, **fields)
+
+    def close(self) -> None:
+        """Close all sinks."""
+        for sink in self._sinks:
+            sink.close()
+
+
+class CountedEvent(NamedTuple):
+    """An event, and the number of similar ones that were dropped before it."""
+
+    name: str
+    fields: Mapping[str, object]
+    omitted: int
+
+    def report_to(self, sink: EventSink) -> None:
+        """Pass the event on, with the number as a field unless it is 0."""
+        more = {"similar_lines_omitted": self.omitted} if self.omitted else {}
+        sink.event(self.name, **{**self.fields, **more})
+
+
+class _TokenBucket:
+    """The rate limit of one kind of event."""
+
+    __slots__ = ("last", "omitted", "tokens", "updated_at")
+
+    def __init__(self, now: float) -> None:
+        self.tokens = float(_BURST)
+        self.updated_at = now
+        self.omitted = 0
+        self.last: tuple[str, Mapping[str, object]] | None = None
+
+    def refill(self, now: float) -> None:
+        earned = (now - self.updated_at) / _REPEAT_INTERVAL_S
+        self.tokens = min(float(_BURST), self.tokens + earned)
+        self.updated_at = now
+
+    @property
+    def due_at(self) -> float:
+        return self.updated_at + (1.0 - self.tokens) * _REPEAT_INTERVAL_S
+
+
+class EventRates:
+    """Token buckets, one per kind of event: a burst of 20 passes, then one event a second.
+
+    Another machine can cause the same event a thousand times a second. Events over the rate are
+    dropped and counted; the last one of each kind is kept and reported when its token is there.
+    """
+
+    def __init__(self) -> None:
+        self._buckets: dict[Hashable, _TokenBucket] = {}
+
+    def admit(
+        self, kind: Hashable, name: str, fields: Mapping[str, object], now: float
+    ) -> CountedEvent | None:
+        """Return the event if it may be reported now (``now`` in seconds); None if it is dropped.
+
+        Events of one ``kind`` share a bucket.
+        """
+        bucket = self._buckets.get(kind)
+        if bucket is None:
+            bucket = self._buckets[kind] = _TokenBucket(now)
+        bucket.refill(now)
+        if bucket.tokens < 1.0:
+            bucket.omitted += 1
+            bucket.last = name, fields
+            return None
+        bucket.tokens -= 1.0
+        omitted, bucket.omitted, bucket.last = bucket.omitted, 0, None
+        return CountedEvent(name, fields, omitted)
+
+    def next_due(self) -> float | None:
+        """Return when :meth:`due` will return something; None if nothing was dropped."""
+        times = [bucket.due_at for bucket in self._buckets.values() if bucket.last is not None]
+        return min(times, default=None)
+
+    def due(self, now: float) -> list[CountedEvent]:
+        """Return the last dropped event of each kind whose time has come; of all if infinite."""
+        found = []
+        for bucket in self._buckets.values():
+            if bucket.last is not None and bucket.due_at <= now:
+                found.append(CountedEvent(*bucket.last, bucket.omitted - 1))
+                bucket.tokens, bucket.updated_at = 0.0, now
+                bucket.omitted, bucket.last = 0, None
+        return found
+
+
+class BoundedEventLog:
+    """Limits the rate of events about a service, so that no service can fill a robot's log.
+
+    Changes of status always pass.
+
+    Parameters
+    ----------
+    clock : callable
+        Returns seconds.
+    """
+
+    def __init__(self, sink: EventSink, clock: Callable[[], float] = time.monotonic) -> None:
+        self._sink = sink
+        self._clock = clock
+        # Reentrant: a signal handler of the same thread may report an event.
+        self._lock = threading.RLock()
+        self._rates = EventRates()
+
+    def event(self, name: str, /, **fields: object) -> None:
+        """Pass an event on, or count it."""
+        with self._lock:
+            now = self._clock()
+            self._report(self._rates.due(now))
+            event: CountedEvent | None = CountedEvent(name, fields, 0)
+            if "service" in fields and name != "status":
+                event = self._rates.admit((name, fields["service"]), name, fields, now)
+            if event is not None:
+                event.report_to(self._sink)
+
+    def close(self) -> None:
+        """Report the last dropped events, and close the sink."""
+        with self._lock:
+            self._report(self._rates.due(math.inf))
+            self._sink.close()
+
+    def _report(self, events: Iterable[CountedEvent]) -> None:
+        for event in events:
+            event.report_to(self._sink)

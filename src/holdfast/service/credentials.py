@@ -1,0 +1,99 @@
+"""A service's credentials: read at its start, and again when their files change.
+
+A tool that renews certificates often cannot send a signal: cert-manager in a cluster only changes
+mounted files. So the event loop checks the files every second. It reads them when they are the same
+in two checks, because a set may be half copied. Credentials that cannot be used change nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from holdfast.errors import HoldfastError
+from holdfast.runtime.events import EventSink
+from holdfast.transport.credentials import date_text, file_versions, read_credentials
+from holdfast.transport.endpoints import TlsFiles
+
+if TYPE_CHECKING:
+    import asyncio
+
+    from holdfast.transport.service_end import StreamServiceTransport
+
+__all__ = ["ServiceCredentials"]
+
+_CHECK_INTERVAL_S = 1.0
+
+
+class ServiceCredentials:
+    """The credentials of this process.
+
+    Parameters
+    ----------
+    warn : callable
+        Takes warnings as text.
+
+    Attributes
+    ----------
+    expires_s : float
+        When the certificate in use expires, in seconds since 1970.
+
+    Raises
+    ------
+    CredentialsError
+        If they cannot be used.
+    """
+
+    def __init__(self, directory: Path, warn: Callable[[str], None]) -> None:
+        self.files = TlsFiles.of(directory)
+        self._directory = directory
+        self._warn = warn
+        self._used = self._seen = file_versions(self.files)
+        self._failure: str | None = None
+        self.expires_s = read_credentials(directory, "service", warn=warn).expires_s
+
+    def watch(
+        self,
+        loop: asyncio.AbstractEventLoop,
+        transport: StreamServiceTransport,
+        events: EventSink,
+    ) -> None:
+        """Check the files from now on."""
+        seen = file_versions(self.files)
+        if seen == self._seen and seen != self._used:
+            self.reload(transport, events, requested=False)
+        self._seen = seen
+        loop.call_later(_CHECK_INTERVAL_S, self.watch, loop, transport, events)
+
+    def reload(
+        self, transport: StreamServiceTransport, events: EventSink, *, requested: bool = True
+    ) -> None:
+        """Read the files again; if they cannot be used, the previous ones stay in use.
+
+        Parameters
+        ----------
+        requested : bool
+            Whether an operator has requested it. Else a repeated failure is logged only once.
+        """
+        read_at = file_versions(self.files)
+        warnings: list[str] = []
+        try:
+            # This check names more faults than the transport's.
+            read = read_credentials(self._directory, "service", warn=warnings.append)
+            ended = transport.reload_credentials()
+        except HoldfastError as error:
+            failure = f"{error}; the previous ones stay in use"
+            if requested or failure != self._failure:
+                events.event("credentials", reason=failure)
+            self._failure = failure
+            return
+        self._used, self._failure, self.expires_s = read_at, None, read.expires_s
+        for text in warnings:
+            self._warn(text)
+        events.event(
+            "credentials_reloaded",
+            links_ended=ended,
+            valid_until=date_text(read.expires_s),
+            num_revoked=transport.num_revoked,
+        )

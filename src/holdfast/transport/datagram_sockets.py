@@ -1,0 +1,117 @@
+"""A service's sockets for datagrams, each shared by the links of many robots."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import socket
+from typing import Any, Final, Protocol
+
+from holdfast.transport.datagram_cipher import AssociationKeys, association_of
+
+__all__ = ["DATAGRAMS_AT_ONCE", "LARGEST_DATAGRAM", "DatagramSocket", "DatagramSockets"]
+
+LARGEST_DATAGRAM: Final = 2048
+DATAGRAMS_AT_ONCE: Final = 64
+"""Read before the event loop serves other sockets."""
+
+_RECEIVE_BUFFER_BYTES: Final = 1 << 20
+"""Asked of the system, so that a burst of one robot does not push out datagrams of others."""
+
+
+class DatagramReceiver(Protocol):
+    """A link that takes datagrams."""
+
+    def take_datagram(self, datagram: bytes, address: Any) -> None:
+        """Take a datagram that claims to be of this link."""
+        ...
+
+
+class DatagramSockets:
+    """A listening service's sockets for datagrams: one at each address that robots have called.
+
+    A socket bound to all addresses might reply from another one, which the robot would ignore. Each
+    has the port of the stream if that is free.
+    """
+
+    def __init__(self) -> None:
+        self._sockets: dict[Any, DatagramSocket] = {}
+
+    def at(self, address: Any) -> DatagramSocket:
+        """Return the socket at the address of a stream's own end.
+
+        Raises
+        ------
+        OSError
+            If the system has none left.
+        """
+        if address not in self._sockets:
+            self._sockets[address] = DatagramSocket(address)
+        return self._sockets[address]
+
+    def close(self) -> None:
+        """Close all of them. May be repeated."""
+        for each in self._sockets.values():
+            each.close()
+        self._sockets.clear()
+
+
+class DatagramSocket:
+    """A socket at one address, for the links of many robots."""
+
+    def __init__(self, address: Any) -> None:
+        self._loop = asyncio.get_running_loop()
+        self._links: dict[int, DatagramReceiver] = {}
+        family = socket.AF_INET6 if len(address) == 4 else socket.AF_INET
+        self._socket = socket.socket(family, socket.SOCK_DGRAM)
+        try:
+            self._socket.setblocking(False)
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER_BYTES)
+            try:
+                self._socket.bind(address)
+            except OSError:
+                self._socket.bind((address[0], 0, *address[2:]))
+        except BaseException:
+            self._socket.close()
+            raise
+        self.port: int = self._socket.getsockname()[1]
+        self._loop.add_reader(self._socket, self._readable)
+
+    def add(self, link: DatagramReceiver) -> AssociationKeys:
+        """Draw keys for a link."""
+        # Random: an attacker that sees no datagram cannot guess one.
+        while (association := int.from_bytes(os.urandom(4))) in self._links:
+            pass
+        self._links[association] = link
+        return AssociationKeys.draw(association)
+
+    def remove(self, association: int) -> None:
+        """Take no more datagrams of an association."""
+        self._links.pop(association, None)
+
+    def send(self, datagram: bytes, address: Any) -> None:
+        """Send a datagram; it may be lost here as well as anywhere."""
+        with contextlib.suppress(OSError):
+            self._socket.sendto(datagram, address)
+
+    def close(self) -> None:
+        """Close the socket. May be repeated."""
+        if self._socket.fileno() >= 0:
+            self._loop.remove_reader(self._socket)
+            self._socket.close()
+
+    def _readable(self) -> None:
+        for _ in range(DATAGRAMS_AT_ONCE):
+            try:
+                datagram, address = self._socket.recvfrom(LARGEST_DATAGRAM)
+            except (BlockingIOError, InterruptedError):
+                return
+            except OSError:
+                continue  # a robot is gone
+            association = association_of(datagram)
+            if association is None:
+                continue
+            link = self._links.get(association)
+            if link is not None:
+                link.take_datagram(datagram, address)

@@ -1,0 +1,75 @@
+"""Fixtures of the transport's tests."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from cryptography.x509 import oid
+from tests.contracts.wires import (
+    WIRES,
+    Authority,
+    InProcessWire,
+    StreamWire,
+    Wire,
+)
+
+from holdfast.transport.endpoints import TlsFiles
+from holdfast.transport.private_socket import PrivateSocket
+
+
+@pytest.fixture(scope="session")
+def authority(tmp_path_factory: pytest.TempPathFactory) -> Authority:
+    return Authority(tmp_path_factory.mktemp("tls") / "authority")
+
+
+@pytest.fixture(scope="session")
+def robot_tls(authority: Authority) -> TlsFiles:
+    return authority.issue("robot", oid.ExtendedKeyUsageOID.CLIENT_AUTH)
+
+
+@pytest.fixture(scope="session")
+def service_tls(authority: Authority) -> TlsFiles:
+    return authority.issue("service", oid.ExtendedKeyUsageOID.SERVER_AUTH)
+
+
+@pytest.fixture
+def socket_directory() -> Iterator[Path]:
+    """Pytest's own directories have paths too long for a socket."""
+    with PrivateSocket() as place:
+        yield Path(place.endpoint.removeprefix("unix/")).parent
+
+
+@pytest.fixture(params=WIRES)
+def wire(
+    request: pytest.FixtureRequest,
+    socket_directory: Path,
+    robot_tls: TlsFiles,
+    service_tls: TlsFiles,
+) -> Wire:
+    match request.param:
+        case "in_process":
+            return InProcessWire()
+        case "robot_listens":
+            return StreamWire("unix", socket_directory, robot_listens=True)
+        case "tls" | "udp" | "robot_listens_tls":
+            return StreamWire(
+                "udp" if request.param == "udp" else "tls",
+                socket_directory,
+                robot_tls=robot_tls,
+                service_tls=service_tls,
+                robot_listens=request.param == "robot_listens_tls",
+            )
+        case protocol:
+            return StreamWire(protocol, socket_directory)
+
+
+@pytest.fixture
+def tcp(socket_directory: Path) -> StreamWire:
+    return StreamWire("tcp", socket_directory)
+
+
+@pytest.fixture
+def tls(socket_directory: Path, robot_tls: TlsFiles, service_tls: TlsFiles) -> StreamWire:
+    return StreamWire("tls", socket_directory, robot_tls=robot_tls, service_tls=service_tls)

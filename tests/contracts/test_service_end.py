@@ -1,0 +1,276 @@
+"""The service's end: whose certificate it believes, and whose links it ends."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import ssl
+from pathlib import Path
+
+import pytest
+from cryptography import x509
+from cryptography.x509 import oid
+from tests.contracts.wires import (
+    HELLO,
+    PATIENCE_S,
+    Authority,
+    Inbox,
+    Received,
+    StreamWire,
+    connected,
+    echo,
+    until,
+)
+
+from holdfast.errors import TransportError
+from holdfast.protocol.events import (
+    CallEnded,
+    ReplyReceived,
+    ServiceAppeared,
+    ServiceVanished,
+)
+from holdfast.transport import service_end
+from holdfast.transport.contract import IncomingCall
+from holdfast.transport.endpoints import ServiceAddress, TlsFiles
+from holdfast.transport.robot_end import StreamRobotTransport
+from holdfast.transport.service_end import StreamServiceTransport
+from holdfast.transport.tls import client_context
+
+
+class TestCertificates:
+    async def test_strangers_see_nothing(
+        self, tls: StreamWire, robot_tls: TlsFiles, tmp_path: Path
+    ) -> None:
+        usage = oid.ExtendedKeyUsageOID.CLIENT_AUTH
+        foreign = Authority(tmp_path / "foreign").issue("robot", usage)
+        # A stranger's certificate, but the right authority: it believes the service.
+        stranger = TlsFiles(robot_tls.authority, foreign.certificate, foreign.key)
+        received: list[bytes] = []
+
+        def serve(call: IncomingCall) -> None:
+            received.append(call.payload)
+            echo(call)
+
+        await tls.service("cloud", "b1").start(serve)
+        address = ServiceAddress(tls.endpoint("cloud"))
+        refusals: list[tuple[str, str]] = []
+        for files in (foreign, stranger):
+            outsider = StreamRobotTransport(
+                {"cloud": address},
+                tls=files,
+                on_unreachable=lambda *each: refusals.append(each),
+            )
+            tls.ends.append(outsider)
+            inbox = Inbox()
+            refusals.clear()
+            outsider.start(inbox)
+            await until(lambda: bool(refusals))
+            outsider.call("cloud", 1, b"stranger")
+            assert await inbox.of_call(1) == [CallEnded(1)]
+            assert inbox.events == [CallEnded(1)]
+            expected = (
+                "has a certificate that was" if files is foreign else "refuses this end's cert"
+            )
+            assert expected in refusals[0][1]
+        bare = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+        bare.load_verify_locations(robot_tls.authority)
+        host, _, port = address.endpoint.removeprefix("tls/").rpartition(":")
+        with pytest.raises(ssl.SSLError, match="CERTIFICATE_REQUIRED"):
+            reader, writer = await asyncio.open_connection(host, int(port), ssl=bare)
+            writer.write(HELLO)
+            await reader.read()
+        writer.close()
+        with contextlib.suppress(ssl.SSLError):
+            await writer.wait_closed()
+        robot, inbox = tls.robot("cloud"), Inbox()
+        robot.start(inbox)
+        await inbox.wait_for(ServiceAppeared("cloud", "b1"))
+        robot.call("cloud", 1, b"friend")
+        assert await inbox.of_call(1) == [ReplyReceived(1, b"friend"), CallEnded(1)]
+        assert received == [b"friend"]
+        assert {"shows no certificate"} < set(tls.reasons())
+
+    async def test_a_robot_does_not_believe_a_service_of_another_authority(
+        self, tls: StreamWire, tmp_path: Path
+    ) -> None:
+        usage = oid.ExtendedKeyUsageOID.SERVER_AUTH
+        tls.service_tls = Authority(tmp_path / "foreign").issue("service", usage)
+        await self.assert_refused(tls, "has a certificate that was not signed by the authority")
+
+    async def test_a_robot_s_certificate_does_not_make_a_service(
+        self, tls: StreamWire, robot_tls: TlsFiles
+    ) -> None:
+        tls.service_tls = robot_tls
+        await self.assert_refused(tls, "has a certificate that is not for a service")
+
+    async def test_a_service_s_certificate_does_not_make_a_robot(
+        self, tls: StreamWire, service_tls: TlsFiles
+    ) -> None:
+        tls.robot_tls = service_tls
+        await self.assert_refused(tls, "refuses this end's certificate")
+        assert tls.reasons()[0] == "has a certificate that is not for a robot"
+
+    async def test_a_robot_has_the_name_of_its_certificate_or_tells_none(
+        self, tls: StreamWire
+    ) -> None:
+        await tls.service("cloud", "b1").start(echo)
+        for name in ("robot", ""):
+            robot, inbox = tls.robot("cloud", name=name), Inbox()
+            robot.start(inbox)
+            await inbox.appeared()
+        robot, inbox = tls.robot("cloud", name="another"), Inbox()
+        robot.start(inbox)
+        await until(lambda: bool(tls.refusals) and bool(tls.reasons()))
+        reason = "says that it is another, and shows the certificate of robot"
+        assert tls.refusals[0] == ("cloud", f"refuses this end, which {reason}")
+        assert tls.reasons()[0] == reason
+
+    async def test_a_certificate_must_name_the_host(
+        self, tls: StreamWire, authority: Authority
+    ) -> None:
+        await tls.service("cloud", "b1").start(echo)
+        place = tls.endpoint("cloud").replace("127.0.0.1", "127.0.0.2")
+        listening = StreamServiceTransport(
+            "cloud", incarnation="b1", listen=[place], tls=tls.service_tls
+        )
+        tls.ends.append(listening)
+        await listening.start(echo)
+        tls._endpoints["cloud"] = place
+        robot, inbox = tls.robot("cloud"), Inbox()
+        robot.start(inbox)
+        await until(lambda: bool(tls.refusals))
+        assert "does not name this host" in tls.refusals[0][1]
+        assert inbox.events == []
+
+    async def test_an_old_version_of_tls_is_refused(self, tls: StreamWire) -> None:
+        await tls.service("cloud", "b1").start(echo)
+        assert tls.robot_tls is not None
+        context = client_context(tls.robot_tls)
+        context.minimum_version = context.maximum_version = ssl.TLSVersion.TLSv1_2
+        host, _, port = tls.endpoint("cloud").removeprefix("tls/").rpartition(":")
+        with pytest.raises(ssl.SSLError, match="PROTOCOL_VERSION"):
+            await asyncio.open_connection(host, int(port), ssl=context)
+
+    @pytest.mark.parametrize("group", ["ffdhe8192", "secp521r1"])
+    async def test_nobody_chooses_a_key_exchange_that_takes_long(
+        self, tls: StreamWire, group: str
+    ) -> None:
+        await tls.service("cloud", "b1").start(echo)
+        assert tls.robot_tls is not None
+        context = client_context(tls.robot_tls)
+        context.set_ecdh_curve(group)
+        host, _, port = tls.endpoint("cloud").removeprefix("tls/").rpartition(":")
+        with pytest.raises(ssl.SSLError, match="HANDSHAKE_FAILURE"):
+            await asyncio.open_connection(host, int(port), ssl=context)
+
+    @staticmethod
+    async def assert_refused(tls: StreamWire, reason: str) -> None:
+        await tls.service("cloud", "b1").start(echo)
+        robot, inbox = tls.robot("cloud"), Inbox()
+        robot.start(inbox)
+        await until(lambda: bool(tls.refusals))
+        assert reason in tls.refusals[0][1]
+        robot.call("cloud", 1, b"")
+        assert await inbox.of_call(1) == [CallEnded(1)]
+        assert inbox.events == [CallEnded(1)]
+
+    async def test_a_call_names_the_robot_s_certificate(
+        self, tls: StreamWire, tcp: StreamWire
+    ) -> None:
+        for wire, name in ((tls, "robot"), (tcp, None)):
+            calls = Received()
+            robot, _, _ = await connected(wire, calls)
+            robot.call("cloud", 1, b"")
+            assert (await calls.next()).robot == name
+
+    async def test_links_of_one_certificate_keep_no_other_out(
+        self, tls: StreamWire, authority: Authority, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(service_end, "MAX_LINKS", 3)
+        await tls.service("cloud", "b1").start(echo)
+        greedy = [(tls.robot("cloud"), Inbox()) for _ in range(3)]
+        for robot, inbox in greedy:
+            robot.start(inbox)
+            await inbox.wait_for(ServiceAppeared("cloud", "b1"))
+        tls.robot_tls = authority.issue("one of many", oid.ExtendedKeyUsageOID.CLIENT_AUTH)
+        other, other_inbox = tls.robot("cloud"), Inbox()
+        other.start(other_inbox)
+        await other_inbox.wait_for(ServiceAppeared("cloud", "b1"))
+        reason = "has 3 links, and another robot needs one of 3"
+        await until(lambda: tls.refusals[:1] == [("cloud", f"refuses this end, which {reason}")])
+        full = "refuses this end, which is one too many: 3 robots are connected"
+        await until(lambda: ("cloud", full) in tls.refusals)  # as it is back
+        other.call("cloud", 1, b"question")
+        assert await other_inbox.of_call(1) == [ReplyReceived(1, b"question"), CallEnded(1)]
+        assert ServiceVanished("cloud", "b1") not in other_inbox
+
+    async def test_links_of_some_certificates_can_be_ended(
+        self, tls: StreamWire, authority: Authority
+    ) -> None:
+        robot, inbox, service = await connected(tls)
+        assert isinstance(service, StreamServiceTransport)
+        tls.robot_tls = authority.issue("other", oid.ExtendedKeyUsageOID.CLIENT_AUTH)
+        other, other_inbox = tls.robot("cloud"), Inbox()
+        other.start(other_inbox)
+        await other_inbox.wait_for(ServiceAppeared("cloud", "b1"))
+        shown = x509.load_pem_x509_certificate(tls.robot_tls.certificate.read_bytes())
+        assert (
+            service.end_links(lambda peer: "is revoked" if peer.serial_number == 1 else None) == 0
+        )
+        assert (
+            service.end_links(
+                lambda peer: (
+                    "is revoked"
+                    if peer.serial_number == shown.serial_number
+                    and peer.name == "other"
+                    and peer.expires_at == shown.not_valid_after_utc.timestamp()
+                    else None
+                ),
+            )
+            == 1
+        )
+        await other_inbox.wait_for(ServiceVanished("cloud", "b1"))
+        assert tls.refusals == [("cloud", "refuses this end, which is revoked")]
+        robot.call("cloud", 1, b"question")
+        assert await inbox.of_call(1) == [ReplyReceived(1, b"question"), CallEnded(1)]
+
+    async def test_credentials_are_read_anew_for_links_to_come(
+        self, tls: StreamWire, authority: Authority, tmp_path: Path
+    ) -> None:
+        usage = oid.ExtendedKeyUsageOID.SERVER_AUTH
+        tls.service_tls = files = authority.issue("renewed", usage)
+        robot, inbox, service = await connected(tls)
+        assert isinstance(service, StreamServiceTransport)
+        foreign = Authority(tmp_path / "foreign").issue("service", usage)
+        files.certificate.write_bytes(b"nonsense")
+        with pytest.raises(TransportError, match="cannot be used"):
+            service.reload_credentials()
+        again, again_inbox = tls.robot("cloud"), Inbox()
+        again.start(again_inbox)
+        await again_inbox.wait_for(ServiceAppeared("cloud", "b1"))
+        files.certificate.write_bytes(foreign.certificate.read_bytes())
+        files.key.write_bytes(foreign.key.read_bytes())
+        service.reload_credentials()
+        late, late_inbox = tls.robot("cloud"), Inbox()
+        late.start(late_inbox)
+        await until(lambda: bool(tls.refusals))
+        assert late_inbox.events == []
+        robot.call("cloud", 1, b"question")
+        assert await inbox.of_call(1) == [ReplyReceived(1, b"question"), CallEnded(1)]
+
+    async def test_a_robot_can_be_closed_amid_a_handshake(self, tls: StreamWire) -> None:
+        host, _, port = tls.endpoint("cloud").removeprefix("tls/").rpartition(":")
+        heard = asyncio.Event()
+
+        async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+            await reader.readexactly(1)
+            heard.set()
+            await reader.read()
+            writer.close()
+
+        async with await asyncio.start_server(serve, host, int(port)):
+            robot, inbox = tls.robot("cloud"), Inbox()
+            robot.start(inbox)
+            await asyncio.wait_for(heard.wait(), PATIENCE_S)
+            await robot.close()
+        assert inbox.events == []

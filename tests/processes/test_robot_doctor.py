@@ -1,0 +1,502 @@
+"""``holdfast doctor``: each layer that can fail, really failing, and what is said of it."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import shutil
+import signal
+import socket
+import ssl
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import pytest
+from tests.ports import free_port
+from tests.processes import lying_problem, test_other_code
+from tests.processes.faults import HERE, PATIENCE_S, PATIENT, Process, Service, Site, document_of
+from tests.wire import CALL, LAST, frame_of, hello_of
+
+from holdfast.config.settings import OffloadSettings
+from holdfast.lab.testbed.namespace import NetworkNamespace, why_no_namespace
+from holdfast.protocol.messages import NeedState, Refused, Reply, decode_request, encode
+from holdfast.robot.doctor import LayerFinding, RobotSetup, check, examine
+from holdfast.transport.frames import FrameDecoder
+from holdfast.transport.key_ring import make_credentials, revoke_credentials
+
+PEG = document_of("peg_in_hole_2d", max_steps=40)
+PLAIN = ["name", "route", "port", "tls", "protocol", "clock", "problem", "round trip"]
+SECURE = [*PLAIN[:4], "certificate", *PLAIN[4:]]
+LAYERS = {
+    "tcp": PLAIN,
+    "tls": SECURE,
+    "udp": [*SECURE[:6], "datagrams", *SECURE[6:]],
+    "unix": [PLAIN[0], *PLAIN[2:]],
+}
+
+
+@dataclass
+class Seen:
+    """What the command has said of one service."""
+
+    code: int
+    findings: list[dict[str, str]]
+
+    def __getitem__(self, layer: str) -> dict[str, str]:
+        (found,) = [each for each in self.findings if each["layer"] == layer]
+        return found
+
+    @property
+    def states(self) -> dict[str, str]:
+        return {each["layer"]: each["state"] for each in self.findings}
+
+
+def look(site: Site, endpoint: str, *options: str | Path, prefix: tuple[str, ...] = ()) -> Seen:
+    command = (*prefix, sys.executable, "-m", "holdfast", "doctor", "--json")
+    process = site.process(*command, "--service", endpoint, *map(str, options))
+    code = process.wait()
+    try:
+        findings = [json.loads(line) for line in process.output.splitlines()]
+    except json.JSONDecodeError:
+        raise AssertionError(process.account()) from None
+    assert {each["service"] for each in findings} == {endpoint}
+    assert code == (1 if "fails" in {each["state"] for each in findings} else 0)
+    return Seen(code, findings)
+
+
+def assert_fails(seen: Seen, layer: str, what: str, to_do: str = "") -> None:
+    """Check that this layer fails, those below work, and those above were not reached."""
+    assert seen.code == 1
+    found = seen[layer]
+    assert found["state"] == "fails", seen.findings
+    assert what in found["seen"], found
+    assert to_do in found["advice"], found
+    names = [each["layer"] for each in seen.findings]
+    below, above = names[: names.index(layer)], names[names.index(layer) + 1 :]
+    assert {seen.states[each] for each in below} <= {"ok", "warns"}, seen.findings
+    assert {seen.states[each] for each in above} <= {"-"}, seen.findings
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return credentials of all sorts; beside them, copies from before a revocation."""
+    home = tmp_path_factory.mktemp("home") / "keys"
+    now = datetime.now(UTC)
+    make_credentials(home, robots=["anna"], services=["cloud"], now=now - timedelta(days=30))
+    for days, name in ((3, "old"), (-3, "early")):
+        moment = now - timedelta(days=days)
+        make_credentials(home, robots=[name], services=[f"{name}-cloud"], days=2, now=moment)
+    make_credentials(home, robots=["soon"], services=["soon-cloud"], days=5)
+    make_credentials(home, robots=["thief"], services=["thief-cloud"])
+    for name in ("thief", "thief-cloud"):
+        shutil.copytree(home / name, home.with_name(name))
+    revoke_credentials(home, names=["thief", "thief-cloud"])
+    crossed = home.with_name("crossed")
+    shutil.copytree(home / "anna", crossed)
+    shutil.copy(home / "soon" / "key.pem", crossed)
+    make_credentials(home.with_name("other"), robots=["anna"], services=["cloud"])
+    return home
+
+
+def service_of(
+    site: Site, protocol: str, credentials: Path | None = None, host: str = "127.0.0.1"
+) -> Service:
+    options = () if credentials is None else ("--tls", str(credentials))
+    return site.service(*options, endpoint=f"{protocol}/{host}:{free_port(host)}").start()
+
+
+@contextlib.contextmanager
+def answering(answer: Callable[[socket.socket], None]) -> Iterator[int]:
+    """Take connections, and do something with each; return the port."""
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+
+        def accept() -> None:
+            with contextlib.suppress(OSError):
+                while True:
+                    taken, _ = listener.accept()
+                    threading.Thread(target=handle, args=(taken,), daemon=True).start()
+
+        def handle(taken: socket.socket) -> None:
+            with taken, contextlib.suppress(OSError):
+                answer(taken)
+
+        threading.Thread(target=accept, daemon=True).start()
+        yield listener.getsockname()[1]
+
+
+class TestAllIsWell:
+    @pytest.mark.parametrize("protocol", ["tcp", "tls", "udp", "unix"])
+    def test_with_a_configuration(self, protocol: str, home: Path, site: Site) -> None:
+        options: tuple[str | Path, ...] = ()
+        if protocol == "unix":
+            cloud = site.service(endpoint=f"unix/{site.directory / 's'}").start()
+        elif protocol == "tcp":
+            cloud = service_of(site, protocol)
+        else:
+            cloud = service_of(site, protocol, home / "cloud")
+            options = ("--tls", home / "anna")
+        seen = look(site, cloud.endpoint, *options, site.configure(PEG, offload=PATIENT))
+        assert [each["layer"] for each in seen.findings] == LAYERS[protocol]
+        assert set(seen.states.values()) == {"ok"}, seen.findings
+        assert "2 decisions are the robot's own, bit for bit" in seen["problem"]["seen"]
+        assert seen["clock"]["seen"].endswith("from the service's")
+        if protocol in ("tls", "udp"):
+            assert seen["certificate"]["seen"].startswith("ours: anna, until ")
+            assert "; theirs: cloud, until " in seen["certificate"]["seen"]
+        assert not cloud.process.matching("link_refused")
+
+    def test_without_one_and_for_people(self, site: Site) -> None:
+        cloud = service_of(site, "tcp")
+        done = site.holdfast("doctor", "--service", cloud.endpoint)
+        assert done.process.returncode == 0
+        lines = done.output.splitlines()
+        assert lines[0] == cloud.endpoint
+        assert "  name         ok     127.0.0.1 is an address" in lines
+        assert "  problem      -      not asked: with CONFIG, decisions are compared" in lines
+        assert len(lines) > len(PLAIN)
+
+    def test_services_and_credentials_of_the_configuration(self, home: Path, site: Site) -> None:
+        cloud = service_of(site, "tls", home / "cloud")
+        nobody = f"tls/127.0.0.1:{free_port()}"
+        offload = {"services": [cloud.endpoint, nobody], "tls": str(home / "anna")}
+        done = site.holdfast("doctor", "--json", site.configure(PEG, offload=offload))
+        assert done.process.returncode == 1
+        found = [json.loads(line) for line in done.output.splitlines()]
+        fails = [each for each in found if each["state"] == "fails"]
+        assert [(each["service"], each["layer"]) for each in fails] == [(nobody, "port")]
+
+    def test_what_ends_soon(self, home: Path, site: Site) -> None:
+        cloud = service_of(site, "tls", home / "soon-cloud")
+        seen = look(site, cloud.endpoint, "--tls", home / "soon")
+        assert seen.code == 0
+        assert seen["certificate"]["state"] == "warns"
+        assert "expires in 5.0 days" in seen["certificate"]["advice"]
+        assert "--renew --service soon-cloud" in seen["certificate"]["advice"]
+
+
+class TestTheWay:
+    def test_a_name_that_is_not_found(self, site: Site) -> None:
+        seen = look(site, "tcp/nobody.invalid:7447")
+        assert_fails(seen, "name", "nobody.invalid is not found", "is it spelled right")
+
+    def test_a_socket_that_is_not_there(self, site: Site) -> None:
+        seen = look(site, f"unix/{site.directory / 's'}")
+        assert_fails(seen, "name", "is not there")
+
+    def test_a_port_at_which_nothing_listens(self, site: Site) -> None:
+        endpoint = f"tcp/127.0.0.1:{free_port()}"
+        seen = look(site, endpoint)
+        assert_fails(seen, "port", "refused", f"holdfast serve --listen {endpoint}")
+
+    def test_a_port_that_does_not_answer(self, site: Site) -> None:
+        with contextlib.ExitStack() as stack:
+            full = stack.enter_context(socket.create_server(("127.0.0.1", 0), backlog=0))
+            for _ in range(4):
+                waiting = stack.enter_context(socket.socket())
+                waiting.setblocking(False)
+                waiting.connect_ex(full.getsockname())
+            seen = look(site, f"tcp/127.0.0.1:{full.getsockname()[1]}")
+        assert_fails(seen, "port", "nothing answers", "firewall")
+
+    def test_a_network_without_a_way(self, site: Site) -> None:
+        with own_network() as network:
+            seen = look(site, "tcp/192.0.2.7:7447", prefix=network.prefix)
+        assert_fails(seen, "route", "network is unreachable", "VPN")
+
+    def test_datagrams_that_do_not_get_through(self, home: Path, site: Site) -> None:
+        with own_network() as network:
+            rules = "add table inet t; add chain inet t c {type filter hook input priority 0;}; "
+            rules += "add rule inet t c meta l4proto udp drop"
+            subprocess.run([*network.prefix, "nft", rules], check=True)
+            cloud = site.service(
+                *("--tls", str(home / "cloud")), endpoint=f"udp/127.0.0.1:{free_port()}"
+            )
+            cloud.command = (*network.prefix, *cloud.command)
+            cloud.start()
+            options = ("--tls", home / "anna", site.configure(PEG, offload=PATIENT))
+            lo = ["ip", "link", "set", "lo", "mtu", "1240"]
+            subprocess.run([*network.prefix, *lo], check=True)
+            seen = look(site, cloud.endpoint, *options, prefix=network.prefix)
+        assert seen["route"]["state"] == "warns"
+        assert "(lo, MTU 1240)" in seen["route"]["seen"]
+        assert "up to 1248 bytes" in seen["route"]["advice"]
+        assert seen["datagrams"]["state"] == "fails"
+        assert "none gets through" in seen["datagrams"]["seen"]
+        assert cloud.endpoint.rpartition(":")[2] in seen["datagrams"]["advice"]
+        # Over the stream all the rest works.
+        rest = {k: state for k, state in seen.states.items() if k not in ("route", "datagrams")}
+        assert set(rest.values()) == {"ok"}
+
+
+@contextlib.contextmanager
+def own_network() -> Iterator[NetworkNamespace]:
+    reason = why_no_namespace()
+    if reason is not None:
+        pytest.skip(reason)
+    with NetworkNamespace() as network:
+        yield network
+
+
+def test_a_host_with_two_addresses(home: Path, site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One of them is a way to the service, and that is enough."""
+    cloud = service_of(site, "tls", home / "cloud")
+    port = int(cloud.endpoint.rpartition(":")[2])
+    tcp = (socket.AF_INET, socket.SOCK_STREAM, 6, "")
+    found = [(*tcp, (address, port)) for address in ("127.0.0.2", "127.0.0.1")]
+    monkeypatch.setattr(socket, "getaddrinfo", lambda *_, **__: found)
+    robot = RobotSetup("", home / "anna", OffloadSettings(detection_timeout_ms=30_000.0), None)
+    seen: list[LayerFinding] = []
+    asyncio.run(examine(check(f"tls/localhost:{port}", robot.tls), robot, seen.append))
+    states = {(each.layer, each.address): each.state for each in seen}
+    assert seen[0].seen == "localhost is 127.0.0.2, 127.0.0.1"
+    assert states["port", "127.0.0.1"] == "ok"
+    assert states["port", "127.0.0.2"] == "fails"
+    assert [layer for layer, address in states if address == "127.0.0.2"] == ["route", "port"]
+    assert states["round trip", "127.0.0.1"] == "ok"
+
+
+class TestTlsAndProtocol:
+    @pytest.mark.parametrize("protocol", ["tcp", "tls"])
+    def test_another_program(self, protocol: str, home: Path, site: Site) -> None:
+        def answer(taken: socket.socket) -> None:
+            taken.recv(1000)
+            taken.sendall(b"HTTP/1.1 400 Bad Request\r\n\r\n")
+
+        options = ("--tls", home / "anna") if protocol == "tls" else ()
+        with answering(answer) as port:
+            seen = look(site, f"{protocol}/127.0.0.1:{port}", *options)
+        if protocol == "tcp":
+            assert_fails(seen, "protocol", "speaks HTTP", "another program")
+        else:
+            assert_fails(seen, "tls", "does not speak TLS", "another program")
+
+    def test_tls_where_there_is_none(self, home: Path, site: Site) -> None:
+        cloud = service_of(site, "tcp")
+        seen = look(site, cloud.endpoint.replace("tcp", "tls"), "--tls", home / "anna")
+        assert_fails(seen, "tls", "closes connections at the first bytes of TLS", "tcp/...")
+
+    def test_no_tls_where_there_is_some(self, home: Path, site: Site) -> None:
+        cloud = service_of(site, "tls", home / "cloud")
+        seen = look(site, cloud.endpoint.replace("tls", "tcp"))
+        assert_fails(seen, "protocol", "refuses this end, which does not speak TLS; as at that end")
+
+    @pytest.mark.parametrize("protocol", ["tcp", "tls"])
+    def test_a_process_that_stands_still(self, protocol: str, home: Path, site: Site) -> None:
+        cloud = service_of(site, protocol, home / "cloud" if protocol == "tls" else None)
+        options = ("--tls", home / "anna") if protocol == "tls" else ()
+        cloud.stop()
+        seen = look(site, cloud.endpoint, *options)
+        layer = "tls" if protocol == "tls" else "protocol"
+        assert_fails(seen, layer, "takes connections and says nothing", "stopped")
+
+    def test_another_version_of_the_wire(self, site: Site) -> None:
+        hello = hello_of("service", "cloud", version=2, release="9.9.9")
+
+        def answer(taken: socket.socket) -> None:
+            taken.sendall(hello)
+            taken.recv(1000)
+
+        with answering(answer) as port:
+            seen = look(site, f"tcp/127.0.0.1:{port}")
+        assert_fails(seen, "protocol", "is holdfast 9.9.9 with version 2 of the wire")
+        assert "install the same release at both ends" in seen["protocol"]["seen"]
+
+    def test_a_clock_that_is_wrong(self, site: Site) -> None:
+        def answer(taken: socket.socket) -> None:
+            play_service(taken, clock_s=time.time() - 3600.0)
+
+        with answering(answer) as port:
+            seen = look(site, f"tcp/127.0.0.1:{port}")
+        assert seen.code == 0
+        assert seen["clock"]["state"] == "warns"
+        assert seen["clock"]["seen"].startswith("3600 s ahead of the service's")
+        assert seen["round trip"]["seen"].startswith("20 echoes")
+
+    def test_another_version_of_the_messages(self, site: Site) -> None:
+        def answer(taken: socket.socket) -> None:
+            play_service(taken, reply=lambda number: Refused(number, "version", "speaks version 9"))
+
+        with answering(answer) as port:
+            seen = look(site, f"tcp/127.0.0.1:{port}")
+        assert_fails(seen, "protocol", "version: speaks version 9", "same release at both ends")
+
+    def test_limits_that_are_short_for_the_way(self, site: Site) -> None:
+        def answer(taken: socket.socket) -> None:
+            play_service(taken, delay_s=0.03)
+
+        file = site.configure(PEG, offload={"detection_timeout_ms": 40.0})
+        with answering(answer) as port:
+            seen = look(site, f"tcp/127.0.0.1:{port}", file)
+        assert seen["round trip"]["state"] == "warns"
+        advice = seen["round trip"]["advice"]
+        assert "offload.detection_timeout_ms, 40, is short for this way: take " in advice
+        # Nor does it come to the state of a run that it has been told of.
+        assert "comes to another state" in seen["problem"]["seen"]
+
+    def test_ctrl_c(self, site: Site) -> None:
+        heard = threading.Event()
+
+        def answer(taken: socket.socket) -> None:
+            taken.recv(1000)
+            heard.set()
+            taken.recv(1000)
+
+        with answering(answer) as port:
+            command = (sys.executable, "-m", "holdfast", "doctor", "--service")
+            process: Process = site.process(*command, f"tcp/127.0.0.1:{port}")
+            assert heard.wait(PATIENCE_S)
+            process.signal(signal.SIGINT)
+            assert process.wait() == 130
+        assert "Traceback" not in process.output
+
+
+def play_service(
+    taken: socket.socket,
+    *,
+    clock_s: float = 0.0,
+    delay_s: float = 0.0,
+    reply: Callable[[int], Reply] = lambda number: NeedState(number, False),
+) -> None:
+    """Say that nothing is known of any run, as a service does, or something else."""
+    taken.sendall(hello_of("service", "cloud", clock_s=clock_s))
+    decoder = FrameDecoder(1 << 20)
+    while data := taken.recv(65536):
+        for frame in decoder.feed(data):
+            if frame.kind == CALL:
+                time.sleep(delay_s)  # the way is long
+                number = decode_request(frame.payload).number
+                taken.sendall(frame_of(LAST, frame.call, encode(reply(number))))
+
+
+class TestCertificates:
+    @pytest.mark.parametrize(
+        ("robot", "what", "to_do"),
+        [
+            (None, "ours: none was given", "--tls DIR"),
+            ("keys/old", "certificate.pem: has expired (valid from ", ""),
+            ("keys/early", "certificate.pem: is not valid yet; is a clock wrong?", ""),
+            ("keys/thief", "certificate.pem: has been revoked", ""),
+            ("keys/cloud", "certificate.pem: is not for a robot", ""),
+            ("keys/nobody", "authority.pem: cannot be read: No such file", ""),
+            ("crossed", "key.pem: is not the key of", ""),
+            ("thief", "ours: thief, until", ""),
+            ("other/anna", "theirs: was not signed by", "shown is cloud"),
+        ],
+    )
+    def test_a_robot_that_is_not_let_in(
+        self, robot: str | None, what: str, to_do: str, home: Path, site: Site
+    ) -> None:
+        cloud = service_of(site, "tls", home / "cloud")
+        options = () if robot is None else ("--tls", home.parent / robot)
+        seen = look(site, cloud.endpoint, *options)
+        assert_fails(seen, "certificate", what, to_do)
+        if robot == "thief":
+            assert "refuses this end, which has a certificate that has been" in str(seen.findings)
+
+    @pytest.mark.parametrize(
+        ("service", "what"),
+        [
+            ("old-cloud", "has expired; 'holdfast keys DIR --renew --service NAME' makes another"),
+            ("early-cloud", "is not valid yet; is a clock wrong?"),
+        ],
+    )
+    def test_a_service_whose_time_is_not_now(
+        self, service: str, what: str, home: Path, site: Site
+    ) -> None:
+        context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+        context.load_cert_chain(home / service / "certificate.pem", home / service / "key.pem")
+
+        def answer(taken: socket.socket) -> None:
+            context.wrap_socket(taken, server_side=True).recv(1000)
+
+        with answering(answer) as port:
+            seen = look(site, f"tls/127.0.0.1:{port}", "--tls", home / "anna")
+        assert_fails(seen, "certificate", what, f"shown is {service} for ")
+        assert "; it is 20" in seen["clock"]["seen"]
+
+    @pytest.mark.parametrize(
+        ("service", "host", "what"),
+        [
+            ("keys/cloud", "127.0.0.2", "does not name this host"),
+            ("other/cloud", "127.0.0.1", "was not signed by the authority in authority.pem"),
+            ("thief-cloud", "127.0.0.1", "has been revoked"),
+        ],
+    )
+    def test_a_service_that_is_not_believed(
+        self, service: str, host: str, what: str, home: Path, site: Site
+    ) -> None:
+        cloud = service_of(site, "udp", home.parent / service, host)
+        # It has the list of those that are revoked.
+        seen = look(site, cloud.endpoint, "--tls", home / "anna")
+        assert_fails(seen, "certificate", f"theirs: {what}", "shown is ")
+
+    def test_another_robot_s_name(self, home: Path, site: Site) -> None:
+        cloud = service_of(site, "tls", home / "cloud")
+        file = site.configure(PEG, offload={"name": "berta"})
+        seen = look(site, cloud.endpoint, "--tls", home / "anna", file)
+        what = "says that it is berta, and shows the certificate of anna"
+        assert_fails(seen, "certificate", what)
+
+    def test_a_key_that_others_can_read(self, home: Path, site: Site) -> None:
+        shutil.copytree(home / "anna", site.directory / "open")
+        (site.directory / "open" / "key.pem").chmod(0o644)
+        cloud = service_of(site, "tls", home / "cloud")
+        seen = look(site, cloud.endpoint, "--tls", site.directory / "open")
+        assert seen["certificate"]["state"] == "warns"
+        assert "others can read this key (mode 644); chmod 600" in seen["certificate"]["advice"]
+
+
+class TestProblem:
+    def test_other_code(self, site: Site) -> None:
+        shutil.copy(test_other_code.EXAMPLE, site.directory)
+        cloud = test_other_code.older_copy(site).start()
+        seen = look(site, cloud.endpoint, site.configure(test_other_code.DOCUMENT))
+        found = seen["problem"]
+        assert found["state"] == "fails"
+        here, there = test_other_code.digests_in(found["seen"].removeprefix("other_code: "))
+        assert here != there
+        assert seen["round trip"]["seen"].startswith("20 echoes: ")
+
+    def test_a_problem_that_the_service_does_not_know(self, site: Site) -> None:
+        shutil.copy(test_other_code.EXAMPLE, site.directory)
+        cloud = service_of(site, "tcp")
+        seen = look(site, cloud.endpoint, site.configure(test_other_code.DOCUMENT))
+        assert "is not known to this service" in seen["problem"]["seen"]
+        assert "(--problem)" in seen["problem"]["seen"]
+
+    @pytest.mark.parametrize("what", ["half", "sensing"])
+    def test_a_service_that_decides_otherwise(self, what: str, site: Site) -> None:
+        name = "lying_problem:LyingPeg"
+        cloud = site.service("--problem", name, "--problem-directory", str(HERE))
+        cloud.variables[lying_problem.VARIABLE] = what
+        cloud.start()
+        document: dict[str, Any] = {**PEG, "problem": name, "problem_directory": str(HERE)}
+        seen = look(site, cloud.endpoint, site.configure(document))
+        assert seen["problem"]["state"] == "fails"
+        assert "answers otherwise than this robot's own planner" in seen["problem"]["seen"]
+        assert "trust.md" in seen["problem"]["advice"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((), "usage"),
+        (("--json",), "no service is named: give --service ENDPOINT"),
+        (("--service", "quic/a:1"), "protocol quic is not allowed"),
+        (("--service", "tcp/a:1", "--tls", "keys"), "tcp does not use the credentials"),
+        (("--service", "tcp/a:1", "missing.yaml"), "missing.yaml: there is no such file"),
+    ],
+)
+def test_options_that_cannot_be_used(arguments: tuple[str, ...], message: str, site: Site) -> None:
+    done = site.holdfast("doctor", *arguments)
+    assert done.process.returncode == 2
+    assert message in done.output
+    assert "Traceback" not in done.output

@@ -1,0 +1,685 @@
+"""``holdfast serve`` as a robot and an operator meet it: real processes, sockets and signals."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import os
+import platform
+import signal
+import socket
+import struct
+import subprocess
+import sys
+import threading
+import urllib.request
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from queue import SimpleQueue
+from typing import Any
+
+import msgspec
+import pytest
+from tests.processes.faults import PATIENT
+from tests.unit.test_protocol_service import Robot, content, planning_of
+
+from holdfast.protocol.events import (
+    CallEnded,
+    ReplyReceived,
+    ServiceAppeared,
+    ServiceVanished,
+    TransportEvent,
+)
+from holdfast.protocol.messages import (
+    PROTOCOL_VERSION,
+    NeedState,
+    Progress,
+    Refused,
+    Reply,
+    SensingAnswer,
+    decode_reply,
+    encode,
+    with_checksum,
+)
+from holdfast.transport.credentials import load_credentials
+from holdfast.transport.endpoints import ServiceAddress, TlsFiles
+from holdfast.transport.key_ring import make_credentials
+from holdfast.transport.private_socket import PrivateSocket
+from holdfast.transport.robot_end import StreamRobotTransport
+
+PATIENCE_S = 30.0
+COMMAND = [sys.executable, "-m", "holdfast", "serve"]
+ANYWHERE = ["--listen", "tcp/127.0.0.1:0"]
+
+# Computes in Python until a file appears, and never sleeps: nothing but the interpreter's own
+# switching lets other threads run meanwhile.
+BUSY = """
+from pathlib import Path
+
+from holdfast.problems.capsule_robot import CapsuleRobot
+
+
+class Busy(CapsuleRobot):
+    name = "busy"
+
+    def policy(self, states, stage):
+        Path("begun").touch()
+        while not Path("let_go").exists():
+            pass
+        return super().policy(states, stage)
+"""
+
+
+def robot_of_busy(directory: Path) -> Robot:
+    """Write that problem's module, and return a robot that has it."""
+    (directory / "busy_problem.py").write_text(BUSY)
+    program = (
+        "from holdfast.problems.registry import problem_class\n"
+        "from holdfast.source_digest import problem_digest\n"
+        "print(problem_digest(problem_class('busy_problem:Busy')))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=directory, capture_output=True, text=True, check=True
+    )
+    robot = Robot()
+    robot.session_configuration = msgspec.structs.replace(
+        robot.session_configuration, problem="busy_problem:Busy", problem_digest=done.stdout.strip()
+    )
+    return robot
+
+
+class Served:
+    """A running service, ready."""
+
+    def __init__(
+        self, *arguments: str, directory: Path | None = None, ready: bool = True, **popen: Any
+    ) -> None:
+        self.process = subprocess.Popen(
+            [*COMMAND, "--lease-ms", str(PATIENT["lease_ms"]), *arguments],
+            cwd=directory,
+            stdin=popen.pop("stdin", subprocess.DEVNULL),
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            **popen,
+        )
+        self.ready_line = ""
+        if ready:
+            assert self.process.stdout is not None
+            self.ready_line = self.process.stdout.readline()
+            assert self.ready_line, self.process.communicate(timeout=PATIENCE_S)[1]
+
+    @property
+    def endpoint(self) -> str:
+        return self.ready_line.split()[-1]
+
+    def end(self, number: int = signal.SIGTERM) -> tuple[int, str]:
+        """Send a signal; return the exit code and the log."""
+        self.process.send_signal(number)
+        _, log = self.process.communicate(timeout=PATIENCE_S)
+        return self.process.returncode, log
+
+
+@contextlib.contextmanager
+def served(*arguments: str, **options: Any) -> Iterator[Served]:
+    service = Served(*arguments, **options)
+    try:
+        yield service
+    finally:
+        service.process.kill()
+        service.process.wait(PATIENCE_S)
+        for stream in (service.process.stdin, service.process.stdout, service.process.stderr):
+            if stream is not None:
+                stream.close()
+
+
+def listening_sockets(pid: int) -> set[tuple[str, int]]:
+    """Return the addresses and ports at which a process listens, as the system knows them."""
+    own = set()
+    for descriptor in Path(f"/proc/{pid}/fd").iterdir():
+        with contextlib.suppress(OSError):
+            own.add(str(descriptor.readlink()))
+    found = set()
+    for table in ("tcp", "tcp6"):
+        for line in Path(f"/proc/{pid}/net/{table}").read_text().splitlines()[1:]:
+            _, local, _, state, *_, inode = line.split()[:10]
+            if state == "0A" and f"socket:[{inode}]" in own:
+                address, _, port = local.partition(":")
+                # Each word of an address is in the machine's own order.
+                words = struct.unpack(f">{len(address) // 8}I", bytes.fromhex(address))
+                packed = struct.pack(f"={len(words)}I", *words)
+                family = socket.AF_INET if table == "tcp" else socket.AF_INET6
+                found.add((socket.inet_ntop(family, packed), int(port, 16)))
+    return found
+
+
+class End:
+    """A robot's end of the wire, on an event loop that has a thread of its own."""
+
+    def __init__(
+        self,
+        endpoint: str,
+        *,
+        listens: bool = False,
+        tls: TlsFiles | None = None,
+        name: str | None = None,
+    ) -> None:
+        self.events: SimpleQueue[TransportEvent] = SimpleQueue()
+        self.loop = asyncio.new_event_loop()
+        address = ServiceAddress(endpoint, listens=listens, name=name)
+        self.transport = StreamRobotTransport(
+            {"service": address}, lease_ms=PATIENT["lease_ms"], tls=tls
+        )
+        self.thread = threading.Thread(target=self.loop.run_forever, daemon=True)
+        self.thread.start()
+        self.on_loop(self.transport.start, self.events.put)
+        self.calls = 0
+
+    def on_loop(self, function: Callable[..., None], *arguments: object) -> None:
+        """Call a function on the loop's thread, and wait until it has returned."""
+
+        async def run() -> None:
+            function(*arguments)
+
+        asyncio.run_coroutine_threadsafe(run(), self.loop).result(PATIENCE_S)
+
+    def close(self) -> None:
+        try:
+            asyncio.run_coroutine_threadsafe(self.transport.close(), self.loop).result(PATIENCE_S)
+        finally:
+            self.loop.call_soon_threadsafe(self.loop.stop)
+            self.thread.join(PATIENCE_S)
+            self.loop.close()
+
+    def appeared(self) -> str:
+        event = self.events.get(timeout=PATIENCE_S)
+        assert isinstance(event, ServiceAppeared), event
+        return event.incarnation
+
+    def send(self, payload: bytes) -> int:
+        self.calls += 1
+        self.on_loop(self.transport.call, "service", self.calls, payload)
+        return self.calls
+
+    def ask(self, payload: bytes) -> list[Reply]:
+        self.send(payload)
+        return self.collect()
+
+    def collect(self) -> list[Reply]:
+        """Return the replies to the one open call, without signs of progress."""
+        replies: list[Reply] = []
+        while not isinstance(event := self.events.get(timeout=PATIENCE_S), CallEnded):
+            assert isinstance(event, ReplyReceived), event
+            reply = decode_reply(event.payload)
+            if not isinstance(reply, Progress):
+                replies.append(reply)
+        return replies
+
+
+def in_work(end: End, robot: Robot) -> TransportEvent:
+    """Have a request worked on; return the sign of progress that tells so."""
+    end.appeared()
+    end.send(encode(robot.request()))
+    event = end.events.get(timeout=PATIENCE_S)
+    assert isinstance(event, ReplyReceived)
+    assert isinstance(decode_reply(event.payload), Progress)
+    return event
+
+
+@contextlib.contextmanager
+def robots_end(endpoint: str, **options: Any) -> Iterator[End]:
+    end = End(endpoint, **options)
+    try:
+        yield end
+    finally:
+        end.close()
+
+
+def run_turns(end: End, robot: Robot, turns: int) -> None:
+    for _ in range(turns):
+        request = robot.request(since=max(0, len(robot.observed) - 1))
+        assert content(end.ask(encode(request))) == robot.right_answer()
+        robot.act_until_sensing()
+        robot.sense()
+
+
+def refused_to_start(*arguments: str) -> str:
+    done = subprocess.run(
+        [*COMMAND, *arguments], capture_output=True, text=True, timeout=PATIENCE_S
+    )
+    assert done.returncode == 2, done
+    assert done.stdout == ""
+    assert "Traceback" not in done.stderr
+    return done.stderr
+
+
+def resident_kb(pid: int) -> int:
+    """Return the most memory that a process has had."""
+    lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+    (line,) = (line for line in lines if line.startswith("VmHWM"))
+    return int(line.split()[1])
+
+
+class TestServing:
+    def test_decides_as_the_planner_does(self) -> None:
+        with served(*ANYWHERE) as service:
+            assert service.ready_line.startswith(
+                "cloud_active_sensing is listening on tcp/127.0.0.1:"
+            )
+            with robots_end(service.endpoint, name="cloud_active_sensing") as end:
+                end.appeared()
+                run_turns(end, Robot("peg_in_hole_2d"), 4)
+                assert isinstance(end.ask(with_checksum(b"rubbish"))[0], Refused)
+                run_turns(end, Robot("peg_in_hole_3d", key=2), 3)
+            code, log = service.end()
+        assert code == 0
+        assert "stopping" in log
+        assert "Traceback" not in log
+
+    def test_a_large_message_that_is_no_request_disturbs_nobody(self) -> None:
+        hostile = with_checksum(
+            b"\xdd" + (10**7).to_bytes(4, "big") + bytes([PROTOCOL_VERSION]) + b"\x90" * 10**7
+        )
+        with (
+            served(*ANYWHERE) as service,
+            robots_end(service.endpoint) as attacker,
+            robots_end(service.endpoint) as end,
+        ):
+            attacker.appeared()
+            end.appeared()
+            run_turns(end, Robot(), 1)
+            size_kb = resident_kb(service.process.pid)
+            attacker.send(hostile)
+            run_turns(end, Robot(key=2), 5)
+            (reply,) = attacker.collect()
+            assert isinstance(reply, Refused)
+            assert reply.code == "malformed"
+            # As lists of lists these would be 640 MB; the message itself comes in parts.
+            assert resident_kb(service.process.pid) - size_kb < 100_000
+            run_turns(end, Robot(key=3), 1)
+
+    def test_restarted_after_a_kill_on_the_same_port(self) -> None:
+        robot = Robot()
+        with served(*ANYWHERE) as service, robots_end(service.endpoint) as end:
+            incarnation = end.appeared()
+            run_turns(end, robot, 2)
+            service.end(signal.SIGKILL)
+            assert end.events.get(timeout=PATIENCE_S) == ServiceVanished("service", incarnation)
+            with served("--listen", service.endpoint):
+                assert end.appeared() != incarnation
+                request = robot.request(session_configuration=False)
+                assert end.ask(encode(request)) == [NeedState(request.number, differs=False)]
+                assert content(end.ask(encode(robot.restore()))) == robot.right_answer()
+
+    def test_killed_while_it_computes(self, tmp_path: Path) -> None:
+        robot = robot_of_busy(tmp_path)
+        with (
+            served(*ANYWHERE, "--problem", "busy_problem:Busy", directory=tmp_path) as service,
+            robots_end(service.endpoint) as end,
+        ):
+            end.appeared()
+            end.send(encode(robot.request()))
+            # Signs of progress come, although the problem keeps the interpreter to itself.
+            for _ in range(3):
+                event = end.events.get(timeout=PATIENCE_S)
+                assert isinstance(event, ReplyReceived)
+                assert isinstance(decode_reply(event.payload), Progress)
+            service.end(signal.SIGKILL)
+            ended = [end.events.get(timeout=PATIENCE_S) for _ in range(2)]
+            while isinstance(ended[0], ReplyReceived):
+                ended = [ended[1], end.events.get(timeout=PATIENCE_S)]
+            assert {type(event) for event in ended} == {ServiceVanished, CallEnded}
+
+    def test_stops_in_order_while_it_computes(self, tmp_path: Path) -> None:
+        robot = robot_of_busy(tmp_path)
+        arguments = ["--problem", "busy_problem:Busy", "--problem-directory", str(tmp_path)]
+        directory = tmp_path / "elsewhere"
+        directory.mkdir()
+        with (
+            served(*ANYWHERE, *arguments, "--drain-s", "0.1", directory=directory) as service,
+            robots_end(service.endpoint) as end,
+        ):
+            event = in_work(end, robot)
+            code, log = service.end()
+            assert code == 0, log
+            assert "Fatal" not in log
+            while isinstance(event, ReplyReceived):
+                event = end.events.get(timeout=PATIENCE_S)
+            assert isinstance(event, CallEnded | ServiceVanished)
+
+    def test_terminated_it_answers_what_it_owes_and_takes_nothing_new(self, tmp_path: Path) -> None:
+        arguments = ["--problem", "busy_problem:Busy", "--drain-s", "3600"]
+        robot = robot_of_busy(tmp_path)
+        with (
+            served(*ANYWHERE, *arguments, directory=tmp_path) as service,
+            robots_end(service.endpoint) as end,
+            robots_end(service.endpoint) as other,
+        ):
+            in_work(end, robot)
+            incarnation = other.appeared()
+            service.process.terminate()
+            assert service.process.stderr is not None
+            while "stopping" not in service.process.stderr.readline():
+                pass
+            # Whoever is owed nothing leaves at once, for nobody else is there.
+            assert other.events.get(timeout=PATIENCE_S) == ServiceVanished("service", incarnation)
+            assert other.ask(encode(Robot(key=2).request())) == []
+            host, _, port = service.endpoint.removeprefix("tcp/").rpartition(":")
+            with pytest.raises(ConnectionRefusedError):
+                socket.create_connection((host, int(port)), PATIENCE_S)
+            (tmp_path / "let_go").touch()
+            (reply,) = end.collect()
+            assert isinstance(reply, SensingAnswer)
+            assert service.process.wait(PATIENCE_S) == 0
+
+    def test_a_second_signal_ends_it_at_once(self, tmp_path: Path) -> None:
+        arguments = ["--problem", "busy_problem:Busy", "--drain-s", "3600"]
+        robot = robot_of_busy(tmp_path)
+        with (
+            served(*ANYWHERE, *arguments, directory=tmp_path) as service,
+            robots_end(service.endpoint) as end,
+        ):
+            in_work(end, robot)
+            service.process.terminate()
+            assert service.process.stderr is not None
+            while "stopping" not in service.process.stderr.readline():
+                pass
+            code, log = service.end()
+            assert code == 0, log
+
+    def test_own_problem_that_was_not_named(self) -> None:
+        robot = Robot()
+        robot.session_configuration = msgspec.structs.replace(
+            robot.session_configuration, problem="os:PathLike"
+        )
+        with served(*ANYWHERE) as service, robots_end(service.endpoint) as end:
+            end.appeared()
+            (reply,) = end.ask(encode(robot.request()))
+            assert isinstance(reply, Refused)
+            assert reply.code == "unknown_problem"
+            assert "--problem" in reply.text
+            run_turns(end, Robot(key=2), 2)
+
+    def test_many_robots_at_once(self) -> None:
+        with served(*ANYWHERE, "--workers", "3") as service, contextlib.ExitStack() as stack:
+            ends = [stack.enter_context(robots_end(service.endpoint)) for _ in range(6)]
+            robots = [Robot(key=key, seed=key) for key in range(1, 7)]
+            for end in ends:
+                end.appeared()
+            for _ in range(4):
+                for end, robot in zip(ends, robots, strict=True):
+                    end.send(encode(robot.request()))
+                for end, robot in zip(ends, robots, strict=True):
+                    assert content(end.collect()) == robot.right_answer()
+                    robot.act_until_sensing()
+                    robot.sense()
+
+    def test_state_of_many_particles(self) -> None:
+        robot = Robot(planning=planning_of(particles=20_000))
+        with served(*ANYWHERE) as service, robots_end(service.endpoint) as end:
+            end.appeared()
+            replies = end.ask(encode(robot.restore()))
+            assert content(replies) == robot.right_answer()
+
+    def test_two_names_on_two_endpoints(self) -> None:
+        with served(
+            *ANYWHERE, "--listen", "tcp/127.0.0.1:0", "--name", "cloud_active_sensing_recovery"
+        ) as service:
+            words = service.ready_line.split()
+            assert words[0] == "cloud_active_sensing_recovery"
+            endpoints = [word for word in words if word.startswith("tcp/")]
+            assert len(set(endpoints)) == 2
+            for key, endpoint in enumerate(endpoints, 1):
+                with robots_end(endpoint) as end:
+                    end.appeared()
+                    run_turns(end, Robot(key=key), 2)
+
+
+class TestConnecting:
+    def test_to_a_robot_that_listens_until_that_dies(self) -> None:
+        with PrivateSocket() as local, robots_end(local.endpoint, listens=True) as end:
+            arguments = ["--connect", local.endpoint, "--until-stdin-closes"]
+            with served(*arguments, stdin=subprocess.PIPE) as service:
+                assert service.ready_line.split()[1:] == ["is", "connecting", "to", local.endpoint]
+                end.appeared()
+                run_turns(end, Robot(), 2)
+                assert service.process.stdin is not None
+                service.process.stdin.write("this is not the end\n")
+                service.process.stdin.flush()
+                run_turns(end, Robot(key=2), 2)
+                _, log = service.process.communicate(timeout=PATIENCE_S)  # closes its input
+                assert service.process.returncode == 0
+                assert "standard input has ended" in log
+
+
+class TestEnding:
+    @pytest.mark.parametrize(
+        ("number", "code"),
+        [(signal.SIGTERM, 0), (signal.SIGINT, 130), (signal.SIGHUP, 129)],
+    )
+    def test_exit_code(self, number: int, code: int) -> None:
+        with served(*ANYWHERE) as service:
+            assert service.end(number)[0] == code
+
+    def test_hangup_that_is_ignored(self) -> None:
+        def ignore() -> None:
+            signal.signal(signal.SIGHUP, signal.SIG_IGN)
+
+        with served(*ANYWHERE, preexec_fn=ignore) as service:
+            service.process.send_signal(signal.SIGHUP)
+            with robots_end(service.endpoint) as end:
+                end.appeared()
+                run_turns(end, Robot(), 1)
+            assert service.end()[0] == 0
+
+    def test_nobody_reads_what_it_says(self) -> None:
+        """A closed terminal is no reason to stop deciding."""
+        with PrivateSocket() as local, robots_end(local.endpoint, listens=True) as end:
+            reading, writing = os.pipe()
+            os.close(reading)
+            process = subprocess.Popen(
+                [*COMMAND, "--connect", local.endpoint],
+                stdin=subprocess.DEVNULL,
+                stdout=writing,
+                stderr=writing,
+            )
+            os.close(writing)
+            try:
+                end.appeared()
+                run_turns(end, Robot(), 2)
+                process.terminate()
+                assert process.wait(PATIENCE_S) in (0, 120)  # 120: Python could not flush
+            finally:
+                process.kill()
+                process.wait()
+
+
+class TestRefusing:
+    """What is refused before anything is opened: unit/test_serve_refusals.py."""
+
+    def test_an_address_that_others_can_reach_unless_it_is_said(self) -> None:
+        assert "--insecure" in refused_to_start("--listen", "tcp/0.0.0.0:0")
+        with served("--listen", "tcp/0.0.0.0:0", "--insecure") as service:
+            port = service.endpoint.rpartition(":")[2]
+            with robots_end(f"tcp/127.0.0.1:{port}") as end:
+                end.appeared()
+                run_turns(end, Robot(), 1)
+
+    def test_port_that_is_taken(self) -> None:
+        with socket.socket() as taken:
+            taken.bind(("127.0.0.1", 0))
+            taken.listen()
+            endpoint = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
+            assert endpoint in refused_to_start("--listen", endpoint)
+
+    def test_no_standard_input_to_wait_for(self) -> None:
+        command = [*COMMAND, *ANYWHERE, "--until-stdin-closes"]
+        done = subprocess.run(
+            ["/bin/sh", "-c", 'exec "$@" <&-', "sh", *command],
+            capture_output=True,
+            text=True,
+            timeout=PATIENCE_S,
+        )
+        # It is as one that has ended: the service ends as well, and says why.
+        assert done.returncode == 0
+        assert "standard input has ended" in done.stderr
+
+
+class TestTls:
+    def test_robot_with_credentials(self, tmp_path: Path) -> None:
+        make_credentials(tmp_path)
+        tls = load_credentials(tmp_path / "robot", "robot")
+        with served("--listen", "tls/127.0.0.1:0", "--tls", str(tmp_path / "service")) as service:
+            with robots_end(service.endpoint, tls=tls) as end:
+                end.appeared()
+                run_turns(end, Robot(), 2)
+            assert service.end()[0] == 0
+
+
+class TestTelling:
+    def test_json(self) -> None:
+        with served(*ANYWHERE, "--log", "json", "--max-sessions", "1") as service:
+            ready = json.loads(service.ready_line)
+            assert ready["event"] == "ready"
+            assert ready["service"] == "cloud_active_sensing"
+            assert ready["pid"] == service.process.pid
+            (endpoint,) = ready["listen"]
+            with robots_end(endpoint) as end:
+                end.appeared()
+                run_turns(end, Robot(), 1)
+                end.ask(encode(Robot(key=2).restore()))
+                end.ask(with_checksum(b"rubbish"))
+            _, log = service.end()
+        events = {record["event"]: record for record in map(json.loads, log.splitlines())}
+        assert set(events) >= {"session_opened", "restored", "refused", "evicted", "stopping"}
+        assert events["refused"]["code"] == "malformed"
+        assert events["stopping"]["reason"] == "SIGTERM"
+
+    def test_metrics(self) -> None:
+        pytest.importorskip("prometheus_client")
+        with served(*ANYWHERE, "--log", "json", "--metrics", "0") as service:
+            ready = json.loads(service.ready_line)
+            with robots_end(ready["listen"][0]) as end:
+                end.appeared()
+                run_turns(end, Robot(), 3)
+                end.ask(with_checksum(b"rubbish"))
+            url = f"http://{ready['metrics']}/metrics"
+            with urllib.request.urlopen(url, timeout=PATIENCE_S) as response:
+                lines = response.read().decode().splitlines()
+            assert service.end()[0] == 0
+        assert 'holdfast_decisions_total{kind="task"} 2.0' in lines
+        assert 'holdfast_decisions_total{kind="sensing"} 3.0' in lines
+        assert 'holdfast_refusals_total{code="malformed"} 1.0' in lines
+        assert "holdfast_sessions 1.0" in lines
+
+    @pytest.mark.skipif(not Path("/proc/net/tcp").exists(), reason="the system's own table")
+    def test_what_is_not_said_to_be_reachable_listens_for_this_machine_alone(self) -> None:
+        """The sockets themselves are looked at, those of the metrics as well."""
+        pytest.importorskip("prometheus_client")
+        watched = ["--metrics", "0", "--health", "0"]
+        with served(*ANYWHERE, "--log", "json", *watched) as service:
+            ready = json.loads(service.ready_line)
+            ports = {int(ready[key].rpartition(":")[2]) for key in ("metrics", "health")}
+            ports.add(int(ready["listen"][0].rpartition(":")[2]))
+            assert listening_sockets(service.process.pid) == {("127.0.0.1", p) for p in ports}
+
+    def test_metrics_port_that_is_taken(self) -> None:
+        pytest.importorskip("prometheus_client")
+        with socket.socket() as taken:
+            taken.bind(("127.0.0.1", 0))
+            taken.listen()
+            port = str(taken.getsockname()[1])
+            assert port in refused_to_start(*ANYWHERE, "--metrics", port)
+
+    def test_help(self) -> None:
+        done = subprocess.run(
+            [*COMMAND, "--help"], capture_output=True, text=True, timeout=PATIENCE_S
+        )
+        assert done.returncode == 0
+        for option in ("--listen", "--connect", "--tls", "--insecure", "--until-stdin-closes"):
+            assert option in done.stdout
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="where there are such arenas")
+def test_the_threads_share_arenas(tmp_path: Path) -> None:
+    """Each keeps as much as its threads ever held at the same time (service/allocator.py)."""
+    robot = robot_of_busy(tmp_path)
+    arguments = ["--problem", "busy_problem:Busy", "--workers", "8"]
+    with (
+        served(*ANYWHERE, *arguments, directory=tmp_path) as service,
+        contextlib.ExitStack() as stack,
+    ):
+        ends = [stack.enter_context(robots_end(service.endpoint)) for _ in range(8)]
+        for key, end in enumerate(ends, 1):
+            robot.session = key.to_bytes(16, "big")
+            in_work(end, robot)
+        (tmp_path / "let_go").touch()
+        for end in ends:
+            end.collect()
+        process = Path(f"/proc/{service.process.pid}")
+        threads = len(list((process / "task").iterdir()))
+        heaps = _heaps((process / "maps").read_text())
+    assert threads > 8
+    # The first arena is the process's own heap.
+    assert heaps <= 1
+
+
+def _heaps(maps: str) -> int:
+    """Count what is reserved for arenas: 64 MB at a multiple of it, of which a part is in use."""
+    size = 64 << 20
+    lines = [line.split() for line in maps.splitlines()]
+    spans = [[int(end, 16) for end in line[0].split("-")] for line in lines]
+    return sum(
+        start % size == 0 and permissions == "rw-p" and (rest == "---p" and last == start + size)
+        for (start, _), (_, last), permissions, rest in zip(
+            spans,
+            spans[1:],
+            (line[1] for line in lines),
+            (line[1] for line in lines[1:]),
+            strict=False,
+        )
+    )
+
+
+def test_a_service_is_ready_without_what_it_does_not_need() -> None:
+    """Start-up time is recovery time: nothing heavy but NumPy is loaded."""
+    program = """
+import json, sys, threading
+from holdfast.service import process as service_process
+ready = service_process._say_ready
+def tell(*arguments):
+    ready(*arguments)
+    print(json.dumps(sorted(sys.modules)), flush=True)
+service_process._say_ready = tell
+sys.exit(service_process.main(["--listen", "tcp/127.0.0.1:0", "--until-stdin-closes"]))
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", program],
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+    )
+    assert done.returncode == 0, done.stderr
+    modules = set(json.loads(done.stdout.splitlines()[1]))
+    assert "numpy" in modules
+    for heavy in (
+        "cryptography", "holdfast.config.loader", "holdfast.config.user_code",
+        "holdfast.service.health",
+        "importlib.metadata", "matplotlib", "multiprocessing", "prometheus_client", "rich",
+        "scipy", "sqlite3", "ssl", "yaml",
+    ):  # fmt: skip
+        assert heavy not in modules
+
+
+def test_whoever_sees_the_service_can_use_it() -> None:
+    with (
+        PrivateSocket() as local,
+        robots_end(local.endpoint, listens=True) as end,
+        served("--connect", local.endpoint, ready=False) as service,
+    ):
+        end.appeared()
+        (reply,) = end.ask(encode(Robot().request()))
+        assert isinstance(reply, SensingAnswer)
+        assert service.process.poll() is None

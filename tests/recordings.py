@@ -1,0 +1,88 @@
+"""Small results, configurations and recorded trials for the tests of recording."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import msgspec
+
+from holdfast.config.loader import Configuration, load
+from holdfast.outcome import Decisions, TrialResult
+from holdfast.planning import Planner
+from holdfast.recording.recorder import Recorder
+from holdfast.robot.trial import run_trial
+
+
+def result_of(
+    trial: int, *, success: bool = True, reward: float = -1.0, sensing_ms: tuple[float, ...] = ()
+) -> TrialResult:
+    """Return a result with decisions of its own."""
+    decisions = Decisions(1, trial.to_bytes(8, "little"))
+    return TrialResult(
+        trial=trial,
+        seed=5,
+        success=success,
+        steps=10 + trial,
+        reward=reward,
+        sensing_decisions=len(sensing_ms),
+        mean_sensing_ms=0.1 + 0.2,
+        recoveries=0,
+        unexplained_observations=1,
+        digest=decisions.digest(),
+        sensing_ms=sensing_ms,
+        decisions=decisions,
+    )
+
+
+def configuration_of(
+    tmp_path: Path,
+    *,
+    seed: int = 5,
+    tolerance: float = 0.1,
+    num_particles: int = 30,
+    max_steps: int = 30,
+) -> Configuration:
+    """Return a small configuration, written to peg.yaml."""
+    path = tmp_path / "peg.yaml"
+    path.write_text(
+        "problem: peg_in_hole_2d\n"
+        f"model: {{hole_tolerance: {tolerance}}}\n"
+        f"particle_filter: {{num_particles: {num_particles}}}\n"
+        "active_sensing: {num_observation_samples: 2, num_cores: 1}\n"
+        f"simulator: {{num_trials: 3, max_steps: {max_steps}, seed: {seed}}}\n"
+    )
+    return load(path)
+
+
+def robot_configuration(tmp_path: Path, *, num_trials: int) -> Configuration:
+    """Return the configuration of a robot's short trials, written to robot.yaml."""
+    path = tmp_path / "robot.yaml"
+    path.write_text(
+        "problem: peg_in_hole_2d\n"
+        "particle_filter: {num_particles: 50}\n"
+        f"simulator: {{num_trials: {num_trials}, max_steps: 60, sensing_intervals: 8, seed: 3}}\n"
+    )
+    return load(path)
+
+
+def failed(result: TrialResult) -> TrialResult:
+    """Return the same result as a failure."""
+    return msgspec.structs.replace(result, success=False, failed=True)
+
+
+def without_decisions(result: TrialResult) -> TrialResult:
+    """Return the result as the journal returns it."""
+    return msgspec.structs.replace(result, decisions=None)
+
+
+def record_trial(configuration: Configuration, trial: int = 1) -> Recorder:
+    """Run a trial and record it."""
+    recorder = Recorder(trial)
+    run_trial(
+        Planner(configuration.problem, configuration.planning),
+        configuration.simulator.seed,
+        trial,
+        max_steps=configuration.simulator.max_steps,
+        observer=recorder,
+    )
+    return recorder

@@ -1,0 +1,93 @@
+"""The command line itself: what is imported when, and how it ends."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+
+import pytest
+
+from holdfast.cli.exit_codes import EndedBySignal, ended_by_signals, signal_of
+
+
+def python(program: str, *arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-c", program, *arguments],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+
+
+def test_a_service_does_not_wait_for_the_command_line() -> None:
+    """Its start-up time is recovery time: what is made for people is not imported."""
+    program = """
+import sys, types
+
+def main(arguments, make_extensions):
+    heavy = {"rich", "yaml", "matplotlib", "importlib.metadata"}
+    print(arguments, sorted(heavy & sys.modules.keys()))
+    return 7
+
+module = types.ModuleType("holdfast.service.process")
+module.main = main
+sys.modules[module.__name__] = module
+import holdfast.cli
+holdfast.cli.main()
+"""
+    done = python(program, "serve", "--name", "a", "--help")
+    assert done.stdout == "['--name', 'a', '--help'] []\n"
+    assert done.returncode == 7
+
+
+def test_every_command_is_listed() -> None:
+    done = python("import holdfast.cli; holdfast.cli.main()", "--help")
+    assert done.returncode == 0
+    commands = done.stdout.partition("\ncommands ")[2].split()
+    assert {"run", "serve", "compare"} <= set(commands)
+
+
+def test_help_imports_no_numbers() -> None:
+    program = """
+import sys
+import holdfast.cli
+try:
+    holdfast.cli.main()
+finally:
+    print(sorted({"numpy", "msgspec", "yaml", "sqlite3", "asyncio", "ssl"} & sys.modules.keys()))
+"""
+    assert python(program, "--help").stdout.endswith("\n[]\n")
+
+
+def test_errors_are_one_message_and_exit_code_2() -> None:
+    done = python("import holdfast.cli; holdfast.cli.main()", "run", "missing.yaml")
+    assert done.returncode == 2
+    assert done.stderr == "holdfast: error: missing.yaml: there is no such file\n"
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_ends_in_order(number: signal.Signals) -> None:
+    before = signal.getsignal(number)
+    with pytest.raises(SystemExit) as ended, ended_by_signals():
+        try:
+            signal.raise_signal(number)
+        except KeyboardInterrupt as interruption:
+            assert isinstance(interruption, EndedBySignal)
+            assert signal_of(interruption) == number
+            # A second one does not cut short what the first one began.
+            signal.raise_signal(number)
+            raise
+    assert ended.value.code == 128 + number
+    assert signal.getsignal(number) == before
+
+
+def test_what_is_ignored_stays_ignored() -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with ended_by_signals():
+            signal.raise_signal(signal.SIGHUP)
+            assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)

@@ -1,0 +1,78 @@
+"""The authority: whose certificate and key it is, and for how long."""
+
+from __future__ import annotations
+
+import shutil
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+
+from holdfast.errors import CredentialsError
+from holdfast.transport import authority
+from holdfast.transport.key_ring import make_credentials
+
+NOW = datetime.now(UTC)
+DAY = timedelta(days=1)
+
+
+class TestAuthority:
+    def test_without_its_key_nothing_is_made(self, tmp_path: Path) -> None:
+        make_credentials(tmp_path)
+        (tmp_path / "authority" / "authority.key").unlink()
+        with pytest.raises(CredentialsError, match=r"authority\.key: cannot be read: No such"):
+            make_credentials(tmp_path, robots=["new"])
+        assert not (tmp_path / "new").exists()
+
+    def test_another_authoritys_key_is_found(self, tmp_path: Path) -> None:
+        for name in ("a", "b"):
+            make_credentials(tmp_path / name)
+        shutil.copy(
+            tmp_path / "b" / "authority" / "authority.key",
+            tmp_path / "a" / "authority" / "authority.key",
+        )
+        with pytest.raises(CredentialsError, match=r"authority\.key: is not the key of"):
+            make_credentials(tmp_path / "a", robots=["new"])
+
+    def test_an_expired_one_signs_no_more(self, tmp_path: Path) -> None:
+        make_credentials(tmp_path, now=NOW - 3651 * DAY)
+        with pytest.raises(CredentialsError, match=r"authority\.pem: has expired on "):
+            make_credentials(tmp_path, robots=["new"])
+
+    def test_a_key_that_others_can_read_is_warned_of(self, tmp_path: Path) -> None:
+        make_credentials(tmp_path)
+        (tmp_path / "authority" / "authority.key").chmod(0o640)
+        said: list[str] = []
+        make_credentials(tmp_path, robots=["new"], warn=said.append)
+        assert len(said) == 1
+        assert "authority.key: others can read this key (mode 640)" in said[0]
+
+
+class TestSignatures:
+    def test_it_knows_its_own_certificates_by_their_signature_not_their_name(self) -> None:
+        ours, other = authority.new_authority(NOW), authority.new_authority(NOW)
+        key = authority.new_key()
+        made = authority.sign_certificate(
+            "anna", "robot", (), key.public_key(), ours, NOW, NOW + DAY
+        )
+        assert authority.is_signed_by(ours.certificate, made)
+        assert not authority.is_signed_by(other.certificate, made)
+        assert authority.common_name_of(made) == "anna"
+        assert authority.role_of(made) == "robot"
+        assert authority.public_key_of(made) == key.public_key()
+        assert authority.role_of(ours.certificate) is None
+
+    def test_a_list_grows_and_keeps_what_was_revoked_when(self, tmp_path: Path) -> None:
+        ours = authority.new_authority(NOW)
+        for moment, serial in ((NOW, 7), (NOW + DAY, 8)):
+            before = authority.read_revocations(tmp_path, ours.certificate)
+            content = authority.sign_revocations(before, [serial], ours, moment)
+            (tmp_path / "revoked.pem").write_bytes(content)
+        revoked = authority.read_revocations(tmp_path, ours.certificate)
+        assert revoked is not None
+        assert [entry.serial_number for entry in revoked] == [7, 8]
+        later, earlier = (each.revocation_date_utc for each in (revoked[1], revoked[0]))
+        assert later - earlier == DAY
+        other = authority.new_authority(NOW)
+        with pytest.raises(CredentialsError, match="was not signed by"):
+            authority.read_revocations(tmp_path, other.certificate)

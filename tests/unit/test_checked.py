@@ -1,0 +1,167 @@
+"""What a problem's functions return is checked where it is used."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from tests.line_problem import SETTINGS, Line
+
+from holdfast import checked
+from holdfast.arrays import FloatArray
+from holdfast.errors import ProblemError
+from holdfast.planning import Planner
+from holdfast.robot.environment import SimulatedEnvironment
+
+
+def run_a_step(problem: Any) -> None:
+    environment = SimulatedEnvironment(problem, 0, 0)
+    planner = Planner(problem, SETTINGS)
+    state = planner.init(0, 0)
+    action, _ = planner.choose_sensing_action(state)
+    state, _ = planner.observe(state, action, environment.perform_sensing(action))
+    task_action, _ = planner.choose_task_action(state)
+    environment.perform(task_action)
+    environment.is_done()
+    planner.advance(state, task_action)
+
+
+def test_a_problem_that_keeps_the_contract_runs() -> None:
+    run_a_step(Line())
+
+
+MISFITS: dict[str, tuple[str, Any, str]] = {
+    "mean without its axis": (
+        "observation_mean",
+        lambda _self, states, action: states[..., action],
+        r"observation_mean of sensing action 0 of line returned float64 of shape \(.*\): need",
+    ),
+    "constant mean": (
+        "observation_mean",
+        lambda _self, _states, _action: np.zeros(1),
+        "observation_mean of sensing action 0 of line returned float64 of shape",
+    ),
+    "variance as a number": (
+        "observation_variance",
+        lambda _self, _states, _action: 0.01,
+        r"observation_variance of sensing action 0 of line returned float \(0.01\): need",
+    ),
+    "variance of another size": (
+        "observation_variance",
+        lambda _self, _states, _action: np.array([0.01, 0.01]),
+        r"observation_variance of sensing action 0 of line returned float64 of shape \(2,\)",
+    ),
+    "policy of another width": (
+        "policy",
+        lambda _self, states, _stage: -states,
+        r"policy of line returned float64 of shape \(30, 2\): need .* \(30, 1\)",
+    ),
+    "policy as a list": (
+        "policy",
+        lambda _self, states, _stage: [[0.0]] * len(states),
+        "policy of line returned list",
+    ),
+    "move without return": ("move", lambda *_: None, "move of line returned NoneType"),
+    "stage out of range": (
+        "next_stage",
+        lambda *_: 7,
+        "next_stage of line is 7: allowed are 0 to 0",
+    ),
+    "several rewards": (
+        "reward",
+        lambda *_: np.zeros(3),
+        r"reward of line returned float64 of shape \(3,\): need one number",
+    ),
+    "several goals": ("is_goal", lambda *_: np.array([True]), "is_goal of line returned bool"),
+    "a distance as goal": (
+        "is_goal",
+        lambda *_: np.float64(5.3),
+        r"is_goal of line is .*5\.3.*: must be True or False",
+    ),
+    "integer states": (
+        "initial_states",
+        lambda _self, _stream, count: np.zeros((count, 2), np.int64),
+        "initial_states of line returned int64",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", MISFITS)
+def test_a_misfit_is_named(case: str) -> None:
+    function, replacement, message = MISFITS[case]
+    with pytest.raises(ProblemError, match=message):
+        run_a_step(type("Misfit", (Line,), {function: replacement})())
+
+
+@pytest.mark.parametrize(
+    ("found", "need"),
+    [
+        ([np.zeros((1, 4, 2)), np.zeros((1, 4), np.int64)], "need a tuple of two arrays$"),
+        ((np.zeros((1, 4)), None), r"need a float64 array of shape \(1, 4, 2\)$"),
+        ((np.zeros((1, 4, 2)), np.zeros((1, 4))), r"need an array of integers of shape \(1, 4\)$"),
+    ],
+)
+def test_what_a_path_must_be(found: object, need: str) -> None:
+    problem: Any = type("Wrong", (Line,), {"expected_path": lambda *_: found})()
+    with pytest.raises(ProblemError, match=f"^expected_path of line returned .*: {need}"):
+        checked.expected_path(problem, np.zeros((4, 2)), 0, (3,), 1)
+
+
+@pytest.mark.parametrize("function", ["policy", "move", "observation_mean"])
+def test_a_function_cannot_change_the_belief(function: str) -> None:
+    def in_place(_self: Line, states: FloatArray, *_: object) -> FloatArray:
+        states += 1.0
+        return states
+
+    broken: Any = type("InPlace", (Line,), {function: in_place})()
+    with pytest.raises(ValueError, match="read-only"):
+        run_a_step(broken)
+
+
+def huge(value: float) -> np.ndarray:
+    return np.full(4000, value)
+
+
+@pytest.mark.parametrize(
+    ("attribute", "value", "message"),
+    [
+        (
+            "motion_variance",
+            huge(-1.0),
+            r"is \[-1\. -1\. -1\. -1\. \.\.\. -1\. -1\. -1\. -1\.\]: must",
+        ),
+        ("motion_variance", ["a", "b"], r"is \['a' 'b'\]: must be 1 numbers >= 0"),
+        ("sensing_actions", "x" * 4000, "is 'xxx.*: must be a sequence of labels"),
+        ("sensing_actions", [1, 2], "has 1: labels must be text"),
+        ("next_stage", lambda *_: 1e300, r"next_stage of .* is 1e\+300: allowed are 0 to 0"),
+        ("next_stage", lambda *_: float("nan"), "next_stage of .* is nan: allowed are 0 to 0"),
+        ("reward", lambda *_: object(), "reward of .* returned object .*: need one number"),
+        ("is_goal", lambda *_: huge(1.0), r"is_goal of .* shape \(4000,\): need one number"),
+        (
+            "policy",
+            lambda states, _: np.full((*states.shape[:-1], 1), np.nan),
+            r"returned \[nan nan\] in|policy of line .*\[nan",
+        ),
+        ("observation_mean", lambda s, _: np.full((*s.shape[:-1], 900), np.nan), r"is nan at \(0"),
+        ("observation_variance", lambda *_: -np.ones(1), r"is -1\.0 at \(0,\) of shape \(1,\)"),
+        ("sample_observation", lambda *_: "no", r"returned str \('no'\): need a float64 array"),
+        ("sample_observation", lambda *_: huge(0.0), "returned .* of 4000 coordinates: need 1 to"),
+        ("sample_observation", lambda *_: np.full(900, np.nan), r"\[nan nan nan nan \.\.\. nan"),
+        ("log_likelihood", lambda s, *_: np.full(len(s), np.nan), "is NaN or plus infinity for a"),
+    ],
+)
+def test_an_account_of_what_is_wrong_is_short(attribute: str, value: object, message: str) -> None:
+    """It names the function, the value and where it stands, on one line, however large all is."""
+    own = staticmethod(value) if callable(value) else value
+    problem: Any = type("Wrong", (Line,), {attribute: own})()
+    if attribute == "log_likelihood":
+        problem.sample_observation = lambda *_: np.zeros(900)
+    if attribute == "sample_observation":
+        problem.log_likelihood = lambda states, *_: np.zeros(len(states))
+    if attribute == "observation_mean":
+        problem.observation_variance = lambda *_: np.ones(900)
+    with pytest.raises(ProblemError, match=message) as refused:
+        run_a_step(problem)
+    assert "\n" not in str(refused.value)
+    assert len(str(refused.value)) < 300

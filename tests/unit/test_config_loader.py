@@ -1,0 +1,999 @@
+"""The configuration file: what loads, to what, and what every mistake in it is answered with."""
+
+from __future__ import annotations
+
+import pickle
+import re
+import sys
+import textwrap
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from holdfast.config.loader import Configuration, load
+from holdfast.config.settings import EnvironmentSettings, OffloadSettings, RecoverySettings
+from holdfast.errors import ConfigurationError, UnknownProblemError
+from holdfast.problems import registry
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+
+# The thesis's file for peg-in-hole, key by key, without anything of ours.
+THESIS = """\
+model:
+  state_size: 3
+  peg_width: 1
+  peg_height: 2
+  hole_tolerance: 0.1
+  init_mean: [4, 2, 0]
+  init_cov: [2, 1, 1.57]
+  motion_cov: [0.01, 0.01, 0.01]
+  sensing_cov: 0.001
+  collision_tol: 0.001
+particle_filter:
+  num_particles: 100
+state_space_planner:
+  translation_step_size: 0.1
+  rotation_step_size: 0.1
+active_sensing:
+  horizon: 1
+  discount: 1.0
+  num_observation_samples: 10
+  num_nearest_neighbors: 5
+  num_cores: 8
+simulator:
+  num_trials: 10
+  max_steps: 700
+  sensing_intervals: 8
+  verbosity: 0
+"""
+
+# A user's problem beside the configuration: once with keyword arguments, once with structs.
+LAMPS = """\
+from typing import Annotated
+
+import msgspec
+import numpy as np
+
+from holdfast.problems.problem import ProblemBase
+
+
+class Lamp(msgspec.Struct, forbid_unknown_fields=True):
+    center: tuple[float, float]
+    height: Annotated[float, msgspec.Meta(gt=0.0)] = 1.0
+
+
+class Model(msgspec.Struct, forbid_unknown_fields=True):
+    colour: str = "red"
+    lamps: Annotated[list[Lamp], msgspec.Meta(min_length=1)] = msgspec.field(
+        default_factory=lambda: [Lamp((0.0, 0.0))]
+    )
+    weights: dict[str, float] = {}
+
+
+class Planner(msgspec.Struct, forbid_unknown_fields=True):
+    gain: Annotated[float, msgspec.Meta(ge=0.0, le=10.0)] = 1.0
+
+
+class Keywords(ProblemBase):
+    name = "lamps"
+    state_size = action_size = 1
+    sensing_actions = ("left", "right")
+
+    def __init__(self, gain=1.0, brightness=(1, 2), colour="red", lamps=None, places=((0, 1),)):
+        if gain < 0.0:
+            raise ValueError(f"gain is {gain}; it must not be negative")
+        self.gain = gain
+        self.colour = colour
+        self.brightness = brightness
+        self.places = places
+
+    def initial_states(self, stream, count): return np.zeros((count, 1))
+    def move(self, states, actions, stream): return states + actions
+    def observation_mean(self, states, sensing_action): return states
+    def observation_variance(self, states, sensing_action): return np.ones(1)
+    def policy(self, states, stage): return -self.gain * states
+    def is_goal(self, states): return np.abs(states[..., 0]) < 0.1
+
+
+class Structs(Keywords):
+    Model = Model
+    StateSpacePlanner = Planner
+
+    @classmethod
+    def from_settings(cls, model, state_space_planner):
+        return cls(
+            gain=msgspec.convert(state_space_planner, Planner).gain,
+            colour=msgspec.convert(model, Model).colour,
+        )
+
+
+class Unfinished(ProblemBase):
+    state_size = 1
+
+
+class Arrays(Keywords):
+    def __init__(self, gain=1.0, matrix=np.eye(2), limit=float("inf")):
+        super().__init__(gain)
+
+
+class Broken(Keywords):
+    def __init__(self, gain=1.0):
+        {}["absent"]
+
+
+class WrongTypes(Keywords):
+    def __init__(self, gain=1.0):
+        gain + "one"
+"""
+
+# A user's environment beside the configuration; it must not be imported to load that.
+ROBOT = "raise RuntimeError('imported')"
+
+Write = Callable[[str], Path]
+
+
+@pytest.fixture
+def write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Write:
+    # A problem beside the file puts its directory on the import path; take it off again.
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    monkeypatch.delitem(sys.modules, "lamps", raising=False)
+
+    def write_file(text: str) -> Path:
+        (tmp_path / "lamps.py").write_text(LAMPS)
+        (tmp_path / "own_robot.py").write_text(ROBOT)
+        path = tmp_path / "run.yaml"
+        path.write_text(textwrap.dedent(text), encoding="utf-8")
+        return path
+
+    return write_file
+
+
+def complaint(path: Path, **arguments: Any) -> str:
+    """Load a file that cannot be used and return the message, which is one or two lines."""
+    with pytest.raises(ConfigurationError) as caught:
+        load(path, **arguments)
+    message = str(caught.value)
+    assert message.count("\n") <= 1, message
+    return message
+
+
+class TestWhatLoads:
+    def test_the_thesis_file_as_it_stands(self, write: Write) -> None:
+        configuration = load(write(THESIS))
+        assert configuration.problem_name == "peg_in_hole_2d"
+        assert configuration.problem.name == "peg_in_hole_2d"
+        assert configuration.planning.particle_filter.num_particles == 100
+        assert configuration.planning.active_sensing.num_nearest_neighbors == 5
+        assert configuration.planning.active_sensing.num_cores == 8
+        assert configuration.planning.sensing_interval == 8
+        assert configuration.simulator.max_steps == 700
+        assert configuration.model["init_cov"] == pytest.approx([2, 1, 1.57])
+
+    def test_the_thesis_example_has_exactly_the_thesis_keys_and_values(self) -> None:
+        example = yaml.safe_load((EXAMPLES / "thesis.yaml").read_text(encoding="utf-8"))
+        assert example.pop("problem") == "peg_in_hole_2d"
+        assert example.pop("selector") == {
+            "method": "action_entropy",
+            "estimator": "nearest_neighbor",
+        }
+        assert example == yaml.safe_load(THESIS)
+
+    @pytest.mark.parametrize("path", sorted(EXAMPLES.rglob("*.yaml")), ids=lambda path: path.stem)
+    def test_an_example_loads_and_is_told_by_its_keys(self, path: Path, write: Write) -> None:
+        named = load(path)
+        text = path.read_text(encoding="utf-8")
+        if ":" in named.problem_name:  # a user's own problem can only be named
+            return
+        inferred = load(write(re.sub(r"(?m)^problem: .*$", "", text)))
+        assert inferred == named
+
+    @pytest.mark.parametrize("name", registry.names())
+    def test_nothing_but_the_name(self, name: str, write: Write) -> None:
+        configuration = load(write(f"problem: {name}"))
+        assert configuration.problem.name == name
+        assert configuration.planning.particle_filter.num_particles == 300
+
+    def test_the_argument_rules_over_the_file(self, write: Write) -> None:
+        path = write("problem: peg_in_hole_2d\nsimulator: {num_trials: 3, seed: 4}")
+        assert load(path).simulator.num_trials == 3
+        configuration = load(path, problem="capsule_robot", num_trials=5, seed=6)
+        assert configuration.problem_name == "capsule_robot"
+        assert (configuration.simulator.num_trials, configuration.simulator.seed) == (5, 6)
+
+    def test_an_empty_section_has_its_defaults(self, write: Write) -> None:
+        empty = load(write("problem: peg_in_hole_2d\nmodel:\nsimulator: ~\nselector: {}"))
+        assert empty == load(write("problem: peg_in_hole_2d"))
+
+    @pytest.mark.parametrize("text", ["1e-3", "1E-3", ".001", "0.001", "1.0e-03", "+1e-3"])
+    def test_every_spelling_of_a_number(self, text: str, write: Write) -> None:
+        configuration = load(write(f"problem: peg_in_hole_2d\nmodel: {{sensing_cov: {text}}}"))
+        assert configuration.model["sensing_cov"] == 1e-3
+
+    def test_a_byte_order_mark_and_anchors(self, write: Write) -> None:
+        path = write(
+            "\ufeffproblem: peg_in_hole_2d\nmodel: {init_cov: &c [1, 1, 1], motion_cov: *c}"
+        )
+        assert load(path).model["motion_cov"] == load(path).model["init_cov"]
+
+    @pytest.mark.parametrize("kind", ["Keywords", "Structs"])
+    def test_a_problem_beside_the_file(self, kind: str, write: Write) -> None:
+        configuration = load(
+            write(
+                f"problem: lamps:{kind}\nmodel: {{colour: 'no'}}\nstate_space_planner: {{gain: 2}}"
+            )
+        )
+        assert configuration.problem_name == f"lamps:{kind}"
+        assert (configuration.problem.colour, configuration.problem.gain) == ("no", 2)  # type: ignore[attr-defined]
+
+
+class TestProblemDirectory:
+    """Where the module of a problem of one's own is looked for."""
+
+    @staticmethod
+    def elsewhere(path: Path, text: str) -> Path:
+        """Write a file into a directory that holds no module."""
+        directory = path.parent / "elsewhere"
+        directory.mkdir(exist_ok=True)
+        (directory / "config.yaml").write_text(text)
+        return directory / "config.yaml"
+
+    def test_a_resolved_file_loads_from_anywhere(self, write: Write) -> None:
+        path = write("problem: lamps:Keywords")
+        configuration = load(path)
+        assert configuration.problem_directory == path.parent
+        again = load(self.elsewhere(path, configuration.to_yaml()))
+        assert again == configuration
+        assert again.to_yaml() == configuration.to_yaml()
+
+    def test_the_current_directory_is_looked_in_too(
+        self, write: Write, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        path = write("")
+        monkeypatch.chdir(path.parent)
+        configuration = load(self.elsewhere(path, "problem: lamps:Keywords"))
+        assert configuration.problem_directory == path.parent
+
+    def test_beside_the_file_comes_first(
+        self, write: Write, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        (tmp_path / "current").mkdir()
+        (tmp_path / "current" / "lamps.py").write_text("Keywords = 3")
+        monkeypatch.chdir(tmp_path / "current")
+        assert load(write("problem: lamps:Keywords")).problem_directory == tmp_path
+
+    def test_it_may_be_relative_to_the_file(self, write: Write) -> None:
+        path = write("")
+        found = load(
+            self.elsewhere(path, "problem: lamps:Keywords\nproblem_directory: ..")
+        ).problem_directory
+        assert found == path.parent
+
+    @pytest.mark.parametrize(
+        ("text", "expected"),
+        [
+            ("lamps:Keywords\nproblem_directory: absent", 'is "absent", where there is no direc'),
+            ("lamps:Keywords\nproblem_directory: empty", 'is "empty", where there is no module'),
+            ("lamps:Keywords\nproblem_directory: 3", "is 3; expected the path of a directory"),
+            ("capsule_robot\nproblem_directory: .", 'is "."; only a problem that is named'),
+        ],
+    )
+    def test_what_is_refused(self, text: str, expected: str, write: Write) -> None:
+        path = write(f"problem: {text}")
+        (path.parent / "empty").mkdir()
+        assert f"line 2: problem_directory {expected}" in complaint(path)
+
+
+class TestResolution:
+    """One for each coordinate, in a file."""
+
+    def test_as_many_as_an_action_has_coordinates(self, write: Write) -> None:
+        text = "problem: peg_in_hole_2d\nselector: {resolution: [0.1, 1, 5e-2]}"
+        assert load(write(text)).planning.selector.resolution == (0.1, 1.0, 0.05)
+
+    @pytest.mark.parametrize("method", ["action_entropy", "state_entropy", "action_covariance"])
+    def test_another_number_is_refused_with_its_line(self, method: str, write: Write) -> None:
+        text = f"problem: peg_in_hole_2d\nselector:\n  method: {method}\n  resolution: [1, 2]"
+        message = complaint(write(text))
+        assert "line 4: selector.resolution is [1.0, 2.0], 2 numbers; need one number" in message
+        assert "3 for peg_in_hole_2d, one for each coordinate of " in message
+
+    def test_another_number_that_was_given_instead_of_the_files(self, write: Write) -> None:
+        path = write("problem: peg_in_hole_2d\nselector: {resolution: [1, 2, 3]}")
+        with pytest.raises(ConfigurationError) as refused:
+            load(path, overrides={"selector.resolution": [0.1]})
+        assert str(refused.value).startswith(
+            f"selector.resolution, given instead of what {path} says, is [0.1], 1 numbers; need "
+        )
+
+    def test_states_of_another_number_of_coordinates_need_their_own(
+        self, write: Write, tmp_path: Path
+    ) -> None:
+        (tmp_path / "without_state_resolution.py").write_text(
+            "import numpy as np\n"
+            "from holdfast.lab.studies.passer_by import PasserBy\n"
+            "class Without(PasserBy):\n"
+            "    resolution = np.array([0.1, 0.2])\n"
+            "    state_resolution = None\n"
+        )
+        text = "problem: without_state_resolution:Without\nselector: {method: "
+        load(write(f"{text}action_entropy}}"))
+        load(write(f"{text}state_entropy, resolution: [1, 1, 2]}}"))
+        message = complaint(write(f"{text}state_entropy}}"))
+        assert (
+            "line 2: selector.method is state_entropy, but the resolution of passer_by" in message
+        )
+        assert "has 2 numbers, for the coordinates of an action" in message
+        assert "give the problem a state_resolution, one number or 3, or write selector" in message
+
+    @pytest.mark.parametrize("method", ["random", "fixed"])
+    def test_where_nothing_is_measured_it_has_no_effect(self, method: str, write: Write) -> None:
+        load(write(f"problem: capsule_robot\nselector: {{method: {method}, resolution: [1]}}"))
+
+
+class TestResolved:
+    @pytest.mark.parametrize(
+        "text",
+        [
+            THESIS,
+            "problem: capsule_robot\nselector: {method: fixed, sensing_action: 1, resolution: 1e-7}"
+            "\nsimulator: {sensing_intervals: 0}",
+            "problem: capsule_robot\nselector: {resolution: [0.1, 2]}",
+            "problem: multitier_peg_in_hole_2d\nsimulator: {seed: 9223372036854775807}",
+            "problem: lamps:Keywords\nmodel: {colour: '1e-3', lamps: [1, null, {a: 'yes'}]}",
+            "problem: lamps:Structs\nmodel: {lamps: [{center: [0.1, 1e22]}], weights: {'1': 2}}",
+        ],
+        ids=["thesis", "capsule", "resolutions", "multitier", "keywords", "structs"],
+    )
+    def test_it_loads_to_the_same(self, text: str, write: Write) -> None:
+        configuration = load(write(text))
+        again = load(write(configuration.to_yaml()))
+        assert again == configuration
+        assert again.to_yaml() == configuration.to_yaml()
+
+    def test_every_default_is_written(self, write: Write) -> None:
+        resolved = yaml.safe_load(load(write("problem: peg_in_hole_2d")).to_yaml())
+        assert resolved["problem"] == "peg_in_hole_2d"
+        assert resolved["model"]["peg_height"] == 2
+        assert resolved["state_space_planner"] == {
+            "translation_step_size": 0.1,
+            "rotation_step_size": 0.1,
+        }
+        assert resolved["selector"]["method"] == "path_entropy"
+        assert resolved["selector"]["resolution"] is None
+        assert resolved["simulator"]["seed"] == 0
+
+    def test_defaults_of_keyword_arguments_are_written_where_yaml_holds_them(
+        self, write: Write
+    ) -> None:
+        resolved = load(write("problem: lamps:Keywords\nstate_space_planner: {gain: 2}")).to_yaml()
+        assert yaml.safe_load(resolved)["model"] == {
+            "brightness": [1, 2],
+            "colour": "red",
+            "lamps": None,
+            "places": [[0, 1]],
+        }
+        assert "Not listed" not in resolved
+
+    def test_defaults_that_yaml_cannot_hold_are_named_in_a_comment(self, write: Write) -> None:
+        resolved = load(write("problem: lamps:Arrays")).to_yaml()
+        assert yaml.safe_load(resolved)["model"] == {"gain": 1.0}
+        assert "# model.matrix, model.limit\n" in resolved
+        assert load(write(resolved)).to_yaml() == resolved
+
+    def test_a_constructor_gets_tuples_where_its_defaults_are_tuples(self, write: Write) -> None:
+        first = load(write("problem: lamps:Keywords")).problem
+        again = load(write(load(write("problem: lamps:Keywords")).to_yaml())).problem
+        other = load(write("problem: lamps:Keywords\nmodel: {places: [[1, 2], [3, 4]]}")).problem
+        for problem in (first, again):
+            assert problem.brightness == (1, 2)  # type: ignore[attr-defined]
+            assert problem.places == ((0, 1),)  # type: ignore[attr-defined]
+        assert other.places == ((1, 2), (3, 4))  # type: ignore[attr-defined]
+
+    @pytest.mark.parametrize("text", [THESIS, "problem: lamps:Keywords"], ids=["thesis", "lamps"])
+    def test_another_process_rebuilds_it(self, text: str, write: Write) -> None:
+        configuration = load(write(text), seed=7)
+        plain = pickle.loads(pickle.dumps(configuration.plain()))
+        again = Configuration.from_plain(plain)
+        assert again == configuration
+        assert again.path.samefile(configuration.path)
+        assert type(again.problem) is type(configuration.problem)
+
+    def test_other_plain_data_is_refused(self) -> None:
+        with pytest.raises(ConfigurationError, match="path and configuration"):
+            Configuration.from_plain({"problem": "peg_in_hole_2d"})
+
+
+class TestFiles:
+    def test_missing(self, tmp_path: Path) -> None:
+        assert "absent.yaml: there is no such file" in complaint(tmp_path / "absent.yaml")
+
+    def test_directory(self, tmp_path: Path) -> None:
+        assert f"{tmp_path}: is a directory" in complaint(tmp_path)
+
+    def test_below_a_file(self, write: Write) -> None:
+        assert "cannot be read: Not a directory" in complaint(write(THESIS) / "run.yaml")
+
+    def test_a_name_that_no_file_can_have(self) -> None:
+        assert "cannot be read" in complaint(Path("a\0b"))
+
+    def test_not_utf8(self, tmp_path: Path) -> None:
+        path = tmp_path / "run.yaml"
+        path.write_bytes(b"problem: peg_in_hole_2d\n# caf\xe9\n")
+        assert "run.yaml, line 2: not UTF-8 text (byte 0xe9" in complaint(path)
+
+    def test_too_large(self, tmp_path: Path) -> None:
+        path = tmp_path / "run.yaml"
+        path.write_bytes(b"#" * (1024 * 1024 + 1))
+        assert "run.yaml: over 1048576 bytes" in complaint(path)
+
+    @pytest.mark.parametrize("text", ["", "# nothing\n", "---\n"])
+    def test_empty(self, text: str, write: Write) -> None:
+        assert "run.yaml: is empty; a configuration has the sections model," in complaint(
+            write(text)
+        )
+
+    @pytest.mark.parametrize(
+        ("text", "expected"),
+        [
+            ("- model\n", "is a list at the top, where a mapping"),
+            ("peg_in_hole_2d\n", 'is "peg_in_hole_2d" at the top'),
+            ("3\n", "is 3 at the top"),
+        ],
+    )
+    def test_not_a_mapping(self, text: str, expected: str, write: Write) -> None:
+        assert expected in complaint(write(text))
+
+
+class TestYaml:
+    @pytest.mark.parametrize(
+        ("text", "expected"),
+        [
+            ("model:\n\tpeg_width: 1\n", "run.yaml, line 2, column 1: not YAML: found character"),
+            ("model: {peg_width: 1\n", "run.yaml, line 2, column 1: not YAML: expected"),
+            ("a: 1\n---\nb: 2\n", "line 2, column 1: not YAML: but found another document"),
+            ("model: *x\n", "line 1, column 8: not YAML: found undefined alias 'x'"),
+            ("model:\n  a: '\x01'\n", "line 2: not YAML: the character U+0001 is not allowed"),
+        ],
+    )
+    def test_not_yaml(self, text: str, expected: str, write: Write) -> None:
+        assert expected in complaint(write(text))
+
+    @pytest.mark.parametrize(
+        ("text", "expected"),
+        [
+            (
+                "simulator:\n  seed: 1\n  max_steps: 5\n  seed: 2\n",
+                "line 4, column 3: the key simulator.seed stands twice, on lines 2 and 4",
+            ),
+            ("simulator: {seed: 1, seed: 1}", "simulator.seed stands twice, on line 1"),
+            ("model: {a: 1}\nmodel: {b: 1}", "the key model stands twice, on lines 1 and 2"),
+        ],
+    )
+    def test_a_key_that_stands_twice(self, text: str, expected: str, write: Write) -> None:
+        assert expected in complaint(write(text))
+
+    @pytest.mark.parametrize("text", [".nan", ".inf", "-.inf", "1e999"])
+    def test_not_finite(self, text: str, write: Write) -> None:
+        message = complaint(write(f"model:\n  init_mean: [4, {text}, 0]\n"))
+        assert f"line 2, column 18: model.init_mean[1]: {text} is not a finite number" in message
+
+    @pytest.mark.parametrize("text", ["no", "On", "YES", "010", "1:30", "1_000"])
+    def test_what_yaml_readers_read_differently(self, text: str, write: Write) -> None:
+        message = complaint(write(f"simulator:\n  num_trials: {text}\n"))
+        assert f"line 2, column 15: simulator.num_trials: {text} means different things" in message
+
+    @pytest.mark.parametrize("text", ["9223372036854775808", "-9223372036854775809", "9" * 5000])
+    def test_a_number_over_64_bits(self, text: str, write: Write) -> None:
+        assert "does not fit into 64 bits" in complaint(write(f"simulator: {{seed: {text}}}"))
+
+    @pytest.mark.parametrize(
+        "value", ["!!python/object/apply:os.system [x]", "!!set {x}", "!mine x", "!!int x"]
+    )
+    def test_tags(self, value: str, write: Write) -> None:
+        assert "the tag" in complaint(write(f"model: {{peg_width: {value}}}"))
+
+    @pytest.mark.parametrize("key", ["1", "null", "true", "0.5", "[a, b]"])
+    def test_a_key_that_is_not_text(self, key: str, write: Write) -> None:
+        assert "stands as a key, which only text may" in complaint(write(f"model: {{{key}: 1}}"))
+
+    @pytest.mark.parametrize(
+        ("text", "expected"),
+        [
+            ("[" * 100_000, "more than 32 levels"),
+            ("model: &a [*a]", "more than 32 levels"),
+            pytest.param(
+                "model: [" + "1," * 100_001 + "]",
+                "more than 100000 keys and values",
+                marks=pytest.mark.slow,
+            ),
+            (
+                "a0: &a0 [0,0,0,0,0,0,0,0,0,0]\n"
+                + "".join(f"a{i}: &a{i} [{','.join([f'*a{i - 1}'] * 10)}]\n" for i in range(1, 8)),
+                "more than 100000 values, counting what aliases repeat",
+            ),
+        ],
+        ids=["deep", "endless", "long", "exploding"],
+    )
+    def test_documents_made_to_exhaust_memory(self, text: str, expected: str, write: Write) -> None:
+        assert expected in complaint(write(text))
+
+
+class TestKeysAndValues:
+    @pytest.mark.parametrize(
+        ("text", "expected"),
+        [
+            (
+                "particle_filter:\n  num_particles: 0",
+                "run.yaml, line 3: particle_filter.num_particles is 0;"
+                " expected a whole number >= 1 and <= 10000000",
+            ),
+            ("particle_filter: {num_particles: ten}", 'is "ten"; expected a whole number'),
+            ("particle_filter: {num_particles: 2.5}", "is 2.5; expected a whole number"),
+            ("particle_filter: {num_particles: true}", "is true; expected a whole number"),
+            ("particle_filter: {num_particles: }", "is null; expected a whole number"),
+            ("particle_filter: {num_particles: [1]}", "is [1] (a list of 1); expected a whole"),
+            ("active_sensing: {discount: 1.5}", "discount is 1.5; expected a number >= 0 and <= 1"),
+            (
+                "selector: {resolution: 0}",
+                "is 0; expected a number >= 1e-150 and <= 1e+150 or a list",
+            ),
+            ("selector: {resolution: [1, 1, 0]}", "selector.resolution[2] is 0; expected a number"),
+            ("selector: {resolution: []}", "resolution is [] (a list of 0); expected a number >="),
+            (
+                "selector:\n  resolution: 1e-160",
+                "line 3: selector.resolution is 1e-160; expected a number >= 1e-150 and <= 1e+150",
+            ),
+            ("selector: {resolution: [1, 1e151, 1]}", "selector.resolution[1] is 1e+151; expected"),
+            (
+                "selector: {method: action-entropy}",
+                'selector.method is "action-entropy"; expected one of action_covariance, '
+                "action_entropy, expected_return, fixed, path_entropy, random, state_entropy; did "
+                "you mean action_entropy?",
+            ),
+            ("model: {init_mean: [1, 2]}", "is [1, 2] (a list of 2); expected a list of 3"),
+            ("model: {init_mean: [1, 2, x]}", 'model.init_mean[2] is "x"; expected a number'),
+            ("model: {peg_width: -1}", "model.peg_width is -1; expected a number > 0"),
+            ("state_space_planner: {rotation_step_size: 0}", "rotation_step_size is 0; expected"),
+            ("simulator: {seed: -1}", "simulator.seed is -1; expected a whole number >= 0"),
+            ("simulator: 3", "line 2: simulator is 3; expected a mapping of keys"),
+            ("simulator: [seed]", 'simulator is ["seed"]; expected a mapping of keys'),
+            ("simulator: ''", 'simulator is ""; expected a mapping of keys'),
+            (f"simulator: {{seed: {'x' * 500}}}", f'is "{"x" * 56}...; expected a whole number'),
+        ],
+    )
+    def test_a_value_that_is_not_allowed(self, text: str, expected: str, write: Write) -> None:
+        assert expected in complaint(write(f"problem: peg_in_hole_2d\n{text}"))
+
+    @pytest.mark.parametrize(
+        ("text", "expected"),
+        [
+            (
+                "\nparticle_filter:\n  num_particle: 10",
+                "line 4: particle_filter.num_particle is not a known key; did you mean"
+                " num_particles?\nallowed: num_particles, resampling_threshold",
+            ),
+            (
+                "model: {peg_wdth: 1}",
+                "model.peg_wdth is not a known key; did you mean peg_width?\nallowed: state_size,",
+            ),
+            (
+                "particle_filter: {horizon: 2}",
+                "particle_filter.horizon is a key of active_sensing, not of particle_filter",
+            ),
+            (
+                "model: {rotation_step_size: 2}",
+                "model.rotation_step_size is a key of state_space_planner, not of model",
+            ),
+            (
+                "particle_filters: {num_particles: 10}",
+                "particle_filters is not a known section; did you mean particle_filter?\n"
+                "allowed: problem, problem_directory, model, particle_filter, state_space_planner,",
+            ),
+            ("num_particles: 10", "line 2: num_particles is not a known section"),
+            ("simulator: {'\\e[2J': 1}", "is not a known key"),
+        ],
+    )
+    def test_a_key_that_is_not_known(self, text: str, expected: str, write: Write) -> None:
+        assert expected in complaint(write(f"problem: peg_in_hole_2d\n{text}"))
+
+    def test_no_control_character_reaches_the_terminal(self, write: Write) -> None:
+        message = complaint(write('problem: peg_in_hole_2d\nsimulator: {"\\e[2J": "\\e[2J"}'))
+        assert "\x1b" not in message
+        message = complaint(write('problem: peg_in_hole_2d\nsimulator: {seed: "\\e[2J"}'))
+        assert "\x1b" not in message
+
+    def test_within_the_lists_of_a_problem(self, write: Write) -> None:
+        holes = "problem: multitier_peg_in_hole_2d\nmodel:\n  holes:\n    - {}\n    - {}\n".format
+        good = "center: [0, 0], tol: 0.1, depth: 1"
+        message = complaint(write(holes(f"{{{good}}}", f"{{{good}, width: 1}}")))
+        assert "line 5: model.holes[1].width is not a known key" in message
+        assert "allowed: center, tol, depth" in message
+        message = complaint(write(holes(f"{{{good}}}", "{center: [0], tol: 0.1, depth: 1}")))
+        assert "model.holes[1].center is [0] (a list of 1); expected a list of 2" in message
+        message = complaint(write(holes("{tol: 0.1, depth: 1}", f"{{{good}}}")))
+        assert "line 4: model.holes[0].center is missing; it has no default" in message
+
+    def test_what_is_given_as_an_argument(self, write: Write) -> None:
+        message = complaint(write("problem: peg_in_hole_2d\nsimulator: {seed: 3}"), seed=-1)
+        assert re.match(
+            r"simulator\.seed, given instead of what .*run\.yaml says, is -1; ", message
+        )
+        assert "num_trials, given instead" in complaint(write(THESIS), num_trials=0)
+
+
+class TestTwoKeys:
+    def test_no_fewer_observation_samples_than_to_begin_with(self, write: Write) -> None:
+        text = "problem: peg_in_hole_2d\nactive_sensing: {num_observation_samples: 21}\n"
+        text += "selector:\n  max_observation_samples: %d\n  method: "
+        message = complaint(write(text % 20 + "expected_return"))
+        assert "line 4: selector.max_observation_samples is 20; with" in message
+        assert "at least active_sensing.num_observation_samples, which is 21" in message
+        load(write(text % 21 + "expected_return"))
+        load(write(text % 20 + "path_entropy"))
+
+    def test_neighbours_need_as_many_other_particles(self, write: Write) -> None:
+        text = "problem: peg_in_hole_2d\nselector: {estimator: nearest_neighbor}\n"
+        text += "particle_filter: {num_particles: %d}\n"
+        message = complaint(write(text % 5 + "active_sensing:\n  num_nearest_neighbors: 5"))
+        assert "line 5: active_sensing.num_nearest_neighbors is 5;" in message
+        assert "below particle_filter.num_particles, which is 5" in message
+        assert "is 5;" in complaint(write(text % 4))  # The default breaks it as well.
+        assert load(write(text % 6)).planning.particle_filter.num_particles == 6
+
+    def test_neighbours_of_the_prior_are_counted_among_few_particles(self, write: Write) -> None:
+        text = "problem: peg_in_hole_2d\nselector: {estimator: prior_neighbors}\n"
+        text += "particle_filter: {num_particles: %d}\n"
+        assert "is 5; the prior_neighbors estimator needs it below" in complaint(write(text % 5))
+        message = complaint(write(text % 4097))
+        assert "line 3: particle_filter.num_particles is 4097;" in message
+        assert "allows 4096" in message
+        assert load(write(text % 4096)).planning.selector.estimator == "prior_neighbors"
+
+    @pytest.mark.parametrize(
+        "selector",
+        ["{estimator: gaussian_mixture_upper}", "{method: random}", "{method: fixed}"],
+    )
+    def test_where_neighbours_are_not_counted_one_particle_is_enough(
+        self, selector: str, write: Write
+    ) -> None:
+        text = "problem: peg_in_hole_2d\nparticle_filter: {num_particles: 1}\nselector: "
+        assert load(write(text + selector)).planning.particle_filter.num_particles == 1
+
+    def test_a_fixed_sensing_action_exists(self, write: Write) -> None:
+        text = "problem: peg_in_hole_2d\nselector: {method: %s, sensing_action: %d}"
+        message = complaint(write(text % ("fixed", 3)))
+        assert "line 2: selector.sensing_action is 3; peg_in_hole_2d has the" in message
+        assert "sensing actions 0 to 2 (x, y, θ)" in message
+        assert load(write(text % ("fixed", 2))).planning.selector.sensing_action == 2
+        assert load(write(text % ("action_entropy", 3))).planning.selector.sensing_action == 3
+
+
+class TestOffload:
+    """The sections `offload` and `recovery`."""
+
+    def test_what_they_are_without_the_sections(self, write: Write) -> None:
+        configuration = load(write("problem: peg_in_hole_2d"))
+        assert configuration.offload == OffloadSettings()
+        assert configuration.recovery == RecoverySettings()
+        assert configuration.environment == EnvironmentSettings()
+        assert configuration.offload.services == ()
+        assert configuration.recovery.launch == "on_failure"
+        assert configuration.environment.object is None
+
+    def test_they_load_and_come_back(self, write: Write) -> None:
+        configuration = load(
+            write(
+                """\
+                problem: peg_in_hole_2d
+                offload:
+                  services: [tcp/127.0.0.1:7447, tls/10.0.0.7:7447]
+                  detection_timeout_ms: 5000
+                  decision_deadline_ms: 20.5
+                recovery: {launch: at_start, journal_survives: power_cut}
+                """
+            )
+        )
+        assert configuration.offload == OffloadSettings(
+            services=("tcp/127.0.0.1:7447", "tls/10.0.0.7:7447"),
+            detection_timeout_ms=5000.0,
+            decision_deadline_ms=20.5,
+        )
+        assert configuration.recovery == RecoverySettings(
+            launch="at_start", journal_survives="power_cut"
+        )
+        assert load(write(configuration.to_yaml())) == configuration
+        assert Configuration.from_plain(configuration.plain()) == configuration
+
+    def test_they_count_in_comparisons(self, write: Write) -> None:
+        text = "problem: peg_in_hole_2d\n"
+        plain = load(write(text))
+        for section in (
+            "offload: {services: [tcp/a:1]}",
+            "recovery: {launch: never}",
+            "environment: {timeout_ms: 1}",
+        ):
+            assert load(write(text + section)) != plain
+
+    @pytest.mark.parametrize(
+        ("text", "expected"),
+        [
+            (
+                "offload:\n  lease_ms: 10",
+                "line 3: offload.lease_ms is 10; expected a number >= 50 and <= 60000",
+            ),
+            (
+                "offload: {services: tcp/a:1}",
+                'is "tcp/a:1"; expected a list of at most 16, as in [tcp/a:1]',
+            ),
+            ("offload: {services: [3]}", "offload.services[0] is 3; expected text of at least 1"),
+            (
+                "offload:\n  services:\n    - tcp/a:1\n    - ''",
+                'line 5: offload.services[1] is ""; expected text of at least 1',
+            ),
+            (
+                f"offload: {{services: [{', '.join(f'tcp/a:{port}' for port in range(17))}]}}",
+                "(a list of 17); expected a list of at most 16",
+            ),
+            (
+                "offload:\n  services:\n    - tcp/a:1\n    - tcp/b:1\n    - tcp/a:1",
+                'line 6: offload.services[2] is "tcp/a:1", as offload.services[0] is already',
+            ),
+            ("offload: {tls: 3}", "offload.tls is 3; expected text of at least 1"),
+            (
+                "recovery: {launch: always}",
+                'recovery.launch is "always"; expected one of at_start, never, on_failure',
+            ),
+            ("recovery: {lauch: never}", "recovery.lauch is not a known key; did you mean launch?"),
+            ("recovery: {lease_ms: 100}", "lease_ms is a key of offload, not of recovery"),
+            (
+                "recovery: {launch: never}\noffload:\n  decision_deadline_ms: 50",
+                "line 4: offload.decision_deadline_ms is 50; then the local service decides instead"
+                ", which is never there with recovery.launch never",
+            ),
+            (
+                "offload: {decision_deadline_ms: 200, decision_timeout_ms: 200,"
+                " detection_timeout_ms: 100}",
+                "decision_deadline_ms is 200; it must be below offload.decision_timeout_ms",
+            ),
+            (
+                "offload: {decision_timeout_ms: 200}",
+                "detection_timeout_ms is 250; it must be at most offload.decision_timeout_ms, after"
+                " which a decision is given up, which is 200",
+            ),
+        ],
+    )
+    def test_what_is_refused(self, text: str, expected: str, write: Write) -> None:
+        assert expected in complaint(write(f"problem: peg_in_hole_2d\n{text}"))
+
+    def test_credentials_are_relative_to_the_file(self, write: Write) -> None:
+        path = write("problem: peg_in_hole_2d\noffload: {tls: keys/robot}")
+        configuration = load(path)
+        assert configuration.offload.tls == str(path.parent / "keys" / "robot")
+        (path.parent / "run").mkdir()
+        (path.parent / "run" / "config.yaml").write_text(configuration.to_yaml())
+        assert load(path.parent / "run" / "config.yaml") == configuration
+
+    def test_credentials_given_instead_are_relative_to_the_current_directory(
+        self, write: Write, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        (tmp_path / "current").mkdir()
+        monkeypatch.chdir(tmp_path / "current")
+        path = write("problem: peg_in_hole_2d\noffload: {tls: keys}")
+        found = load(path, overrides={"offload.tls": "mine"}).offload.tls
+        assert found == str(tmp_path / "current" / "mine")
+
+
+class TestOverrides:
+    def test_they_rule_over_the_file(self, write: Write) -> None:
+        path = write(
+            "problem: peg_in_hole_2d\noffload: {services: [tcp/a:1], lease_ms: 100}\n"
+            "recovery: {launch: never}"
+        )
+        configuration = load(
+            path,
+            seed=3,
+            overrides={
+                "offload.services": ("tcp/b:1", "tcp/c:1"),
+                "recovery.launch": "at_start",
+                "offload.decision_deadline_ms": 10,
+                "offload.tls": None,
+            },
+        )
+        assert configuration.offload.services == ("tcp/b:1", "tcp/c:1")
+        assert configuration.offload.lease_ms == 100
+        assert configuration.offload.decision_deadline_ms == 10
+        assert configuration.offload.tls is None
+        assert configuration.recovery.launch == "at_start"
+        assert configuration.simulator.seed == 3
+        assert load(write(configuration.to_yaml())) == configuration
+
+    @pytest.mark.parametrize(
+        ("name", "value", "expected"),
+        [
+            (
+                "offload.services",
+                ["tcp/a:1", "tcp/a:1"],
+                r"services\[1\], given instead of what .*run.yaml says, is",
+            ),
+            ("offload.lease", 3, "^offload.lease is not a known key; did you mean lease_ms"),
+            ("recovery.launch", "now", 'recovery.launch, given instead .*run.yaml says, is "now"'),
+            ("ofload.lease_ms", 3, "ofload.* is not a known section; did you mean offload"),
+        ],
+    )
+    def test_what_is_refused(self, name: str, value: object, expected: str, write: Write) -> None:
+        message = complaint(write("problem: peg_in_hole_2d"), overrides={name: value})
+        assert re.search(expected, message)
+
+
+class TestEnvironment:
+    """The section `environment`."""
+
+    TEXT = "problem: peg_in_hole_2d\nenvironment: "
+
+    def test_it_loads_without_importing_it_and_comes_back(self, write: Write) -> None:
+        path = write(
+            self.TEXT + "{object: 'own_robot:Robot', arguments: {port: 3, at: [1, {a: null}]}}"
+        )
+        configuration = load(path)
+        assert configuration.environment == EnvironmentSettings(
+            object="own_robot:Robot",
+            directory=str(path.parent),
+            arguments={"port": 3, "at": [1, {"a": None}]},
+        )
+        (path.parent / "run").mkdir()
+        (path.parent / "run" / "config.yaml").write_text(configuration.to_yaml())
+        assert load(path.parent / "run" / "config.yaml") == configuration
+        assert Configuration.from_plain(configuration.plain()) == configuration
+
+    def test_the_current_directory_is_looked_in_too(
+        self, write: Write, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        path = write("")
+        (path.parent / "elsewhere").mkdir()
+        other = path.parent / "elsewhere" / "run.yaml"
+        other.write_text(self.TEXT + "{object: 'own_robot:Robot'}")
+        monkeypatch.chdir(path.parent)
+        assert load(other).environment.directory == str(path.parent)
+
+    def test_one_that_is_installed_has_no_directory(self, write: Write) -> None:
+        found = load(write(self.TEXT + "{object: 'holdfast.robot.environment:Mine'}"))
+        assert found.environment.directory is None
+
+    def test_an_entry_point_is_looked_up_later(self, write: Write) -> None:
+        assert load(write(self.TEXT + "{object: turtle}")).environment.object == "turtle"
+
+    def test_the_argument_names_one(self, write: Write) -> None:
+        path = write(self.TEXT + "{arguments: {port: 3}}")
+        assert load(path).environment.directory is None
+        found = load(path, overrides={"environment.object": "own_robot:Robot"}).environment
+        assert (found.object, found.arguments) == ("own_robot:Robot", {"port": 3})
+        assert found.directory == str(path.parent)
+
+    @pytest.mark.parametrize(
+        ("text", "expected"),
+        [
+            ("{object: 3}", "line 2: environment.object is 3; expected text"),
+            ("{object: ''}", 'environment.object is ""; expected text of at least 1'),
+            ("{object: 'a:'}", 'environment.object is "a:"; expected module:Class or the name of'),
+            ("{object: 'a-b:C'}", 'object is "a-b:C"; expected module:Class or the name of an'),
+            (
+                "\n  object: absent_robot:Robot",
+                'line 3: environment.object is "absent_robot:Robot"; there is no module'
+                " absent_robot beside run.yaml",
+            ),
+            (
+                "\n  object: own_robot:Robot\n  directory: absent",
+                'line 4: environment.directory is "absent", where there is no directory',
+            ),
+            (
+                "{object: 'own_robot:Robot', directory: /}",
+                'environment.directory is "/", where there is no module own_robot',
+            ),
+            ("{object: turtle, directory: .}", 'is "."; only an environment that is named module:'),
+            ("{arguments: [3]}", "arguments is [3] (a list of 1); expected a mapping of keys"),
+            ("{timeout_ms: 0}", "environment.timeout_ms is 0; expected a number > 0 and <="),
+        ],
+    )
+    def test_what_is_refused(self, text: str, expected: str, write: Write) -> None:
+        assert expected in complaint(write(self.TEXT + text))
+
+
+class TestProblems:
+    def test_none_named_and_none_told(self, write: Write) -> None:
+        message = complaint(write("model: {colour: red}"))
+        assert "names no problem, and the keys of its model belong to none" in message
+        for name in registry.names():
+            assert name in message
+
+    def test_several_told(self, write: Write) -> None:
+        message = complaint(write("model: {peg_width: 1, robot_radius: 0.1}"))
+        assert "belong to capsule_robot and peg_in_hole_2d" in message
+
+    def test_unknown(self, write: Write) -> None:
+        with pytest.raises(UnknownProblemError) as caught:
+            load(write("\nproblem: peg_in_hole_2\n"))
+        message = str(caught.value)
+        assert "run.yaml, line 2: problem" in message
+        assert "peg_in_hole_2d" in message
+
+    def test_unknown_as_an_argument(self, write: Write) -> None:
+        with pytest.raises(UnknownProblemError, match="capsule_robot"):
+            load(write(THESIS), problem="capsule")
+
+    @pytest.mark.parametrize("name", ["lamps:Absent", "absent_module:Lamps", "lamps:"])
+    def test_not_importable(self, name: str, write: Write) -> None:
+        with pytest.raises(UnknownProblemError):
+            load(write(f"problem: '{name}'"))
+
+    @pytest.mark.parametrize("name", ["3", "[a]", "{a: b}"])
+    def test_not_a_name(self, name: str, write: Write) -> None:
+        message = complaint(write(f"problem: {name}"))
+        assert "line 1: problem is" in message
+        assert "or module:Class" in message
+
+    @pytest.mark.parametrize(
+        ("text", "expected"),
+        [
+            (
+                "lamps:Keywords\nmodel:\n  color: red",
+                "line 3: model.color is not a known key; did you mean colour?\n"
+                "allowed: gain, brightness, colour, lamps, places",
+            ),
+            (
+                "lamps:Keywords\nmodel: {gain: 1}\nstate_space_planner: {gain: 1}",
+                "gain: given in both model and state_space_planner",
+            ),
+            (
+                "lamps:Keywords\nstate_space_planner:\n  gain: -1",
+                "line 3: gain is -1; it must not be negative",
+            ),
+            ("lamps:Structs\nstate_space_planner: {gain: 11}", "gain is 11; expected a number"),
+            ("lamps:Structs\nmodel: {lamps: []}", "model.lamps is [] (a list of 0); expected"),
+            (
+                "lamps:Structs\nmodel: {lamps: [{center: [0, 0], height: 0}]}",
+                "lamps[0].height is 0",
+            ),
+            (
+                "lamps:Structs\nmodel: {weights: {a: b}}",
+                'model.weights.a is "b"; expected a number',
+            ),
+            ("lamps:Unfinished", "lamps:Unfinished is no problem: it lacks initial_states, move,"),
+        ],
+    )
+    def test_a_user_s_problem(self, text: str, expected: str, write: Write) -> None:
+        assert expected in complaint(write(f"problem: {text}"))
+
+    @pytest.mark.parametrize(
+        ("name", "raised", "source"),
+        [
+            ("Broken", "KeyError: 'absent'", '{}["absent"]'),
+            ("WrongTypes", "TypeError: unsupported operand", 'gain + "one"'),
+        ],
+    )
+    def test_what_a_constructor_raises_comes_with_its_own_frames(
+        self, name: str, raised: str, source: str, write: Write
+    ) -> None:
+        path = write(f"problem: lamps:{name}")
+        with pytest.raises(ConfigurationError) as caught:
+            load(path)
+        message = str(caught.value)
+        assert f"{path}: lamps:{name} raised {raised}" in message
+        assert source in message
+        assert message.count("  File ") == 1
+        assert f'  File "{path.parent / "lamps.py"}", line ' in message
+
+    def test_a_module_that_cannot_be_parsed_is_shown(self, write: Write) -> None:
+        path = write("problem: unparsable_lamps:Keywords")
+        (path.parent / "unparsable_lamps.py").write_text("import sys\n\ndef f(:\n")
+        with pytest.raises(ConfigurationError) as caught:
+            load(path)
+        message = str(caught.value)
+        assert "line 1: problem: unparsable_lamps:Keywords raised SyntaxError" in message
+        assert 'unparsable_lamps.py", line 3\n    def f(:' in message
+
+    def test_what_a_problem_itself_refuses(self, write: Write) -> None:
+        message = complaint(write("problem: capsule_robot\nmodel:\n  num_walls: 5"))
+        assert "run.yaml, line 3: model.num_walls" in message

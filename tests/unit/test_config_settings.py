@@ -1,0 +1,77 @@
+"""Settings that are made in Python."""
+
+from __future__ import annotations
+
+from typing import Any, get_args
+
+import pytest
+
+from holdfast.config.settings import (
+    ENTROPY_METHODS,
+    NEIGHBOR_ESTIMATORS,
+    UNINFORMED_METHODS,
+    ActiveSensingSettings,
+    Estimator,
+    Method,
+    PlanningSettings,
+    SelectorSettings,
+    check_settings,
+    estimator_of,
+    path_steps,
+)
+from holdfast.errors import InvalidValueError
+from holdfast.planning import Planner
+from holdfast.problems.peg_in_hole_2d import PegInHole2D
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        (PlanningSettings(selector=SelectorSettings(method="entropy")), r"selector\.method"),  # type: ignore[arg-type]
+        (PlanningSettings(selector=SelectorSettings(estimator="knn")), r"selector\.estimator"),  # type: ignore[arg-type]
+        (PlanningSettings(active_sensing=ActiveSensingSettings(horizon=0)), "horizon"),
+        (PlanningSettings(active_sensing=ActiveSensingSettings(discount=5.0)), "discount"),
+        (PlanningSettings(sensing_interval=-1), "sensing_interval"),
+        (
+            PlanningSettings(
+                active_sensing=ActiveSensingSettings(num_observation_samples=41),
+                selector=SelectorSettings(method="expected_return"),
+            ),
+            r"max_observation_samples is 40; .*num_observation_samples, which is 41",
+        ),
+        (PlanningSettings(selector=SelectorSettings(sensing_action=-1)), "sensing_action"),
+    ],
+)
+def test_settings_made_in_python_are_checked(settings: PlanningSettings, message: str) -> None:
+    with pytest.raises(InvalidValueError, match=message):
+        check_settings(settings)
+    with pytest.raises(InvalidValueError, match=message):
+        Planner(PegInHole2D(), settings).init(0, 0)
+
+
+@pytest.mark.parametrize(
+    ("selector", "particles", "estimator"),
+    [
+        ({}, 500, "prior_neighbors"),
+        ({}, 501, "nearest_neighbor"),
+        ({"method": "action_entropy"}, 500, "nearest_neighbor"),
+        ({"estimator": "gaussian_mixture_lower"}, 500, "gaussian_mixture_lower"),
+    ],
+)
+def test_the_estimator_that_is_left_open(
+    selector: dict[str, Any], particles: int, estimator: str
+) -> None:
+    assert estimator_of(SelectorSettings(**selector), particles) == estimator
+
+
+def test_offsets_in_steps() -> None:
+    offsets = SelectorSettings(path_offsets=(0, 1, 3))
+    assert path_steps(PlanningSettings(selector=offsets, sensing_interval=8)) == (0, 9, 27)
+    in_steps = SelectorSettings(path_offsets=(0, 1, 3), path_unit="steps")
+    assert path_steps(PlanningSettings(selector=in_steps, sensing_interval=8)) == (0, 1, 3)
+
+
+def test_the_sets_of_methods_and_estimators_are_some_of_all() -> None:
+    assert set(get_args(Method)) > ENTROPY_METHODS | UNINFORMED_METHODS
+    assert not ENTROPY_METHODS & UNINFORMED_METHODS
+    assert set(get_args(Estimator)) > NEIGHBOR_ESTIMATORS

@@ -1,0 +1,63 @@
+"""Complaints about a configuration name the file, the line, the key and what is allowed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from holdfast.config.settings import SimulatorSettings
+from holdfast.config.source import Source, module_directory
+from holdfast.config.yaml_document import read
+from holdfast.errors import ConfigurationError
+
+PATH = Path("run.yaml")
+
+
+def source(text: str, overrides: dict[tuple[str, str], Any] | None = None) -> Source:
+    return Source(read(text.encode(), str(PATH)), PATH, overrides or {})
+
+
+def test_a_section_with_its_defaults() -> None:
+    settings = source("simulator: {seed: 3}").section("simulator", SimulatorSettings)
+    assert settings == SimulatorSettings(seed=3)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("simulator:\n  seed: -1", "run.yaml, line 2: simulator.seed is -1; expected a whole"),
+        ("simulator:\n  sed: 1", "line 2: simulator.sed is not a known key; did you mean seed?"),
+        ("simulator:\n  launch: never", "simulator.launch is a key of recovery, not of simulator"),
+    ],
+)
+def test_a_section_that_is_refused(text: str, message: str) -> None:
+    with pytest.raises(ConfigurationError) as refused:
+        source(text).section("simulator", SimulatorSettings)
+    assert message in str(refused.value)
+
+
+def test_a_value_given_instead_has_no_line() -> None:
+    given = source("simulator: {seed: 1}", {("simulator", "seed"): "x"})
+    with pytest.raises(ConfigurationError, match=r"^simulator\.seed, given instead of "):
+        given.section("simulator", SimulatorSettings)
+    assert given.directory_of(("simulator", "seed")) == Path.cwd()
+
+
+def test_an_unknown_section_is_refused() -> None:
+    with pytest.raises(ConfigurationError, match="simlator is not a known section; did you mean"):
+        source("simlator: {}")
+
+
+def test_the_directory_of_a_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "own").mkdir()
+    (tmp_path / "own" / "lamp_module.py").write_text("")
+    here = source("problem_directory: own")
+    key = ("problem_directory",)
+    assert module_directory(here, key, "own", "lamp_module.inner") == tmp_path / "own"
+    assert module_directory(here, key, None, "lamp_module") is None
+    for value, reason in (("none", "there is no directory"), (".", "there is no module lamp")):
+        with pytest.raises(ConfigurationError, match=reason):
+            module_directory(here, key, value, "lamp_module")

@@ -1,0 +1,56 @@
+"""The tables of an exported run: what is not known is an empty cell."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+from tests.recordings import configuration_of, result_of
+
+from holdfast.belief import Belief
+from holdfast.recording.csv_export import TABLES, CsvSink, state_labels
+from holdfast.recording.facts import (
+    Decider,
+    EventFact,
+    SensingFact,
+    TaskFact,
+    TrialBeginFact,
+    TrialEndFact,
+)
+
+
+def rows_of(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_rows(tmp_path: Path) -> None:
+    problem = configuration_of(tmp_path).problem
+    tables = tmp_path / "tables"
+    tables.mkdir()
+    belief = Belief(np.array([[0.1 + 0.2, 0.0, 1.0]]), np.array([1.0]))
+    decider = Decider("local", "standard", 1.5, None, None)
+    with CsvSink(tables, problem) as sink:
+        sink.trial_begins(TrialBeginFact(0, 1_000_000_000, True))
+        sink.sensed(SensingFact(0, 0, 1_500_000_000, 1_600_000_000, 2, bytes(32), decider, belief))
+        sink.acted(TaskFact(0, 0, 1_700_000_000, np.array([0.5, -0.0, 1e-300]), None))
+        sink.sensed(SensingFact(0, 1, 2_500_000_000, 2_600_000_000, 1, bytes(32), None))
+        sink.happened(EventFact(2_700_000_000, "status", {"status": "keep_alive"}))
+        sink.trial_ends(TrialEndFact(0, 3_000_000_000, 1, None))
+        sink.trial_begins(TrialBeginFact(1, 3_500_000_000, False))
+        sink.trial_ends(TrialEndFact(1, 4_000_000_000, 10, result_of(1)))
+    assert sorted(path.name for path in tables.iterdir()) == sorted(TABLES)
+    first, second = rows_of(tables / "steps.csv")
+    assert (first["sensing_time"], first["action_time"]) == ("1.500000000", "1.700000000")
+    assert (first["sensing_service"], first["sensing_waited_ms"]) == ("local", "1.5")
+    assert (first["sensing_round_trip_ms"], first["action_service"]) == ("", "")
+    actions = [first[f"action_{index}"] for index in range(problem.action_size)]
+    assert actions == ["0.5", "-0.0", "1e-300"]
+    # It ends in mid-step.
+    assert (second["step"], second["sensing_action"], second["action_time"]) == ("1", "1", "")
+    assert [row["outcome"] for row in rows_of(tables / "trials.csv")] == ["unfinished", "succeeded"]
+    (particle,) = rows_of(tables / "beliefs.csv")
+    assert float(particle[state_labels(problem)[0]]) == 0.1 + 0.2
+    (event,) = rows_of(tables / "events.csv")
+    assert (event["event"], event["fields"]) == ("status", '{"status": "keep_alive"}')

@@ -1,0 +1,608 @@
+"""Calling a robot's world: every call ends in one event, whatever the world does."""
+
+from __future__ import annotations
+
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from queue import Empty, SimpleQueue
+from typing import Any
+
+import numpy as np
+import pytest
+
+from holdfast.arrays import FloatArray
+from holdfast.errors import EnvironmentFailedError, InvalidValueError
+from holdfast.problems.capsule_robot import CapsuleRobot
+from holdfast.problems.peg_in_hole_2d import PegInHole2D
+from holdfast.protocol.events import (
+    Acted,
+    EnvironmentEvent,
+    EnvironmentFailed,
+    EnvironmentReady,
+    Sensed,
+)
+from holdfast.randomness import Stream
+from holdfast.robot.environment import Environment, EnvironmentMaker, SimulatedEnvironment
+from holdfast.robot.environment_runner import (
+    EnvironmentRunner,
+    InlineRunner,
+    ThreadedRunner,
+    make_runner,
+)
+
+PATIENCE_S = 30.0
+"""Longest wait for what is sure to come; nothing is measured by it."""
+
+ACTION = np.array([0.1, 0.0, 0.0])
+
+
+class Robot:
+    """A world that does what a test says; each method's answer is a value or is called for one."""
+
+    def __init__(self, **answers: Any) -> None:
+        self.answers = {
+            "perform_sensing": [0.5],
+            "perform": -1.0,
+            "is_done": False,
+            "steps_performed": 4,
+            **answers,
+        }
+        self.calls: list[tuple[str, Any]] = []
+        self.threads: set[str] = set()
+        self.closed = threading.Event()
+
+    def _answer(self, method: str, argument: Any = None) -> Any:
+        self.calls.append((method, argument))
+        self.threads.add(threading.current_thread().name)
+        answer = self.answers[method]
+        return answer() if callable(answer) else answer
+
+    def perform_sensing(self, sensing_action: int) -> Any:
+        return self._answer("perform_sensing", sensing_action)
+
+    def perform(self, task_action: FloatArray) -> Any:
+        return self._answer("perform", task_action)
+
+    def is_done(self) -> Any:
+        return self._answer("is_done")
+
+    def steps_performed(self) -> Any:
+        return self._answer("steps_performed")
+
+    def close(self) -> None:
+        self.threads.add(threading.current_thread().name)
+        self.closed.set()
+
+
+class Bench:
+    """A runner under test, and the queue of its events."""
+
+    def __init__(self, kind: str) -> None:
+        self.kind = kind
+        self.queue: SimpleQueue[EnvironmentEvent] = SimpleQueue()
+        self.opened: list[EnvironmentRunner] = []
+
+    def open(
+        self,
+        environment: Environment | Callable[[], Environment],
+        *,
+        resumed: bool = False,
+        timeout_ms: float = 1e3 * PATIENCE_S,
+        problem: Any = None,
+    ) -> EnvironmentRunner:
+        make = environment if callable(environment) else lambda: environment
+        problem = problem or PegInHole2D()
+        runner: EnvironmentRunner
+        if self.kind == "inline":
+            runner = InlineRunner(make, problem, self.queue.put, "robot", resumed=resumed)
+        else:
+            runner = ThreadedRunner(
+                make, problem, self.queue.put, "robot", timeout_ms, resumed=resumed
+            )
+        self.opened.append(runner)
+        return runner
+
+    def event(self) -> EnvironmentEvent:
+        return self.queue.get(timeout=PATIENCE_S)
+
+    def failure(self) -> EnvironmentFailed:
+        event = self.event()
+        assert isinstance(event, EnvironmentFailed)
+        return event
+
+    def begin(self, robot: Environment, **settings: Any) -> EnvironmentRunner:
+        runner = self.open(robot, **settings)
+        runner.begin()
+        assert isinstance(self.event(), EnvironmentReady)
+        return runner
+
+
+@pytest.fixture(params=["inline", "threaded"])
+def bench(request: pytest.FixtureRequest) -> Iterator[Bench]:
+    yield from opened_bench(request.param)
+
+
+@pytest.fixture
+def threaded() -> Iterator[Bench]:
+    yield from opened_bench("threaded")
+
+
+def opened_bench(kind: str) -> Iterator[Bench]:
+    bench = Bench(kind)
+    before = set(threading.enumerate())
+    yield bench
+    for runner in bench.opened:
+        runner.close(PATIENCE_S)
+    # Whatever was not expected would otherwise go unseen.
+    with pytest.raises(Empty):
+        bench.queue.get_nowait()
+    begun = set(threading.enumerate()) - before
+    assert not [thread for thread in begun if "environment" in thread.name]
+
+
+def fail() -> None:
+    raise ValueError("the motor is hot")
+
+
+class TestEvents:
+    def test_each_call_is_answered(self, bench: Bench) -> None:
+        robot = Robot()
+        runner = bench.open(robot)
+        runner.begin()
+        assert bench.event() == EnvironmentReady(False, None)
+        runner.sense(0, 2)
+        sensed = bench.event()
+        assert isinstance(sensed, Sensed)
+        assert sensed.step == 0
+        assert sensed.observation.tolist() == [0.5]
+        assert sensed.observation.dtype == np.float64
+        runner.perform(0, ACTION)
+        assert bench.event() == Acted(0, -1.0, False)
+        robot.answers.update(perform=None, is_done=np.True_)
+        runner.perform(1, ACTION)
+        acted = bench.event()
+        assert acted == Acted(1, None, True)
+        assert isinstance(acted, Acted)
+        assert acted.done is True
+        assert [method for method, _ in robot.calls] == [
+            "is_done",
+            "perform_sensing",
+            "perform",
+            "is_done",
+            "perform",
+            "is_done",
+        ]
+        assert robot.calls[1][1] == 2
+        assert robot.calls[2][1].tolist() == ACTION.tolist()
+
+    @pytest.mark.parametrize("failed", ["failed", np.str_("failed")])
+    def test_the_task_may_have_failed(self, failed: str, bench: Bench) -> None:
+        robot = Robot(is_done=failed)
+        runner = bench.open(robot)
+        runner.begin()
+        assert bench.event() == EnvironmentReady("failed", None)
+        runner.perform(0, ACTION)
+        acted = bench.event()
+        assert acted == Acted(0, -1.0, "failed")
+        assert isinstance(acted, Acted)
+        assert type(acted.done) is str
+
+    def test_the_count_is_asked_for_after_a_crash_alone(self, bench: Bench) -> None:
+        robot = Robot(is_done=True)
+        bench.open(robot, resumed=True).begin(4)
+        assert bench.event() == EnvironmentReady(True, 4)
+        assert [method for method, _ in robot.calls] == ["steps_performed", "is_done"]
+
+    def test_an_environment_need_not_count(self, bench: Bench) -> None:
+        robot = Robot()
+        robot.steps_performed = None  # type: ignore[assignment, method-assign]
+        bench.open(robot, resumed=True).begin()
+        assert bench.event() == EnvironmentReady(False, None)
+
+    def test_what_was_handed_over_stays_what_it_was(self, bench: Bench) -> None:
+        shown = np.array([1.0])
+        robot = Robot(perform_sensing=lambda: shown)
+        runner = bench.begin(robot)
+        runner.sense(0, 0)
+        sensed = bench.event()
+        assert isinstance(sensed, Sensed)
+        shown[0] = 7.0
+        assert sensed.observation.tolist() == [1.0]
+        with pytest.raises(ValueError, match="read-only"):
+            sensed.observation[0] = 3.0
+        action = ACTION.copy()
+        action.setflags(write=False)
+        runner.perform(0, action)
+        assert isinstance(bench.event(), Acted)
+        robot.calls[-2][1][:] = 9.0  # the robot may do with its copy what it likes
+        assert action.tolist() == ACTION.tolist()
+
+    @pytest.mark.parametrize("problem", [PegInHole2D(), CapsuleRobot()])
+    def test_a_simulated_world_fits(self, problem: Any, bench: Bench) -> None:
+        runner = bench.begin(SimulatedEnvironment(problem, 1, 0), problem=problem)
+        world = SimulatedEnvironment(problem, 1, 0)
+        for sensing_action in range(len(problem.sensing_actions)):
+            runner.sense(0, sensing_action)
+            sensed = bench.event()
+            assert isinstance(sensed, Sensed)
+            assert (sensed.observation == world.perform_sensing(sensing_action)).all()
+        action = problem.execute(np.full(problem.action_size, -0.05))
+        runner.perform(0, action)
+        assert bench.event() == Acted(0, world.perform(action), world.is_done())
+
+
+class TestFailures:
+    def test_an_environment_that_cannot_be_made(self, bench: Bench) -> None:
+        def make() -> Environment:
+            raise OSError("no such port")
+
+        runner = bench.open(make)
+        runner.begin(3)
+        failed = bench.failure()
+        assert failed[:2] == (3, "robot")
+        assert failed.text.startswith("robot raised OSError: no such port\n  File ")
+        assert 'raise OSError("no such port")' in failed.text
+        assert not failed.action_in_doubt
+
+    @pytest.mark.parametrize(
+        ("method", "unknown", "performed"),
+        [
+            ("steps_performed", False, False),
+            ("perform_sensing", False, False),
+            ("perform", True, False),
+            ("is_done", False, True),
+        ],
+    )
+    def test_a_method_that_raises(
+        self, method: str, unknown: bool, performed: bool, bench: Bench
+    ) -> None:
+        robot = Robot()
+        runner = bench.open(robot, resumed=True)
+        if method == "steps_performed":
+            robot.answers[method] = fail
+            runner.begin(5)
+        else:
+            runner.begin(5)
+            assert bench.event() == EnvironmentReady(False, 4)
+            robot.answers[method] = fail
+            if method == "perform_sensing":
+                runner.sense(5, 0)
+            else:
+                runner.perform(5, ACTION)
+        failed = bench.failure()
+        assert (failed.step, failed.what, failed.action_in_doubt) == (5, method, unknown)
+        assert (failed.performed, failed.reward) == (performed, -1.0 if performed else None)
+        assert failed.text.startswith(
+            f"robot: {method} raised ValueError: the motor is hot\n  File"
+        )
+        assert "holdfast/runtime" not in failed.text
+
+    def test_after_a_failure_nothing_more_is_called(self, bench: Bench) -> None:
+        robot = Robot(perform=fail)
+        runner = bench.begin(robot)
+        runner.perform(0, ACTION)
+        first = bench.failure()
+        called = len(robot.calls)
+        robot.answers["perform"] = None
+        runner.perform(1, ACTION)
+        runner.sense(2, 0)
+        assert bench.event() == EnvironmentFailed(1, "perform", first.text, False)
+        assert bench.event() == EnvironmentFailed(2, "perform", first.text, False)
+        assert len(robot.calls) == called
+
+    def test_nothing_is_performed_before_the_trial_has_begun(self, bench: Bench) -> None:
+        runner = bench.open(Robot())
+        runner.perform(0, ACTION)
+        failed = bench.failure()
+        assert "a trial in it has not begun" in failed.text
+        assert not failed.action_in_doubt
+
+    def test_errors_of_holdfast_come_as_they_are(self, bench: Bench) -> None:
+        runner = bench.begin(SimulatedEnvironment(PegInHole2D(), 0, 0))
+        runner.perform(0, np.array([np.nan, 0.0, 0.0]))
+        failed = bench.failure()
+        assert "nan" in failed.text
+        assert failed.action_in_doubt
+
+    @pytest.mark.parametrize(
+        ("method", "answer", "expected"),
+        [
+            ("perform_sensing", None, "returned None; it must return an array of shape (1,)"),
+            ("perform_sensing", 0.5, "returned 0.5; it must return an array of shape (1,)"),
+            ("perform_sensing", [0.5, 0.5], "returned [0.5, 0.5]; it must return an array of sha"),
+            ("perform_sensing", [], "returned []; it must return an array of shape (1,)"),
+            ("perform_sensing", ["0.5"], "returned ['0.5']; it must return an array of shape (1,)"),
+            ("perform_sensing", [[1], [1, 2]], "it must return an array of shape (1,)"),
+            ("perform_sensing", [1j], "returned [1j]; it must return an array of shape (1,)"),
+            ("perform_sensing", np.zeros((1, 1)), "returned an array of shape (1, 1): array([[0.]"),
+            ("perform_sensing", [float("nan")], "returned [nan]; it must return finite numbers"),
+            ("perform_sensing", [float("inf")], "returned [inf]; it must return finite numbers"),
+            ("perform", float("nan"), "returned nan; it must return a finite number, the reward"),
+            ("perform", "1", "returned '1'; it must return a finite number, the reward, or None"),
+            ("perform", [1.0], "returned [1.0]; it must return a finite number"),
+            ("perform", True, "returned True; it must return a finite number"),
+            ("is_done", None, 'returned None; it must return True, False or "failed"'),
+            ("is_done", 1, 'returned 1; it must return True, False or "failed"'),
+            ("is_done", "", """returned ''; it must return True, False or "failed\""""),
+            ("is_done", "done", """returned 'done'; it must return True, False or "failed\""""),
+            ("is_done", np.array([True]), 'it must return True, False or "failed"'),
+            ("steps_performed", -1, "returned -1; it must return a whole number >= 0"),
+            ("steps_performed", 3.0, "returned 3.0; it must return a whole number >= 0"),
+            ("steps_performed", True, "returned True; it must return a whole number >= 0"),
+            ("steps_performed", None, "returned None; it must return a whole number >= 0"),
+        ],
+    )
+    def test_a_value_that_nobody_can_use(
+        self, method: str, answer: object, expected: str, bench: Bench
+    ) -> None:
+        robot = Robot()
+        if method == "steps_performed":
+            robot.answers[method] = answer
+            bench.open(robot, resumed=True).begin()
+        else:
+            runner = bench.begin(robot)
+            robot.answers[method] = answer
+            if method == "perform_sensing":
+                runner.sense(0, 1)
+            else:
+                runner.perform(0, ACTION)
+        failed = bench.failure()
+        assert failed.what == method
+        assert failed.text.startswith(f"robot: {method} returned ")
+        assert expected in failed.text
+        # What perform returned may mean that it was not performed; what is_done did does not.
+        assert failed.action_in_doubt == (method == "perform")
+        assert failed.performed == (method == "is_done")
+
+    def test_numbers_of_other_kinds_will_do(self, bench: Bench) -> None:
+        robot = Robot(
+            perform_sensing=np.array([2], dtype=np.int8),
+            perform=np.float32(0.5),
+            is_done=np.False_,
+            steps_performed=np.int64(2**40),
+        )
+        runner = bench.open(robot, resumed=True)
+        runner.begin()
+        assert bench.event() == EnvironmentReady(False, 2**40)
+        runner.sense(0, 0)
+        sensed = bench.event()
+        assert isinstance(sensed, Sensed)
+        assert sensed.observation.tolist() == [2.0]
+        runner.perform(0, ACTION)
+        acted = bench.event()
+        assert acted == Acted(0, 0.5, False)
+        assert isinstance(acted, Acted)
+        assert type(acted.reward) is float
+
+    def test_general_observations_have_any_size(self, bench: Bench) -> None:
+        class General(PegInHole2D):
+            def log_likelihood(
+                self, states: FloatArray, sensing_action: int, observation: FloatArray
+            ) -> FloatArray:
+                return np.zeros(len(states))
+
+            def sample_observation(
+                self, state: FloatArray, sensing_action: int, stream: Stream
+            ) -> FloatArray:
+                return np.zeros(5)
+
+        runner = bench.begin(Robot(perform_sensing=np.zeros(5)), problem=General())
+        runner.sense(0, 0)
+        assert isinstance(bench.event(), Sensed)
+
+
+class TestClose:
+    def test_the_environment_is_closed_once(self, bench: Bench) -> None:
+        robot = Robot()
+        runner = bench.begin(robot)
+        runner.close(PATIENCE_S)
+        assert robot.closed.is_set()
+        robot.closed.clear()
+        runner.close(PATIENCE_S)
+        assert not robot.closed.is_set()
+
+    def test_what_close_raises_concerns_nobody(self, bench: Bench) -> None:
+        robot = Robot()
+        robot.close = fail  # type: ignore[method-assign]
+        bench.begin(robot).close(PATIENCE_S)
+
+    def test_an_environment_that_was_never_made(self, bench: Bench) -> None:
+        robot = Robot()
+        bench.open(robot).close(PATIENCE_S)
+        assert not robot.closed.is_set()
+
+    def test_after_it_nothing_happens(self, bench: Bench) -> None:
+        robot = Robot()
+        runner = bench.begin(robot)
+        runner.close(PATIENCE_S)
+        called = len(robot.calls)
+        runner.sense(0, 0)
+        runner.perform(0, ACTION)
+        assert len(robot.calls) == called
+        # The fixture looks whether an event came.
+
+
+class TestThreads:
+    def test_the_loop_goes_on_while_the_robot_moves(self, threaded: Bench) -> None:
+        moving, arrived = threading.Event(), threading.Event()
+
+        def move() -> float:
+            moving.set()
+            assert arrived.wait(PATIENCE_S)
+            return -1.0
+
+        runner = threaded.begin(Robot(perform=move))
+        runner.perform(0, ACTION)
+        assert moving.wait(PATIENCE_S)
+        with pytest.raises(Empty):
+            threaded.queue.get_nowait()
+        arrived.set()
+        assert threaded.event() == Acted(0, -1.0, False)
+
+    def test_one_call_at_a_time(self, threaded: Bench) -> None:
+        arrived = threading.Event()
+        robot = Robot(perform=lambda: arrived.wait(PATIENCE_S) and None)
+        runner = threaded.begin(robot)
+        runner.perform(0, ACTION)
+        with pytest.raises(
+            InvalidValueError, match="sense of step 1 while perform of step 0 has not ended"
+        ):
+            runner.sense(1, 0)
+        arrived.set()
+        assert threaded.event() == Acted(0, None, False)
+        assert "perform_sensing" not in [method for method, _ in robot.calls]
+
+    def test_it_is_made_called_and_closed_on_one_thread(self, threaded: Bench) -> None:
+        threads = []
+
+        def make() -> Environment:
+            threads.append(threading.current_thread().name)
+            return robot
+
+        robot = Robot()
+        runner = threaded.open(make)
+        runner.begin()
+        threaded.event()
+        runner.perform(0, ACTION)
+        threaded.event()
+        runner.close(PATIENCE_S)
+        assert robot.threads == set(threads) == {"environment"}
+
+    def test_leaving_the_program_is_a_failure_as_well(self, threaded: Bench) -> None:
+        runner = threaded.begin(Robot(perform=lambda: sys.exit(3)))
+        runner.perform(0, ACTION)
+        assert threaded.failure().text.startswith("robot: perform raised SystemExit: 3\n")
+
+    def test_ctrl_c_passes_through_where_there_is_no_thread(self) -> None:
+        def interrupt() -> None:
+            raise KeyboardInterrupt
+
+        events: list[EnvironmentEvent] = []
+        robot = Robot(perform=interrupt)
+        runner = InlineRunner(lambda: robot, PegInHole2D(), events.append, "robot")
+        runner.begin()
+        assert runner.environment is robot
+        with pytest.raises(KeyboardInterrupt):
+            runner.perform(0, ACTION)
+        assert events == [EnvironmentReady(False, None)]
+
+    @pytest.mark.parametrize("timeout_ms", [0.0, -1.0, float("nan")])
+    def test_a_timeout_is_positive(self, timeout_ms: float) -> None:
+        with pytest.raises(InvalidValueError, match=r"environment\.timeout_ms"):
+            ThreadedRunner(Robot, PegInHole2D(), print, "robot", timeout_ms)
+
+
+class TestStalls:
+    """The environment waits for the test, and so the timeout always comes first."""
+
+    @pytest.mark.parametrize(
+        ("method", "unknown"),
+        [("perform_sensing", False), ("perform", True), ("is_done", False)],
+    )
+    def test_a_method_that_does_not_return(
+        self, method: str, unknown: bool, threaded: Bench
+    ) -> None:
+        released = threading.Event()
+        robot = Robot()
+        # Long enough for the calls before that one, however busy the machine is.
+        runner = threaded.begin(robot, timeout_ms=1000.0)
+        robot.answers[method] = lambda: released.wait(PATIENCE_S) and None
+        if method == "perform_sensing":
+            runner.sense(7, 0)
+        else:
+            runner.perform(7, ACTION)
+        assert threaded.event() == EnvironmentFailed(
+            7,
+            method,
+            f"robot: {method} has not returned within 1000 ms, which is environment.timeout_ms",
+            unknown,
+            *((True, -1.0) if method == "is_done" else ()),
+        )
+        runner.perform(8, ACTION)
+        assert threaded.failure()[:2] == (8, method)
+        released.set()
+        runner.close(PATIENCE_S)
+        # It is closed although it had stalled; what it returned is dropped (the fixture looks).
+        assert robot.closed.is_set()
+
+    def test_one_that_cannot_be_made_in_time(self, threaded: Bench) -> None:
+        released = threading.Event()
+
+        def make() -> Environment:
+            released.wait(PATIENCE_S)
+            return Robot()
+
+        runner = threaded.open(make, timeout_ms=20.0)
+        runner.begin(2)
+        assert threaded.event() == EnvironmentFailed(
+            2,
+            "robot",
+            "the constructor of robot has not returned within 20 ms, which is "
+            "environment.timeout_ms",
+            False,
+        )
+        released.set()
+
+    def test_close_does_not_wait_for_it(self, threaded: Bench) -> None:
+        released = threading.Event()
+        robot = Robot()
+        runner = threaded.begin(robot)
+        robot.answers["perform"] = lambda: released.wait(PATIENCE_S) and None
+        runner.perform(0, ACTION)
+        runner.close(0.05)
+        assert not robot.closed.is_set()
+        released.set()
+        assert robot.closed.wait(PATIENCE_S)
+
+    def test_many_calls_outlive_the_timeout_of_one(self, threaded: Bench) -> None:
+        """Each call has the whole time to itself, and none is watched for an older one's."""
+        pause = threading.Event()
+        robot = Robot(perform=lambda: float(pause.wait(0.06)))
+        runner = threaded.begin(robot, timeout_ms=1000.0)
+        for step in range(25):
+            runner.perform(step, ACTION)
+            assert threaded.event() == Acted(step, 0.0, False)
+
+
+class TestMakePerformer:
+    def test_a_simulated_world_is_performed_at_once(self) -> None:
+        problem = PegInHole2D()
+        lived = SimulatedEnvironment(problem, 3, 1)
+        for _ in range(2):
+            lived.perform(ACTION)
+        maker = EnvironmentMaker("simulated", problem, 3, 1000.0)
+        events: list[EnvironmentEvent] = []
+        runner = make_runner(maker, 1, events.append, resumed=True, performed=[ACTION, ACTION])
+        runner.begin(2)
+        assert events == [EnvironmentReady(False, 2)]
+        assert isinstance(runner, InlineRunner)
+        assert isinstance(runner.environment, SimulatedEnvironment)
+        assert runner.environment.state.tobytes() == lived.state.tobytes()
+
+    def test_a_robot_is_performed_on_a_thread(self) -> None:
+        class Own(Robot):
+            def __init__(self, trial: int, resumed: bool) -> None:
+                super().__init__(steps_performed=trial, is_done=resumed)
+
+        maker = EnvironmentMaker("own:Own", PegInHole2D(), 3, 1e3 * PATIENCE_S, Own)
+        queue: SimpleQueue[EnvironmentEvent] = SimpleQueue()
+        runner = make_runner(maker, 6, queue.put, resumed=True)
+        assert isinstance(runner, ThreadedRunner)
+        runner.begin()
+        assert queue.get(timeout=PATIENCE_S) == EnvironmentReady(True, 6)
+        runner.close(PATIENCE_S)
+
+    def test_what_is_no_robot_names_what_it_lacks(self) -> None:
+        maker = EnvironmentMaker("own:Int", PegInHole2D(), 3, 1e3 * PATIENCE_S, int)
+        queue: SimpleQueue[EnvironmentEvent] = SimpleQueue()
+        runner = make_runner(maker, 0, queue.put)
+        runner.begin()
+        failed = queue.get(timeout=PATIENCE_S)
+        assert isinstance(failed, EnvironmentFailed)
+        assert failed.text.startswith(
+            "own:Int is no environment: it lacks perform_sensing and perform and is_done; it needs"
+        )
+        runner.close(PATIENCE_S)
+        with pytest.raises(EnvironmentFailedError):
+            maker(0)

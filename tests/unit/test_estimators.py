@@ -1,0 +1,357 @@
+"""Entropies of weighted points: what does not depend on what, degenerate points, bad input."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from holdfast import estimators as estimation
+from holdfast.arrays import FloatArray
+from holdfast.errors import InvalidValueError
+from holdfast.estimators import GaussianMixture, NearestNeighbor
+
+# Sums of up to some thousand terms, the same but for rounding.
+TOLERANCE = 1e-9
+
+ESTIMATORS: dict[str, NearestNeighbor | GaussianMixture] = {
+    "neighbours": NearestNeighbor(5, 1e-3),
+    "resolution": NearestNeighbor(3, 0.8),
+    "upper": GaussianMixture(np.array([0.04, 0.04, 0.04]), upper=True),
+    "lower": GaussianMixture(np.array([0.04, 0.04, 0.04]), upper=False),
+}
+
+# Numbers of points that are treated in different ways by the kernel.
+COUNTS = [6, 50, 100, 1500]
+
+
+def entropy(
+    points: FloatArray,
+    weights: FloatArray | None = None,
+    estimator: NearestNeighbor | GaussianMixture | None = None,
+) -> float:
+    estimate = estimation.entropy(points, weights, estimator)
+    assert isinstance(estimate, float)
+    return estimate
+
+
+def draw(count: int, seed: int = 1, dimension: int = 3) -> tuple[FloatArray, FloatArray]:
+    rng = np.random.default_rng([seed, count])
+    return rng.normal(size=(count, dimension)), rng.uniform(0.1, 1.0, size=count)
+
+
+@pytest.mark.parametrize("count", COUNTS)
+@pytest.mark.parametrize("name", ESTIMATORS)
+class TestWhatMakesNoDifference:
+    def test_scale_of_the_weights(self, name: str, count: int) -> None:
+        points, weights = draw(count)
+        expected = entropy(points, weights, ESTIMATORS[name])
+        for scale in (1e-290, 1e-3, 1e290):
+            found = entropy(points, weights * scale, ESTIMATORS[name])
+            assert abs(found - expected) < TOLERANCE
+
+    def test_order_of_the_points(self, name: str, count: int) -> None:
+        points, weights = draw(count)
+        expected = entropy(points, weights, ESTIMATORS[name])
+        order = np.random.default_rng(2).permutation(count)
+        found = entropy(points[order], weights[order], ESTIMATORS[name])
+        assert abs(found - expected) < TOLERANCE
+
+    def test_translation(self, name: str, count: int) -> None:
+        points, weights = draw(count)
+        expected = entropy(points, weights, ESTIMATORS[name])
+        # By powers of two not much larger than the points, so that differences keep their digits.
+        found = entropy(points + np.array([64.0, -8.0, 0.0]), weights, ESTIMATORS[name])
+        assert abs(found - expected) < TOLERANCE
+
+    def test_rotation(self, name: str, count: int) -> None:
+        points, weights = draw(count)
+        expected = entropy(points, weights, ESTIMATORS[name])
+        rotation, _ = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))
+        found = entropy(points @ rotation, weights, ESTIMATORS[name])
+        assert abs(found - expected) < TOLERANCE
+
+    def test_points_of_weight_zero(self, name: str, count: int) -> None:
+        """They may be among the others or on top of them: they are not there."""
+        points, weights = draw(count)
+        expected = entropy(points, weights, ESTIMATORS[name])
+        rng = np.random.default_rng(4)
+        order = rng.permutation(4 * count)
+        more = np.concatenate([points, points, rng.normal(size=(2 * count, 3))])[order]
+        more_weights = np.concatenate([weights, np.zeros(3 * count)])[order]
+        assert abs(entropy(more, more_weights, ESTIMATORS[name]) - expected) < TOLERANCE
+
+    def test_company_of_other_posteriors(self, name: str, count: int) -> None:
+        """One of many weightings of the same points has the entropy that it has alone."""
+        points, _ = draw(count)
+        rng = np.random.default_rng(5)
+        weights = rng.exponential(size=(70, count))
+        weights[rng.random(weights.shape) < 0.3] = 0.0
+        weights[:, 0] = 1.0
+        together = estimation.entropy(points, weights, ESTIMATORS[name])
+        assert isinstance(together, np.ndarray)
+        for row in (0, 31, 32, 69):
+            alone = entropy(points, weights[row], ESTIMATORS[name])
+            assert abs(together[row] - alone) < TOLERANCE
+
+    def test_threads(self, name: str, count: int) -> None:
+        """Here to the last bit."""
+        points, _ = draw(count)
+        weights = np.random.default_rng(6).exponential(size=(40, count))
+        one = estimation.entropy(points, weights, ESTIMATORS[name], threads=1)
+        for threads in (0, 2, 5):
+            other = estimation.entropy(points, weights, ESTIMATORS[name], threads=threads)
+            assert np.asarray(other).tobytes() == np.asarray(one).tobytes()
+
+    def test_layout_of_the_arguments(self, name: str, count: int) -> None:
+        points, weights = draw(count)
+        expected = entropy(points, weights, ESTIMATORS[name])
+        assert entropy(np.asfortranarray(points), weights, ESTIMATORS[name]) == expected
+        strided = np.repeat(np.repeat(points, 2, axis=0), 2, axis=1)[::2, ::2]
+        assert entropy(strided, np.repeat(weights, 2)[::2], ESTIMATORS[name]) == expected
+        for array in (points, weights):
+            array.setflags(write=False)
+        assert entropy(points, weights, ESTIMATORS[name]) == expected
+
+
+class TestScaling:
+    """Stretching space by s adds d log s, if the resolution or the noise is stretched too."""
+
+    @pytest.mark.parametrize("scale", [2.0**-20, 0.3, 8.0, 1e6])
+    @pytest.mark.parametrize("count", COUNTS)
+    @pytest.mark.parametrize("ties", [False, True])
+    def test_nearest_neighbor(self, count: int, scale: float, ties: bool) -> None:
+        for dimension in (1, 2, 3, 6):
+            points, weights = draw(count, dimension=dimension)
+            if ties:
+                points = np.round(points, 1)
+            expected = entropy(points, weights, NearestNeighbor(5, 0.2)) + dimension * np.log(scale)
+            found = entropy(points * scale, weights, NearestNeighbor(5, 0.2 * scale))
+            assert abs(found - expected) < TOLERANCE
+
+    @pytest.mark.parametrize("upper", [True, False])
+    @pytest.mark.parametrize("count", COUNTS)
+    def test_gaussian_mixture(self, count: int, upper: bool) -> None:
+        """Each direction on its own, as the noise may have another size in each."""
+        points, weights = draw(count)
+        scale, variance = np.array([0.01, 3.0, 1e3]), np.array([0.1, 0.2, 0.3])
+        expected = entropy(points, weights, GaussianMixture(variance, upper)) + np.log(scale).sum()
+        found = entropy(points * scale, weights, GaussianMixture(variance * scale**2, upper))
+        assert abs(found - expected) < TOLERANCE
+
+
+class TestResolutionOfEachCoordinate:
+    SIZES = np.array([0.3, 5.0, 0.01])
+
+    @pytest.mark.parametrize("count", COUNTS)
+    def test_points_are_measured_in_it(self, count: int) -> None:
+        points, weights = draw(count)
+        expected = entropy(points, weights, NearestNeighbor(5, 1.0)) + np.log(self.SIZES).sum()
+        found = entropy(points * self.SIZES, weights, NearestNeighbor(5, self.SIZES))
+        assert abs(found - expected) < TOLERANCE
+
+    def test_equal_sizes_are_one_size(self) -> None:
+        points, weights = draw(50)
+        expected = entropy(points, weights, NearestNeighbor(5, 0.2))
+        found = entropy(points, weights, NearestNeighbor(5, np.full(3, 0.2)))
+        assert abs(found - expected) < TOLERANCE
+
+    def test_a_single_point_is_known_to_within_an_ellipsoid(self) -> None:
+        expected = np.log(4.0 / 3.0 * np.pi * self.SIZES.prod())
+        assert abs(entropy(np.ones((1, 3)), None, NearestNeighbor(1, self.SIZES)) - expected) < 1e-9
+
+    def test_a_number_of_numpy_is_a_number(self) -> None:
+        points, weights = draw(50)
+        expected = entropy(points, weights, NearestNeighbor(5, 0.25))
+        for number in (np.float32(0.25), np.array(0.25)):
+            estimator = NearestNeighbor(5, number)  # type: ignore[arg-type]
+            assert entropy(points, weights, estimator) == expected
+
+    def test_another_number_of_sizes(self) -> None:
+        with pytest.raises(InvalidValueError, match=r"resolution of shape \(2,\): need .* \(3,\)"):
+            entropy(draw(20)[0], None, NearestNeighbor(5, np.ones(2)))
+
+    @pytest.mark.parametrize("bad", [0.0, -1.0, np.nan, np.inf, 1e-151])
+    def test_a_size_out_of_bounds(self, bad: float) -> None:
+        with pytest.raises(InvalidValueError, match=r"resolution \[.*\]: allowed are .* in every"):
+            entropy(draw(20)[0], None, NearestNeighbor(5, np.array([0.1, bad, 0.1])))
+
+    def test_a_point_that_is_too_many_resolutions_away(self) -> None:
+        points = draw(20)[0] + 1e9
+        with pytest.raises(
+            InvalidValueError, match=r"point 0 is .* resolutions from zero: at most"
+        ):
+            entropy(points, None, NearestNeighbor(5, np.full(3, 1e-145)))
+
+
+class TestDegeneratePoints:
+    """Policies map half of the particles to the same action: entropies stay finite."""
+
+    @pytest.mark.parametrize("count", [2, 10, 64, 100, 1500])
+    def test_all_equal(self, count: int) -> None:
+        """A ball of the resolution: all that is known is that the points lie within it.
+
+        To the ball's own entropy comes log q - psi(q) of its q = N - 1 others, between 1 / (2 q)
+        and 1 / q.
+        """
+        for dimension, ball in ((1, 2.0), (2, np.pi), (3, 4.0 * np.pi / 3.0)):
+            points = np.full((count, dimension), 1.7)
+            excess = entropy(points, None, NearestNeighbor(min(5, count - 1), 0.01)) - (
+                np.log(ball) + dimension * np.log(0.01)
+            )
+            assert 0.5 / (count - 1) < excess < 1.0 / (count - 1)
+
+    @pytest.mark.parametrize("weight", [1.0, 1e-300])
+    def test_one_point(self, weight: float) -> None:
+        expected = np.log(np.pi) + 2.0 * np.log(0.3)
+        for points, weights in (
+            (np.ones((1, 2)), np.array([weight])),
+            (np.arange(10.0).reshape(5, 2), np.array([0.0, 0.0, weight, 0.0, 0.0])),
+        ):
+            assert abs(entropy(points, weights, NearestNeighbor(3, 0.3)) - expected) < 1e-12
+
+    @pytest.mark.parametrize("count", [40, 100, 1500])
+    def test_two_places(self, count: int) -> None:
+        """Half here, half far away: the entropy of one ball and one bit."""
+        points = np.zeros((count, 3))
+        points[::2, 0] = 1e3
+        ball = np.log(4.0 * np.pi / 3.0) + 3.0 * np.log(0.1)
+        found = entropy(points, None, NearestNeighbor(5, 0.1))
+        # The N / 2 - 1 others at one place are a little less than half of all.
+        assert abs(found - (ball + np.log(2.0))) < 4.0 / count
+
+    @pytest.mark.parametrize("count", [20, 100, 700, 1500])
+    @pytest.mark.parametrize("kind", ["line", "plane", "grid", "half at rest", "with outlier"])
+    def test_finite(self, kind: str, count: int) -> None:
+        points, weights = draw(count)
+        if kind == "line":
+            points[:, 1:] = 0.0
+        elif kind == "plane":
+            points[:, 1] = 2.0
+        elif kind == "grid":
+            points = np.round(points)
+        elif kind == "half at rest":
+            points[: count // 2] = 0.0
+        else:
+            points[0] = 1e12
+        for estimator in ESTIMATORS.values():
+            for w in (weights, weights**30, None):
+                assert np.isfinite(entropy(points, w, estimator))
+
+    def test_a_line_in_space_does_not_diverge(self) -> None:
+        """With a resolution, more points on a line in space do not send the entropy down for ever.
+
+        Without one it falls by 2 log N: the estimate of a three-dimensional density of a line. With
+        one it settles at that of the line (width w) blurred by the ball: about log of w pi delta^2.
+        """
+        rng = np.random.default_rng(7)
+        lines = {count: np.zeros((count, 3)) for count in (100, 1000, 4000)}
+        for line in lines.values():
+            line[:, 0] = rng.uniform(0.0, 10.0, size=len(line))
+        blurred = [entropy(line, None, NearestNeighbor(5, 0.5)) for line in lines.values()]
+        sharp = [entropy(line, None, NearestNeighbor(5, 1e-9)) for line in lines.values()]
+        assert sharp[0] - sharp[2] > 5.0
+        assert abs(blurred[1] - blurred[2]) < 0.1
+        # Ball and cylinder of the same radius differ by a third of the volume at its widest.
+        assert abs(blurred[2] - np.log(10.0 * np.pi * 0.5**2)) < 0.5
+
+    def test_more_certain_is_less(self) -> None:
+        """Drawing points together, by half each time, never raises the estimate."""
+        points, weights = draw(200)
+        for estimator in ESTIMATORS.values():
+            values = [entropy(points * 2.0**-n, weights, estimator) for n in range(6)]
+            assert (np.diff(values) <= TOLERANCE).all()
+            assert values[-1] < values[0] - 2.0
+
+
+class TestDefaults:
+    def test_weights_and_estimator(self) -> None:
+        points, _ = draw(100)
+        expected = entropy(points, np.ones(100), NearestNeighbor(5, 1e-3))
+        assert entropy(points) == expected
+        assert estimation.entropy(points.tolist()) == expected
+
+    def test_form_of_the_result(self) -> None:
+        points, weights = draw(30)
+        assert isinstance(estimation.entropy(points, weights), float)
+        rows = estimation.entropy(points, np.tile(weights, (3, 1)))
+        assert isinstance(rows, np.ndarray)
+        assert rows.shape == (3,)
+        assert rows.dtype == np.float64
+        assert np.asarray(estimation.entropy(points, weights.reshape(1, -1))).shape == (1,)
+
+
+class TestBadInput:
+    @pytest.mark.parametrize("shape", [(0, 3), (5,), (2, 3, 1), ()])
+    def test_shape_of_points(self, shape: tuple[int, ...]) -> None:
+        with pytest.raises(InvalidValueError, match=r"points of shape \(.*\): need \(n, d\)"):
+            estimation.entropy(np.zeros(shape))
+
+    @pytest.mark.parametrize("dimension", [0, 65])
+    def test_dimension(self, dimension: int) -> None:
+        with pytest.raises(
+            InvalidValueError, match=f"points of {dimension} coordinates: allowed are 1 to 64"
+        ):
+            estimation.entropy(np.zeros((9, dimension)))
+
+    @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+    def test_points_not_finite(self, bad: float) -> None:
+        points, _ = draw(20)
+        points[7] = [1.0, bad, 2.0]
+        for estimator in ESTIMATORS.values():
+            with pytest.raises(InvalidValueError, match=rf"point 7 is \[ *1\. +{bad} +2\. *\]"):
+                entropy(points, None, estimator)
+
+    @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, -0.5])
+    def test_weights_out_of_bounds(self, bad: float) -> None:
+        points, weights = draw(20)
+        weights[3] = bad
+        for rows in (weights, np.stack([np.ones(20), weights])):
+            with pytest.raises(
+                InvalidValueError, match=f"weight of point 3 is {bad}: must be >= 0"
+            ):
+                estimation.entropy(points, rows)
+
+    def test_weights_all_zero(self) -> None:
+        points, weights = draw(20)
+        with pytest.raises(InvalidValueError, match=r"weights\[1\] are all zero: one must be pos"):
+            estimation.entropy(points, np.stack([weights, np.zeros(20)]))
+
+    @pytest.mark.parametrize("shape", [(19,), (21,), (2, 19), (2, 2, 20), (0,)])
+    def test_shape_of_weights(self, shape: tuple[int, ...]) -> None:
+        with pytest.raises(InvalidValueError, match=r"weights of shape .* need \(20,\) or \(b, 20"):
+            estimation.entropy(draw(20)[0], np.ones(shape))
+
+    @pytest.mark.parametrize("neighbors", [0, -1])
+    def test_no_neighbours(self, neighbors: int) -> None:
+        with pytest.raises(InvalidValueError, match=f"neighbors {neighbors}: must be at least 1"):
+            entropy(draw(20)[0], None, NearestNeighbor(neighbors, 0.1))
+
+    @pytest.mark.parametrize("neighbors", [20, 21, 10**6])
+    def test_as_many_neighbours_as_points(self, neighbors: int) -> None:
+        with pytest.raises(InvalidValueError, match=f"neighbors {neighbors}: must be below .* 20"):
+            entropy(draw(20)[0], None, NearestNeighbor(neighbors, 0.1))
+
+    @pytest.mark.parametrize("resolution", [0.0, -1.0, np.nan, np.inf])
+    def test_resolution(self, resolution: float) -> None:
+        with pytest.raises(InvalidValueError, match=f"resolution {resolution}: allowed are"):
+            entropy(draw(20)[0], None, NearestNeighbor(5, resolution))
+
+    @pytest.mark.parametrize("bad", [0.0, -0.1, np.nan, np.inf])
+    def test_variance(self, bad: float) -> None:
+        with pytest.raises(InvalidValueError, match=r"variance \[.*\]: every entry must be > 0"):
+            entropy(draw(20)[0], None, GaussianMixture(np.array([0.1, bad, 0.1])))
+
+    @pytest.mark.parametrize("size", [1, 2, 4])
+    def test_size_of_the_variance(self, size: int) -> None:
+        with pytest.raises(InvalidValueError, match=rf"variance of shape \({size},\): need \(3,\)"):
+            entropy(draw(20)[0], None, GaussianMixture(np.ones(size)))
+
+
+def test_the_scale_of_the_weights_does_not_matter() -> None:
+    """Not even where weights are exactly the fractions at which others become negligible."""
+    points = np.random.default_rng(0).normal(size=(200, 2))
+    weights = np.power(10.0, -np.random.default_rng(3).integers(0, 8, 200)).astype(np.float64)
+    expected = entropy(points, weights, NearestNeighbor(3, 0.01))
+    for scale in (0.1, 3.0, 1e-7, 1e12):
+        scaled = entropy(points, scale * weights, NearestNeighbor(3, 0.01))
+        assert scaled == pytest.approx(expected, abs=1e-12)

@@ -1,0 +1,77 @@
+"""FairScheduler: who has much to do waits, by owners, and nobody waits for that."""
+
+from __future__ import annotations
+
+import asyncio
+
+from holdfast.transport.fair_scheduler import SLICE_S, FairScheduler
+
+
+class Busy:
+    """Takes so many slices, and notes each."""
+
+    def __init__(
+        self, scheduler: FairScheduler, owner: object, number: int, taken: list[object]
+    ) -> None:
+        self._scheduler = scheduler
+        self._number = number
+        self._taken = taken
+        self.owner = owner
+
+    def enqueue(self) -> None:
+        self._scheduler.enqueue(self.owner, self.run_slice)
+
+    def run_slice(self) -> None:
+        self._taken.append(self.owner)
+        self._number -= 1
+        if self._number:
+            self.enqueue()
+
+
+async def test_owners_go_by_turns_however_many_they_are() -> None:
+    scheduler, taken = FairScheduler(), list[object]()
+    for _ in range(3):
+        Busy(scheduler, "mallory", 2, taken).enqueue()
+    Busy(scheduler, "anna", 3, taken).enqueue()
+    while len(taken) < 9:
+        await asyncio.sleep(0)
+    assert taken == ["mallory", "anna"] * 3 + ["mallory"] * 3
+
+
+async def test_one_goes_on_in_each_turn_of_the_loop() -> None:
+    scheduler, taken = FairScheduler(), list[object]()
+    for _ in range(2):
+        Busy(scheduler, "mallory", 3, taken).enqueue()
+    for number in range(6):
+        assert len(taken) == number
+        await asyncio.sleep(0)
+
+
+async def test_an_owner_has_one_turn_at_once_in_a_while() -> None:
+    scheduler = FairScheduler()
+    assert scheduler.may_run("mallory", 1.0)
+    scheduler.charge("mallory", 0.75 * SLICE_S)
+    assert scheduler.may_run("mallory", 1.001)
+    scheduler.charge("mallory", 0.75 * SLICE_S)
+    assert not scheduler.may_run("mallory", 1.002)
+    assert scheduler.may_run("anna", 1.002)
+    assert scheduler.may_run("mallory", 1.006)
+
+
+async def test_nobody_overtakes_another_of_the_same_owner() -> None:
+    scheduler, taken = FairScheduler(), list[object]()
+    Busy(scheduler, "mallory", 1, taken).enqueue()
+    assert not scheduler.may_run("mallory", 1.0)
+    assert scheduler.may_run("anna", 1.0)
+    await asyncio.sleep(0)
+    assert scheduler.may_run("mallory", 1.0)
+
+
+async def test_between_turns_there_may_be_a_pause() -> None:
+    taken: list[object] = []
+    for pause_s in (3600.0, 1e-4):
+        scheduler = FairScheduler(pause_s)
+        Busy(scheduler, pause_s, 2, taken).enqueue()
+    while len(taken) < 2:
+        await asyncio.sleep(0.001)
+    assert taken == [1e-4, 1e-4]

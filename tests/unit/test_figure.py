@@ -1,0 +1,112 @@
+"""The picture of a trial."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+from matplotlib.image import imread
+from tests.recordings import record_trial
+
+from holdfast.config.loader import load
+from holdfast.recording.figure import _draw_entropies, _draw_workspace, trial_figure
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+
+
+class TestFigure:
+    @pytest.mark.parametrize("example", ["light_dark_room", "capsule_robot", "peg_in_hole_3d"])
+    def test_nothing_is_cut_off(self, tmp_path: Path, example: str) -> None:
+        configuration = load(EXAMPLES / f"{example}.yaml")
+        recorder = record_trial(configuration, trial=0)
+        trial_figure(configuration, recorder.record, tmp_path / "trial.png")
+        picture = imread(tmp_path / "trial.png")[..., :3]
+        for edge in (picture[0], picture[-1], picture[:, 0], picture[:, -1]):
+            assert (edge == 1.0).all()
+        assert (picture < 1.0).any()
+
+    @pytest.mark.parametrize(
+        ("method", "label"),
+        [
+            ("action_entropy", "expected entropy of\nthe actions (nats)"),
+            ("state_entropy", "expected entropy of\nthe state (nats)"),
+            ("path_entropy", "expected entropies of\nthe actions, sum (nats)"),
+            ("action_covariance", "expected covariance\nof the actions (trace)"),
+            ("expected_return", "expected loss\n(minus the return)"),
+        ],
+    )
+    def test_the_scores_say_of_what_they_are_and_which_were_not_chosen(
+        self, method: str, label: str
+    ) -> None:
+        overrides = {"selector.method": method, "simulator.max_steps": 12}
+        configuration = load(EXAMPLES / "peg_in_hole_2d.yaml", overrides=overrides)
+        record = record_trial(configuration, trial=0).record
+        panel = Figure().subplots()
+        _draw_entropies(panel, configuration, record)
+        assert panel.get_ylabel() == label
+        legend = panel.get_legend()
+        assert legend is not None
+        assert [text.get_text() for text in legend.get_texts()] == [
+            "chosen",
+            "not chosen (hollow)",
+        ]
+
+    @pytest.mark.parametrize("method", ["action_entropy", "random"])
+    @pytest.mark.parametrize("problem", ["peg_in_hole_2d", "capsule_robot", "peg_in_hole_3d"])
+    def test_every_kind_of_problem_is_drawn(
+        self, tmp_path: Path, problem: str, method: str
+    ) -> None:
+        path = tmp_path / "run.yaml"
+        path.write_text(
+            f"problem: {problem}\n"
+            f"selector: {{method: {method}}}\n"
+            "simulator: {num_trials: 1, max_steps: 12}\n"
+        )
+        configuration = load(path)
+        recorder = record_trial(configuration, trial=0)
+        trial_figure(configuration, recorder.record, tmp_path / "trial.png")
+        assert (tmp_path / "trial.png").read_bytes().startswith(b"\x89PNG\r\n")
+
+    def test_a_problem_without_a_scene_is_drawn(self, tmp_path: Path) -> None:
+        (tmp_path / "sceneless.py").write_text(
+            "from holdfast.problems.peg_in_hole_2d import PegInHole2D\n"
+            "class Sceneless(PegInHole2D):\n"
+            "    state_labels = ()\n"
+            "    def scene(self):\n"
+            "        return None\n"
+        )
+        path = tmp_path / "run.yaml"
+        path.write_text("problem: sceneless:Sceneless\nsimulator: {num_trials: 1, max_steps: 12}\n")
+        configuration = load(path)
+        recorder = record_trial(configuration, trial=0)
+        trial_figure(configuration, recorder.record, tmp_path / "trial.png")
+        assert (tmp_path / "trial.png").read_bytes().startswith(b"\x89PNG\r\n")
+
+    @pytest.mark.parametrize(
+        "points",
+        [
+            pytest.param([(4.5, 3.5), (-0.9, -0.9)], id="far from where anything happened"),
+            pytest.param([(30.0, 1.0), (2.0, -12.0)], id="outside the scene's limits"),
+        ],
+    )
+    def test_points_of_interest_are_seen(
+        self, tmp_path: Path, points: list[tuple[float, float]]
+    ) -> None:
+        configuration = load(EXAMPLES / "light_dark_room.yaml")
+        record = record_trial(configuration, trial=0).record
+        scene = configuration.problem.scene()
+        assert scene is not None
+        # Short of the lamp and of the door: nothing but the points makes the drawn part large.
+        for rows in (record.true_states, record.estimates, record.standard_deviations):
+            del rows[3:]
+        del record.sensing[1:]
+        scene.points, scene.goal = np.array(points), None
+        panel = Figure().subplots()
+        _draw_workspace(panel, configuration.problem, scene, record)
+        (x_min, x_max), (y_min, y_max) = panel.get_xlim(), panel.get_ylim()
+        for x, y in points:
+            # The whole of the mark, not its edge.
+            assert x_min < x < x_max
+            assert y_min < y < y_max

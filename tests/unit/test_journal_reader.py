@@ -1,0 +1,131 @@
+"""Reading a journal: finished trials, kept steps, other files and versions."""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import sqlite3
+from pathlib import Path
+
+import pytest
+from tests.recordings import failed, result_of, without_decisions
+
+from holdfast.config.loader import load
+from holdfast.errors import OutputError
+from holdfast.planning import Planner
+from holdfast.protocol.records import (
+    replay,
+)
+from holdfast.recording.journal import Journal
+from holdfast.robot.trial import run_trial
+
+BEFORE_OUTCOMES = Path(__file__).parent / "data" / "journal_before_outcomes.sqlite"
+"""Of a robot killed at step 21 of trial 2, when results said only whether a trial succeeded."""
+
+
+class TestJournal:
+    def test_what_was_added_comes_back_in_order(self, tmp_path: Path) -> None:
+        path = tmp_path / "journal.sqlite"
+        results = [result_of(2, success=False), result_of(0), result_of(1, sensing_ms=(0.5, 1.5))]
+        with Journal.create(path, {"key": "value"}) as journal:
+            for result in results:
+                journal.add(result)
+        with Journal.open(path) as journal:
+            assert journal.meta()["key"] == "value"
+            assert journal.finished() == {0, 1, 2}
+            assert journal.tally() == (3, 2, 0)
+            expected = sorted(map(without_decisions, results), key=lambda result: result.trial)
+            assert list(journal.results()) == expected
+            for result in results:
+                assert journal.decisions(result.trial) == result.decisions
+
+    def test_how_a_trial_ended_comes_back(self, tmp_path: Path) -> None:
+        path = tmp_path / "journal.sqlite"
+        with Journal.create(path, {}) as journal:
+            journal.add(result_of(0))
+            journal.add(failed(result_of(1)))
+            journal.add(result_of(2, success=False))
+        with Journal.open(path) as journal:
+            outcomes = [result.outcome for result in journal.results()]
+            assert outcomes == ["succeeded", "failed", "truncated"]
+            assert journal.tally() == (3, 1, 1)
+
+    def test_one_from_before_trials_could_fail(self, tmp_path: Path) -> None:
+        """It was made by that code: trials without success had run out of steps."""
+        path = tmp_path / "journal.sqlite"
+        shutil.copyfile(BEFORE_OUTCOMES, path)
+        with Journal.open(path) as journal:
+            results = list(journal.results(with_decisions=True))
+            assert [result.outcome for result in results] == ["truncated", "succeeded"]
+            assert [result.success for result in results] == [False, True]
+            assert journal.tally() == (2, 1, 0)
+            (tmp_path / "old.yaml").write_text(journal.meta()["configuration"])
+            configuration = load(tmp_path / "old.yaml")
+            for result in results:
+                again = run_trial(
+                    Planner(configuration.problem, configuration.planning),
+                    configuration.simulator.seed,
+                    result.trial,
+                    max_steps=configuration.simulator.max_steps,
+                )
+                assert again.digest == result.digest
+                assert again.outcome == result.outcome
+            unfinished = journal.unfinished()
+            assert unfinished is not None
+            planner = Planner(configuration.problem, configuration.planning)
+            history = replay(planner, 2, unfinished.trial, unfinished.records)
+            assert (unfinished.trial, history.state.step) == (2, 21)
+
+    def test_closing_leaves_one_file(self, tmp_path: Path) -> None:
+        with Journal.create(tmp_path / "journal.sqlite", {}) as journal:
+            journal.add(result_of(0))
+        assert [entry.name for entry in tmp_path.iterdir()] == ["journal.sqlite"]
+
+    def test_a_trial_is_kept_once(self, tmp_path: Path) -> None:
+        with Journal.create(tmp_path / "journal.sqlite", {}) as journal:
+            journal.add(result_of(0, reward=-1.0))
+            with pytest.raises(OutputError, match="UNIQUE"):
+                journal.add(result_of(0, reward=-2.0))
+            assert [result.reward for result in journal.results()] == [-1.0]
+
+    def test_it_belongs_to_one_process_at_a_time(self, tmp_path: Path) -> None:
+        path = tmp_path / "journal.sqlite"
+        with (
+            Journal.create(path, {}),
+            pytest.raises(OutputError, match="another process is using this run"),
+        ):
+            Journal.open(path)
+        Journal.open(path).close()
+
+    def test_a_trial_that_is_not_there_is_named(self, tmp_path: Path) -> None:
+        with (
+            Journal.create(tmp_path / "journal.sqlite", {}) as journal,
+            pytest.raises(OutputError, match="trial 7 is not in the journal"),
+        ):
+            journal.decisions(7)
+
+    def test_other_files_are_refused(self, tmp_path: Path) -> None:
+        path = tmp_path / "journal.sqlite"
+        with pytest.raises(OutputError, match="there is no journal"):
+            Journal.open(path)
+        path.write_bytes(b"no database at all, but long enough to be looked at" * 20)
+        with pytest.raises(OutputError, match="not a usable journal"):
+            Journal.open(path)
+        path.unlink()
+        path.touch()
+        with pytest.raises(OutputError, match="is empty"):
+            Journal.open(path)
+        path.unlink()
+        with contextlib.closing(sqlite3.connect(path)) as connection:
+            connection.execute("CREATE TABLE other (value INTEGER)")
+        before = path.read_bytes()
+        with pytest.raises(OutputError, match="no such table: meta"):
+            Journal.open(path)
+        assert path.read_bytes() == before
+
+    def test_another_version_is_refused(self, tmp_path: Path) -> None:
+        path = tmp_path / "journal.sqlite"
+        with Journal.create(path, {}) as journal:
+            journal.set_meta("schema_version", "999")
+        with pytest.raises(OutputError, match="schema version 999; this holdfast reads version 3"):
+            Journal.open(path)

@@ -1,0 +1,54 @@
+"""The bound on half-received messages: which link is ended when memory runs out."""
+
+from __future__ import annotations
+
+from typing import cast
+
+from holdfast.transport.link_settings import PartialMessageBudget, receive_buffer
+from holdfast.transport.links import Link
+
+
+class Holder:
+    """Stands for a link of an owner; notes whether it was ended."""
+
+    def __init__(self, owner: str) -> None:
+        self.owner = owner
+        self.reason = ""
+
+    def end(self, reason: str) -> None:
+        self.reason = reason
+
+    def holds(self, budget: PartialMessageBudget, size_bytes: int) -> None:
+        budget.note(cast(Link, self), size_bytes)
+
+
+def test_within_the_bound_nobody_is_ended() -> None:
+    budget = PartialMessageBudget(100)
+    holders = [Holder(name) for name in "abc"]
+    for holder in holders:
+        holder.holds(budget, 30)
+    holders[0].holds(budget, 40)
+    holders[0].holds(budget, 0)
+    holders[1].holds(budget, 70)
+    assert not any(holder.reason for holder in holders)
+
+
+def test_the_owner_that_holds_the_most_loses_its_oldest() -> None:
+    budget = PartialMessageBudget(100)
+    small = Holder("small")
+    greedy = [Holder("greedy") for _ in range(3)]
+    small.holds(budget, 20)
+    for holder in greedy:
+        holder.holds(budget, 30)
+    assert [bool(holder.reason) for holder in (small, *greedy)] == [False, True, False, False]
+    # What it held is free again.
+    greedy[0].holds(budget, 0)
+    small.holds(budget, 40)
+    assert not small.reason
+
+
+def test_ends_do_not_share_a_buffer() -> None:
+    first, second = receive_buffer(), receive_buffer()
+    first[0] = 7
+    assert second[0] == 0
+    assert len(first) == 256 * 1024

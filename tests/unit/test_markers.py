@@ -1,0 +1,46 @@
+"""Shapes for RViz and Foxglove: the scene, and the chosen sensing action."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from holdfast.belief import Belief
+from holdfast.problems.peg_in_hole_2d import PegInHole2D
+from holdfast.ros.markers import scene_markers, sensing_markers
+from holdfast.ros.poses import PoseLayout, pose_layout
+
+
+@pytest.fixture
+def layout() -> PoseLayout:
+    found = pose_layout(PegInHole2D())
+    assert found is not None
+    return found
+
+
+def test_the_scene_has_obstacles_goal_and_a_body_in_each_frame(layout: PoseLayout) -> None:
+    markers = scene_markers(PegInHole2D(), layout, "task", "estimate", "truth")
+    assert {marker.namespace for marker in markers} >= {"obstacle", "body_estimate", "body_truth"}
+    for marker in markers:
+        assert marker.moves_with_frame == marker.namespace.startswith("body")
+        assert np.isfinite([*marker.pose, *marker.scale]).all()
+    assert not [
+        marker
+        for marker in scene_markers(PegInHole2D(), layout, "task", None, None)
+        if marker.moves_with_frame
+    ]
+
+
+@pytest.mark.parametrize(("action", "kind"), [(0, "ARROW"), (1, "ARROW"), (2, "LINE_STRIP")])
+def test_a_sensed_coordinate_is_an_arrow_along_it_or_an_arc_about_it(
+    layout: PoseLayout, action: int, kind: str
+) -> None:
+    problem = PegInHole2D()
+    belief = Belief(np.array([[1.0, 2.0, 0.1], [3.0, 2.0, 0.1]]), np.array([0.5, 0.5]))
+    shape, label = sensing_markers(problem, layout, "task", belief, action)
+    assert shape.kind == kind
+    assert label.text == f"sense {problem.sensing_actions[action]}"
+    if kind == "ARROW":
+        first, last = np.array(shape.points)
+        assert np.allclose(0.5 * (first + last), [2.0, 2.0, 0.0])
+        assert np.flatnonzero(last - first).tolist() == [action]

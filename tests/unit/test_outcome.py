@@ -1,0 +1,117 @@
+"""A trial's decisions as bytes, and its outcome."""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Any
+
+import numpy as np
+import pytest
+from tests.recordings import failed, result_of
+
+from holdfast.errors import InvalidValueError
+from holdfast.outcome import (
+    TRIAL_COLUMNS,
+    DecisionLog,
+    Decisions,
+    RewardAccount,
+    SensingDecision,
+    TaskDecision,
+    TrialResult,
+)
+from holdfast.problems.peg_in_hole_2d import PegInHole2D
+
+DIGEST = bytes(range(32))
+
+
+def whole() -> Decisions:
+    log = DecisionLog(2)
+    log.sensed(0, 1, DIGEST)
+    log.acted(0, np.array([0.5, -0.0]))
+    log.acted(1, np.array([1e-300, 2.0]))
+    log.ended(2, DIGEST)
+    return log.decisions()
+
+
+def test_what_is_noted_is_read_back() -> None:
+    decisions = whole()
+    assert list(decisions) == [
+        SensingDecision(0, 1, DIGEST),
+        TaskDecision(0, (0.5, -0.0)),
+        TaskDecision(1, (1e-300, 2.0)),
+    ]
+    assert decisions.digest() == hashlib.blake2b(decisions.log, digest_size=32).hexdigest()
+
+
+def test_the_layout_is_pinned() -> None:
+    """Runs of years ago are compared by it."""
+    assert whole().log.hex() == (
+        "53" + 8 * "00" + "01000000" + DIGEST.hex()
+        + "41" + 8 * "00" + "000000000000e03f" + "0000000000000080"
+        + "41" + "0100000000000000" + np.float64(1e-300).tobytes().hex() + "0000000000000040"
+        + "45" + "0200000000000000" + DIGEST.hex()
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("length", [1, 20, 44, 50, 60, 94, 130])
+def test_a_log_that_is_cut_short(length: int) -> None:
+    with pytest.raises(InvalidValueError, match=rf"of {length} is cut short"):
+        list(Decisions(2, whole().log[:length]))
+
+
+def test_a_record_of_no_kind() -> None:
+    with pytest.raises(InvalidValueError, match="byte 0 is b'X', not b'S', b'A' or b'E'"):
+        list(Decisions(2, b"X" + whole().log[1:]))
+
+
+def test_the_sum_of_rewards_begins_with_the_first() -> None:
+    rewards = RewardAccount(PegInHole2D())
+    rewards.sensed(0)
+    rewards.acted(None)
+    totals = [rewards.total]
+    for reward in (-1.0, None, -0.5):
+        rewards.acted(reward)
+        totals.append(rewards.total)
+    assert totals == [None, -1.0, -1.0, -1.5]
+
+
+def test_sensing_actions_cost_their_price() -> None:
+    problem = PegInHole2D()
+    problem.sensing_costs = (0.5, 0.25, 0.0)  # type: ignore[attr-defined]
+    rewards = RewardAccount(problem)
+    assert rewards.total == 0.0
+    for sensing_action in (0, 2, 1):
+        rewards.sensed(sensing_action)
+    assert rewards.total == -0.75
+
+
+@pytest.mark.parametrize(
+    ("ending", "outcome"),
+    [
+        ({"success": True}, "succeeded"),
+        ({"success": False, "failed": True}, "failed"),
+        ({"success": False}, "truncated"),
+    ],
+)
+def test_outcomes(ending: dict[str, Any], outcome: str) -> None:
+    result = TrialResult(
+        trial=0,
+        seed=0,
+        steps=2,
+        reward=None,
+        sensing_decisions=1,
+        mean_sensing_ms=0.0,
+        recoveries=0,
+        unexplained_observations=0,
+        digest="",
+        sensing_ms=(),
+        **ending,
+    )
+    assert result.outcome == outcome
+
+
+def test_every_column_is_of_a_result() -> None:
+    result = failed(result_of(3))
+    row = {column: getattr(result, column) for column in TRIAL_COLUMNS}
+    assert (row["trial"], row["success"], row["outcome"]) == (3, False, "failed")
+    assert not {"decisions", "sensing_ms", "failed"} & row.keys()

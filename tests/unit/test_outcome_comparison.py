@@ -1,0 +1,225 @@
+"""Comparing outcomes: known effects are found, intervals cover, and wrong pairs are refused."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from holdfast.errors import OutputError
+from holdfast.outcome import DecisionLog, TrialResult
+from holdfast.recording.journal import Journal
+from holdfast.recording.outcome_comparison import OutcomeEffect, compare_outcomes, effects_of
+
+LIMIT = 100
+
+CONFIGURATION = """\
+problem: peg_in_hole_2d
+model: {{hole_tolerance: {tolerance}}}
+simulator: {{num_trials: {trials}, seed: {seed}, max_steps: {limit}}}
+"""
+
+
+def result_of(
+    trial: int,
+    steps: int,
+    *,
+    success: bool = True,
+    reward: float | None = None,
+    sensing_ms: Sequence[float] = (),
+) -> TrialResult:
+    log = DecisionLog(2)
+    log.ended(steps, bytes(32))
+    decisions = log.decisions()
+    return TrialResult(
+        trial=trial,
+        seed=5,
+        success=success,
+        steps=steps,
+        reward=reward,
+        sensing_decisions=len(sensing_ms),
+        mean_sensing_ms=0.0,
+        recoveries=0,
+        unexplained_observations=0,
+        digest=decisions.digest(),
+        sensing_ms=tuple(sensing_ms),
+        decisions=decisions,
+    )
+
+
+def run_of(
+    path: Path,
+    results: Sequence[TrialResult],
+    *,
+    tolerance: float = 0.1,
+    seed: int = 5,
+    limit: int = LIMIT,
+    trials: int | None = None,
+) -> Path:
+    path.mkdir()
+    text = CONFIGURATION.format(
+        tolerance=tolerance, trials=trials or len(results), seed=seed, limit=limit
+    )
+    with Journal.create(path / "journal.sqlite", {"configuration": text}) as journal:
+        for result in results:
+            journal.add(result)
+    return path
+
+
+def by_measure(effects: Sequence[OutcomeEffect]) -> dict[str, OutcomeEffect]:
+    return {effect.measure: effect for effect in effects}
+
+
+class TestEffects:
+    def test_known_values(self) -> None:
+        first = [
+            result_of(0, 10, reward=-1.0, sensing_ms=(1.0, 3.0)),
+            result_of(1, 40, success=False, reward=-2.0, sensing_ms=(2.0,)),
+            result_of(2, 0, reward=0.0),
+            result_of(3, 50, reward=-5.0, sensing_ms=(4.0,)),
+        ]
+        second = [
+            result_of(0, 20, reward=-2.0, sensing_ms=(4.0,)),
+            result_of(1, 50, reward=-2.0, sensing_ms=(4.0,)),
+            result_of(2, 0, reward=0.0),
+            result_of(3, 100, success=False, reward=-6.0, sensing_ms=(8.0,)),
+        ]
+        found = by_measure(effects_of(first, second, step_limit=LIMIT, paired=True))
+        assert found["success_rate"].effect == 0.0
+        # The failure counts as the limit, and the trial that begins in the goal does not count.
+        assert found["steps"].trials == 3
+        assert found["steps"].effect == pytest.approx((2 * 0.5 * 2) ** (1 / 3))
+        assert found["steps"].baseline == pytest.approx((10 * 100 * 50) ** (1 / 3))
+        assert found["reward"].effect == pytest.approx(-0.5)
+        assert found["decision_ms"].effect == 2.0
+        assert found["decision_ms"].interval is None, "each took twice as long"
+        assert found["decision_ms"].verdict == "too few trials"
+
+    @pytest.mark.parametrize(("trials", "verdict"), [(9, "too few trials"), (10, "worse")])
+    def test_few_trials_have_no_verdict(self, trials: int, verdict: str) -> None:
+        runs = [
+            [result_of(each, 10 + factor * each) for each in range(trials)] for factor in (1, 2)
+        ]
+        steps = by_measure(effects_of(*runs, step_limit=LIMIT, paired=True))["steps"]
+        assert steps.interval is not None and steps.interval[0] > 1.0
+        assert steps.verdict == verdict
+
+    def test_what_is_not_recorded_is_not_compared(self) -> None:
+        runs = [[result_of(trial, 5 + trial) for trial in range(4)] for _ in range(2)]
+        found = by_measure(effects_of(*runs, step_limit=LIMIT, paired=True))
+        assert set(found) == {"success_rate", "steps"}
+        assert found["steps"].interval is None
+
+    @pytest.mark.parametrize("paired", [True, False])
+    def test_intervals_cover(self, paired: bool) -> None:
+        """At most 7 of 20 miss: with a rate of 8 %, 2 seeds in 10,000 fail that."""
+        generator = np.random.default_rng(20)
+        missed = {"success_rate": 0, "steps": 0, "reward": 0}
+        true = {"success_rate": 0.2, "steps": np.exp(-0.1), "reward": 1.0}
+        for _ in range(20):
+            world = generator.normal(size=40)
+            first, second = (
+                [
+                    result_of(
+                        trial,
+                        max(1, round(1e6 * np.exp(value + generator.normal(shift, 0.3)))),
+                        success=bool(generator.random() < rate),
+                        reward=value + generator.normal(reward, 1.0),
+                    )
+                    for trial, value in enumerate(world)
+                ]
+                for shift, rate, reward in ((0.0, 0.6, 0.0), (-0.1, 0.8, 1.0))
+            )
+            found = by_measure(effects_of(first, second, step_limit=LIMIT, paired=paired))
+            always = [
+                [msgspec.structs.replace(result, success=True) for result in results]
+                for results in (first, second)
+            ]
+            steps = by_measure(effects_of(*always, step_limit=LIMIT, paired=paired))["steps"]
+            for effect in (found["success_rate"], steps, found["reward"]):
+                assert effect.interval is not None
+                low, high = effect.interval
+                missed[effect.measure] += not low <= true[effect.measure] <= high
+        assert max(missed.values()) <= 7, missed
+
+    def test_pairs_find_what_independent_samples_do_not(self) -> None:
+        generator = np.random.default_rng(3)
+        steps = np.exp(generator.normal(5.0, 1.0, size=30))
+        first = [result_of(trial, round(each)) for trial, each in enumerate(steps)]
+        second = [
+            result_of(trial, round(each * factor))
+            for trial, (each, factor) in enumerate(
+                zip(steps, np.exp(generator.normal(-0.2, 0.1, size=30)), strict=True)
+            )
+        ]
+        verdicts = [
+            by_measure(effects_of(first, second, step_limit=LIMIT, paired=paired))["steps"].verdict
+            for paired in (True, False)
+        ]
+        assert verdicts == ["better", "no difference found"]
+
+    def test_the_same_every_time(self) -> None:
+        runs = [
+            [result_of(trial, 10 + (trial * factor) % 7) for trial in range(20)]
+            for factor in (2, 3)
+        ]
+        once, again = (effects_of(*runs, step_limit=LIMIT, paired=True) for _ in range(2))
+        assert once == again
+
+
+class TestRuns:
+    def test_the_first_is_the_baseline_of_all(self, tmp_path: Path) -> None:
+        runs = [
+            run_of(
+                tmp_path / str(factor),
+                [result_of(trial, factor * (5 + trial % 3)) for trial in range(10)],
+            )
+            for factor in (2, 1, 4)
+        ]
+        found = compare_outcomes(runs)
+        assert found.baseline == str(runs[0])
+        assert [run.run for run in found.runs] == [str(run) for run in runs[1:]]
+        effects = [by_measure(run.effects)["steps"].effect for run in found.runs]
+        assert effects == pytest.approx([0.5, 2.0])
+        assert f"{runs[1]} against {runs[0]}, 10 trials paired by number:" in found.describe()
+
+    def test_trials_that_one_run_alone_has_are_left_out(self, tmp_path: Path) -> None:
+        results = [result_of(trial, 5 + trial) for trial in range(6)]
+        first = run_of(tmp_path / "first", results)
+        second = run_of(tmp_path / "second", results[1:5], trials=6)
+        (run,) = compare_outcomes([first, second]).runs
+        assert run.trials == 4
+        assert run.notes == (
+            "trials that only one of the runs has finished, left out: 2",
+            f"{second}: is not finished",
+        )
+
+    @pytest.mark.parametrize(
+        ("other", "message"),
+        [
+            ({"seed": 6}, r"the seed is 6 here and 5 there.*\(--unpaired\)"),
+            ({"tolerance": 0.2}, "model.hole_tolerance is 0.2 here and 0.1 there"),
+            ({"limit": 50}, "simulator.max_steps is 50 here and 100 there"),
+        ],
+    )
+    def test_other_worlds_are_refused(
+        self, other: dict[str, float], message: str, tmp_path: Path
+    ) -> None:
+        results = [result_of(trial, 5) for trial in range(3)]
+        first = run_of(tmp_path / "first", results)
+        second = run_of(tmp_path / "second", results, **other)  # type: ignore[arg-type]
+        with pytest.raises(OutputError, match=message):
+            compare_outcomes([first, second])
+        if "seed" in other:
+            assert not compare_outcomes([first, second], paired=False).paired
+        else:
+            with pytest.raises(OutputError, match=message):
+                compare_outcomes([first, second], paired=False)
+
+    def test_one_trial_is_too_few(self, tmp_path: Path) -> None:
+        runs = [run_of(tmp_path / name, [result_of(0, 5)]) for name in ("first", "second")]
+        with pytest.raises(OutputError, match="intervals need at least 2"):
+            compare_outcomes(runs)

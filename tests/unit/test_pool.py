@@ -1,0 +1,62 @@
+"""The service's threads: results come back to the loop, and errors do, too."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+
+from holdfast.service.pool import ThreadPool
+
+
+async def test_results_come_back_on_the_loops_thread() -> None:
+    errors: list[BaseException] = []
+    pool = ThreadPool(2, "test", errors.append)
+    done: asyncio.Future[tuple[str, str]] = asyncio.get_running_loop().create_future()
+    here = threading.current_thread()
+    pool.submit(
+        lambda: threading.current_thread().name,
+        lambda name: done.set_result((name, threading.current_thread().name)),
+    )
+    assert pool.num_open == 1
+    name, of_result = await done
+    assert name.startswith("test-")
+    assert of_result == here.name
+    assert pool.num_open == 0
+    assert errors == []
+    pool.close()
+
+
+async def test_an_error_is_handed_over_and_the_thread_goes_on() -> None:
+    loop = asyncio.get_running_loop()
+    failed: asyncio.Future[BaseException] = loop.create_future()
+    pool = ThreadPool(1, "test", failed.set_result)
+    pool.submit(lambda: 1 // 0, lambda _: None)
+    assert isinstance(await failed, ZeroDivisionError)
+    done: asyncio.Future[int] = loop.create_future()
+    pool.submit(lambda: 7, done.set_result)
+    assert await done == 7
+    pool.close()
+
+
+async def test_no_more_threads_than_allowed() -> None:
+    pool = ThreadPool(2, "few", lambda _: None)
+    gate = threading.Event()
+    names: set[str] = set()
+    done: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+
+    def work() -> str:
+        gate.wait()
+        return threading.current_thread().name
+
+    def note(name: str) -> None:
+        names.add(name)
+        if pool.num_open == 0:
+            done.set_result(None)
+
+    for _ in range(6):
+        pool.submit(work, note)
+    assert pool.num_open == 6
+    gate.set()
+    await done
+    assert names <= {"few-0", "few-1"}
+    pool.close()

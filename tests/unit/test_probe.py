@@ -1,0 +1,61 @@
+"""One address of a service: certificates, interfaces, and calls that cannot be broken off."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+import threading
+from concurrent.futures import Future
+
+import pytest
+from tests.ports import free_port
+
+from holdfast.robot.probe import (
+    AddressPath,
+    account_of,
+    certificate_at,
+    in_thread,
+    interface_of,
+    waited_for,
+)
+
+
+def test_without_a_service_there_is_no_certificate() -> None:
+    async def look() -> tuple[bytes, str]:
+        address = ("127.0.0.1", free_port())
+        return await certificate_at(AddressPath(socket.AF_INET, address, "127.0.0.1"))
+
+    shown, reason = asyncio.run(look())
+    assert (shown, reason) == (b"", "connection refused")
+
+
+@pytest.mark.parametrize("der", [b"", b"nonsense"])
+def test_bytes_that_are_no_certificate_say_nothing(der: bytes) -> None:
+    assert account_of(der) == ""
+
+
+def test_the_loopback_interface_is_known_by_its_address() -> None:
+    assert interface_of("127.0.0.1") == "lo, "
+    assert interface_of("192.0.2.1") == ""
+
+
+def test_a_call_in_a_thread_is_waited_for_only_so_long() -> None:
+    may = threading.Event()
+    done: Future[bool] = in_thread(lambda: may.wait(30.0))
+
+    async def wait(limit_s: float) -> bool:
+        return await waited_for(done, limit_s)
+
+    with pytest.raises(TimeoutError):
+        asyncio.run(wait(0.0))
+    late = in_thread(may.is_set)
+    assert late.result(30.0) is False
+    may.set()
+
+
+def test_an_error_in_a_thread_comes_back() -> None:
+    def fail() -> None:
+        raise OSError("no")
+
+    with pytest.raises(OSError, match="no"):
+        in_thread(fail).result(30.0)

@@ -1,0 +1,171 @@
+"""A problem's attributes and the parameters of its functions."""
+
+from __future__ import annotations
+
+import inspect
+from typing import Any
+
+import numpy as np
+import pytest
+from tests.line_problem import SETTINGS, Line
+
+from holdfast.errors import InvalidValueError, ProblemError
+from holdfast.planning import Planner
+from holdfast.problem_attributes import PARAMETERS, check_problem, resolution_of
+from holdfast.problems.problem import (
+    BatchedMotionProblem,
+    ExpectedMotionProblem,
+    GeneralObservationProblem,
+    KnownStateReturnProblem,
+    Problem,
+)
+
+
+@pytest.mark.parametrize(
+    ("attribute", "value", "message"),
+    [
+        ("name", "", "name of .* is ''"),
+        ("state_size", 0, "state_size of line is 0"),
+        ("sensing_actions", "abcd", "sensing_actions of line is 'abcd'"),
+        ("sensing_actions", (), "sensing_actions of line"),
+        ("state_labels", ("x",), "state_labels of line has 1 labels: must have 2"),
+        ("resolution", 0.0, "resolution of line is 0.0"),
+        ("resolution", np.inf, "resolution of line is inf"),
+        ("resolution", None, "resolution of line is None: must be one number or 1, one for each"),
+        ("resolution", np.array([0.1, 0.1]), r"line is \[0.1 0.1\]: must be one number or 1, one"),
+        ("resolution", np.array([np.nan]), r"line is \[nan\].* coordinate of an action, positive"),
+        ("resolution", np.array(["x"]), r"resolution of line is \['x'\]: must be one number"),
+        ("state_resolution", -1.0, "state_resolution of line is -1.0: must be positive and finite"),
+        (
+            "state_resolution",
+            (0.1, 0.0),
+            r"state_resolution of line is \[0.1 0. \]: must be one number or 2, one for each "
+            "coordinate of a state",
+        ),
+        ("state_resolution", np.array([0.1]), "state_resolution of line"),
+        (
+            "resolution",
+            [[1], [1, 2]],
+            r"^resolution of line is \[\[1\], \[1, 2\]\]: must be one num",
+        ),
+        ("state_resolution", [[1], [1, 2]], r"^state_resolution of line is .*: must be one num"),
+        ("sensing_costs", [[1], [1, 2]], r"sensing_costs of line is .*: must be 2 numbers"),
+        ("motion_variance", [[1], [1, 2]], r"motion_variance of line is .*: must be 1 numbers"),
+        ("resolution", True, "resolution of line is True: must be one number"),
+        ("resolution", np.array(0.0), "resolution of line is 0.0: must be positive and finite"),
+        ("motion_variance", np.array([0.1, 0.1]), "motion_variance of line"),
+        ("log_likelihood", lambda *_: 0.0, "log_likelihood alone"),
+        ("sample_observation", lambda *_: 0.0, "sample_observation alone"),
+    ],
+)
+def test_an_attribute_is_named(attribute: str, value: object, message: str) -> None:
+    broken: Any = type("Broken", (Line,), {attribute: value})()
+    with pytest.raises(ProblemError, match=message):
+        Planner(broken, SETTINGS).init(0, 0)
+
+
+class TestResolution:
+    """Which resolution the points have whose entropy counts."""
+
+    @staticmethod
+    def of(
+        given: float | tuple[float, ...] | None, *, of_states: bool, **attributes: object
+    ) -> object:
+        problem = type("Resolved", (Line,), attributes)()
+        found = resolution_of(problem, given, of_states=of_states)
+        return found if isinstance(found, float) else found.tolist()
+
+    def test_one_number_is_for_actions_and_states(self) -> None:
+        for of_states in (False, True):
+            assert self.of(None, of_states=of_states, resolution=0.3) == 0.3
+            assert self.of(0.2, of_states=of_states, resolution=np.array([0.3])) == 0.2
+
+    @pytest.mark.parametrize("number", [np.float32(0.5), np.array(0.5), np.float64(0.5)])
+    def test_a_number_of_numpy_is_one_number(self, number: Any) -> None:
+        for name, of_states in (("resolution", False), ("state_resolution", True)):
+            assert self.of(None, of_states=of_states, **{name: number}) == 0.5
+            problem: Any = type("Resolved", (Line,), {name: number})()
+            check_problem(problem)
+        problem = type("Whole", (Line,), {"resolution": np.int64(1)})()
+        check_problem(problem)
+        assert resolution_of(problem, None, of_states=False) == 1.0
+
+    @pytest.mark.parametrize("own", [[[1], [1, 2]], "x", True])
+    @pytest.mark.parametrize("name", ["resolution", "state_resolution"])
+    def test_what_is_no_number_is_named(self, name: str, own: object) -> None:
+        with pytest.raises(ProblemError, match=f"^{name} of line is .*: must be numbers"):
+            self.of(None, of_states=name == "state_resolution", **{name: own})
+
+    def test_what_is_given_comes_first(self) -> None:
+        own = {"resolution": np.array([0.3]), "state_resolution": np.array([0.1, 0.2])}
+        assert self.of((0.5,), of_states=False, **own) == [0.5]
+        assert self.of((0.5, 0.6), of_states=True, **own) == [0.5, 0.6]
+
+    def test_states_have_their_own(self) -> None:
+        own = {"resolution": np.array([0.3]), "state_resolution": np.array([0.1, 0.2])}
+        assert self.of(None, of_states=False, **own) == [0.3]
+        assert self.of(None, of_states=True, **own) == [0.1, 0.2]
+        assert self.of(None, of_states=True, resolution=(0.3,), state_resolution=0.4) == 0.4
+
+    def test_states_of_as_many_coordinates_have_the_actions(self) -> None:
+        found = self.of(None, of_states=True, resolution=np.array([0.3, 0.4]), action_size=2)
+        assert found == [0.3, 0.4]
+
+    def test_states_of_another_number_of_coordinates_need_one(self) -> None:
+        with pytest.raises(
+            InvalidValueError,
+            match=r"selector.method is state_entropy, but the resolution of .* 1 n.*and a state "
+            "has 2; give the problem a state_resolution, one number or 2, or write",
+        ):
+            self.of(None, of_states=True, resolution=np.array([0.3]))
+
+    def test_another_number_of_numbers(self) -> None:
+        with pytest.raises(
+            InvalidValueError,
+            match=r"selector.resolution is \[0.5, 0.6\], 2 numbers; need one number, or 1 for "
+            "line, one for each coordinate of an action",
+        ):
+            self.of((0.5, 0.6), of_states=False)
+        with pytest.raises(InvalidValueError, match="2 for line, one for each coordinate of a sta"):
+            self.of((0.5,), of_states=True)
+
+
+@pytest.mark.parametrize(
+    ("function", "own", "message"),
+    [
+        (
+            "policy",
+            Line.is_goal,
+            r"takes \(self, states: .*: it is called as policy\(states, stage\)",
+        ),
+        (
+            "move",
+            Line.policy,
+            r"move of line takes .*it is called as move\(states, actions, stream\)",
+        ),
+        ("is_goal", 1.0, r"is_goal of line is 1.0: must be a function, is_goal\(states\)"),
+    ],
+)
+def test_a_function_that_takes_something_else_is_named(
+    function: str, own: object, message: str
+) -> None:
+    broken: Any = type("Broken", (Line,), {function: own})()
+    with pytest.raises(ProblemError, match=message):
+        Planner(broken, SETTINGS).init(0, 0)
+
+
+def test_the_parameters_are_those_of_the_contract() -> None:
+    protocols = (
+        Problem,
+        GeneralObservationProblem,
+        ExpectedMotionProblem,
+        KnownStateReturnProblem,
+        BatchedMotionProblem,
+    )
+    members = {name: own for protocol in protocols for name, own in vars(protocol).items()}
+    functions = {
+        name: tuple(inspect.signature(member).parameters)[1:]
+        for name, member in members.items()
+        if inspect.isfunction(member) and not name.startswith("_")
+    }
+    assert functions == PARAMETERS

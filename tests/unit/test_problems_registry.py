@@ -1,0 +1,67 @@
+"""Problems by name."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from holdfast.errors import UnknownProblemError
+from holdfast.problems import registry
+from holdfast.problems.capsule_robot import CapsuleRobot
+from holdfast.problems.peg_in_hole_2d import PegInHole2D
+
+
+class TestRegistry:
+    def test_names(self) -> None:
+        assert set(registry.names()) >= {
+            "capsule_robot",
+            "multitier_peg_in_hole_2d",
+            "peg_in_hole_2d",
+            "peg_in_hole_3d",
+        }
+
+    def test_finds_a_registered_class(self) -> None:
+        assert registry.problem_class("peg_in_hole_2d") is PegInHole2D
+
+    def test_finds_an_importable_class(self) -> None:
+        name = "holdfast.problems.capsule_robot:CapsuleRobot"
+        assert registry.problem_class(name) is CapsuleRobot
+
+    def test_finds_a_file_in_the_directory(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(sys, "path", sys.path.copy())
+        (tmp_path / "a_problem_in_a_file.py").write_text("class Mine:\n    pass\n")
+        name = "a_problem_in_a_file:Mine"
+        with pytest.raises(UnknownProblemError, match="a_problem_in_a_file"):
+            registry.problem_class(name)
+        assert registry.problem_class(name, tmp_path).__name__ == "Mine"
+
+    def test_an_unknown_name_is_answered_with_close_and_all_names(self) -> None:
+        with pytest.raises(
+            UnknownProblemError, match=r"peg_in_hole_2.*did you mean.*peg_in_hole_2d.*capsule_robot"
+        ):
+            registry.problem_class("peg_in_hole_2")
+
+    def test_an_unknown_class(self) -> None:
+        with pytest.raises(UnknownProblemError, match=r"has no PegInHole.*PegInHole2D"):
+            registry.problem_class("holdfast.problems.peg_in_hole_2d:PegInHole")
+
+    def test_not_a_class(self) -> None:
+        with pytest.raises(UnknownProblemError, match="not a class but function"):
+            registry.problem_class("holdfast.problems.registry:names")
+
+    @pytest.mark.parametrize("name", ["", ":", "a:", ":b", "a b:c", "../a:b"])
+    def test_not_a_name(self, name: str) -> None:
+        with pytest.raises(UnknownProblemError):
+            registry.problem_class(name)
+
+
+def test_signature_keys_tell_one_problem_alone() -> None:
+    for name, own in registry.BUILT_IN.items():
+        keys = set(registry.problem_class(name).Model.__struct_fields__)
+        told = [other for other, each in registry.BUILT_IN.items() if each.signature_keys <= keys]
+        assert own.signature_keys <= keys
+        assert told == [name]

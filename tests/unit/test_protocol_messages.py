@@ -1,0 +1,336 @@
+"""The codec: what goes in comes out, and what is no message is said to be none."""
+
+from __future__ import annotations
+
+import tracemalloc
+from typing import cast
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from holdfast.config.settings import PlanningSettings
+from holdfast.errors import MessageError
+from holdfast.protocol import messages
+from holdfast.protocol.messages import (
+    CHECKSUM_SIZE,
+    DIGEST_SIZE,
+    MAX_CONFIGURATION_BYTES,
+    MAX_CONFIGURATION_VALUES,
+    MAX_OBSERVATIONS,
+    MAX_TASK_ACTIONS,
+    PROTOCOL_VERSION,
+    Busy,
+    NeedState,
+    Observed,
+    Progress,
+    Refused,
+    Reply,
+    Request,
+    SensingAnswer,
+    SessionConfiguration,
+    TaskAnswer,
+    decode_floats,
+    decode_reply,
+    decode_request,
+    encode,
+    encode_floats,
+    settings_digest,
+    with_checksum,
+)
+
+REQUEST = Request(
+    PROTOCOL_VERSION,
+    b"s" * 16,
+    3,
+    17,
+    2,
+    40,
+    True,
+    b"d" * DIGEST_SIZE,
+    (Observed(36, 1, encode_floats([1.0, 2.0])),),
+    SessionConfiguration("peg_in_hole_2d", {"peg_width": 1.0}, {}, PlanningSettings(), 9),
+)
+REPLIES: list[Reply] = [
+    TaskAnswer(17, 2, encode_floats(np.arange(6.0)), 250),
+    SensingAnswer(17, 44, 2, b"e" * DIGEST_SIZE, 80),
+    Progress(17, True),
+    NeedState(17, False),
+    Busy(17, 30),
+    Refused(17, "stale_epoch", "epoch 1: epoch 2 was seen"),
+]
+
+
+def test_a_request_survives_the_wire() -> None:
+    assert decode_request(encode(REQUEST)) == REQUEST
+
+
+@pytest.mark.parametrize("reply", REPLIES, ids=lambda reply: type(reply).__name__)
+def test_a_reply_survives_the_wire(reply: Reply) -> None:
+    assert decode_reply(encode(reply)) == reply
+
+
+def test_another_version_is_named_even_if_its_fields_are_unknown() -> None:
+    other = msgspec.structs.replace(REQUEST, version=PROTOCOL_VERSION + 1)
+    unknown = with_checksum(msgspec.msgpack.encode([PROTOCOL_VERSION + 1, {"new": 1}]))
+    for payload in (encode(other), unknown):
+        with pytest.raises(MessageError, match=f"version {PROTOCOL_VERSION + 1}") as raised:
+            decode_request(payload)
+        assert raised.value.code == "version"
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"session": b"short"},
+        {"epoch": -1},
+        {"step": 2**32},
+        {"digest": b"d" * 32},
+        {"observations": (Observed(1, 0, b""),) * (MAX_OBSERVATIONS + 1)},
+        {"checkpoint": b"a checkpoint and observations"},
+    ],
+)
+def test_a_request_out_of_bounds_is_malformed(change: dict[str, object]) -> None:
+    payload = encode(msgspec.structs.replace(REQUEST, **change))
+    with pytest.raises(MessageError) as raised:
+        decode_request(payload)
+    assert raised.value.code == "malformed"
+
+
+def test_hostile_settings_are_malformed() -> None:
+    fields = msgspec.msgpack.decode(encode(REQUEST)[:-CHECKSUM_SIZE])
+    session_configuration = msgspec.msgpack.decode(fields[9])
+    session_configuration[3]["particle_filter"]["num_particles"] = 10**12
+    fields[9] = msgspec.msgpack.encode(session_configuration)
+    with pytest.raises(MessageError):
+        decode_request(with_checksum(msgspec.msgpack.encode(fields)))
+
+
+def test_a_task_answer_has_a_bounded_number_of_actions() -> None:
+    with pytest.raises(MessageError):
+        decode_reply(encode(TaskAnswer(1, MAX_TASK_ACTIONS + 1, b"", 1)))
+    with pytest.raises(MessageError):
+        decode_reply(encode(TaskAnswer(1, 0, b"", 1)))
+
+
+@given(st.binary(max_size=300))
+def test_any_bytes_decode_or_are_malformed(content: bytes) -> None:
+    for decode in (decode_request, decode_reply):
+        try:
+            decode(with_checksum(content))
+        except MessageError as error:
+            # A message of nothing is no message, whatever its checksum says.
+            assert error.code in ("malformed", "version") or not content
+
+
+@given(st.binary(max_size=300))
+def test_bytes_without_their_checksum_are_damaged(payload: bytes) -> None:
+    if payload == with_checksum(payload[:-CHECKSUM_SIZE]):
+        return  # one in four thousand million
+    for decode in (decode_request, decode_reply):
+        with pytest.raises(MessageError) as raised:
+            decode(payload)
+        assert raised.value.code == "damaged"
+
+
+@pytest.mark.parametrize("message", [REQUEST, *REPLIES], ids=lambda each: type(each).__name__)
+def test_every_flipped_bit_is_seen(message: Request | Reply) -> None:
+    payload = encode(message)
+    decode = decode_request if isinstance(message, Request) else decode_reply
+    for bit in range(8 * len(payload)):
+        damaged = bytearray(payload)
+        damaged[bit // 8] ^= 1 << bit % 8
+        with pytest.raises(MessageError) as raised:
+            decode(bytes(damaged))
+        assert raised.value.code == "damaged"
+
+
+LARGE = 8_000_000
+HEAD = msgspec.msgpack.decode(encode(REQUEST)[:-CHECKSUM_SIZE])[:8]
+
+
+def _packed(*fields: object) -> bytes:
+    """Pack fields; bytearrays are packed already."""
+    packed = (
+        bytes(field) if isinstance(field, bytearray) else msgspec.msgpack.encode(field)
+        for field in fields
+    )
+    return bytes([0x90 + len(fields)]) + b"".join(packed)
+
+
+def _empty_lists(count: int) -> bytearray:
+    return bytearray(b"\xdd" + count.to_bytes(4, "big") + b"\x90" * count)
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [
+        pytest.param(bytes(_empty_lists(LARGE)), id="no version"),
+        pytest.param(_packed(PROTOCOL_VERSION, _empty_lists(LARGE)), id="session"),
+        pytest.param(_packed(PROTOCOL_VERSION + 1, _empty_lists(LARGE)), id="another version"),
+        pytest.param(_packed(*HEAD, _empty_lists(LARGE)), id="observations"),
+        pytest.param(
+            _packed(*HEAD, bytearray(b"\x91\x94\x01\x01\xc4\x00" + _empty_lists(LARGE))),
+            id="field of an observation",
+        ),
+        pytest.param(_packed(*HEAD, [], _empty_lists(LARGE), None), id="opening that is a list"),
+        pytest.param(_packed(*HEAD, [], b"\x90" * LARGE, None), id="opening"),
+        pytest.param(_packed(*HEAD, [], None, _empty_lists(LARGE)), id="checkpoint"),
+        pytest.param(_packed(*HEAD, [], None, None, _empty_lists(LARGE)), id="unknown field"),
+    ],
+)
+def test_a_large_message_that_is_no_request_is_not_read(payload: bytes) -> None:
+    payload = with_checksum(payload)
+    tracemalloc.start()
+    try:
+        with pytest.raises(MessageError):
+            decode_request(payload)
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak < 100_000
+
+
+def test_settings_that_are_understood_otherwise_are_refused() -> None:
+    """As by a service that does not know one of them, or takes another default."""
+    encoded = encode(REQUEST)[:-CHECKSUM_SIZE]
+    assert REQUEST.session_configuration is not None
+    ours = settings_digest(REQUEST.session_configuration)
+    assert encoded.count(ours) == 1
+    for theirs in (b"t" * DIGEST_SIZE, None):
+        fields = msgspec.msgpack.decode(encoded)
+        fields[-1] = theirs
+        with pytest.raises(MessageError, match=ours.hex()) as raised:
+            decode_request(with_checksum(msgspec.msgpack.encode(fields)))
+        assert raised.value.code == "other_code"
+        assert (theirs.hex() if theirs else "not told") in str(raised.value)
+
+
+def test_each_setting_that_decides_has_its_part_in_the_digest() -> None:
+    session_configuration = REQUEST.session_configuration
+    assert session_configuration is not None
+    others = [
+        msgspec.structs.replace(session_configuration, **change)
+        for change in (
+            {"problem": "peg_in_hole_3d"},
+            {"model": {"peg_width": 2.0}},
+            {"state_space_planner": {"a": 1}},
+            {"planning": PlanningSettings(sensing_interval=7)},
+            {"seed": 10},
+        )
+    ]
+    digests = {settings_digest(each) for each in (session_configuration, *others)}
+    assert len(digests) == 1 + len(others)
+    named = msgspec.structs.replace(session_configuration, core_version="1", problem_digest="2")
+    assert settings_digest(named) == settings_digest(session_configuration), (
+        "code has digests of its own"
+    )
+
+
+def test_a_whole_number_in_the_place_of_another_is_the_same_setting() -> None:
+    planning = msgspec.convert({"sensing_interval": 3}, PlanningSettings)
+    filter_ = msgspec.structs.replace(planning.particle_filter, num_particles=50)
+    planning = msgspec.structs.replace(planning, particle_filter=filter_)
+    request = msgspec.structs.replace(
+        REQUEST,
+        session_configuration=SessionConfiguration(
+            "peg_in_hole_2d", {"peg_width": 1}, {}, planning, 9
+        ),
+    )
+    assert decode_request(encode(request)) == request
+
+
+def _session_configuration(model: dict[str, object]) -> SessionConfiguration:
+    return SessionConfiguration("peg_in_hole_2d", model, {}, PlanningSettings(), 9)
+
+
+@pytest.mark.parametrize(
+    "model",
+    [
+        {"a": [[]] * MAX_CONFIGURATION_VALUES},
+        {"a": [[[0] * 100] * 100]},
+        {str(number): number for number in range(MAX_CONFIGURATION_VALUES // 2 + 1)},
+        {"a": {"b": {str(number): 0 for number in range(MAX_CONFIGURATION_VALUES)}}},
+        {"a": {(0,) * MAX_CONFIGURATION_VALUES: 0}},
+    ],
+    ids=["empty lists", "nested lists", "keys", "keys inside", "a key"],
+)
+def test_a_session_configuration_has_a_bounded_number_of_values(model: dict[str, object]) -> None:
+    request = msgspec.structs.replace(REQUEST, session_configuration=_session_configuration(model))
+    with pytest.raises(
+        MessageError, match=f"more than {MAX_CONFIGURATION_VALUES} values"
+    ) as raised:
+        decode_request(encode(request))
+    assert raised.value.code == "too_large"
+
+
+def test_a_session_configuration_of_many_values_survives_the_wire() -> None:
+    model: dict[str, object] = {"a": [0.5] * (MAX_CONFIGURATION_VALUES - 100)}
+    request = msgspec.structs.replace(REQUEST, session_configuration=_session_configuration(model))
+    assert decode_request(encode(request)) == request
+
+
+def test_a_session_configuration_has_a_bounded_size() -> None:
+    request = msgspec.structs.replace(
+        REQUEST, session_configuration=_session_configuration({"a": "x" * MAX_CONFIGURATION_BYTES})
+    )
+    with pytest.raises(MessageError, match=f"at most {MAX_CONFIGURATION_BYTES} are") as raised:
+        decode_request(encode(request))
+    assert raised.value.code == "too_large"
+
+
+def test_a_checkpoint_is_not_copied() -> None:
+    """To copy a large one would hold up all other threads."""
+    request = msgspec.structs.replace(REQUEST, observations=(), checkpoint=bytes(100_000))
+    payload = bytearray(encode(request))
+    decoded = decode_request(cast(bytes, payload))
+    assert decoded == request
+    assert decoded.checkpoint is not None
+    assert np.shares_memory(np.frombuffer(decoded.checkpoint, np.uint8), payload)
+
+
+@pytest.mark.parametrize("version", [0, 1, 127, 128, 255, 256, 65535, 65536, 2**32 - 1])
+@pytest.mark.parametrize("count", [1, 15, 16, 70_000])
+def test_a_version_is_read_in_every_form(version: int, count: int) -> None:
+    content = msgspec.msgpack.encode([version, *[None] * (count - 1)])
+    with pytest.raises(MessageError, match=f"version {version}: ") as raised:
+        decode_request(with_checksum(content))
+    assert raised.value.code == "version"
+    for end in range(min(len(content), 9)):
+        with pytest.raises(MessageError):
+            decode_request(with_checksum(content[:end]))
+
+
+def encode_opening() -> bytes:
+    session_configuration: bytes = msgspec.msgpack.encode(_session_configuration({"a": None}))
+    return session_configuration
+
+
+def test_deep_nesting_is_malformed() -> None:
+    session_configuration = encode_opening().replace(
+        b"\xa1a\xc0", b"\xa1a" + b"\x91" * 100_000 + b"\xc0"
+    )
+    nested = _packed(*HEAD, [], session_configuration, None)
+    for payload in (b"\x91" * 100_000, b"\x81\xa1a" * 100_000, nested):
+        with pytest.raises(MessageError):
+            decode_request(with_checksum(payload))
+
+
+@given(st.lists(st.floats(allow_nan=False, allow_infinity=False), max_size=20))
+def test_numbers_keep_their_bits(numbers: list[float]) -> None:
+    data = encode_floats(numbers)
+    assert encode_floats(decode_floats(data, len(numbers))) == data
+
+
+@pytest.mark.parametrize("number", [np.nan, np.inf, -np.inf])
+def test_numbers_that_are_not_finite_are_refused(number: float) -> None:
+    with pytest.raises(MessageError):
+        decode_floats(encode_floats([0.0, number]), 2)
+    with pytest.raises(MessageError):
+        decode_floats(encode_floats([0.0]), 2)
+
+
+def test_every_message_is_listed() -> None:
+    assert {type(reply).__name__ for reply in REPLIES} < set(messages.__all__)

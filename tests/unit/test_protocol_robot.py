@@ -1,0 +1,582 @@
+"""The robot's loop: its journal, its environment and its trials."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Callable
+
+import msgspec
+import numpy as np
+import pytest
+from tests.robot_world import (
+    LOCAL,
+    PLANNING,
+    PROBLEM,
+    FailingWorld,
+    Misleading,
+    World,
+    nth,
+)
+
+from holdfast.config.settings import (
+    SimulatorSettings,
+)
+from holdfast.errors import HeldError, UnknownPerformanceError
+from holdfast.planning import Planner
+from holdfast.protocol.events import (
+    Act,
+    Acted,
+    EnvironmentFailed,
+    EnvironmentReady,
+    RobotEffect,
+    Send,
+    Sensed,
+    WriteRecords,
+)
+from holdfast.protocol.messages import (
+    DIGEST_SIZE,
+    Refused,
+    Reply,
+    Request,
+    SensingAnswer,
+    TaskAnswer,
+    decode_request,
+    encode,
+)
+from holdfast.protocol.records import ActingRecord, ObservedRecord, PerformedRecord, Record, replay
+from holdfast.protocol.status import Status
+from holdfast.recording.recorder import Recorder
+from holdfast.robot.environment import SimulatedEnvironment
+from holdfast.robot.trial import run_trial
+
+
+def test_a_sensing_action_for_another_state_is_not_followed() -> None:
+    world = World()
+    cloud = world.services["cloud"]
+
+    def drift(request: Request) -> list[Reply] | None:
+        if nth(request) != 3:
+            return None
+        cloud.rule = lambda _: None
+        replies = cloud.answer(encode(request))
+        cloud.rule = drift
+        return [
+            reply
+            if isinstance(reply, TaskAnswer)
+            else SensingAnswer(request.number, request.step + 4, 2, b"x" * DIGEST_SIZE, 1)
+            for reply in replies
+        ]
+
+    cloud.rule = drift
+    world.start()
+    world.run()
+    world.assert_same_as_without_faults()
+    assert len(world.reports("prefetch_unused")) == 1
+
+
+# -- the robot's own death ------------------------------------------------------------------------
+
+
+def recorded() -> tuple[list[tuple[Record, ...]], World]:
+    """Return what the journal held at each moment of a run without faults."""
+    world = World(simulator=SimulatorSettings(num_trials=1, max_steps=14, seed=11))
+    stages: list[tuple[Record, ...]] = [()]
+    world.start()
+    carry_out = world.carry_out
+
+    def watching(effects: list[RobotEffect]) -> None:
+        for effect in effects:
+            carry_out([effect])
+            if isinstance(effect, WriteRecords):
+                stages.append(tuple(world.journal))
+
+    world.carry_out = watching  # type: ignore[method-assign]
+    world.run()
+    return stages, world
+
+
+@pytest.mark.parametrize("performed", [True, False])
+def test_resumed_from_any_moment(performed: bool) -> None:
+    stages, whole = recorded()
+    for records in stages:
+        world = World(simulator=SimulatorSettings(num_trials=1, max_steps=14, seed=11))
+        history = replay(Planner(PROBLEM, PLANNING), 11, 0, records)
+        world.journal = list(records)
+        world.environment = SimulatedEnvironment(PROBLEM, 11, 0)
+        for action in history.actions:
+            world.environment.perform(action)
+        pending = history.pending
+        if pending is not None and performed:
+            world.environment.perform(pending)
+        world.carry_out(world.robot.start(0.0))
+        world.bring_up("cloud")
+        begun = EnvironmentReady(world.environment.is_done(), world.environment.step)
+        world.carry_out(world.robot.begin_trial(0, history, begun, 0.0, tail_is_certain=False))
+        world.run()
+        (result,) = world.results
+        (expected,) = whole.results
+        assert result.digest == expected.digest
+        missing = 1 if pending is not None and performed else 0
+        steps = [step for step, _ in world.acted]
+        assert steps == list(range(14 - len(steps), 14))
+        assert len(history.actions) + missing + len(steps) == 14
+
+
+def test_what_earlier_processes_did_counts_in_the_result() -> None:
+    """Each sensing decision with its time, and each time that another service took over."""
+
+    def resumed(records: list[Record], lost_at: int | None, dies_at: int | None) -> World:
+        world = World(simulator=SimulatorSettings(num_trials=1, max_steps=30, seed=11))
+        cloud = world.services["cloud"]
+        answer = cloud.answer
+
+        def timed(payload: bytes) -> list[Reply]:
+            return [
+                msgspec.structs.replace(reply, computed_us=1000 * reply.step)
+                if isinstance(reply, SensingAnswer)
+                else reply
+                for reply in answer(payload)
+            ]
+
+        cloud.answer = timed  # type: ignore[method-assign]
+        world.services[LOCAL].answer = timed  # type: ignore[method-assign]
+
+        def fault(step: int) -> None:
+            if step == lost_at:
+                world.kill("cloud")
+                world.bring_up("cloud", 0.012)
+            if step == dies_at:
+                world.heap.clear()
+                world.ended = True
+
+        world.on_act = fault
+        world.start(records=tuple(records))
+        world.run()
+        return world
+
+    first = resumed([], 5, 12)
+    second = resumed(first.journal, 16, 20)
+    third = resumed(second.journal, None, None)
+    (result,) = third.results
+    assert result.recoveries == 2
+    assert result.sensing_decisions == 8
+    assert result.sensing_ms == pytest.approx([4.0 * number for number in range(8)])
+    assert result.mean_sensing_ms == pytest.approx(14.0)
+    assert (
+        result.digest
+        == run_trial(
+            Planner(PROBLEM, PLANNING), third.simulator.seed, 0, max_steps=third.simulator.max_steps
+        ).digest
+    )
+
+
+def test_a_recovery_alone_begins_no_trial_and_counts_in_the_next_one() -> None:
+    world = World(simulator=SimulatorSettings(num_trials=1, max_steps=14, seed=11))
+    written: list[Record] = []
+    world.launchable = False
+    world.start(present=False)
+    world.run(until_s=3.0)
+    assert world.statuses() == ["local_recovery"]
+    written = world.journal.copy()
+    assert written == []
+    world.bring_up("cloud")
+    world.run()
+    assert world.results[0].recoveries == 1
+
+
+def test_a_pause_is_the_last_that_is_written_down() -> None:
+    """Although another service took over since the record before."""
+    world = World(simulator=SimulatorSettings(num_trials=1, max_steps=14, seed=11))
+
+    def fault(step: int) -> None:
+        if step == 6:
+            world.kill("cloud", 0.001)
+            world.after(0.002, lambda: world.robot.pause(world.now))
+
+    world.on_act = fault
+    world.start()
+    world.run()
+    assert world.statuses() == ["local_recovery"]
+    history = replay(Planner(PROBLEM, PLANNING), 11, 0, world.journal)
+    assert history.paused
+    assert history.recoveries == 1
+
+
+def begin_after(
+    records: tuple[Record, ...], steps_performed: int | None, *, tail_is_certain: bool = True
+) -> World:
+    world = World()
+    history = replay(Planner(PROBLEM, PLANNING), 11, 0, records)
+    world.journal = list(records)
+    world.environment = SimulatedEnvironment(PROBLEM, 11, 0)
+    for action in history.actions:
+        world.environment.perform(action)
+    world.carry_out(
+        world.robot.begin_trial(
+            0,
+            history,
+            EnvironmentReady(False, steps_performed),
+            0.0,
+            tail_is_certain=tail_is_certain,
+        )
+    )
+    return world
+
+
+def test_an_unknown_performance_stops_unless_the_environment_can_tell() -> None:
+    stages, _ = recorded()
+    pending = next(s for s in stages if s and isinstance(s[-1], ActingRecord) and len(s) > 6)
+    known = len([r for r in pending if isinstance(r, PerformedRecord)])
+    stopped = begin_after(pending, None).stopped
+    assert stopped is not None
+    assert isinstance(stopped.error, UnknownPerformanceError)
+    assert f"step {known}" in str(stopped.error)
+    for count in (known - 1, known + 2):
+        stopped = begin_after(pending, count).stopped
+        assert stopped is not None
+        assert isinstance(stopped.error, UnknownPerformanceError)
+    for count in (known, known + 1):
+        assert begin_after(pending, count).stopped is None
+
+
+def test_a_tail_that_may_be_lost_stops_unless_the_environment_can_tell() -> None:
+    stages, _ = recorded()
+    settled = next(s for s in stages if s and isinstance(s[-1], ObservedRecord) and len(s) > 6)
+    known = len([r for r in settled if isinstance(r, PerformedRecord)])
+    assert begin_after(settled, None, tail_is_certain=True).stopped is None
+    assert begin_after(settled, None, tail_is_certain=False).stopped is not None
+    assert begin_after(settled, known, tail_is_certain=False).stopped is None
+    assert begin_after(settled, known + 1, tail_is_certain=False).stopped is not None
+
+
+@pytest.mark.parametrize(
+    ("counts", "expected"), [(True, HeldError), (False, UnknownPerformanceError)]
+)
+def test_an_environment_that_fails_holds_the_robot(counts: bool, expected: type) -> None:
+    # One that counts can say later whether the action was performed; else nobody ever can.
+    world = World()
+    world.start()
+
+    def fail(step: int) -> None:
+        if step == 5:
+            world.heap.clear()
+            failure = EnvironmentFailed(5, "perform", "the arm is stuck", True, counts_steps=counts)
+            world.after(0.1, lambda: world.robot.handle(failure, world.now))
+
+    world.on_act = fail
+    act = world.act
+
+    def act_or_fail(effect: Act) -> None:
+        act(effect)
+        if effect.step == 5:
+            # What the environment would have delivered never comes.
+            world.heap = [item for item in world.heap if item[0] - world.now > 0.05]
+            heapq.heapify(world.heap)
+
+    world.act = act_or_fail  # type: ignore[method-assign]
+    world.run()
+    assert world.stopped is not None
+    assert type(world.stopped.error) is expected
+    assert str(world.stopped.error).endswith(": the arm is stuck")
+    assert ("steps_performed" in str(world.stopped.error)) is not counts
+    assert isinstance(world.journal[-1], ActingRecord)
+
+
+@pytest.mark.parametrize("counts", [True, False])
+def test_what_fails_after_an_action_was_performed_leaves_it_in_the_journal(counts: bool) -> None:
+    world = World()
+    world.start()
+    act = world.act
+
+    def act_and_fail(effect: Act) -> None:
+        act(effect)
+        if effect.step == 5:
+            failure = EnvironmentFailed(5, "is_done", "returned None", False, True, -2.5)
+            world.heap = []
+            world.after(0.1, lambda: world.robot.handle(failure, world.now))
+
+    world.act = act_and_fail  # type: ignore[method-assign]
+    world.run()
+    assert world.stopped is not None
+    assert type(world.stopped.error) is HeldError
+    assert "step 5, whose task action was performed: returned None" in str(world.stopped.error)
+    assert world.journal[-1] == PerformedRecord(5, -2.5)
+    # The effects come in this order: what is to be written down is, before the robot stops.
+    resumed = begin_after(tuple(world.journal), None)
+    assert resumed.stopped is None
+    assert resumed.robot.step == 6
+
+
+def test_pause_writes_everything_down_and_a_new_robot_goes_on() -> None:
+    world = World(simulator=SimulatorSettings(num_trials=1, max_steps=14, seed=11))
+    world.on_act = lambda step: (
+        world.after(0.0001, lambda: world.robot.pause(world.now)) if step == 6 else None
+    )
+    world.start()
+    world.run()
+    assert world.ended
+    assert not world.results
+    history = replay(Planner(PROBLEM, PLANNING), 11, 0, world.journal)
+    assert history.paused
+    assert history.pending is None
+    assert history.state.step == 7
+    begun = begin_after(tuple(world.journal), None, tail_is_certain=False)
+    assert begun.stopped is None
+
+
+class TestFailedTask:
+    """An environment says that the task has failed: the trial ends, and not with success."""
+
+    def world(self) -> World:
+        world = World(simulator=SimulatorSettings(num_trials=1, max_steps=14, seed=11))
+        world.environment_class = FailingWorld
+        return world
+
+    def assert_failed(self, world: World) -> None:
+        (result,) = world.results
+        assert (result.outcome, result.success, result.failed) == ("failed", False, True)
+        assert result.steps == FailingWorld.fails_at
+        expected = run_trial(
+            Planner(PROBLEM, PLANNING),
+            world.simulator.seed,
+            0,
+            max_steps=world.simulator.max_steps,
+            environment=FailingWorld(PROBLEM, world.simulator.seed, 0),
+        )
+        assert (result.digest, result.outcome) == (expected.digest, expected.outcome)
+
+    def test_ends_the_trial(self) -> None:
+        world = self.world()
+        world.start()
+        world.run()
+        self.assert_failed(world)
+
+    def test_out_of_steps_is_no_failure(self) -> None:
+        world = World(simulator=SimulatorSettings(num_trials=1, max_steps=14, seed=11))
+        world.start()
+        world.run()
+        assert world.results[0].outcome == "truncated"
+
+    def test_is_still_so_for_a_robot_that_was_killed_right_after(self) -> None:
+        killed = self.world()
+        killed.on_act = lambda step: setattr(killed, "ended", step == FailingWorld.fails_at - 1)
+        killed.start()
+        killed.run()
+        assert not killed.results
+        assert isinstance(killed.journal[-1], ActingRecord)
+        resumed = self.world()
+        resumed.carry_out(resumed.robot.start(0.0))
+        history = replay(resumed.planner, 11, 0, killed.journal)
+        begun = EnvironmentReady(killed.environment.is_done(), killed.environment.step)
+        resumed.carry_out(resumed.robot.begin_trial(0, history, begun, 0.0, tail_is_certain=True))
+        self.assert_failed(resumed)
+
+    @pytest.mark.parametrize("environment_class", [FailingWorld, SimulatedEnvironment])
+    def test_is_kept_when_the_robot_is_asked_to_end_in_the_last_action(
+        self, environment_class: type[SimulatedEnvironment]
+    ) -> None:
+        """Nobody may be there to say it again."""
+        world = self.world()
+        world.environment_class = environment_class
+        last = (FailingWorld.fails_at if environment_class is FailingWorld else 14) - 1
+        world.on_act = lambda step: (
+            world.after(0.0001, lambda: world.robot.pause(world.now)) if step == last else None
+        )
+        world.start()
+        world.run()
+        (result,) = world.results
+        assert result.outcome == ("failed" if environment_class is FailingWorld else "truncated")
+        assert result.steps == last + 1
+
+
+class TestUnexplainedObservations:
+    def world(self, lies: set[int], num_sensing: int, records: tuple[Record, ...] = ()) -> World:
+        class Lying(Misleading):
+            pass
+
+        Lying.lies = frozenset(lies)
+        world = World(simulator=SimulatorSettings(num_trials=1, max_steps=4 * num_sensing, seed=11))
+        world.environment_class = Lying
+        world.start(records=records)
+        world.run()
+        return world
+
+    def test_each_is_told(self) -> None:
+        world = self.world({2, 4}, 6)
+        recorder = Recorder(trial=0)
+        alike = world.environment_class(PROBLEM, world.simulator.seed, 0)
+        run_trial(
+            Planner(PROBLEM, PLANNING),
+            world.simulator.seed,
+            0,
+            max_steps=world.simulator.max_steps,
+            environment=alike,
+            observer=recorder,
+        )
+        unexplained = [each for each in recorder.record.sensing if not each.explained]
+        told = world.reports("unexplained")
+        assert [(fields["step"], fields["sensing_action"]) for fields in told] == [
+            (each.step, each.sensing_action) for each in unexplained
+        ]
+        assert {2 * 4, 4 * 4} <= {each.step for each in unexplained}
+        assert len(unexplained) == world.results[0].unexplained_observations < 5
+        for fields in told:
+            assert fields["trial"] == 0
+            assert isinstance(fields["deviations"], float)
+            assert fields["deviations"] > 8.0
+        assert not world.reports("filter_diverged")
+
+    def test_none_is_told_where_all_are_explained(self) -> None:
+        world = self.world(set(), 6)
+        assert world.results[0].unexplained_observations == 0
+        assert not world.reports("unexplained")
+
+    def test_a_run_of_them_is_told_once_and_the_lines_are_bounded(self) -> None:
+        world = self.world(set(range(1, 40)), 40)
+        assert len(world.reports("unexplained")) == 10
+        (diverged,) = world.reports("filter_diverged")
+        assert diverged["step"] == 4 * 5
+        assert world.results[0].unexplained_observations == 39
+        assert "counted only" in str(world.reports("unexplained")[-1]["reason"])
+
+    def test_a_robot_that_was_restarted_counts_on(self) -> None:
+        first = World(simulator=SimulatorSettings(num_trials=1, max_steps=32, seed=11))
+
+        class Lying(Misleading):
+            lies = frozenset(range(20))
+
+        first.environment_class = Lying
+        first.on_act = lambda step: setattr(first, "ended", step == 10)
+        first.start()
+        first.run()
+        assert len(first.reports("unexplained")) == 3
+        assert not first.reports("filter_diverged")
+        second = self.world(set(range(20)), 8, tuple(first.journal[:-1]))
+        (diverged,) = second.reports("filter_diverged")
+        assert diverged["step"] == 4 * 4
+        assert len(second.reports("unexplained")) == 5
+        assert second.results[0].unexplained_observations == 8
+
+
+def test_rate_paces_the_steps_and_counts_missed_ticks() -> None:
+    world = World(rate_hz=20.0, launch="never")
+
+    def fault(performed: int) -> None:
+        if performed == 8 and not world.results:
+            world.kill("cloud")
+            world.bring_up("cloud", 0.42)
+
+    world.on_act = fault
+    world.start()
+    world.run()
+    world.assert_same_as_without_faults()
+    times = [at for at, e in world.trace if isinstance(e, Act)][:20]
+    gaps = np.diff(times)
+    assert np.count_nonzero(np.abs(gaps - 0.05) < 1e-9) >= 17
+    assert 3 <= world.robot.missed_ticks <= 6
+    assert sum(int(str(f["missed"])) for f in world.reports("missed_ticks")) == (
+        world.robot.missed_ticks
+    )
+
+
+def test_effects_before_sending_are_written() -> None:
+    world = World()
+    world.start()
+    world.run()
+    written = 0
+    for _, effect in world.trace:
+        if isinstance(effect, WriteRecords):
+            written += len([r for r in effect.records if isinstance(r, ObservedRecord)])
+        if isinstance(effect, Send):
+            request = decode_request(effect.payload)
+            if request.sensed:
+                assert written >= 1
+    assert world.robot.status is Status.STANDARD
+
+
+# -- found in review -------------------------------------------------------------------------------
+
+
+def test_a_performance_is_written_down_before_the_robot_waits_for_anything() -> None:
+    world = World(rate_hz=10.0)
+    waits = 0
+
+    def watch(step: int) -> None:
+        def look() -> list[RobotEffect]:
+            nonlocal waits
+            waits += 1
+            last = world.journal[-1] if world.journal else None
+            assert not isinstance(last, ActingRecord), "killed now, nobody would know"
+            return []
+
+        world.after(0.05, look)  # between the performance and the next tick
+
+    world.on_act = watch
+    world.start()
+    world.run()
+    world.assert_same_as_without_faults()
+    assert waits >= 75
+
+
+def test_a_performance_is_written_down_before_the_robot_stops() -> None:
+    world = World(launch="never")
+    cloud = world.services["cloud"]
+    cloud.rule = lambda r: [Refused(r.number, "version", "no")] if r.step >= 8 else None
+    world.start()
+    world.run()
+    assert world.stopped is not None
+    history = replay(Planner(PROBLEM, PLANNING), 11, 0, world.journal)
+    assert history.pending is None
+
+
+def test_an_observation_of_the_wrong_size_stops_the_robot_resumably() -> None:
+    world = World(launch="never")
+    later = world.later
+
+    def spoil(event: Sensed | Acted) -> Callable[[], list[RobotEffect]]:
+        if isinstance(event, Sensed) and event.step >= 4:
+            event = event._replace(observation=np.zeros(7))
+        return later(event)
+
+    world.later = spoil  # type: ignore[method-assign]
+    world.start()
+    world.run()
+    assert world.stopped is not None
+    history = replay(Planner(PROBLEM, PLANNING), 11, 0, world.journal)
+    assert history.pending is None
+    assert history.state.step == 4
+
+
+def test_an_answer_for_another_step_than_was_asked_of_the_environment_stops_the_robot() -> None:
+    world = World()
+    later = world.later
+
+    def spoil(event: Sensed | Acted) -> Callable[[], list[RobotEffect]]:
+        if isinstance(event, Acted) and event.step == 6:
+            event = event._replace(step=5)
+        return later(event)
+
+    world.later = spoil  # type: ignore[method-assign]
+    world.start()
+    world.run()
+    assert world.stopped is not None
+    assert "step 5 where step 6" in str(world.stopped.error)
+
+
+def test_events_say_how_long_things_took() -> None:
+    world = World()
+
+    def fault(performed: int) -> None:
+        if performed == 5 and not world.results:
+            world.kill("cloud")
+            world.bring_up("cloud", 0.4)
+
+    world.on_act = fault
+    world.start()
+    world.run()
+    lost, answered = world.reports("status")
+    assert "silent_ms" in lost
+    assert "outage_ms" in answered
+    assert all("restore_ms" in fields for fields in world.reports("restored"))
+    assert world.reports("restored")
+    assert all("launch_ms" in fields for fields in world.reports("launched"))

@@ -1,0 +1,1465 @@
+"""The service's machine: what it answers, in which order, and what it never does.
+
+The reference is planning itself: a robot here folds its own state with the functions of
+``holdfast.planning``, and every answer of the machine must be what these say of that state.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import random
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tests.questions import request_of
+
+from holdfast.config.settings import (
+    ActiveSensingSettings,
+    ParticleFilterSettings,
+    PlanningSettings,
+    SelectorSettings,
+)
+from holdfast.errors import (
+    ConfigurationError,
+    MessageError,
+    OtherCodeError,
+    ProblemError,
+    UnknownProblemError,
+)
+from holdfast.planning import Planner, PlanningState, digest, encode_checkpoint, needs_sensing
+from holdfast.problems import registry
+from holdfast.problems.capsule_robot import CapsuleRobot
+from holdfast.problems.problem import Problem
+from holdfast.problems.registry import BUILT_IN
+from holdfast.protocol.events import LogEvent
+from holdfast.protocol.messages import (
+    DIGEST_SIZE,
+    MAX_TASK_ACTIONS,
+    Busy,
+    NeedState,
+    Observed,
+    Progress,
+    Refused,
+    Reply,
+    Request,
+    SensingAnswer,
+    SessionConfiguration,
+    TaskAnswer,
+    decode_floats,
+    decode_reply,
+    encode,
+    encode_floats,
+    unpack_configuration,
+)
+from holdfast.protocol.service import Service
+from holdfast.protocol.service_jobs import (
+    EndCall,
+    Job,
+    SendReply,
+    ServiceEffect,
+    StartJob,
+)
+from holdfast.protocol.service_limits import ServiceLimits
+from holdfast.robot.environment import SimulatedEnvironment
+from holdfast.source_digest import core_version, problem_digest
+
+PROBLEMS = tuple(BUILT_IN)
+
+
+CODE = core_version(), problem_digest(object)
+"""Of a problem that is one of holdfast's."""
+
+
+def planning_of(interval: int = 3, particles: int = 20, **sensing: Any) -> PlanningSettings:
+    sensing = {"num_observation_samples": 2, "num_nearest_neighbors": 3, **sensing}
+    return PlanningSettings(
+        particle_filter=ParticleFilterSettings(num_particles=particles),
+        active_sensing=ActiveSensingSettings(**sensing),
+        selector=SelectorSettings(method="action_entropy", estimator="nearest_neighbor"),
+        sensing_interval=interval,
+    )
+
+
+def make_problem(session_configuration: SessionConfiguration) -> Problem:
+    built: Problem = registry.problem_class(session_configuration.problem).from_settings(
+        session_configuration.model, session_configuration.state_space_planner
+    )
+    return built
+
+
+class Bench:
+    """Carries effects out; jobs wait until they are run."""
+
+    def __init__(
+        self,
+        make: Callable[[SessionConfiguration], Problem] = make_problem,
+        workers: int = 1,
+        **limits: Any,
+    ) -> None:
+        self.service = Service(make, workers, ServiceLimits(**limits))
+        self.workers = workers
+        self.now = 100.0
+        self.jobs: deque[Job] = deque()
+        self.replies: dict[int, list[Reply]] = {}
+        self.ended: set[int] = set()
+        self.notes: list[LogEvent] = []
+        self.trace: list[tuple[str, int]] = []
+
+    def apply(self, effects: list[ServiceEffect]) -> None:
+        for effect in effects:
+            if isinstance(effect, SendReply):
+                assert effect.call not in self.ended
+                reply = decode_reply(effect.payload)
+                self.replies[effect.call].append(reply)
+                self.trace.append((type(reply).__name__, effect.call))
+            elif isinstance(effect, EndCall):
+                assert effect.call not in self.ended
+                self.ended.add(effect.call)
+            elif isinstance(effect, StartJob):
+                self.jobs.append(effect.job)
+                self.trace.append((f"run {effect.job.kind}", -1))
+            elif isinstance(effect, LogEvent):
+                self.notes.append(effect)
+        assert len(self.jobs) <= self.workers
+
+    def send(self, message: Request | bytes, owner: str | None = None) -> int:
+        call = len(self.replies)
+        self.replies[call] = []
+        payload = message if isinstance(message, bytes) else encode(message)
+        self.apply(self.service.receive(call, payload, self.now, owner))
+        return call
+
+    def run(self, index: int = 0) -> None:
+        """Run one of the jobs that were handed out."""
+        job = self.jobs[index]
+        del self.jobs[index]
+        outcome = job.run()
+        self.apply(self.service.finished(job, outcome, self.now))
+
+    def run_all(self) -> None:
+        while self.jobs:
+            self.run()
+
+    def ask(self, message: Request | bytes, owner: str | None = None) -> list[Reply]:
+        call = self.send(message, owner)
+        self.run_all()
+        assert call in self.ended
+        return self.replies[call]
+
+    def kinds(self, call: int) -> list[str]:
+        return [type(reply).__name__ for reply in self.replies[call]]
+
+
+class Robot:
+    """Keeps the true state, makes requests, and knows the right answers."""
+
+    def __init__(
+        self,
+        problem: str = "capsule_robot",
+        planning: PlanningSettings | None = None,
+        key: int = 1,
+        seed: int = 5,
+    ) -> None:
+        planning = planning or planning_of()
+        self.session_configuration = SessionConfiguration(problem, {}, {}, planning, seed, *CODE)
+        self.problem = make_problem(self.session_configuration)
+        self.session = key.to_bytes(16, "big")
+        self.epoch = 1
+        self.number = 0
+        self.begin(0)
+
+    def begin(self, trial: int) -> None:
+        self.state = Planner(self.problem, self.planning).init(
+            self.session_configuration.seed, trial
+        )
+        self.environment = SimulatedEnvironment(
+            self.problem, self.session_configuration.seed, trial
+        )
+        self.observed: list[Observed] = []
+
+    @property
+    def planning(self) -> PlanningSettings:
+        return self.session_configuration.planning
+
+    def request(
+        self, *, session_configuration: bool = True, since: int = 0, **changes: Any
+    ) -> Request:
+        """Return the question of now; ``since`` counts the observations that are known already."""
+        self.number += 1
+        request = request_of(
+            self.state,
+            self.session,
+            self.number,
+            epoch=self.epoch,
+            observations=tuple(self.observed[since:]),
+            session_configuration=self.session_configuration if session_configuration else None,
+        )
+        return msgspec.structs.replace(request, **changes)
+
+    def restore(self, **changes: Any) -> Request:
+        changes = {"checkpoint": encode_checkpoint(self.state), **changes}
+        return self.request(observations=(), **changes)
+
+    def sense(self) -> None:
+        planner = Planner(self.problem, self.planning)
+        index, _ = planner.choose_sensing_action(self.state)
+        observation = self.environment.perform_sensing(index)
+        self.observed.append(Observed(self.state.step, index, encode_floats(observation)))
+        self.state, _ = planner.observe(self.state, index, observation)
+
+    def act(self) -> None:
+        planner = Planner(self.problem, self.planning)
+        action, _ = planner.choose_task_action(self.state)
+        self.environment.perform(action)
+        self.state = planner.advance(self.state, action)
+
+    def act_until_sensing(self) -> None:
+        while not needs_sensing(self.planning, self.state):
+            self.act()
+
+    def right_answer(self) -> list[tuple[Any, ...]]:
+        """Return what a service has to say, but for the number and the time."""
+        state: PlanningState = self.state
+        actions: list[Any] = []
+        planner = Planner(self.problem, self.planning)
+        while len(actions) < MAX_TASK_ACTIONS and not planner.needs_sensing(state):
+            action, _ = planner.choose_task_action(state)
+            actions.append(action)
+            state = planner.advance(state, action)
+        answer: list[tuple[Any, ...]] = []
+        if actions:
+            answer.append(("task", len(actions), b"".join(map(encode_floats, actions))))
+        if planner.needs_sensing(state):
+            index, _ = planner.choose_sensing_action(state)
+            answer.append(("sensing", state.step, index, digest(state)[:DIGEST_SIZE]))
+        return answer
+
+
+def content(replies: list[Reply]) -> list[tuple[Any, ...]]:
+    found: list[tuple[Any, ...]] = []
+    for reply in replies:
+        if isinstance(reply, TaskAnswer):
+            found.append(("task", reply.count, reply.actions))
+        elif isinstance(reply, SensingAnswer):
+            found.append(("sensing", reply.step, reply.sensing_action, reply.digest))
+        elif not isinstance(reply, Progress):
+            found.append((reply,))
+    return found
+
+
+def only(replies: list[Reply]) -> Reply:
+    assert len(replies) == 1, replies
+    return replies[0]
+
+
+def refused(replies: list[Reply]) -> Refused:
+    reply = only(replies)
+    assert isinstance(reply, Refused), reply
+    return reply
+
+
+class TestAnswers:
+    @pytest.mark.parametrize("name", PROBLEMS)
+    def test_trial_is_that_of_the_planner(self, name: str) -> None:
+        bench, robot = Bench(), Robot(name)
+        known = 0
+        for turn in range(6):
+            request = robot.request(session_configuration=turn == 0, since=known)
+            assert content(bench.ask(request)) == robot.right_answer()
+            known = len(robot.observed)
+            robot.act_until_sensing()
+            robot.sense()
+        statistics = bench.service.statistics
+        # The first request asks for a sensing action alone, each other one for both parts.
+        assert (statistics.task_parts, statistics.sensing_parts) == (5, 6)
+        assert statistics.state_requests == 0
+
+    def test_numbers_are_those_of_the_requests(self) -> None:
+        bench, robot = Bench(), Robot()
+        for _ in range(3):
+            request = robot.request()
+            assert {reply.number for reply in bench.ask(request)} == {request.number}
+            robot.sense()
+            robot.act_until_sensing()
+
+    def test_task_part_is_answered_before_the_sensing_part_is_begun(self) -> None:
+        bench, robot = Bench(), Robot()
+        robot.sense()
+        call = bench.send(robot.request())
+        bench.run()
+        assert bench.kinds(call) == ["TaskAnswer"]
+        assert bench.trace == [("run task", -1), ("TaskAnswer", call), ("run sensing", -1)]
+        assert call not in bench.ended
+        bench.run()
+        assert bench.kinds(call) == ["TaskAnswer", "SensingAnswer"]
+        assert call in bench.ended
+
+    def test_time_of_an_answer_is_that_of_its_job(self) -> None:
+        bench, robot = Bench(), Robot()
+        call = bench.send(robot.request())
+        bench.now += 0.25
+        bench.run_all()
+        reply = only(bench.replies[call])
+        assert isinstance(reply, SensingAnswer)
+        assert reply.computed_us == 250_000
+
+    @pytest.mark.parametrize("interval", [0, 1, 63, 64, 65, 150])
+    def test_any_interval_between_sensing_steps(self, interval: int) -> None:
+        bench, robot = Bench(), Robot(planning=planning_of(interval))
+        bench.ask(robot.request())
+        robot.sense()
+        for _ in range(3):
+            right = robot.right_answer()
+            assert content(bench.ask(robot.request(since=len(robot.observed) - 1))) == right
+            for _ in range(right[0][1]):
+                robot.act()
+            if needs_sensing(robot.planning, robot.state):
+                robot.sense()
+
+    def test_in_the_middle_between_two_sensing_steps(self) -> None:
+        bench, robot = Bench(), Robot()
+        robot.sense()
+        bench.ask(robot.request())
+        robot.act()
+        robot.act()
+        assert (
+            content(bench.ask(robot.request(session_configuration=False, since=1)))
+            == robot.right_answer()
+        )
+        # The sensing part is that of the request before.
+        assert bench.service.statistics.sensing_parts == 1
+
+    def test_next_trial_needs_no_opening(self) -> None:
+        bench, robot = Bench(), Robot()
+        bench.ask(robot.request())
+        robot.sense()
+        bench.ask(robot.request())
+        robot.begin(1)
+        assert (
+            content(bench.ask(robot.request(session_configuration=False))) == robot.right_answer()
+        )
+
+
+class TestRollingForward:
+    def test_from_the_beginning_by_all_observations(self) -> None:
+        bench, robot = Bench(), Robot()
+        for _ in range(4):
+            robot.sense()
+            robot.act_until_sensing()
+        assert content(bench.ask(robot.request())) == robot.right_answer()
+
+    def test_observations_that_are_known_already_are_passed_over(self) -> None:
+        bench, robot = Bench(), Robot()
+        for _ in range(2):
+            robot.sense()
+            bench.ask(robot.request())  # as far as the robot knows its answers are lost
+            robot.act_until_sensing()
+        robot.sense()
+        assert (
+            content(bench.ask(robot.request(session_configuration=False, since=0)))
+            == robot.right_answer()
+        )
+        assert bench.service.statistics.state_requests == 0
+
+    def test_from_a_checkpoint(self) -> None:
+        bench, robot = Bench(), Robot()
+        for _ in range(3):
+            robot.sense()
+            robot.act_until_sensing()
+        robot.sense()
+        assert content(bench.ask(robot.restore())) == robot.right_answer()
+        assert bench.service.statistics.restores == 1
+        robot.act_until_sensing()
+        robot.sense()
+        assert (
+            content(bench.ask(robot.request(session_configuration=False, since=4)))
+            == robot.right_answer()
+        )
+
+    def test_unknown_session(self) -> None:
+        bench, robot = Bench(), Robot()
+        request = robot.request(session_configuration=False)
+        assert bench.ask(request) == [NeedState(request.number, differs=False)]
+        request = robot.restore(session_configuration=False)
+        assert bench.ask(request) == [NeedState(request.number, differs=False)]
+
+    def test_missing_observation(self) -> None:
+        bench, robot = Bench(), Robot()
+        for _ in range(3):
+            robot.sense()
+            robot.act_until_sensing()
+        request = robot.request(since=1)
+        assert bench.ask(request) == [NeedState(request.number, differs=False)]
+        assert (
+            content(bench.ask(robot.restore(session_configuration=False))) == robot.right_answer()
+        )
+
+    def test_missing_observation_in_a_known_trial(self) -> None:
+        bench, robot = Bench(), Robot()
+        robot.sense()
+        bench.ask(robot.request())
+        for _ in range(2):
+            robot.act_until_sensing()
+            robot.sense()
+        request = robot.request(session_configuration=False, since=2)
+        assert bench.ask(request) == [NeedState(request.number, differs=True)]
+
+    def test_robot_that_is_behind(self) -> None:
+        bench, robot = Bench(), Robot()
+        robot.sense()
+        behind = robot.state, list(robot.observed)
+        for _ in range(2):
+            robot.act_until_sensing()
+            robot.sense()
+        bench.ask(robot.request())
+        robot.state, robot.observed = behind
+        request = robot.request(session_configuration=False, since=1)
+        assert bench.ask(request) == [NeedState(request.number, differs=True)]
+        assert content(bench.ask(robot.restore())) == robot.right_answer()
+        assert bench.service.statistics.states_diverged == 0, "it only is where it was before"
+
+    def test_other_digest(self) -> None:
+        bench, robot = Bench(), Robot()
+        robot.sense()
+        bench.ask(robot.request())
+        robot.act_until_sensing()
+        robot.sense()
+        last = robot.observed[-1]
+        other = decode_floats(last.observation, len(last.observation) // 8) + 0.5
+        changed = msgspec.structs.replace(last, observation=encode_floats(other))
+        request = robot.request(session_configuration=False, observations=(changed,))
+        assert bench.ask(request) == [NeedState(request.number, True, diverged=True)]
+        assert bench.service.statistics.states_diverged == 1
+        told = [note.fields for note in bench.notes if note.name == "state_diverged"]
+        assert [(each["trial"], each["step"]) for each in told] == [(0, robot.state.step)]
+        # The state from before is still there.
+        assert (
+            content(bench.ask(robot.request(session_configuration=False, since=1)))
+            == robot.right_answer()
+        )
+
+    def test_far_ahead_of_what_is_bearable(self) -> None:
+        bench, robot = Bench(max_steps=100), Robot(planning=planning_of(10**6))
+        robot.sense()
+        bench.ask(robot.request())
+        request = robot.request(
+            session_configuration=False, since=1, step=4_000_000_000, sensed=False, digest=bytes(16)
+        )
+        assert bench.ask(request) == [NeedState(request.number, differs=True)]
+
+    @pytest.mark.parametrize(
+        ("changes", "name"),
+        [({"step": 5}, "step"), ({"trial": 1}, "trial"), ({"sensed": False, "step": 1}, "step")],
+    )
+    def test_checkpoint_of_another_state(self, changes: dict[str, Any], name: str) -> None:
+        bench, robot = Bench(), Robot()
+        robot.sense()
+        reply = refused(bench.ask(robot.restore(**changes)))
+        assert reply.code == "invalid"
+        assert name in reply.text
+
+    def test_checkpoint_with_another_digest(self) -> None:
+        bench, robot = Bench(), Robot()
+        assert refused(bench.ask(robot.restore(digest=bytes(16)))).code == "invalid"
+
+    def test_checkpoint_of_another_size(self) -> None:
+        bench, robot, other = Bench(), Robot(), Robot(planning=planning_of(particles=30))
+        reply = refused(bench.ask(robot.restore(checkpoint=encode_checkpoint(other.state))))
+        assert reply.code == "invalid"
+        assert "30 particles" in reply.text
+
+    def test_checkpoint_that_is_none(self) -> None:
+        bench, robot = Bench(), Robot()
+        assert refused(bench.ask(robot.restore(checkpoint=b"rubbish"))).code == "invalid"
+
+
+class TestOnce:
+    def computed(self, bench: Bench) -> tuple[int, int]:
+        statistics = bench.service.statistics
+        return statistics.task_parts, statistics.sensing_parts
+
+    def test_the_same_bytes_at_any_moment(self) -> None:
+        bench, robot, other = Bench(), Robot(), Robot(key=2)
+        robot.sense()
+        request = robot.request()
+        right = robot.right_answer()
+        bench.send(other.request())  # takes the worker
+        calls = [bench.send(request), bench.send(request)]  # waiting
+        bench.run()
+        calls.append(bench.send(request))  # the task part is in work
+        bench.run()
+        calls.append(bench.send(request))  # the sensing part is
+        bench.run()
+        calls.append(bench.send(request))  # all is there
+        bench.run_all()
+        assert [content(bench.replies[call]) for call in calls] == [right] * 5
+        assert bench.ended >= set(calls)
+        assert self.computed(bench) == (1, 2)  # the other robot's first sensing action is one
+
+    def test_under_another_number(self) -> None:
+        bench, robot = Bench(), Robot()
+        robot.sense()
+        first = bench.send(robot.request())
+        bench.run()
+        second = bench.send(robot.request())
+        bench.run_all()
+        third = bench.send(robot.request())
+        for call in (first, second, third):
+            assert content(bench.replies[call]) == robot.right_answer()
+            assert len({reply.number for reply in bench.replies[call]}) == 1
+        assert self.computed(bench) == (1, 1)
+        assert bench.service.statistics.cache_hits == 2
+
+    @pytest.mark.parametrize("moment", ["waiting", "running", "done"])
+    def test_state_ahead_asked_for_by_itself(self, moment: str) -> None:
+        bench, robot, other = Bench(), Robot(), Robot(key=2)
+        robot.sense()
+        bench.send(robot.request())
+        if moment == "waiting":
+            bench.send(other.request())
+        bench.run()
+        if moment == "done":
+            bench.run()
+        robot.act_until_sensing()
+        call = bench.send(robot.request(session_configuration=False, since=1))
+        bench.run_all()
+        assert content(bench.replies[call]) == robot.right_answer()
+        assert self.computed(bench) == (1, 1 + (moment == "waiting"))
+
+    def test_calls_that_wait_for_one_answer_are_bounded(self) -> None:
+        bench, robot = Bench(max_calls_per_request=3), Robot()
+        robot.sense()
+        request = robot.request()
+        calls = [bench.send(request) for _ in range(5)]
+        assert bench.ended == set(calls[:2])
+        bench.run_all()
+        for call in calls[2:]:
+            assert content(bench.replies[call]) == robot.right_answer()
+
+    def test_digest_of_a_known_state_with_another_step(self) -> None:
+        bench, robot = Bench(), Robot()
+        robot.sense()
+        bench.ask(robot.request())
+        assert refused(bench.ask(robot.request(step=1, sensed=False))).code == "invalid"
+
+    def test_prefetch_that_was_dropped_is_taken_up_again(self) -> None:
+        bench, robot, other = Bench(), Robot(), Robot(key=2)
+        robot.sense()
+        call = bench.send(robot.request())
+        bench.send(other.request())
+        bench.run()
+        # The robot's next process asks the same: what the one before waited for is dropped.
+        robot.epoch += 1
+        again = bench.send(robot.request())
+        assert call in bench.ended
+        assert bench.kinds(again) == ["TaskAnswer"]
+        bench.run_all()
+        assert content(bench.replies[again]) == robot.right_answer()
+        assert self.computed(bench) == (1, 2)
+        assert bench.service.statistics.superseded == 1
+
+
+class TestOrder:
+    def test_first_parts_go_before_prefetches(self) -> None:
+        bench = Bench()
+        robots = [Robot(key=key) for key in (1, 2, 3)]
+        calls = []
+        for robot in robots:
+            robot.sense()
+            calls.append(bench.send(robot.request()))
+        bench.run_all()
+        assert bench.trace == [
+            ("run task", -1),
+            *[
+                step
+                for call in calls
+                for step in (
+                    ("TaskAnswer", call),
+                    ("run task" if call != calls[-1] else "run sensing", -1),
+                )
+            ],
+            ("SensingAnswer", calls[0]),
+            ("run sensing", -1),
+            ("SensingAnswer", calls[1]),
+            ("run sensing", -1),
+            ("SensingAnswer", calls[2]),
+        ]
+
+    def test_a_prefetch_is_not_put_off_for_ever(self) -> None:
+        bench = Bench(prefetch_patience_ms=20.0)
+        robots = [Robot(key=key) for key in range(1, 9)]
+        for robot in robots:
+            robot.sense()
+        first = bench.send(robots[0].request())
+        bench.send(robots[1].request())
+        bench.run()  # the first's task part; the second's is handed out
+        ran = 0
+        for robot in robots[2:]:
+            bench.now += 0.015
+            bench.send(robot.request())
+            bench.run()
+            ran += 1
+            if first in bench.ended:
+                break
+        assert ran <= 4
+
+    def test_a_robot_that_floods_has_one_turn(self) -> None:
+        bench = Bench()
+        flood, calm, third = Robot(key=1), Robot(key=2), Robot(key=3)
+        bench.send(third.request())  # takes the worker
+        flood.sense()
+        for _ in range(50):
+            flood.act() if not needs_sensing(flood.planning, flood.state) else flood.sense()
+            bench.send(flood.request())
+        call = bench.send(calm.request())
+        for _ in range(50):
+            flood.act() if not needs_sensing(flood.planning, flood.state) else flood.sense()
+            bench.send(flood.request())
+        assert bench.service.statistics.waiting == 2
+        bench.run()  # the third
+        bench.run()  # the flood
+        bench.run()
+        assert call in bench.ended
+        assert content(bench.replies[call]) == calm.right_answer()
+
+    def test_newer_request_supersedes(self) -> None:
+        bench, robot, other = Bench(), Robot(), Robot(key=2)
+        bench.send(other.request())
+        robot.sense()
+        older = bench.send(robot.request())
+        robot.act()
+        newer = bench.send(robot.request())
+        assert older in bench.ended
+        assert bench.replies[older] == []
+        bench.run_all()
+        assert content(bench.replies[newer]) == robot.right_answer()
+        assert bench.service.statistics.task_parts == 1
+
+    def test_newer_request_ends_the_calls_of_what_runs(self) -> None:
+        bench, robot = Bench(workers=2), Robot()
+        robot.sense()
+        older = bench.send(robot.request())
+        bench.run()  # the prefetch is handed out
+        robot.act_until_sensing()
+        robot.sense()
+        newer = bench.send(robot.request(session_configuration=False, since=1))
+        assert bench.kinds(older) == ["TaskAnswer"]
+        assert older in bench.ended
+        assert len(bench.jobs) == 2
+        bench.run(1)  # the newer one is not held up by the older prefetch
+        assert bench.kinds(newer) == ["TaskAnswer"]
+        bench.run_all()
+        assert content(bench.replies[newer]) == robot.right_answer()
+
+    def test_request_that_comes_late_is_ended(self) -> None:
+        bench, robot = Bench(), Robot()
+        robot.sense()
+        early = robot.request()
+        robot.act()
+        bench.ask(robot.request())
+        call = bench.send(early)
+        assert bench.replies[call] == []
+        assert call in bench.ended
+        assert not bench.jobs
+
+    def test_one_robot_has_one_worker_for_its_requests(self) -> None:
+        bench, robot, other = Bench(workers=2), Robot(), Robot(key=2)
+        robot.sense()
+        bench.send(robot.request())
+        robot.act()
+        newer = bench.send(robot.request())
+        assert len(bench.jobs) == 1
+        bench.send(other.request())
+        assert len(bench.jobs) == 2
+        bench.run_all()
+        assert content(bench.replies[newer]) == robot.right_answer()
+
+
+class TestEpochs:
+    def test_lower_epoch_is_refused(self) -> None:
+        bench, robot = Bench(), Robot()
+        robot.epoch = 3
+        bench.ask(robot.request())
+        robot.epoch = 2
+        reply = refused(bench.ask(robot.request()))
+        assert reply.code == "stale_epoch"
+        assert "2" in reply.text
+        assert "3" in reply.text
+
+    def test_higher_epoch_takes_over_with_the_state(self) -> None:
+        bench, robot = Bench(), Robot()
+        robot.sense()
+        robot.number = 1000
+        call = bench.send(robot.request())
+        robot.epoch, robot.number = 2, 0
+        robot.act()
+        newer = bench.send(robot.request(session_configuration=False, since=1))
+        assert call in bench.ended
+        bench.run_all()
+        assert content(bench.replies[newer]) == robot.right_answer()
+        assert [note.name for note in bench.notes] == ["session_opened", "session_taken_over"]
+
+    def test_epoch_outlives_the_session(self) -> None:
+        bench, robot, other = Bench(max_sessions=1), Robot(), Robot(key=2)
+        robot.epoch = 7
+        bench.ask(robot.request())
+        bench.ask(other.request())
+        assert bench.service.statistics.sessions == 1
+        robot.epoch = 6
+        assert refused(bench.ask(robot.request())).code == "stale_epoch"
+
+    def test_other_settings_under_the_same_epoch(self) -> None:
+        bench, robot = Bench(), Robot()
+        bench.ask(robot.request())
+        robot.session_configuration = msgspec.structs.replace(robot.session_configuration, seed=99)
+        assert refused(bench.ask(robot.request())).code == "invalid"
+
+    def test_other_settings_under_a_higher_epoch(self) -> None:
+        bench, robot = Bench(), Robot()
+        bench.ask(robot.request())
+        robot.session_configuration = msgspec.structs.replace(robot.session_configuration, seed=99)
+        robot.epoch = 2
+        robot.begin(0)
+        assert content(bench.ask(robot.request())) == robot.right_answer()
+
+
+class BrokenProblem(CapsuleRobot):
+    """Fails in its own way where it is told to."""
+
+    name = "broken"
+
+    def __init__(self, where: str, error: BaseException) -> None:
+        super().__init__()
+        self._where = where
+        self._error = error
+
+    def policy(self, states: Any, stage: Any) -> Any:
+        if self._where == "policy":
+            raise self._error
+        return super().policy(states, stage)
+
+    def observation_mean(self, states: Any, sensing_action: int) -> Any:
+        if self._where == "observation_mean":
+            raise self._error
+        return super().observation_mean(states, sensing_action)
+
+
+class Panic(BaseException):
+    """As an extension in Rust raises it."""
+
+
+class UnspeakableError(Exception):
+    def __str__(self) -> str:
+        raise KeyboardInterrupt
+
+
+class OurUnspeakableError(ProblemError):
+    def __str__(self) -> str:
+        raise ValueError("no words")
+
+
+class TestRefusals:
+    @pytest.mark.parametrize(
+        ("error", "code", "text"),
+        [
+            (ValueError("out of order"), "failed", "ValueError: out of order"),
+            (ProblemError("policy is odd"), "failed", "policy is odd"),
+            (SystemExit(3), "failed", "SystemExit: 3"),
+            (KeyboardInterrupt(), "failed", "KeyboardInterrupt"),
+            (asyncio.CancelledError(), "failed", "CancelledError"),
+            (GeneratorExit(), "failed", "GeneratorExit"),
+            (Panic("in Rust"), "failed", "Panic: in Rust"),
+            (UnspeakableError(), "failed", "UnspeakableError, which cannot be put into words"),
+            (
+                OurUnspeakableError(),
+                "failed",
+                "OurUnspeakableError, which cannot be put into words",
+            ),
+            (RuntimeError("\ud800 half a pair"), "failed", "RuntimeError: ? half a pair"),
+            (ValueError("x" * 10_000), "failed", "ValueError: xxx"),
+            (
+                MemoryError("Unable to allocate 7 GiB"),
+                "out_of_memory",
+                "out of memory for a decision of particle_filter.num_particles 20 x "
+                "active_sensing.num_observation_samples 2 x 2 sensing actions x "
+                "active_sensing.horizon 1: MemoryError: Unable to allocate 7 GiB",
+            ),
+        ],
+    )
+    @pytest.mark.parametrize("where", ["policy", "observation_mean"])
+    def test_failing_problem(self, error: BaseException, code: str, text: str, where: str) -> None:
+        def make(session_configuration: SessionConfiguration) -> Problem:
+            if session_configuration.problem == "broken":
+                return BrokenProblem(where, error)
+            return make_problem(session_configuration)
+
+        bench, broken, sound = Bench(make), Robot(key=1), Robot(key=2)
+        broken.session_configuration = msgspec.structs.replace(
+            broken.session_configuration, problem="broken"
+        )
+        call = bench.send(sound.request())
+        reply = refused(bench.ask(broken.request()))
+        assert reply.code == code
+        assert reply.text.startswith(text)
+        bench.run_all()
+        assert content(bench.replies[call]) == sound.right_answer()
+        sound.sense()
+        assert (
+            content(bench.ask(sound.request(session_configuration=False))) == sound.right_answer()
+        )
+        # It is not computed from what is left of the failed attempt.
+        assert refused(bench.ask(broken.request())).code == code
+
+    def test_sensing_part_that_fails_leaves_the_task_part(self) -> None:
+        problem = CapsuleRobot()
+        bench, robot = Bench(lambda _: problem), Robot()
+        robot.sense()
+        call = bench.send(robot.request())
+        bench.run()
+        problem.observation_mean = None  # type: ignore[assignment, method-assign]
+        bench.run()
+        assert bench.kinds(call) == ["TaskAnswer", "Refused"]
+        assert call in bench.ended
+
+    def test_unknown_problem(self) -> None:
+        def make(session_configuration: SessionConfiguration) -> Problem:
+            raise UnknownProblemError(
+                f"problem {session_configuration.problem}: known are this and that"
+            )
+
+        bench = Bench(make)
+        reply = refused(bench.ask(Robot().request()))
+        assert reply.code == "unknown_problem"
+        assert "this and that" in reply.text
+        assert bench.service.statistics.sessions == 0
+        assert bench.service.statistics.refusals == {"unknown_problem": 1}
+
+    def test_a_problem_is_not_lent_to_a_robot_with_other_code(self) -> None:
+        def make(session_configuration: SessionConfiguration) -> Problem:
+            if (session_configuration.core_version, session_configuration.problem_digest) != (
+                "1",
+                "2",
+            ):
+                raise OtherCodeError("deploy the same version")
+            return make_problem(session_configuration)
+
+        bench = Bench(make)
+        session_configuration = msgspec.structs.replace(
+            Robot().session_configuration, core_version="1", problem_digest="2"
+        )
+        robot = Robot(key=1)
+        robot.session_configuration = session_configuration
+        assert content(bench.ask(robot.request())) == robot.right_answer()
+        for key, changes in ((2, {"core_version": "0"}), (3, {"problem_digest": "0"})):
+            other = Robot(key=key)
+            other.session_configuration = msgspec.structs.replace(session_configuration, **changes)
+            assert refused(bench.ask(other.request())).code == "other_code"
+
+    def test_model_that_does_not_fit(self) -> None:
+        def make(session_configuration: SessionConfiguration) -> Problem:
+            raise ConfigurationError("model.robot_radius is -1")
+
+        assert refused(Bench(make).ask(Robot().request())).code == "invalid"
+
+    def test_too_many_particles(self) -> None:
+        bench, robot = Bench(max_particles=10), Robot()
+        reply = refused(bench.ask(robot.request()))
+        assert reply.code == "invalid"
+        assert "particle_filter.num_particles 20" in reply.text
+        assert "10 (max_particles)" in reply.text
+        assert bench.service.statistics.sessions == 0
+
+    def test_too_much_work(self) -> None:
+        bench, robot = Bench(max_work=20 * 2 * 6), Robot()
+        actions = len(robot.problem.sensing_actions)
+        bench.ask(robot.request())  # leaves the problem, ready built
+        for key, problem in ((2, "capsule_robot"), (3, "peg_in_hole_2d")):
+            greedy = Robot(problem, planning_of(num_observation_samples=1000), key=key)
+            reply = refused(bench.ask(greedy.request()))
+            assert reply.code == "invalid"
+            assert "num_observation_samples 1000" in reply.text
+            assert "240 (max_work)" in reply.text
+        assert actions <= 6
+
+    def test_settings_that_do_not_fit_the_problem(self) -> None:
+        bench = Bench()
+        robot = Robot(planning=planning_of(num_nearest_neighbors=3))
+        robot.session_configuration = msgspec.structs.replace(
+            robot.session_configuration, planning=planning_of(num_nearest_neighbors=20)
+        )
+        reply = refused(bench.ask(robot.request()))
+        assert reply.code == "invalid"
+        assert "num_nearest_neighbors 20" in reply.text
+
+    def test_observation_of_the_wrong_size(self) -> None:
+        bench, robot = Bench(), Robot()
+        robot.sense()
+        wrong = Observed(0, 0, encode_floats(np.zeros(7)))
+        assert refused(bench.ask(robot.request(observations=(wrong,)))).code == "invalid"
+
+    @pytest.mark.parametrize(
+        ("observed", "code"),
+        [
+            (Observed(0, 10**6, encode_floats(np.zeros(1))), "invalid"),
+            (Observed(0, 0, b"123"), "malformed"),
+            (Observed(0, 0, encode_floats([np.nan])), "malformed"),
+        ],
+    )
+    def test_observation_that_is_none(self, observed: Observed, code: str) -> None:
+        bench, robot = Bench(), Robot()
+        robot.sense()
+        assert refused(bench.ask(robot.request(observations=(observed,)))).code == code
+
+    def test_other_version(self) -> None:
+        bench, robot = Bench(), Robot()
+        reply = refused(bench.ask(robot.request(version=99)))
+        assert reply.code == "version"
+
+    @settings(max_examples=300, deadline=None, derandomize=True)
+    @given(data=st.data())
+    def test_any_bytes(self, data: st.DataObject) -> None:
+        """Whatever comes gets an answer and an end, and harms no other robot."""
+        bench, robot, hostile = Bench(max_steps=20), Robot(), Robot(key=2)
+        hostile.sense()
+        good = data.draw(
+            st.sampled_from(
+                [hostile.request(), hostile.restore(), hostile.request(session_configuration=False)]
+            )
+        )
+        payload = bytearray(encode(good))
+        for _ in range(data.draw(st.integers(1, 4))):
+            at = data.draw(st.integers(0, len(payload) - 1))
+            match data.draw(st.sampled_from(["change", "cut", "insert"])):
+                case "change":
+                    payload[at] = data.draw(st.integers(0, 255))
+                case "cut":
+                    del payload[at : at + data.draw(st.integers(1, 20))]
+                case _:
+                    payload[at:at] = data.draw(st.binary(min_size=1, max_size=8))
+            if not payload:
+                break
+        bench.ask(robot.request())
+        replies = bench.ask(bytes(payload))
+        assert replies
+        assert all(not isinstance(reply, Busy) for reply in replies)
+        robot.sense()
+        assert (
+            content(bench.ask(robot.request(session_configuration=False))) == robot.right_answer()
+        )
+
+
+class TestCapacity:
+    def test_beyond_the_longest_line(self) -> None:
+        bench = Bench(max_waiting=4)  # half of it is for those who were served before
+        calls = [bench.send(Robot(key=key).request()) for key in range(1, 6)]
+        assert [len(bench.replies[call]) for call in calls] == [0, 0, 0, 1, 1]
+        reply = only(bench.replies[calls[-1]])
+        assert isinstance(reply, Busy)
+        assert reply.retry_after_ms >= 1
+        assert bench.service.statistics.busy == 2
+        assert bench.service.statistics.sessions == 3
+        bench.run_all()
+        assert bench.ended == set(calls)
+
+    def test_bytes_of_the_line(self) -> None:
+        bench = Bench(max_waiting_bytes=6000)  # and so is half of this
+        robots = [Robot(key=key) for key in range(1, 8)]
+        size = len(encode(robots[0].restore()))
+        calls = [bench.send(robot.restore()) for robot in robots]
+        accepted = [call for call in calls if not bench.replies[call]]
+        assert len(accepted) == 1 + -(-3000 // size)
+
+    def test_by_the_time_that_jobs_take(self) -> None:
+        bench = Bench(max_wait_ms=100.0)
+        slow = Robot(key=1)
+        slow.sense()
+        for _ in range(30):
+            bench.send(slow.request())
+            while bench.jobs:
+                bench.now += 0.02
+                bench.run()
+            slow.act() if not needs_sensing(slow.planning, slow.state) else slow.sense()
+        others = [Robot(key=key) for key in range(2, 40)]
+        for robot in others:
+            robot.sense()
+        calls = [bench.send(robot.request()) for robot in others]
+        accepted = [call for call in calls if not bench.replies[call]]
+        # About 40 ms for each, one in work and two to three before the wait is above 100 ms.
+        assert 2 <= len(accepted) <= 5
+        busy = only(bench.replies[calls[-1]])
+        assert isinstance(busy, Busy)
+        assert 60 <= busy.retry_after_ms <= 250
+
+    def test_newcomers_turn_nobody_away_who_was_served_before(self) -> None:
+        """To be somebody new costs nothing: one client can be thousands of them."""
+        bench = Bench(max_wait_ms=10.0)
+        known = Robot(key=1)
+        bench.ask(known.request())
+        known.sense()
+        newcomers = [Robot(key=key) for key in range(2, 60)]
+        calls = [bench.send(robot.request()) for robot in newcomers]
+        assert any(bench.replies[call] for call in calls)
+        right = known.right_answer()
+        call = bench.send(known.request())
+        assert bench.replies[call] == []
+        # It does not wait for those who came before it either.
+        bench.run()
+        bench.run()
+        assert content(bench.replies[call]) == right[:1]
+        bench.run_all()
+        assert content(bench.replies[call]) == right
+
+    def test_newcomers_have_half_of_the_room(self) -> None:
+        bench = Bench(max_sessions=10, max_waiting=12)
+        known = [Robot(key=key) for key in range(1, 4)]
+        for robot in known:
+            bench.ask(robot.request())
+            robot.sense()
+        for key in range(4, 60):
+            bench.send(Robot(key=key).request())
+        calls = [bench.send(robot.request(session_configuration=False)) for robot in known]
+        assert all(not bench.replies[call] for call in calls), "neither forgotten nor turned away"
+        bench.run_all()
+        for robot, call in zip(known, calls, strict=True):
+            assert content(bench.replies[call]) == robot.right_answer()
+
+    def test_newcomers_have_their_turn(self) -> None:
+        bench = Bench(max_wait_ms=100.0)
+        known = [Robot(key=key) for key in range(1, 6)]
+        for robot in known:
+            bench.ask(robot.request())
+            robot.sense()
+        calls = [bench.send(robot.request()) for robot in known]
+        newcomer = bench.send(Robot(key=9).request())
+        bench.now += 0.11
+        late = bench.send(known[0].request(digest=bytes(16)))
+        while newcomer not in bench.ended:
+            assert late not in bench.ended
+            bench.run()
+        bench.run_all()
+        assert set(calls) <= bench.ended
+
+    def test_a_robot_that_was_served_waits_for_one_newcomer_at_most(self) -> None:
+        """However many there are, and however long they have waited."""
+        bench = Bench(max_wait_ms=100.0)
+        known = Robot(key=1)
+        bench.ask(known.request())
+        known.sense()
+        for key in range(2, 60):
+            bench.send(Robot(key=key).request())
+        bench.now += 10.0
+        for _ in range(3):
+            right = known.right_answer()
+            call = bench.send(known.request())
+            jobs = 0
+            while not bench.replies[call]:
+                bench.run()
+                jobs += 1
+            assert jobs <= 3, "what ran, one newcomer, and this one"
+            assert content(bench.replies[call]) == right[:1]
+            known.act_until_sensing()
+            known.sense()
+
+    def test_prefetches_do_not_starve_behind_newcomers(self) -> None:
+        bench = Bench(max_wait_ms=100.0, prefetch_patience_ms=20.0)
+        known = Robot(key=1)
+        bench.ask(known.request())
+        known.sense()
+        call = bench.send(known.request())
+        for key in range(2, 60):
+            bench.send(Robot(key=key).request())
+        bench.run()  # the task part; the sensing part is ahead of its robot
+        assert len(bench.replies[call]) == 1
+        jobs = 0
+        while call not in bench.ended:
+            bench.now += 0.005
+            bench.run()
+            jobs += 1
+        assert jobs <= 20 / 5 + 3
+
+    def test_one_job_that_was_held_up_turns_nobody_away(self) -> None:
+        bench = Bench(max_wait_ms=100.0)
+        first = Robot(key=1)
+        bench.ask(first.request())
+        first.sense()
+        bench.send(first.request())
+        bench.now += 60.0  # the process was stopped
+        bench.run_all()
+        calls = [bench.send(Robot(key=key).request()) for key in range(2, 8)]
+        assert all(not bench.replies[call] for call in calls)
+
+    def test_one_more_robot_than_workers_is_never_too_many(self) -> None:
+        bench = Bench(max_wait_ms=1.0, max_waiting=1)
+        first = Robot(key=1)
+        bench.send(first.request())
+        bench.now += 30.0
+        bench.run()
+        first.sense()
+        bench.send(first.request())
+        second = bench.send(Robot(key=2).request())
+        assert bench.replies[second] == []
+        third = bench.send(Robot(key=3).request())
+        assert isinstance(only(bench.replies[third]), Busy)
+
+    def test_what_is_known_is_answered_even_then(self) -> None:
+        bench, robot = Bench(max_waiting=1), Robot()
+        robot.sense()
+        right = robot.right_answer()
+        bench.ask(robot.request())
+        for key in range(2, 5):
+            bench.send(Robot(key=key).request())
+        call = bench.send(robot.request())
+        assert content(bench.replies[call]) == right
+        assert call in bench.ended
+
+    def test_waiting_request_is_replaced_even_then(self) -> None:
+        bench, robot = Bench(max_waiting=1), Robot()
+        bench.send(Robot(key=2).request())
+        robot.sense()
+        bench.send(robot.request())
+        robot.act()
+        call = bench.send(robot.request())
+        bench.run_all()
+        assert content(bench.replies[call]) == robot.right_answer()
+
+    def test_oldest_session_is_forgotten(self) -> None:
+        bench = Bench(max_sessions=2)
+        robots = [Robot(key=key) for key in (1, 2, 3)]
+        for robot in (robots[0], robots[1], robots[0], robots[2]):
+            bench.ask(robot.request())
+        request = robots[1].request(session_configuration=False)
+        assert bench.ask(request) == [NeedState(request.number, differs=False)]
+        assert (
+            content(bench.ask(robots[0].request(session_configuration=False)))
+            == robots[0].right_answer()
+        )
+
+    def test_session_in_use_is_not_forgotten(self) -> None:
+        bench = Bench(max_sessions=1)
+        robot = Robot()
+        call = bench.send(robot.request())
+        other = bench.send(Robot(key=2).request())
+        assert isinstance(only(bench.replies[other]), Busy)
+        bench.run_all()
+        assert content(bench.replies[call]) == robot.right_answer()
+
+    def test_no_room_is_not_asked_for_again_at_once(self) -> None:
+        bench = Bench(max_sessions=2, max_waiting=1000, max_wait_ms=1e6)
+        for key in (1, 2):
+            bench.send(Robot(key=key).request())
+        delays = []
+        for key in range(3, 103):
+            reply = only(bench.replies[bench.send(Robot(key=key).request())])
+            assert isinstance(reply, Busy)
+            delays.append(reply.retry_after_ms)
+        assert 100 <= min(delays) < 110
+        assert 115 < max(delays) <= 126
+        # Each robot has its own delay, and it is the same in every run.
+        again = only(bench.replies[bench.send(Robot(key=3).request())])
+        assert isinstance(again, Busy)
+        assert again.retry_after_ms == delays[0]
+        assert len(set(delays)) > 15
+
+    def test_request_that_was_decoded_before(self) -> None:
+        bench, robot = Bench(), Robot()
+        robot.sense()
+        request = robot.request()
+        bench.replies[0] = []
+        size = len(encode(request))
+        bench.apply(bench.service.receive_request(0, request, size, bench.now))
+        bench.run_all()
+        assert content(bench.replies[0]) == robot.right_answer()
+        bench.replies[1] = []
+        error = MessageError("malformed", "no request")
+        bench.apply(bench.service.receive_request(1, error, 9, bench.now))
+        assert refused(bench.replies[1]) == Refused(0, "malformed", "no request")
+
+    def test_bytes_of_states(self) -> None:
+        robots = [Robot(key=key) for key in range(1, 6)]
+        size = robots[0].state.belief.states.nbytes + robots[0].state.belief.weights.nbytes
+        bench = Bench(max_state_bytes=5 * size)
+        for robot in robots:
+            robot.sense()
+            bench.ask(robot.request())
+            assert bench.service.statistics.state_bytes <= 5 * size
+        assert bench.service.statistics.sessions == 2
+        assert (
+            content(bench.ask(robots[-1].request(session_configuration=False)))
+            == robots[-1].right_answer()
+        )
+
+    def test_state_that_is_too_large_to_keep(self) -> None:
+        bench, robot = Bench(max_state_bytes=100), Robot()
+        robot.sense()
+        assert content(bench.ask(robot.request())) == robot.right_answer()
+        assert bench.service.statistics.state_bytes == 0
+        robot.act_until_sensing()
+        robot.sense()
+        assert isinstance(only(bench.ask(robot.request(since=1))), NeedState)
+        assert content(bench.ask(robot.restore())) == robot.right_answer()
+
+    def test_bytes_of_openings(self) -> None:
+        """A plate with a thousand holes is 24 KB as it is sent, and half a megabyte unpacked."""
+        holes = [{"center": [4.0, 6.0 - 0.01 * number], "depth": 0.01} for number in range(900)]
+        session_configuration = SessionConfiguration(
+            "multitier_peg_in_hole_2d", {"holes": holes}, {}, planning_of(), 5
+        )
+        bench = Bench(max_configuration_bytes=250_000)
+        for key in range(1, 31):
+            bench.ask(Robot(key=key).request())
+        assert bench.service.statistics.sessions == 30
+        for key in range(31, 61):
+            request = msgspec.structs.replace(
+                Robot(key=key).request(), session_configuration=session_configuration
+            )
+            bench.ask(request)
+            held = [session.configuration for session in bench.service._sessions._sessions.values()]
+            assert sum(map(len, held)) <= 250_000
+            assert unpack_configuration(held[-1]) == session_configuration
+        assert 4 <= bench.service.statistics.sessions <= 8
+        # Each by itself is served, however large it is beside the limit.
+        small = Bench(max_configuration_bytes=100)
+        robot = Robot()
+        assert content(small.ask(robot.request())) == robot.right_answer()
+        other = small.send(Robot(key=2).request())
+        assert small.replies[other] == []
+        third = small.send(Robot(key=3).request())
+        assert isinstance(only(small.replies[third]), Busy)
+        small.run_all()
+        assert small.service.statistics.sessions == 1
+
+    def test_requests_that_wait_hold_no_opening(self) -> None:
+        bench = Bench()
+        first = Robot(key=2)
+        bench.send(first.request())
+        robot = Robot()
+        robot.sense()
+        bench.send(robot.request())
+        waiting = bench.service._sessions.get((None, robot.session))
+        assert waiting is not None
+        assert [
+            work.request and work.request.session_configuration for work in waiting.pending.values()
+        ] == [None]
+        bench.run_all()
+
+    def test_idle_session_is_forgotten(self) -> None:
+        bench, robot = Bench(max_idle_s=10.0), Robot()
+        bench.ask(robot.request())
+        due = bench.service.next_wakeup()
+        assert due == bench.now + 10.0
+        bench.apply(bench.service.tick(due - 0.001))
+        assert bench.service.statistics.sessions == 1
+        bench.apply(bench.service.tick(due))
+        statistics = bench.service.statistics
+        assert (statistics.sessions, statistics.state_bytes) == (0, 0)
+        assert bench.service.next_wakeup() is None
+
+    def test_equal_problems_are_shared(self) -> None:
+        built = []
+
+        def make(session_configuration: SessionConfiguration) -> Problem:
+            built.append(session_configuration.problem)
+            return make_problem(session_configuration)
+
+        bench = Bench(make)
+        for key in range(1, 5):
+            bench.ask(Robot(key=key, seed=key).request())
+        bench.ask(Robot("peg_in_hole_2d", key=9).request())
+        assert built == ["capsule_robot", "peg_in_hole_2d"]
+
+
+class TestProgress:
+    def test_signs_while_waiting_and_in_work(self) -> None:
+        bench, robot, other = Bench(progress_interval_ms=50.0), Robot(), Robot(key=2)
+        assert bench.service.next_wakeup() is None
+        running = bench.send(robot.request())
+        waiting = bench.send(other.request())
+        start = bench.now
+        for turn in range(1, 4):
+            due = bench.service.next_wakeup()
+            assert due is not None
+            assert due == pytest.approx(start + 0.05 * turn)
+            bench.apply(bench.service.tick(due - 0.001))
+            assert len(bench.replies[running]) == turn - 1
+            bench.now = due
+            bench.apply(bench.service.tick(due))
+        assert bench.replies[running] == [Progress(robot.number, waiting=False)] * 3
+        assert bench.replies[waiting] == [Progress(other.number, waiting=True)] * 3
+
+    def test_an_answer_is_a_sign(self) -> None:
+        bench, robot = Bench(progress_interval_ms=50.0), Robot()
+        robot.sense()
+        bench.send(robot.request())
+        bench.now += 0.04
+        bench.run()
+        assert bench.service.next_wakeup() == pytest.approx(bench.now + 0.05)
+
+    def test_calls_that_are_nearly_due_go_together(self) -> None:
+        bench = Bench(progress_interval_ms=50.0)
+        for key in range(1, 6):
+            bench.send(Robot(key=key).request())
+            bench.now += 0.001
+        due = bench.service.next_wakeup()
+        assert due is not None
+        bench.apply(bench.service.tick(due))
+        assert all(len(replies) == 1 for replies in bench.replies.values())
+
+    @pytest.mark.parametrize(("count", "interval_s"), [(64, 0.05), (96, 0.075), (300, 0.1)])
+    def test_where_many_wait_each_is_told_less_often(self, count: int, interval_s: float) -> None:
+        bench = Bench(progress_interval_ms=50.0, max_wait_ms=1e6)
+        request = Robot().request()
+        for key in range(count):
+            session = (key + 1).to_bytes(16, "big")
+            bench.send(msgspec.structs.replace(request, session=session))
+        assert bench.service.next_wakeup() == pytest.approx(bench.now + interval_s)
+        for turn in range(1, 4):
+            bench.now += interval_s
+            bench.apply(bench.service.tick(bench.now))
+            assert {len(replies) for replies in bench.replies.values()} == {turn}
+
+
+class TestAnyOrder:
+    @pytest.mark.parametrize("seed", range(12))
+    def test_many_robots_and_any_order_of_events(self, seed: int) -> None:
+        """Retries, duplicates, restarts, eviction, and jobs that end in any order."""
+        chance = random.Random(seed)
+        bench = Bench(
+            workers=3,
+            max_sessions=chance.choice([3, 100]),
+            max_waiting=chance.choice([3, 100]),
+            max_state_bytes=chance.choice([2000, 1 << 20]),
+            answers_per_session=chance.choice([1, 2, 8]),
+            max_calls_per_request=2,
+        )
+        robots = [Robot(key=key, planning=planning_of(2, 12)) for key in range(1, 7)]
+        open_calls: dict[int, tuple[Robot, list[tuple[Any, ...]], bytes]] = {}
+        turns = dict.fromkeys(range(6), 0)
+        seen: list[bytes] = []
+        for _ in range(900):
+            index = chance.randrange(6)
+            robot = robots[index]
+            match chance.choice(["ask", "ask", "run", "run", "run", "tick", "again"]):
+                case "ask":
+                    whole = chance.random() < 0.3
+                    request = robot.restore() if whole else robot.request()
+                    seen.append(encode(request))
+                    call = bench.send(request)
+                    open_calls[call] = (robot, robot.right_answer(), request.digest)
+                case "again" if seen:
+                    bench.send(chance.choice(seen))
+                case "run" if bench.jobs:
+                    bench.now += chance.choice([0.0, 0.001, 0.05])
+                    bench.run(chance.randrange(len(bench.jobs)))
+                case "tick":
+                    due = bench.service.next_wakeup()
+                    if due is not None:
+                        bench.now = max(bench.now, due)
+                        bench.apply(bench.service.tick(bench.now))
+                case _:
+                    pass
+            for call in sorted(set(open_calls) & bench.ended):
+                asker, right, _ = open_calls.pop(call)
+                given_answer = content(bench.replies[call])
+                if given_answer and not isinstance(given_answer[0][0], str):
+                    assert isinstance(given_answer[0][0], Busy | NeedState)
+                    continue
+                # What was said is right, even where it was not all.
+                assert given_answer == right[: len(given_answer)]
+                if given_answer == right and right == asker.right_answer():
+                    turns[robots.index(asker)] += 1
+                    asker.act_until_sensing()
+                    asker.sense()
+        while bench.jobs:
+            bench.run()
+        statistics = bench.service.statistics
+        assert (statistics.waiting, statistics.running, statistics.calls) == (0, 0, 0)
+        assert min(turns.values()) >= 1
+        for robot in robots:
+            assert content(bench.ask(robot.restore())) == robot.right_answer()
+
+    def test_with_no_worker_there_is_no_service(self) -> None:
+        with pytest.raises(ValueError, match="workers 0"):
+            Service(make_problem, 0)
+
+    def test_selector_fixed(self) -> None:
+        planning = msgspec.structs.replace(
+            planning_of(), selector=SelectorSettings(method="fixed", sensing_action=1)
+        )
+        bench, robot = Bench(), Robot(planning=planning)
+        assert content(bench.ask(robot.request())) == robot.right_answer()
+
+
+def runs_of(service: Service, call: int, request: Request, now: float) -> list[float]:
+    """Have a request answered; return how long each of its jobs was expected to take."""
+    expected = []
+    effects = service.receive(call, encode(request), now)
+    while runs := [effect for effect in effects if isinstance(effect, StartJob)]:
+        (run,) = runs
+        expected.append(run.expected_s)
+        service.started(run.job, now)
+        now += 0.001
+        effects = service.finished(run.job, run.job.run(), now)
+    return expected
+
+
+def test_only_what_was_measured_of_a_robot_is_expected_to_be_brief() -> None:
+    service = Service(make_problem, 1)
+    light = Robot(key=1)
+    found = []
+    for call in range(1, 5):
+        found.append(
+            runs_of(service, call, light.request(since=max(0, len(light.observed) - 1)), call)
+        )
+        light.act_until_sensing()
+        light.sense()
+    assert found[0] == [math.inf]  # the problem is to be built
+    assert found[1][0] == math.inf  # the first task part of this robot
+    assert all(expected_s == pytest.approx(0.001) for expected_s in found[3])
+    # Another robot with the same problem may have other settings: nothing is known of it.
+    heavy = Robot(key=2, planning=planning_of(particles=500))
+    assert runs_of(service, 10, heavy.request(), 20.0) == [math.inf]
+    # Neither of a request that takes more than one observation to answer, or a whole state.
+    for _ in range(2):
+        light.act_until_sensing()
+        light.sense()
+    assert runs_of(service, 11, light.request(since=len(light.observed) - 3), 21.0)[0] == math.inf
+
+
+def test_other_peoples_code_is_not_expected_to_be_brief() -> None:
+    service, robot = Service(lambda _: CapsuleRobot(), 1), Robot()
+    robot.session_configuration = msgspec.structs.replace(
+        robot.session_configuration, problem="own_problem:Mine"
+    )
+    for call in range(5):
+        request = robot.request(since=max(0, len(robot.observed) - 1))
+        assert set(runs_of(service, call, request, call)) == {math.inf}
+        robot.act_until_sensing()
+        robot.sense()
+
+
+def test_what_may_be_of_few_steps_or_many_is_not_expected_to_be_brief() -> None:
+    service, robot = Service(make_problem, 1), Robot(planning=planning_of(interval=33))
+    for call in range(5):
+        request = robot.request(since=max(0, len(robot.observed) - 1))
+        expected = runs_of(service, call, request, call)
+        assert expected[0] == math.inf
+        robot.act_until_sensing()
+        robot.sense()
+    assert expected[1] < math.inf  # the sensing part is of none
+
+
+def test_the_first_question_of_a_trial_is_as_brief_as_those_before() -> None:
+    service, robot = Service(make_problem, 1), Robot()
+    expected = []
+    for trial in range(3):
+        robot.begin(trial)
+        expected += runs_of(service, trial, robot.request(), trial)
+    # The first one also builds the problem.
+    assert expected == [math.inf, math.inf, pytest.approx(0.001)]

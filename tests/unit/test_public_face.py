@@ -1,0 +1,161 @@
+"""The public face, ``import holdfast as hf``: its names, and what importing it costs."""
+
+from __future__ import annotations
+
+import ast
+import importlib.metadata
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+import holdfast as hf
+from holdfast.errors import InvalidValueError, ProblemError, UnknownProblemError
+
+SOURCE = Path(hf.__file__)
+
+
+def test_every_name_is_there_and_typed() -> None:
+    """The names, the imports that type checkers read and what is imported are the same."""
+    assert hf.__all__ == sorted(hf.__all__, key=lambda name: (name.islower(), name))
+    tree = ast.parse(SOURCE.read_text(encoding="utf-8"))
+    typed = {}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("holdfast."):
+            for alias in node.names:
+                typed[alias.asname or alias.name] = f"{node.module}.{alias.name}"
+    places = hf._PLACES
+    assert {name: f"holdfast.{place}" for name, place in places.items()} == typed
+    assert set(places) == set(hf.__all__) == set(dir(hf)) - {"__version__"}
+    for name, place in places.items():
+        assert getattr(hf, name).__name__ == place.rpartition(".")[2]
+
+
+def test_no_other_name() -> None:
+    with pytest.raises(AttributeError, match=r"module 'holdfast' has no attribute 'planer'"):
+        _ = hf.planer  # type: ignore[attr-defined]
+
+
+def test_no_name_is_also_a_module() -> None:
+    """Importing a module sets it as an attribute of its package, in the place of the name."""
+    modules = {path.stem for path in SOURCE.parent.iterdir()}
+    assert modules.isdisjoint(hf.__all__)
+
+
+def test_importing_it_imports_nothing_else() -> None:
+    program = (
+        "import sys; before = set(sys.modules); import holdfast; "
+        "print(sorted(name for name in set(sys.modules) - before if '.' in name or 'num' in name))"
+    )
+    found = subprocess.run(
+        [sys.executable, "-S", "-c", f"import sys; sys.path[:] = {sys.path!r}; {program}"],
+        check=True,
+        capture_output=True,
+        text=True,
+    )
+    assert "holdfast." not in found.stdout
+    assert "numpy" not in found.stdout
+
+
+def test_it_is_typed() -> None:
+    assert (SOURCE.parent / "py.typed").is_file()
+    assert "Typing :: Typed" in importlib.metadata.metadata("holdfast").get_all("Classifier", [])
+
+
+class TestMake:
+    def test_settings_of_both_sections(self) -> None:
+        problem = hf.make("peg_in_hole_2d", peg_width=0.5, rotation_step_size=0.2)
+        assert problem.execute(np.full(3, 9.0)).tolist() == [0.1, 0.1, 0.2]
+        assert problem.model.peg_width == 0.5  # type: ignore[attr-defined]
+
+    def test_a_class_of_ones_own(self) -> None:
+        problem = hf.make("holdfast.lab.studies.busy_room:BusyRoom")
+        assert isinstance(problem, hf.Problem)
+
+    @pytest.mark.parametrize(
+        ("name", "settings", "error", "message"),
+        [
+            ("peg", {}, UnknownProblemError, "peg is not a registered name"),
+            ("peg_in_hole_2d", {"peg_width": -1}, InvalidValueError, "peg_in_hole_2d: .*> 0"),
+            ("peg_in_hole_2d", {"width": 1}, InvalidValueError, "no setting .width."),
+            (
+                "holdfast.lab.studies.busy_room:BusyRoom",
+                {"width": 1},
+                ProblemError,
+                "BusyRoom cannot be built",
+            ),
+        ],
+    )
+    def test_refusals(
+        self, name: str, settings: dict[str, float], error: type[Exception], message: str
+    ) -> None:
+        with pytest.raises(error, match=message):
+            hf.make(name, **settings)
+
+
+def test_the_loop_and_run_trial_decide_the_same() -> None:
+    problem = hf.make("peg_in_hole_2d")
+    planner = hf.Planner(problem, particles=50)
+    assert planner.settings.particle_filter.num_particles == 50
+    world = hf.SimulatedEnvironment(problem, seed=3)
+    state = planner.init(seed=3)
+    while not world.is_done() and state.step < 40:
+        if planner.needs_sensing(state):
+            sensing_action, _ = planner.choose_sensing_action(state)
+            observation = world.perform_sensing(sensing_action)
+            state, _ = planner.observe(state, sensing_action, observation)
+        task_action, _ = planner.choose_task_action(state)
+        world.perform(task_action)
+        state = planner.advance(planner.decode(planner.encode(state)), task_action)
+    result = hf.run_trial(planner, seed=3, max_steps=40)
+    assert result.decisions is not None
+    assert result.decisions.log.endswith(planner.digest(state))
+
+
+def test_load_configuration(tmp_path: Path) -> None:
+    (tmp_path / "peg.yaml").write_text("problem: peg_in_hole_2d\nsimulator: {seed: 4}\n")
+    assert hf.load_configuration(tmp_path / "peg.yaml").simulator.seed == 4
+
+
+@pytest.mark.parametrize(
+    ("make_it", "message"),
+    [
+        (
+            lambda: hf.Planner(cast("Any", "peg_in_hole_2d")),
+            r"problem is the name 'peg_in_hole_2d'",
+        ),
+        (lambda: planner_of(particles=0), r"particle_filter\.num_particles"),
+        (lambda: planner_of(particles="300"), r"particle_filter\.num_particles"),
+        (lambda: planner_of(method="rnd"), r"selector\.method"),
+        (
+            lambda: planner_of(
+                hf.PlanningSettings(selector=cast("Any", {"method": "random"}))
+            ).init(0),
+            r"selector is of type dict; it must be a SelectorSettings",
+        ),
+        (lambda: hf.run_trial(planner_of(), max_steps=0), r"max_steps is 0; allowed are"),
+        (
+            lambda: hf.entropy(np.zeros((9, 1)), None, cast("Any", "nearest")),
+            r"estimator is 'nearest'",
+        ),
+        (
+            lambda: hf.make("peg_in_hole_2d", hole_tolernce=0.2),
+            r"no setting 'hole_tolernce'; allowed: .*hole_tolerance",
+        ),
+    ],
+)
+def test_a_wrong_argument_is_named(make_it: Callable[[], object], message: str) -> None:
+    with pytest.raises(InvalidValueError, match=message):
+        make_it()
+
+
+def planner_of(*arguments: Any, **keywords: Any) -> hf.Planner:
+    return hf.Planner(hf.make("peg_in_hole_2d"), *arguments, **keywords)
+
+
+def test_the_method_is_chosen_by_name() -> None:
+    assert planner_of(particles=50, method="random").settings.selector.method == "random"

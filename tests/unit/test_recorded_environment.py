@@ -1,0 +1,110 @@
+"""The world of a recorded trial."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from tests.recordings import configuration_of, record_trial
+
+from holdfast.config.loader import Configuration
+from holdfast.errors import RecordError
+from holdfast.outcome import TrialResult
+from holdfast.planning import Planner, digest
+from holdfast.protocol.records import (
+    ActingRecord,
+    ObservedRecord,
+    PerformedRecord,
+    Record,
+)
+from holdfast.recording.figure import trial_figure
+from holdfast.recording.recorded_environment import RecordedEnvironment
+from holdfast.recording.recorder import Recorder
+from holdfast.robot.trial import NullObserver, SensingStep, TaskStep, run_trial
+
+
+class _Journalling(NullObserver):
+    """Writes down what a robot writes down."""
+
+    def __init__(self) -> None:
+        self.records: list[Record] = []
+
+    def sensed(self, step: SensingStep) -> None:
+        data = np.asarray(step.observation, dtype="<f8").tobytes()
+        record = ObservedRecord(step.before.step, step.sensing_action, data, digest(step.after), 0)
+        self.records.append(record)
+
+    def acted(self, step: TaskStep) -> None:
+        data = np.asarray(step.executed, dtype="<f8").tobytes()
+        self.records.append(ActingRecord(step.state.step, data))
+        self.records.append(PerformedRecord(step.state.step, step.reward))
+
+
+class TestRecordedEnvironment:
+    """What was observed, given to the same planner, leads to the same beliefs."""
+
+    @staticmethod
+    def again(
+        configuration: Configuration, records: list[Record], result: TrialResult
+    ) -> tuple[Recorder, TrialResult]:
+        recorder = Recorder(result.trial)
+        found = run_trial(
+            Planner(configuration.problem, configuration.planning),
+            configuration.simulator.seed,
+            result.trial,
+            max_steps=configuration.simulator.max_steps,
+            environment=RecordedEnvironment(result.trial, records, result),
+            observer=recorder,
+        )
+        return recorder, found
+
+    @staticmethod
+    def first(configuration: Configuration) -> tuple[list[Record], TrialResult]:
+        journalling = _Journalling()
+        result = run_trial(
+            Planner(configuration.problem, configuration.planning),
+            configuration.simulator.seed,
+            1,
+            max_steps=configuration.simulator.max_steps,
+            observer=journalling,
+        )
+        return journalling.records, result
+
+    @pytest.mark.parametrize("max_steps", [20, 500])
+    def test_the_beliefs_are_those_of_the_trial(self, tmp_path: Path, max_steps: int) -> None:
+        configuration = configuration_of(tmp_path, max_steps=max_steps)
+        records, result = self.first(configuration)
+        assert result.success == (max_steps == 500)
+        # The last performance is not written down on its own: the result says all of it.
+        recorder, again = self.again(configuration, records[:-1], result)
+        assert again.digest == result.digest
+        assert (again.success, again.steps) == (result.success, result.steps)
+        expected = record_trial(configuration).record
+        record = recorder.record
+        assert np.array_equal(record.estimates, expected.estimates)
+        assert np.array_equal(record.standard_deviations, expected.standard_deviations)
+        for seen, known in zip(record.sensing, expected.sensing, strict=True):
+            assert np.array_equal(seen.after, known.after)
+        assert record.true_states == []
+        assert record.rewards[:-1] == expected.rewards[:-1]
+        trial_figure(configuration, record, tmp_path / "trial.png")
+        assert (tmp_path / "trial.png").read_bytes().startswith(b"\x89PNG\r\n")
+
+    def test_a_failure_is_one_again(self, tmp_path: Path) -> None:
+        configuration = configuration_of(tmp_path)
+        records, result = self.first(configuration)
+        failed = msgspec.structs.replace(result, success=False, failed=True, steps=4)
+        _, again = self.again(configuration, records, failed)
+        assert (again.failed, again.steps) == (True, 4)
+
+    def test_what_was_decided_otherwise_is_refused(self, tmp_path: Path) -> None:
+        configuration = configuration_of(tmp_path)
+        records, result = self.first(configuration)
+        observed = records[0]
+        assert isinstance(observed, ObservedRecord)
+        other = msgspec.structs.replace(observed, sensing_action=observed.sensing_action ^ 1)
+        for spoilt in ([other, *records[1:]], records[:20], records[1:]):
+            with pytest.raises(RecordError, match="trial 1: the decision of step"):
+                self.again(configuration, spoilt, result)

@@ -1,0 +1,54 @@
+"""The observer that records a trial for its figure."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tests.recordings import configuration_of, record_trial
+
+from holdfast.planning import Planner
+from holdfast.recording.recorder import MAX_PARTICLES_KEPT, Recorder
+from holdfast.robot.trial import run_trial
+
+
+class TestRecorder:
+    def test_it_keeps_every_step(self, tmp_path: Path) -> None:
+        record = record_trial(configuration_of(tmp_path)).record
+        assert record.result is not None
+        steps = record.result.steps
+        assert len(record.actions) == len(record.rewards) == steps
+        # One more than steps: the states before the first and after each.
+        assert len(record.true_states) == len(record.estimates) == steps + 1
+        assert len(record.standard_deviations) == steps + 1
+        assert sum(record.rewards) == pytest.approx(record.result.reward)
+        assert [sensing.step for sensing in record.sensing] == list(range(0, steps, 9))
+
+    def test_the_choice_has_the_least_entropy(self, tmp_path: Path) -> None:
+        for sensing in record_trial(configuration_of(tmp_path)).record.sensing:
+            assert sensing.entropies is not None
+            assert sensing.sensing_action == int(np.argmin(sensing.entropies))
+
+    def test_it_keeps_copies(self, tmp_path: Path) -> None:
+        record = record_trial(configuration_of(tmp_path)).record
+        states = np.array(record.true_states)
+        assert len(np.unique(states, axis=0)) == len(states)
+
+    def test_it_looks_away_from_other_trials(self, tmp_path: Path) -> None:
+        configuration = configuration_of(tmp_path)
+        recorder = Recorder(trial=0)
+        run_trial(
+            Planner(configuration.problem, configuration.planning),
+            configuration.simulator.seed,
+            1,
+            max_steps=configuration.simulator.max_steps,
+            observer=recorder,
+        )
+        assert recorder.record.result is None
+        assert not recorder.record.actions
+
+    def test_particles_are_thinned_out(self, tmp_path: Path) -> None:
+        configuration = configuration_of(tmp_path, num_particles=2 * MAX_PARTICLES_KEPT + 1)
+        before = record_trial(configuration).record.sensing[0].before
+        assert MAX_PARTICLES_KEPT // 2 < len(before) <= MAX_PARTICLES_KEPT

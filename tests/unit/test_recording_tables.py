@@ -1,0 +1,138 @@
+"""``trials.csv`` and ``summary.json``."""
+
+from __future__ import annotations
+
+import csv
+import json
+
+import msgspec
+import pytest
+import scipy.stats
+from tests.recordings import failed, result_of
+
+from holdfast.cli.terminal import _summary_rows
+from holdfast.outcome import TRIAL_COLUMNS
+from holdfast.recording.tables import (
+    SummaryBuilder,
+    csv_lines,
+    wilson_interval,
+)
+from holdfast.recording.timings import AnswerCounts
+
+
+class TestTables:
+    @pytest.mark.parametrize("trials", [1, 2, 10, 1000])
+    def test_wilson_interval_is_that_of_scipy(self, trials: int) -> None:
+        for successes in {0, 1, trials // 3, trials - 1, trials}:
+            expected = scipy.stats.binomtest(successes, trials).proportion_ci(method="wilson")
+            low, high = wilson_interval(successes, trials)
+            assert low == pytest.approx(expected.low, abs=1e-12)
+            assert high == pytest.approx(expected.high, abs=1e-12)
+
+    def test_csv_numbers_read_back_exactly(self) -> None:
+        results = [
+            result_of(0, reward=-0.1 - 0.2),
+            result_of(1, success=False, reward=1e-300),
+            failed(result_of(2)),
+        ]
+        rows = list(csv.DictReader("".join(csv_lines(results)).splitlines()))
+        assert tuple(rows[0]) == TRIAL_COLUMNS
+        assert TRIAL_COLUMNS == (
+            "trial",
+            "seed",
+            "success",
+            "steps",
+            "reward",
+            "sensing_decisions",
+            "mean_sensing_ms",
+            "recoveries",
+            "unexplained_observations",
+            "digest",
+            "outcome",
+        )
+        for row, result in zip(rows, results, strict=True):
+            assert float(row["reward"]) == result.reward
+            assert float(row["mean_sensing_ms"]) == result.mean_sensing_ms
+            assert int(row["success"]) == result.success
+            assert row["digest"] == result.digest
+        assert [row["outcome"] for row in rows] == ["succeeded", "truncated", "failed"]
+        assert [row["success"] for row in rows] == ["1", "0", "0"]
+
+    def test_summary(self) -> None:
+        builder = SummaryBuilder()
+        builder.add(result_of(0, reward=-1.0, sensing_ms=(1.0, 2.0)))
+        builder.add(result_of(1, reward=-3.0, sensing_ms=(3.0,)))
+        builder.add(result_of(2, reward=-8.0, success=False))
+        summary = builder.build(problem="p", seed=5, version="1", trials=4, wall_time_s=2.0)
+        assert (summary.trials, summary.finished, summary.successes) == (4, 3, 2)
+        assert summary.success_rate == pytest.approx(2 / 3)
+        assert summary.mean_reward == pytest.approx(-4.0)
+        assert summary.mean_reward_of_successes == pytest.approx(-2.0)
+        assert summary.mean_steps == pytest.approx(11.0)
+        assert summary.sensing_ms_median == pytest.approx(2.0)
+        assert summary.sensing_ms_p99 == pytest.approx(2.98)
+        assert summary.unexplained_observations == 3
+        assert json.loads(summary.to_json())["digest"] == summary.digest
+        assert summary.failures == 0
+        assert "failed" not in dict(_summary_rows(summary))
+
+    def test_failures_are_no_successes_and_told_if_there_are_any(self) -> None:
+        builder = SummaryBuilder()
+        builder.add(result_of(0, reward=-1.0))
+        builder.add(failed(result_of(1, reward=-8.0)))
+        builder.add(failed(result_of(2)))
+        builder.add(result_of(3, success=False))
+        summary = builder.build(problem="p", seed=5, version="1", trials=4, wall_time_s=2.0)
+        assert (summary.successes, summary.failures, summary.finished) == (1, 2, 4)
+        assert summary.success_rate == pytest.approx(0.25)
+        assert summary.mean_reward_of_successes == pytest.approx(-1.0)
+        assert dict(_summary_rows(summary))["failed"] == "2 of 4 trials"
+
+    def test_the_mean_of_rewards_that_are_not_there_is_none(self) -> None:
+        """A trial without a reward has not earned 0."""
+        without = msgspec.structs.replace(result_of(1, success=False), reward=None)
+        builder = SummaryBuilder()
+        builder.add(result_of(0, reward=-1.0))
+        builder.add(without)
+        summary = builder.build(problem="p", seed=5, version="1", trials=2, wall_time_s=2.0)
+        assert summary.mean_reward is None
+        assert summary.mean_reward_of_successes == -1.0
+        assert "mean reward" not in dict(_summary_rows(summary))
+        (row,) = csv.DictReader(csv_lines([without]))
+        assert row["reward"] == ""
+
+    def test_who_decided_is_told_where_it_is_known(self) -> None:
+        builder = SummaryBuilder()
+        result = result_of(0, sensing_ms=(1.0, 2.0))
+        builder.add(msgspec.structs.replace(result, sensing_decisions=17))
+        summary = builder.build(
+            problem="p",
+            seed=5,
+            version="1",
+            trials=1,
+            wall_time_s=2.0,
+            answers=AnswerCounts({"cloud": 13, "local": 4}, {"cloud": 17}, 12.5),
+        )
+        assert summary.sensing_decisions == 17
+        written = json.loads(summary.to_json())
+        assert written["sensing_decisions_by_service"] == {"cloud": 13, "local": 4}
+        assert written["task_answers_by_service"] == {"cloud": 17}
+        assert written["longest_wait_ms"] == 12.5
+
+    def test_the_digest_depends_on_every_trial_and_their_order(self) -> None:
+        def digest(*order: int) -> str:
+            builder = SummaryBuilder()
+            for trial in order:
+                builder.add(result_of(trial))
+            return builder.build(problem="p", seed=5, version="1", trials=3, wall_time_s=0.0).digest
+
+        assert len({digest(0, 1, 2), digest(0, 2, 1), digest(0, 1), digest()}) == 4
+
+    def test_without_trials_there_are_no_means(self) -> None:
+        summary = SummaryBuilder().build(
+            problem="p", seed=5, version="1", trials=3, wall_time_s=0.0
+        )
+        assert summary.finished == 0
+        assert summary.success_rate is None
+        assert summary.mean_reward is None
+        assert summary.sensing_ms_median is None

@@ -1,0 +1,72 @@
+"""Records of an unfinished trial: what is none is said to be none, whatever it is instead."""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+import pytest
+
+from holdfast.config.settings import ParticleFilterSettings, PlanningSettings
+from holdfast.errors import RecordError
+from holdfast.planning import Planner
+from holdfast.problems.peg_in_hole_2d import PegInHole2D
+from holdfast.protocol.messages import encode_floats
+from holdfast.protocol.records import (
+    ActingRecord,
+    LocalTookOverRecord,
+    ObservedRecord,
+    PausedRecord,
+    PerformedRecord,
+    Record,
+    decode_record,
+    encode_record,
+    replay,
+)
+
+PROBLEM = PegInHole2D()
+PLANNING = PlanningSettings(
+    particle_filter=ParticleFilterSettings(num_particles=12), sensing_interval=3
+)
+RECORDS: list[Record] = [
+    ObservedRecord(8, 1, encode_floats([0.5]), bytes(32), 1.5),
+    ActingRecord(8, encode_floats([0.25, -0.5, 0.0])),
+    PerformedRecord(8, None),
+    PausedRecord(),
+    LocalTookOverRecord(2),
+]
+
+
+@pytest.mark.parametrize("record", RECORDS, ids=lambda record: type(record).__name__)
+def test_a_record_comes_back(record: Record) -> None:
+    assert decode_record(encode_record(record)) == record
+
+
+def test_deep_nesting_is_no_record() -> None:
+    """After the fields of a record others may follow, which are skipped, by recursion."""
+    for data in (b"\x92\x04" + b"\x91" * 100_000, b"\x91" * 100_000, b"\x92\x04" + b"\x81" * 9999):
+        with pytest.raises(RecordError, match="no record of a journal"):
+            decode_record(data)
+
+
+def first_record(**changes: object) -> ObservedRecord:
+    """Return an observation that could be the first of a trial, but for its digest."""
+    shown = encode_floats(np.zeros(1))
+    return msgspec.structs.replace(ObservedRecord(0, 0, shown, bytes(32), 1.0), **changes)
+
+
+@pytest.mark.parametrize(
+    ("record", "why"),
+    [
+        (first_record(sensing_action=99), "sensing action 99"),
+        (first_record(sensing_action=-1), "sensing action -1"),
+        (first_record(observation=encode_floats(np.zeros(7))), "observation"),
+        (first_record(observation=b""), "observation"),
+        (first_record(observation=b"short"), "5 bytes are not 0 numbers"),
+        (first_record(), "another state"),
+        (first_record(step=1), "of step 1"),
+    ],
+    ids=["too high", "too low", "too long", "empty", "half a number", "digest", "step"],
+)
+def test_a_record_that_does_not_follow_is_named(record: Record, why: str) -> None:
+    with pytest.raises(RecordError, match=rf"trial 4: record 1 of its journal .*{why}"):
+        replay(Planner(PROBLEM, PLANNING), 11, 4, [LocalTookOverRecord(1), record])

@@ -1,0 +1,92 @@
+"""Round-trip times, copies of datagrams and the budget that they share."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from holdfast.transport.redundancy import (
+    COPY_DELAY_S,
+    Paths,
+    RedundantSender,
+    RoundTripEstimator,
+)
+
+
+class Sent:
+    """Two paths that remember what was sent."""
+
+    def __init__(self) -> None:
+        self.datagrams: list[bytes] = []
+        self.on_stream: list[tuple[int, bytes]] = []
+        self.sender = RedundantSender(
+            Paths(
+                self.datagrams.append,
+                lambda number, message: self.on_stream.append((number, message)),
+                lambda: 300,
+            )
+        )
+
+
+class TestSender:
+    def test_a_message_carries_its_kind_and_the_loss_seen_here(self) -> None:
+        sent = Sent()
+        sent.sender.send_unbudgeted(4, b"body")
+        sent.sender.send_on_stream(9, 2, b"body")
+        assert sent.datagrams == [b"\x04\xffbody"]
+        assert sent.on_stream == [(9, b"\x02\xffbody")]
+
+    def test_a_copy_follows_while_the_path_loses_datagrams(self) -> None:
+        sent = Sent()
+        sent.sender.send_first(1, b"x", 10.0, lambda: True)
+        assert sent.sender.due == 10.0 + COPY_DELAY_S
+        sent.sender.expire(10.0 + 0.9 * COPY_DELAY_S)
+        assert len(sent.datagrams) == 1
+        sent.sender.expire(10.0 + COPY_DELAY_S)
+        assert len(sent.datagrams) == 2
+        assert sent.sender.due == math.inf
+
+    def test_no_copy_without_loss_or_where_it_is_of_no_use_any_more(self) -> None:
+        sent = Sent()
+        sent.sender.send_first(1, b"x", 0.0, lambda: False)
+        sent.sender.expire(1.0)
+        sent.sender.num_lost = 0
+        sent.sender.send_first(1, b"y", 1.0, lambda: True)
+        sent.sender.expire(2.0)
+        assert len(sent.datagrams) == 2
+
+    def test_the_budget_bounds_repetition_and_is_earned_by_first_transmissions(self) -> None:
+        sent = Sent()
+        for _ in range(1000):
+            sent.sender.retransmit(1, bytes(1000))
+        burst = len(sent.datagrams)
+        assert 1 <= burst < 9
+        sent.sender.num_lost = 0
+        sent.sender.send_first(1, bytes(1000), 0.0, lambda: True)
+        for _ in range(1000):
+            sent.sender.retransmit(1, bytes(1000))
+        assert len(sent.datagrams) - burst in (3, 4)  # itself, twice again, and what was left
+
+
+class TestRoundTrips:
+    def test_as_in_the_standard(self) -> None:
+        trips = RoundTripEstimator()
+        assert trips.timeout_s == 0.2
+        trips.add(0.1)
+        assert trips.timeout_s == pytest.approx(0.1 + 4 * 0.05)
+        trips.add(0.1)
+        assert trips.timeout_s == pytest.approx(0.1 + 4 * 0.0375)
+        trips.add(0.2)
+        assert trips.smoothed_s == pytest.approx(0.1125)
+        assert trips.timeout_s == pytest.approx(0.1125 + 4 * (0.75 * 0.0375 + 0.25 * 0.1))
+
+    def test_the_margin_is_never_less_than_ten_milliseconds_nor_the_sum_more_than_a_second(
+        self,
+    ) -> None:
+        trips = RoundTripEstimator()
+        for _ in range(200):
+            trips.add(0.0002)
+        assert trips.timeout_s == pytest.approx(0.0102, abs=1e-6)
+        trips.add(30.0)
+        assert trips.timeout_s == 1.0

@@ -1,0 +1,121 @@
+"""Whose turn it is."""
+
+from __future__ import annotations
+
+import pytest
+from tests.unit.test_protocol_service import Robot, make_problem
+
+from holdfast.protocol.expected_time import ExpectedTimes
+from holdfast.protocol.messages import Request, pack_configuration
+from holdfast.protocol.request_queue import RequestQueue
+from holdfast.protocol.service_jobs import Job
+from holdfast.protocol.service_limits import ServiceLimits
+from holdfast.protocol.service_sessions import PendingTask, Session
+
+
+class TestRequestQueue:
+    """One worker; works named by the order in which they came."""
+
+    def setup_method(self) -> None:
+        self.queue = RequestQueue(1, ServiceLimits(prefetch_patience_ms=20.0))
+        self.now = 0.0
+
+    def session(self, key: int) -> Session:
+        robot = Robot(key=key)
+        request = robot.request()
+        return Session(
+            (None, request.session),
+            request,
+            robot.session_configuration,
+            1,
+            ExpectedTimes(4.0, 0.001, 0.001),
+        )
+
+    def task(self, session: Session, name: bytes, since: float, *, prefetched: bool) -> PendingTask:
+        request: Request | None = None if prefetched else Robot().request()
+        task = PendingTask(
+            session, name, sensing=True, request=request, state=None, size=10, since=since
+        )
+        self.queue.enqueue(task)
+        self.now = max(self.now, since)
+        return task
+
+    def run_one(self) -> tuple[bytes, Job]:
+        task = self.queue.take(self.now)
+        assert task is not None
+        robot = Robot()
+        job = Job(
+            "sensing",
+            None,
+            make_problem,
+            str,
+            pack_configuration(robot.session_configuration),
+            robot.session_configuration.planning,
+            5,
+            ServiceLimits(),
+            task.request,
+            None,
+        )
+        self.queue.handed_out(task, job, 0.0)
+        return task.digest, job
+
+    def finish(self, job: Job) -> None:
+        self.queue.release_held(self.queue.end(job).session)
+
+    def test_those_that_robots_stand_still_for_go_first(self) -> None:
+        self.task(self.session(1), b"ahead", 0.0, prefetched=True)
+        self.task(self.session(2), b"awaited", 0.01, prefetched=False)
+        assert self.run_one()[0] == b"awaited"
+
+    def test_but_not_for_ever(self) -> None:
+        self.task(self.session(1), b"ahead", 0.0, prefetched=True)
+        self.task(self.session(2), b"awaited", 0.03, prefetched=False)
+        assert self.run_one()[0] == b"ahead"
+
+    @pytest.mark.parametrize("held", [False, True])
+    def test_what_is_awaited_meanwhile_goes_first(self, held: bool) -> None:
+        session = self.session(1)
+        job = None
+        if held:
+            # Behind another one of the same robot.
+            self.task(session, b"before", 0.0, prefetched=True)
+            _, job = self.run_one()
+        hastened = self.task(session, b"hastened", 0.0, prefetched=True)
+        self.task(self.session(2), b"other", 0.001, prefetched=True)
+        self.queue.promote(hastened)
+        if job is not None:
+            self.finish(job)
+        self.task(self.session(3), b"awaited", 0.002, prefetched=False)
+        assert self.run_one()[0] == b"hastened"
+
+    def test_a_robot_has_one_turn_at_a_time(self) -> None:
+        session = self.session(1)
+        self.task(session, b"first", 0.0, prefetched=False)
+        name, job = self.run_one()
+        assert name == b"first"
+        self.task(session, b"second", 0.0, prefetched=False)
+        self.task(self.session(2), b"other", 0.1, prefetched=False)
+        self.finish(job)
+        # It was held back meanwhile, so the other robot's turn comes before.
+        assert self.run_one()[0] == b"other"
+
+    def test_no_more_than_there_are_workers(self) -> None:
+        for key in range(3):
+            self.task(self.session(key), b"%d" % key, 0.0, prefetched=False)
+        _, job = self.run_one()
+        assert self.queue.take(self.now) is None
+        assert self.queue.num_waiting == 2
+        self.finish(job)
+        assert self.run_one()[0] == b"1"
+        assert self.queue.num_waiting == 1
+
+    def test_prefetches_that_waited_together_run_together(self) -> None:
+        """Found by the simulator (seed 27053): the second end found the slot free already."""
+        self.queue = RequestQueue(2, ServiceLimits(prefetch_patience_ms=20.0))
+        session = self.session(1)
+        for name in (b"first", b"second"):
+            self.task(session, name, 0.0, prefetched=True)
+        (_, first), (_, second) = self.run_one(), self.run_one()
+        self.finish(first)
+        self.finish(second)
+        assert (self.queue.num_running, self.queue.num_waiting) == (0, 0)

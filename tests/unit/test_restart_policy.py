@@ -1,0 +1,82 @@
+"""When the local service is launched."""
+
+from __future__ import annotations
+
+import random
+
+import pytest
+
+from holdfast.config.settings import RecoverySettings
+from holdfast.protocol.restart_policy import RestartPolicy
+
+
+class TestRestartPolicy:
+    def test_a_process_that_answers_is_not_replaced(self) -> None:
+        launches = RestartPolicy(RecoverySettings(relaunch_delay_ms=100.0))
+        launches.want(0.0)
+        launches.begin(0.0)
+        launches.failed(1.0)
+        assert launches.is_due(1.0)
+        launches.succeeded()
+        assert not launches.pending
+        assert not launches.is_due(10.0)
+
+    @pytest.mark.parametrize("seed", range(20))
+    def test_a_launch_is_overdue_when_it_was_said_to_be(self, seed: int) -> None:
+        # On the bit: who is woken at the time that was asked for must find that it has come.
+        draw = random.Random(seed)
+        for _ in range(500):
+            launches = RestartPolicy(RecoverySettings(launch_timeout_ms=draw.uniform(1.0, 5000.0)))
+            now = draw.uniform(0.0, 10.0)
+            launches.want(now)
+            assert launches.is_due(now)
+            launches.begin(now)
+            at = launches.next_wakeup(present=False)
+            assert at is not None
+            assert launches.overdue_launch_age_s(at, present=False) is not None
+
+    @pytest.mark.parametrize("begun_at", [0.0, 7.0])
+    def test_a_long_life_makes_up_for_failures(self, begun_at: float) -> None:
+        launches = RestartPolicy(RecoverySettings(relaunch_delay_ms=100.0))
+        launches.want(begun_at)
+        launches.failed(begun_at)
+        launches.begin(begun_at)
+        launches.failed(begun_at)
+        launches.begin(begun_at)
+        launches.ended(begun_at + 5.0)
+        assert launches.is_due(begun_at + 5.0)  # at once, as after the first failure
+
+    def test_a_short_life_does_not(self) -> None:
+        launches = RestartPolicy(RecoverySettings(relaunch_delay_ms=100.0))
+        launches.want(0.0)
+        for _ in range(3):
+            launches.begin(0.0)
+            launches.ended(0.5)
+        assert launches.next_wakeup(present=False) == pytest.approx(0.5 + 0.2)
+
+    def test_one_that_was_not_seen_in_time_gets_more_time_the_next_time(self) -> None:
+        """On a machine where a start takes longer than the limit, one comes up nevertheless."""
+        launches = RestartPolicy(RecoverySettings(launch_timeout_ms=5000.0))
+        allowed_s = []
+        now = 0.0
+        for _ in range(6):
+            launches.begin(now)
+            overdue_at = launches.next_wakeup(present=False)
+            assert overdue_at is not None
+            assert launches.overdue_launch_age_s(overdue_at - 0.001, present=False) is None
+            assert launches.overdue_launch_age_s(overdue_at, present=False) is not None
+            allowed_s.append(overdue_at - now)
+            now = overdue_at
+            launches.failed(now, late=True)
+        assert allowed_s == [5.0, 10.0, 20.0, 40.0, 40.0, 40.0]
+        launches.succeeded()
+        launches.begin(now)
+        assert launches.next_wakeup(present=False) == now + 5.0
+
+    def test_one_that_has_ended_gets_no_more_time(self) -> None:
+        launches = RestartPolicy(RecoverySettings(launch_timeout_ms=5000.0))
+        for _ in range(3):
+            launches.begin(0.0)
+            launches.ended(0.5)
+        launches.begin(1.0)
+        assert launches.next_wakeup(present=False) == 6.0

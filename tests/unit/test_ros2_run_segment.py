@@ -1,0 +1,191 @@
+"""A segment of a run on a thread of its own: how it ends, and that the next one goes on."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from tests.recordings import robot_configuration
+
+from holdfast.config.loader import Configuration
+from holdfast.planning import Planner
+from holdfast.robot.environment import EnvironmentMaker, SimulatedEnvironment, load_environment
+from holdfast.robot.trial import run_trial
+from holdfast.ros.ros2.run_segment import Ending, RunSegment, SegmentResult
+from holdfast.runtime.events import NullEventLog
+
+PATIENCE_S = 60.0
+
+
+@pytest.fixture
+def configuration(tmp_path: Path) -> Configuration:
+    return robot_configuration(tmp_path, num_trials=2)
+
+
+class Segments:
+    """Makes segments of one run, one after another."""
+
+    def __init__(self, configuration: Configuration, path: Path) -> None:
+        self.configuration = configuration
+        self.path = path
+        self.maker = load_environment(configuration)
+        self.on_order: Callable[[RunSegment, int], None] = lambda _, __: None
+        self.orders = 0
+
+    def make(self) -> RunSegment:
+        def order(state: object, effect: object) -> None:
+            self.orders += 1
+            self.on_order(segment, self.orders)
+
+        segment = RunSegment(
+            self.configuration,
+            self.path,
+            self.maker,
+            rate_hz=None,
+            sink=NullEventLog(),
+            on_order=order,
+            on_timing=lambda _: None,
+            on_end=lambda _: None,
+            interrupt=lambda _: None,
+        )
+        return segment
+
+    def run(self) -> SegmentResult:
+        segment = self.make()
+        segment.start()
+        assert segment.ended.wait(PATIENCE_S)
+        assert segment.outcome is not None
+        return segment.outcome
+
+
+@pytest.fixture
+def segments(configuration: Configuration, tmp_path: Path) -> Segments:
+    return Segments(configuration, tmp_path / "run")
+
+
+def digests(configuration: Configuration) -> list[str]:
+    return [
+        run_trial(
+            Planner(configuration.problem, configuration.planning),
+            configuration.simulator.seed,
+            trial,
+            max_steps=configuration.simulator.max_steps,
+        ).digest
+        for trial in range(configuration.simulator.num_trials)
+    ]
+
+
+def test_all_trials(segments: Segments) -> None:
+    outcome = segments.run()
+    assert (outcome.ending, outcome.message) == (Ending.FINISHED, "2 trials")
+    assert [trial.digest for trial in outcome.trials] == digests(segments.configuration)
+    assert (segments.path / "summary.json").exists()
+    orders = segments.orders
+    assert (outcome.status, outcome.num_finished) == ("standard", 2)
+    # Nobody decides in a segment that has nothing to do.
+    assert segments.run() == outcome._replace(status="")
+    assert segments.orders == orders
+
+
+def test_parts_that_are_paused(segments: Segments) -> None:
+    segments.on_order = lambda segment, count: (
+        segment.pause(f"order {count}", PATIENCE_S) if count % 7 == 1 else None
+    )
+    reasons = []
+    while (outcome := segments.run()).ending == Ending.PAUSED:
+        reasons.append(outcome.message)
+    assert reasons[0] == "order 1"
+    assert len(reasons) > 5
+    assert outcome.ending == Ending.FINISHED
+    assert [trial.digest for trial in outcome.trials] == digests(segments.configuration)
+
+
+def test_paused_before_it_began(segments: Segments) -> None:
+    segment = segments.make()
+    segment.pause("at once", PATIENCE_S)
+    segment.start()
+    assert segment.ended.wait(PATIENCE_S)
+    assert segment.outcome is not None
+    assert segment.outcome[:3] == (Ending.PAUSED, "at once", ())
+    assert segments.orders == 0
+
+
+def test_a_robot_that_moves_is_interrupted_when_it_takes_too_long(segments: Segments) -> None:
+    stopped = threading.Event()
+
+    class Slow(SimulatedEnvironment):
+        def perform(self, task_action: Any) -> Any:
+            segment.pause("enough", 0.0)
+            assert stopped.wait(PATIENCE_S)
+            raise OSError("stopped")
+
+    segments.maker = EnvironmentMaker("robot", segments.configuration.problem, 3, 60_000.0, Slow)
+    segment = segments.make()
+    segment._interrupt = lambda _: stopped.set()
+    segment.start()
+    assert segment.ended.wait(PATIENCE_S)
+    assert segment.outcome is not None
+    assert segment.outcome[:2] == (Ending.PAUSED, "enough")
+
+
+class Failing(SimulatedEnvironment):
+    """Fails until it is mended."""
+
+    broken = threading.Event()
+
+    def __init__(self, problem: Any, seed: int, trial: int) -> None:
+        super().__init__(problem, seed, trial)
+
+    def perform_sensing(self, sensing_action: int) -> Any:
+        if self.broken.is_set():
+            raise OSError("no camera")
+        return super().perform_sensing(sensing_action)
+
+
+def test_an_error_whose_reason_can_go_away(segments: Segments) -> None:
+    configuration = segments.configuration
+    segments.maker = EnvironmentMaker("robot", configuration.problem, 3, 60_000.0, Failing)
+    Failing.broken.set()
+    outcome = segments.run()
+    assert outcome.ending == Ending.HELD
+    assert "OSError: no camera" in outcome.message
+    Failing.broken.clear()
+    outcome = segments.run()
+    assert outcome.ending == Ending.FINISHED
+    assert [trial.digest for trial in outcome.trials] == digests(configuration)
+
+
+def test_an_error_that_ends_the_run_for_good(segments: Segments) -> None:
+    class NoCount:
+        def __init__(self) -> None:
+            self.is_done = lambda: False
+            self.perform_sensing = lambda _: [4.0]
+
+        def perform(self, task_action: object) -> None:
+            raise OSError("no motor")
+
+    segments.maker = EnvironmentMaker("robot", segments.configuration.problem, 3, 60_000.0, NoCount)
+    outcome = segments.run()
+    assert outcome.ending == Ending.FAILED
+    assert "nobody can say whether its task action was performed" in outcome.message
+
+
+def test_a_directory_that_is_none(segments: Segments) -> None:
+    segments.path.write_text("")
+    outcome = segments.run()
+    assert outcome.ending == Ending.HELD
+    assert outcome.message.startswith(str(segments.path))
+
+
+def test_a_defect_is_told_whole(segments: Segments, monkeypatch: pytest.MonkeyPatch) -> None:
+    def break_down(*_: object, **__: object) -> None:
+        raise RuntimeError("a defect")
+
+    monkeypatch.setattr("holdfast.ros.ros2.run_segment.perform_trials", break_down)
+    outcome = segments.run()
+    assert outcome.ending == Ending.FAILED
+    assert "Traceback" in outcome.message
+    assert "RuntimeError: a defect" in outcome.message

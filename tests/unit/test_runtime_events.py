@@ -1,0 +1,86 @@
+"""Events: sinks, and the limit on repeated ones."""
+
+from __future__ import annotations
+
+import io
+
+from holdfast.runtime.events import BoundedEventLog, EventSink, NullEventLog, TeeEventLog
+from holdfast.runtime.logs import EventLog
+
+
+class RecordingSink:
+    """Keeps the events that it gets."""
+
+    def __init__(self) -> None:
+        self.events: list[tuple[str, dict[str, object]]] = []
+        self.closed = False
+
+    def event(self, name: str, /, **fields: object) -> None:
+        self.events.append((name, fields))
+
+    def close(self) -> None:
+        self.closed = True
+
+
+class TestRepeatedEvents:
+    def test_of_each_kind_and_service_one_a_second_after_a_burst(self) -> None:
+        now, reported = [0.0], RecordingSink()
+        log = BoundedEventLog(reported, lambda: now[0])
+        for number in range(1000):
+            log.event("refused", service="east", number=number)
+            log.event("refused", service="west", number=number)
+            log.event("status", service="east", number=number)
+            log.event("holding", number=number)
+        burst = [
+            fields["number"] for name, fields in reported.events if fields.get("service") == "west"
+        ]
+        assert burst == list(range(20))
+        assert sum(name == "status" for name, _ in reported.events) == 1000
+        assert sum(name == "holding" for name, _ in reported.events) == 1000
+        reported.events.clear()
+        # The last dropped one is reported when its time has come, with the number of others.
+        now[0] = 1.0
+        log.event("holding", number=1000)
+        assert reported.events == [
+            ("refused", {"service": service, "number": 999, "similar_lines_omitted": 979})
+            for service in ("east", "west")
+        ] + [("holding", {"number": 1000})]
+        reported.events.clear()
+        log.event("refused", service="east", number=1000)
+        log.event("refused", service="east", number=1001)
+        now[0] = 2.5
+        log.event("refused", service="east", number=1002)
+        log.event("refused", service="east", number=1003)
+        log.close()
+        assert reported.events == [
+            ("refused", {"service": "east", "number": 1001, "similar_lines_omitted": 1}),
+            ("refused", {"service": "east", "number": 1003, "similar_lines_omitted": 1}),
+        ]
+        assert reported.closed
+
+    def test_what_is_rare_is_reported_at_once(self) -> None:
+        now, reported = [0.0], RecordingSink()
+        log = BoundedEventLog(reported, lambda: now[0])
+        for number in range(100):
+            log.event("refused", service="east", number=number)
+            now[0] += 1.0
+        assert reported.events == [
+            ("refused", {"service": "east", "number": number}) for number in range(100)
+        ]
+
+
+class TestOthers:
+    def test_all_take_events_and_close(self) -> None:
+        stream = io.StringIO()
+        sinks: list[EventSink] = [
+            NullEventLog(),
+            EventLog(stream, component="robot"),
+            TeeEventLog(NullEventLog(), EventLog(stream, component="robot")),
+        ]
+        for sink in sinks:
+            sink.event("trial", trial=1)
+            sink.close()
+            sink.event("trial", trial=2)
+            sink.close()
+        assert stream.getvalue().count("trial 1") == 2
+        assert "trial 2" not in stream.getvalue()

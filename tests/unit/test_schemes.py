@@ -1,0 +1,57 @@
+"""The table of schemes: each has an implementation, and says who may listen."""
+
+from __future__ import annotations
+
+import inspect
+import socket
+import subprocess
+import sys
+
+import pytest
+
+from holdfast.errors import TransportError
+from holdfast.transport.endpoints import SCHEMES, Endpoint, check_direction
+from holdfast.transport.schemes import Scheme, load_scheme
+
+
+@pytest.mark.parametrize("name", SCHEMES)
+def test_each_is_implemented_by_a_class_with_the_same_methods(name: str) -> None:
+    scheme = load_scheme(name)
+    assert isinstance(scheme, Scheme)
+    for method, base in inspect.getmembers(Scheme, inspect.isfunction):
+        if not method.startswith("_"):
+            assert inspect.signature(getattr(type(scheme), method)) == inspect.signature(base)
+    scheme.close()
+
+
+@pytest.mark.parametrize("name", SCHEMES)
+def test_who_may_listen(name: str) -> None:
+    endpoint = Endpoint(name, "there", 0)
+    check_direction(endpoint, service_listens=True)
+    if SCHEMES[name].services_listen:
+        with pytest.raises(TransportError, match=f"endpoint {name}/there.*service"):
+            check_direction(endpoint, service_listens=False)
+    else:
+        check_direction(endpoint, service_listens=False)
+
+
+def test_streams_are_looked_up_as_they_are_written() -> None:
+    endpoint = Endpoint("tls", "planner.example", 7447)
+    scheme = load_scheme("tls")
+    assert scheme.look_up(endpoint) == ("planner.example", 7447, socket.AF_UNSPEC)
+    assert scheme.listening_endpoint(endpoint) == endpoint
+    assert scheme.bound_endpoint(endpoint, endpoint.with_port(9)) == endpoint.with_port(9)
+
+
+def test_what_no_endpoint_uses_is_not_imported() -> None:
+    program = (
+        "import sys; from holdfast.transport.schemes import load_scheme; "
+        "load_scheme('tcp'); print(*sys.modules)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    )
+    loaded = {name for name in done.stdout.split() if name.startswith("holdfast.transport.")}
+    assert not loaded & {
+        f"holdfast.transport.{name}" for name in ("datagram_links", "ros1", "ros1_node", "tls")
+    }

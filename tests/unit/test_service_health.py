@@ -1,0 +1,209 @@
+"""Health over HTTP: what is asked and answered, over real sockets on one event loop."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import re
+import socket
+from collections.abc import AsyncIterator, Awaitable, Callable
+
+import pytest
+
+from holdfast.errors import HealthError
+from holdfast.service import health
+from holdfast.service.health import HttpAddress, HttpServer, Page, parse_http_address
+
+PATIENCE_S = 30.0
+
+
+async def ready() -> Page:
+    return Page.of(None)
+
+
+async def draining() -> Page:
+    return Page.of("draining")
+
+
+@contextlib.asynccontextmanager
+async def serving(host: str = "127.0.0.1", port: int = 0) -> AsyncIterator[HttpAddress]:
+    server = HttpServer(HttpAddress(host, port), {"/livez": ready, "/readyz": draining})
+    try:
+        yield await server.start()
+    finally:
+        server.close()
+
+
+async def exchange(address: HttpAddress, request: bytes) -> bytes:
+    reader, writer = await asyncio.open_connection(*address)
+    try:
+        writer.write(request)
+        async with asyncio.timeout(PATIENCE_S):
+            return await reader.read()
+    finally:
+        writer.close()
+
+
+def run(test: Callable[[HttpAddress], Awaitable[None]], host: str = "127.0.0.1") -> None:
+    async def main() -> None:
+        async with serving(host) as address:
+            await test(address)
+
+    asyncio.run(main())
+
+
+class TestAnswers:
+    @pytest.mark.parametrize(
+        ("request_line", "status", "body"),
+        [
+            (b"GET /livez HTTP/1.1", b"200 OK", b"ok\n"),
+            (b"GET /livez?verbose HTTP/1.0", b"200 OK", b"ok\n"),
+            (b"HEAD /livez HTTP/1.1", b"200 OK", b""),
+            (b"GET /readyz HTTP/1.1", b"503 Service Unavailable", b"draining\n"),
+            (b"GET / HTTP/1.1", b"404 Not Found", b"there are /livez, /readyz\n"),
+            (b"GET /\xff HTTP/1.1", b"404 Not Found", b"there are /livez, /readyz\n"),
+            (b"POST /livez HTTP/1.1", b"405 Method Not Allowed", b"GET and HEAD are answered\n"),
+            (b"GET /livez", b"400 Bad Request", b"this is no request of HTTP/1\n"),
+            (b"", b"400 Bad Request", b"this is no request of HTTP/1\n"),
+            (b"\x16\x03\x01 hello TLS", b"400 Bad Request", b"this is no request of HTTP/1\n"),
+        ],
+    )
+    def test_to_a_request(self, request_line: bytes, status: bytes, body: bytes) -> None:
+        async def test(address: HttpAddress) -> None:
+            answer = await exchange(address, request_line + b"\r\nHost: here\r\n\r\n")
+            head, _, got = answer.partition(b"\r\n\r\n")
+            assert head.startswith(b"HTTP/1.1 " + status + b"\r\n")
+            assert got == body
+
+        run(test)
+
+    def test_a_head_in_pieces(self) -> None:
+        async def test(address: HttpAddress) -> None:
+            reader, writer = await asyncio.open_connection(*address)
+            for piece in (b"GET /li", b"vez HTTP/1.1\r\nHo", b"st: here\r\n", b"\r", b"\n"):
+                writer.write(piece)
+                await writer.drain()
+                await asyncio.sleep(0.001)
+            async with asyncio.timeout(PATIENCE_S):
+                assert (await reader.read()).endswith(b"\r\n\r\nok\n")
+            writer.close()
+
+        run(test)
+
+    def test_a_head_without_an_end(self) -> None:
+        async def test(address: HttpAddress) -> None:
+            answer = await exchange(address, b"GET /livez HTTP/1.1\r\n" + b"X: y\r\n" * 1365)
+            assert answer.startswith(b"HTTP/1.1 431 ")
+
+        run(test)
+
+    def test_over_version_6(self) -> None:
+        if not socket.has_dualstack_ipv6():
+            pytest.skip("no IPv6 here")
+
+        async def test(address: HttpAddress) -> None:
+            assert (await exchange(address, b"GET /livez HTTP/1.1\r\n\r\n")).endswith(b"ok\n")
+
+        run(test, "::1")
+
+
+class TestBounds:
+    def test_silent_connections_are_sent_away(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(health, "_TIMEOUT_S", 0.05)
+
+        async def test(address: HttpAddress) -> None:
+            with contextlib.suppress(ConnectionResetError):
+                assert await exchange(address, b"GET /livez HTTP/1.1\r\n") == b""
+
+        run(test)
+
+    def test_the_oldest_connection_makes_room(self) -> None:
+        async def test(address: HttpAddress) -> None:
+            silent = [await asyncio.open_connection(*address) for _ in range(65)]
+            assert (await exchange(address, b"GET /livez HTTP/1.1\r\n\r\n")).endswith(b"ok\n")
+            for reader, _ in silent[:2]:
+                async with asyncio.timeout(PATIENCE_S):
+                    with contextlib.suppress(ConnectionResetError):
+                        assert await reader.read() == b""
+            reader, writer = silent[-1]
+            writer.write(b"GET /livez HTTP/1.1\r\n\r\n")
+            async with asyncio.timeout(PATIENCE_S):
+                assert (await reader.read()).endswith(b"ok\n")
+            for _, writer in silent:
+                writer.close()
+
+        run(test)
+
+    def test_close_ends_connections_and_frees_the_port(self) -> None:
+        async def main() -> None:
+            async with serving() as address:
+                reader, writer = await asyncio.open_connection(*address)
+                await asyncio.sleep(0)  # it is accepted in some later turn
+                assert (await exchange(address, b"GET /livez HTTP/1.1\r\n\r\n")).endswith(b"ok\n")
+            async with asyncio.timeout(PATIENCE_S):
+                with contextlib.suppress(ConnectionResetError):
+                    assert await reader.read() == b""
+            writer.close()
+            with pytest.raises(ConnectionRefusedError):
+                await asyncio.open_connection(*address)
+            async with serving(*address) as again:
+                assert again == address
+
+        asyncio.run(main())
+
+
+class TestAddresses:
+    @pytest.mark.parametrize(
+        ("text", "host", "port"),
+        [
+            ("9090", "127.0.0.1", 9090),
+            ("0", "127.0.0.1", 0),
+            ("0.0.0.0:9090", "0.0.0.0", 9090),
+            ("[::1]:9090", "::1", 9090),
+            ("planner.example:80", "planner.example", 80),
+        ],
+    )
+    def test_forms(self, text: str, host: str, port: int) -> None:
+        assert parse_http_address(text) == HttpAddress(host, port)
+
+    @pytest.mark.parametrize(
+        "text",
+        [
+            *("", "ten", "-1", ":9090", "here:", "here:ten", "here:65536", "::1:9090", "65536"),
+            *(f"{'b' * 64}.example:80", "[nonsense]:80", "[fe80::1%eth\u00e9]:80", "300.1.1.1:80"),
+        ],
+    )
+    def test_what_is_none_is_named(self, text: str) -> None:
+        with pytest.raises(HealthError, match=re.escape(f"{text!r}")):
+            parse_http_address(text)
+
+    def test_an_address_of_another_machine_is_named_once(self) -> None:
+        async def main() -> None:
+            text = r"health or metrics at 192\.0\.2\.1:8080: Cannot assign requested address: "
+            text += r"this machine has no such address \(0\.0\.0\.0 is all that it has\)"
+            with pytest.raises(HealthError, match=f"^{text}$"):
+                async with serving("192.0.2.1", 8080):
+                    pass
+
+        asyncio.run(main())
+
+    def test_a_port_that_is_taken_is_named(self) -> None:
+        async def main() -> None:
+            with socket.socket() as other:
+                other.bind(("127.0.0.1", 0))
+                other.listen()
+                port = other.getsockname()[1]
+                text = rf"127\.0\.0\.1:{port}: another program listens there"
+                with pytest.raises(HealthError, match=text):
+                    async with serving("127.0.0.1", port):
+                        pass
+
+        asyncio.run(main())
+
+    def test_an_address_that_is_not_this_machines_is_named(self) -> None:
+        async def main() -> None:
+            with pytest.raises(HealthError, match=r"192\.0\.2\.1:0: "):
+                async with serving("192.0.2.1"):
+                    pass
+
+        asyncio.run(main())

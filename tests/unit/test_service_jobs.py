@@ -1,0 +1,74 @@
+"""Jobs are pure functions of what they were made with; problems are lent to one at a time."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import pytest
+from tests.unit.test_protocol_service import Robot, make_problem
+
+from holdfast.protocol.messages import Request, pack_configuration
+from holdfast.protocol.service_jobs import Job, ProblemPool
+from holdfast.protocol.service_limits import ServiceLimits
+
+
+def job(
+    robot: Robot,
+    request: Request,
+    kind: Literal["task", "sensing"] = "sensing",
+    limits: ServiceLimits | None = None,
+) -> Job:
+    configuration = robot.session_configuration
+    return Job(
+        kind,
+        None,
+        make_problem,
+        str,
+        pack_configuration(configuration),
+        configuration.planning,
+        configuration.seed,
+        limits or ServiceLimits(),
+        request,
+        None,
+    )
+
+
+def test_the_same_job_has_the_same_result() -> None:
+    robot = Robot()
+    first, second = (job(robot, robot.request()) for _ in range(2))
+    assert first.identity == second.identity
+    results = [each.run() for each in (first, second)]
+    assert results[0].failure is None
+    assert results[0].sensing_action == results[1].sensing_action >= 0
+
+
+def test_a_state_that_does_not_follow_is_asked_for() -> None:
+    robot = Robot()
+    result = job(robot, robot.request(digest=b"\1" * 16)).run()
+    assert (result.lacks_state, result.differs, result.diverged) == (True, True, True)
+    assert result.problem is not None, "it is worth keeping"
+
+
+@pytest.mark.parametrize(
+    ("limits", "says"), [(ServiceLimits(max_work=1), "max_work"), (ServiceLimits(), None)]
+)
+def test_a_decision_has_a_bounded_size(limits: ServiceLimits, says: str | None) -> None:
+    robot = Robot()
+    failure = job(robot, robot.request(), limits=limits).run().failure
+    if says is None:
+        assert failure is None
+    else:
+        assert failure is not None
+        assert failure[0] == "invalid"
+        assert says in failure[1]
+
+
+def test_a_problem_is_lent_to_one_job_and_the_oldest_are_dropped() -> None:
+    pool = ProblemPool(2)
+    problem = make_problem(Robot().session_configuration)
+    assert pool.acquire(b"a") is None
+    for key in (b"a", b"b", b"c"):
+        pool.release(key, problem)
+    assert pool.acquire(b"a") is None
+    assert pool.acquire(b"c") is problem
+    assert pool.acquire(b"c") is None

@@ -1,0 +1,429 @@
+"""Whose a session is: what one certificate can do to the sessions of another, which is nothing."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tests.unit.test_protocol_service import Bench, Robot, content, only, refused
+
+from holdfast.problems.problem import Problem
+from holdfast.protocol.messages import NeedState, Request, SessionConfiguration, encode
+from holdfast.protocol.service import Service
+from holdfast.protocol.service_jobs import EndCall, Job, SendReply, ServiceEffect, StartJob
+from holdfast.protocol.service_limits import ServiceLimits
+
+OWNERS = ("anna", "berta", None)
+
+
+@pytest.mark.parametrize("other", ["berta", None])
+class TestAnotherOwner:
+    def test_sees_a_session_as_one_that_is_not_there(self, other: str | None) -> None:
+        bench, robot = Bench(), Robot()
+        bench.ask(robot.request(), "anna")
+        unknown = Robot(key=77)
+        for epoch in (0, 1, 2**32 - 1):
+            shown = only(bench.ask(robot.request(session_configuration=False, epoch=epoch), other))
+            never = only(
+                bench.ask(unknown.request(session_configuration=False, epoch=epoch), other)
+            )
+            assert isinstance(shown, NeedState)
+            assert isinstance(never, NeedState)
+            assert shown.differs == never.differs
+
+    def test_cannot_end_a_session_by_its_epoch(self, other: str | None) -> None:
+        bench, robot = Bench(), Robot()
+        bench.ask(robot.request(), "anna")
+        bench.ask(robot.request(epoch=2**32 - 1), other)
+        robot.sense()
+        answer = bench.ask(robot.request(session_configuration=False), "anna")
+        assert content(answer) == robot.right_answer()
+        assert bench.service.statistics.sessions_taken_over == 0
+        # Nor one that is forgotten by now.
+        bench.apply(bench.service.tick(bench.now + 10_000.0))
+        assert bench.service.statistics.sessions == 0
+        assert content(bench.ask(robot.request(), "anna")) == robot.right_answer()
+
+    def test_cannot_supersede_what_is_in_work(self, other: str | None) -> None:
+        bench, robot = Bench(), Robot()
+        robot.sense()
+        call = bench.send(robot.request(), "anna")
+        theirs = Robot()
+        for number in (1, 5, 2**32 - 1):
+            bench.send(theirs.request(number=number, epoch=3), other)
+        assert call not in bench.ended
+        bench.run_all()
+        assert content(bench.replies[call]) == robot.right_answer()
+
+    def test_gets_no_answer_that_was_computed_for_another(self, other: str | None) -> None:
+        bench, robot = Bench(), Robot()
+        bench.ask(robot.request(), "anna")
+        before = bench.service.statistics.sensing_parts
+        call = bench.send(robot.request(), other)
+        assert bench.replies[call] == []
+        bench.run_all()
+        assert content(bench.replies[call]) == robot.right_answer()
+        assert bench.service.statistics.sensing_parts == before + 1
+        assert bench.service.statistics.cache_hits == 0
+        assert bench.service.statistics.sessions == 2
+
+    def test_does_not_join_what_another_waits_for(self, other: str | None) -> None:
+        bench, robot = Bench(max_calls_per_request=1), Robot()
+        call = bench.send(robot.request(), "anna")
+        for _ in range(3):
+            bench.send(robot.request(), other)
+        assert call not in bench.ended
+        bench.run_all()
+        assert content(bench.replies[call]) == robot.right_answer()
+
+    def test_cannot_replace_the_settings(self, other: str | None) -> None:
+        bench, robot = Bench(), Robot()
+        bench.ask(robot.request(), "anna")
+        theirs = msgspec.structs.replace(
+            robot.session_configuration, seed=robot.session_configuration.seed + 1
+        )
+        bench.ask(robot.request(epoch=9, session_configuration=False), other)
+        bench.ask(
+            msgspec.structs.replace(robot.request(), session_configuration=theirs, epoch=9), other
+        )
+        robot.sense()
+        answer = bench.ask(robot.request(session_configuration=False), "anna")
+        assert content(answer) == robot.right_answer()
+
+
+def test_an_owners_replaced_process_stays_replaced() -> None:
+    bench, robot = Bench(), Robot()
+    bench.ask(robot.request(epoch=2), "anna")
+    assert refused(bench.ask(robot.request(), "anna")).code == "stale_epoch"
+    bench.apply(bench.service.tick(bench.now + 10_000.0))
+    assert refused(bench.ask(robot.request(), "anna")).code == "stale_epoch"
+
+
+def test_notes_name_the_robot_that_has_a_certificate() -> None:
+    bench = Bench()
+    bench.ask(Robot().request(), "anna")
+    bench.ask(Robot().request())
+    opened = [note.fields.get("robot") for note in bench.notes if note.name == "session_opened"]
+    assert opened == ["anna", None]
+
+
+class TestEpochMemory:
+    def test_one_owner_cannot_make_the_others_forgotten(self) -> None:
+        bench, robot = Bench(max_sessions=4), Robot(key=1)
+        bench.ask(robot.request(epoch=5), "berta")
+        bench.apply(bench.service.tick(bench.now + 10_000.0))
+        sessions = bench.service._sessions
+        for number in range(20_000):
+            sessions.note_epoch(("anna", number.to_bytes(16, "big")), 1)
+        assert refused(bench.ask(robot.request(), "berta")).code == "stale_epoch"
+        assert sessions.epoch_of(("anna", (0).to_bytes(16, "big"))) == 0
+        assert sessions.epoch_of(("anna", (19_999).to_bytes(16, "big"))) == 1
+
+
+class TestTurns:
+    def test_many_sessions_of_one_owner_have_one_turn(self) -> None:
+        bench = Bench(max_wait_ms=1e9)
+        order = [bench.send(Robot(key=100 + n).request(), "anna") for n in range(12)]
+        mine = bench.send(Robot(key=1).request(), "berta")
+        bench.run_all()
+        ended = [call for name, call in bench.trace if name == "SensingAnswer"]
+        # Anna's first is in work, and her next was there before.
+        assert ended.index(mine) <= 2
+        assert sorted(ended) == sorted([*order, mine])
+        assert [call for call in ended if call != mine] == order, "her own as they came"
+
+    def test_robots_that_were_served_go_by_turns_too(self) -> None:
+        bench = Bench(max_wait_ms=1e9)
+        annas = [Robot(key=100 + number) for number in range(8)]
+        berta = Robot(key=1)
+        for robot in annas:
+            bench.ask(robot.request(), "anna")
+        bench.ask(berta.request(), "berta")
+        for robot in (*annas, berta):
+            robot.sense()
+        calls = [bench.send(robot.request(), "anna") for robot in annas]
+        mine = bench.send(berta.request(), "berta")
+        bench.run_all()
+        tasks = [call for name, call in bench.trace if name == "TaskAnswer"]
+        assert tasks.index(mine) <= 2
+        assert [call for call in tasks if call in calls] == calls
+
+    def test_owners_with_one_robot_each_go_as_they_came(self) -> None:
+        bench = Bench(max_wait_ms=1e9)
+        calls = [bench.send(Robot(key=1).request(), f"robot-{number}") for number in range(6)]
+        bench.run_all()
+        assert [call for name, call in bench.trace if name == "SensingAnswer"] == calls
+
+    def test_those_without_a_certificate_have_one_turn(self) -> None:
+        bench = Bench(max_wait_ms=1e9)
+        for number in range(12):
+            bench.send(Robot(key=100 + number).request())
+        mine = bench.send(Robot(key=1).request(), "berta")
+        bench.run_all()
+        ended = [call for name, call in bench.trace if name == "SensingAnswer"]
+        assert ended.index(mine) <= 2
+
+    def test_old_works_of_one_owner_do_not_starve_prefetches_of_another(self) -> None:
+        bench = Bench(max_wait_ms=1e9, prefetch_patience_ms=20.0)
+        annas = [Robot(key=100 + number) for number in range(12)]
+        berta = Robot(key=1)
+        for robot in annas:
+            bench.ask(robot.request(), "anna")
+        bench.ask(berta.request(), "berta")
+        for robot in (*annas, berta):
+            robot.sense()
+        mine = bench.send(berta.request(), "berta")
+        for robot in annas:
+            bench.send(robot.request(), "anna")
+        bench.run()  # Berta's task part; her sensing part waits behind Anna's task parts now.
+        assert bench.kinds(mine) == ["TaskAnswer"]
+        turns = 0
+        while mine not in bench.ended:
+            bench.now += 0.01
+            bench.run()
+            turns += 1
+        assert turns <= 5
+
+    def test_a_flood_of_one_owner_turns_no_other_away(self) -> None:
+        bench = Bench(max_waiting=100, max_waiting_per_robot=10, max_wait_ms=1e9)
+        calls = [bench.send(Robot(key=100 + n).request(), "anna") for n in range(40)]
+        told = [call for call in calls if bench.kinds(call) == ["Busy"]]
+        # One is in work, ten wait.
+        assert len(told) == 40 - 11
+        for number in range(5):
+            call = bench.send(Robot(key=1).request(), f"robot-{number}")
+            assert bench.kinds(call) == []
+        bench.run_all()
+        assert bench.service.statistics.busy == len(told)
+
+    def test_the_wait_behind_one_owner_is_a_turn(self) -> None:
+        """Ten sessions of one owner would take ten times what another may wait."""
+        bench = Bench(max_wait_ms=100.0)
+        annas = [Robot(key=100 + number) for number in range(10)]
+        berta = Robot(key=1)
+        for robot, owner in [*((each, "anna") for each in annas), (berta, "berta")]:
+            for _ in range(3):
+                bench.send(robot.request(), owner)
+                while bench.jobs:
+                    bench.now += 0.06
+                    bench.run()
+                robot.act_until_sensing()
+                robot.sense()
+        calls = [bench.send(robot.request(), "anna") for robot in annas]
+        assert "Busy" in [kind for call in calls for kind in bench.kinds(call)]
+        mine = bench.send(berta.request(), "berta")
+        assert bench.kinds(mine) == []
+        bench.run_all()
+        assert content(bench.replies[mine]) == berta.right_answer()
+
+    def test_half_of_the_bytes_that_wait(self) -> None:
+        """Also of robots that were served before."""
+        berta = Robot(key=1)
+        size = len(encode(berta.restore()))
+        bench = Bench(max_waiting_bytes=6 * size, max_wait_ms=1e9)
+        annas = [Robot(key=100 + number) for number in range(12)]
+        for robot in annas:
+            bench.ask(robot.request(), "anna")
+            robot.sense()
+        calls = [bench.send(robot.restore(), "anna") for robot in annas]
+        taken = [call for call in calls if bench.kinds(call) == []]
+        assert 1 + 3 <= len(taken) <= 1 + 4
+        assert bench.kinds(bench.send(berta.restore(), "berta")) == []
+
+    def test_a_new_robot_with_a_certificate_is_no_newcomer(self) -> None:
+        """It costs a certificate to be one, so robots that were served do not go before it."""
+        bench = Bench(max_wait_ms=1e9)
+        annas = [Robot(key=100 + number) for number in range(6)]
+        for robot in annas:
+            bench.ask(robot.request(), "anna")
+            robot.sense()
+        for robot in annas:
+            bench.send(robot.request(), "anna")
+        mine = bench.send(Robot(key=1).request(), "berta")
+        more = bench.send(Robot(key=2).request(), "berta")
+        bench.run_all()
+        told = [call for name, call in bench.trace if name in ("TaskAnswer", "SensingAnswer")]
+        assert told[len(annas) :].index(mine) <= 2
+        # Her second session that was never served is one: there could be thousands of these.
+        assert told[len(annas) :].index(more) > 4
+
+
+class TestRoom:
+    def test_one_owner_does_not_push_out_another(self) -> None:
+        bench, berta = Bench(max_sessions=6), Robot(key=1)
+        bench.ask(berta.request(), "berta")
+        for number in range(30):
+            bench.ask(Robot(key=100 + number).request(), "anna")
+        assert bench.service.statistics.sessions == 6
+        berta.sense()
+        assert (
+            content(bench.ask(berta.request(session_configuration=False), "berta"))
+            == berta.right_answer()
+        )
+
+    def test_nor_one_that_was_never_served(self) -> None:
+        bench, berta = Bench(max_sessions=6, max_wait_ms=1e9), Robot(key=1)
+        for number in range(30):
+            bench.ask(Robot(key=100 + number).request(), "anna")
+        call = bench.send(berta.request(), "berta")
+        for number in range(30):
+            bench.send(Robot(key=200 + number).request(), "anna")
+        bench.run_all()
+        assert content(bench.replies[call]) == berta.right_answer()
+
+    def test_among_equals_the_one_unused_the_longest_goes(self) -> None:
+        bench = Bench(max_sessions=3)
+        robots = {name: Robot(key=1) for name in ("a", "b", "c", "d")}
+        for name in ("a", "b", "c"):
+            bench.ask(robots[name].request(), name)
+        bench.ask(robots["a"].request(), "a")
+        bench.ask(robots["d"].request(), "d")
+        held = [
+            name for name in robots if bench.service._sessions.get((name, robots[name].session))
+        ]
+        assert held == ["a", "c", "d"]
+
+    def test_most_sessions_of_one_robot(self) -> None:
+        bench = Bench(max_sessions_per_robot=2)
+        for owner in ("anna", None):
+            for number in range(4):
+                bench.ask(Robot(key=100 + number).request(), owner)
+        # Those that have proved nothing are not one robot.
+        assert bench.service.statistics.sessions == 2 + 4
+        held = [
+            number
+            for number in range(4)
+            if bench.service._sessions.get(("anna", (100 + number).to_bytes(16, "big")))
+        ]
+        assert held == [2, 3]
+
+    def test_most_sessions_of_one_robot_that_are_all_in_use(self) -> None:
+        bench = Bench(max_sessions_per_robot=2, max_wait_ms=1e9)
+        calls = [bench.send(Robot(key=100 + number).request(), "anna") for number in range(3)]
+        assert [bench.kinds(call) for call in calls] == [[], [], ["Busy"]]
+        assert bench.kinds(bench.send(Robot(key=1).request(), "berta")) == []
+
+    def test_bytes_of_states(self) -> None:
+        berta = Robot(key=1)
+        size = berta.state.belief.states.nbytes + berta.state.belief.weights.nbytes
+        bench = Bench(max_state_bytes=6 * size)
+        bench.ask(berta.request(), "berta")
+        for number in range(20):
+            bench.ask(Robot(key=100 + number).request(), "anna")
+        assert bench.service._sessions.get(("berta", berta.session)) is not None
+        assert bench.service.statistics.state_bytes <= 6 * size
+
+    def test_bytes_of_openings(self) -> None:
+        berta = Robot(key=1)
+        bench = Bench()
+        bench.ask(berta.request(), "berta")
+        size = bench.service._sessions.configuration_bytes
+        bench = Bench(max_configuration_bytes=5 * size)
+        bench.ask(berta.request(), "berta")
+        for number in range(20):
+            bench.ask(Robot(key=100 + number).request(), "anna")
+        assert bench.service._sessions.get(("berta", berta.session)) is not None
+        assert bench.service._sessions.configuration_bytes <= 5 * size
+
+
+class _Split:
+    """A service with a worker for each job, so that nobody waits; answers by whose they are."""
+
+    def __init__(self) -> None:
+        self.service = Service(_problem, 1000, ServiceLimits())
+        self.jobs: dict[str | None, list[Job]] = {owner: [] for owner in OWNERS}
+        self.replies: dict[str | None, list[tuple[int, bytes | None]]] = {
+            owner: [] for owner in OWNERS
+        }
+        self._calls: dict[int, tuple[str | None, int]] = {}
+
+    def send(self, owner: str | None, number: int, payload: bytes) -> None:
+        call = len(self._calls)
+        self._calls[call] = owner, number
+        self._apply(owner, self.service.receive(call, payload, 0.0, owner))
+
+    def run(self, owner: str | None) -> None:
+        if self.jobs[owner]:
+            job = self.jobs[owner].pop(0)
+            self._apply(owner, self.service.finished(job, job.run(), 0.0))
+
+    def _apply(self, owner: str | None, effects: list[ServiceEffect]) -> None:
+        for effect in effects:
+            if isinstance(effect, StartJob):
+                self.jobs[owner].append(effect.job)
+            elif isinstance(effect, SendReply | EndCall):
+                whose, number = self._calls[effect.call]
+                assert whose == owner, "what one owner does tells another something"
+                payload = effect.payload if isinstance(effect, SendReply) else None
+                self.replies[owner].append((number, payload))
+
+
+def _problem(session_configuration: SessionConfiguration) -> Problem:
+    return _ROBOT.problem
+
+
+_ROBOT = Robot()
+
+
+def _turns() -> list[Robot]:
+    """Return a robot at several moments of its trial."""
+    robots = []
+    for count in range(4):
+        robot = Robot()
+        for _ in range(count):
+            robot.act_until_sensing()
+            robot.sense()
+        robots.append(robot)
+    return robots
+
+
+_MOMENTS = _turns()
+
+ACTIONS = st.tuples(
+    st.sampled_from(OWNERS),
+    st.one_of(
+        st.none(),
+        st.tuples(
+            st.sampled_from(range(len(_MOMENTS))),
+            st.sampled_from([1, 2, 3]),  # epochs
+            st.sampled_from([1, 2, 3, 9]),  # numbers
+            st.booleans(),  # with the opening
+            st.booleans(),  # with the state
+        ),
+    ),
+)
+
+
+def _request(what: tuple[int, int, int, bool, bool]) -> Request:
+    moment, epoch, number, session_configuration, state = what
+    robot = _MOMENTS[moment]
+    changes: dict[str, Any] = {
+        "epoch": epoch,
+        "number": number,
+        "session_configuration": robot.session_configuration if session_configuration else None,
+    }
+    return robot.restore(**changes) if state else robot.request(**changes)
+
+
+@given(st.lists(ACTIONS, max_size=40))
+@settings(max_examples=150, deadline=None)
+def test_each_owner_is_answered_as_if_it_were_alone(
+    actions: list[tuple[str | None, tuple[int, int, int, bool, bool] | None]],
+) -> None:
+    """The same session, epochs and numbers: byte for byte the same replies in the same order."""
+    together = _Split()
+    alone = {owner: _Split() for owner in OWNERS}
+    for count, (owner, what) in enumerate(actions):
+        for service in (together, alone[owner]):
+            if what is None:
+                service.run(owner)
+            else:
+                service.send(owner, count, encode(_request(what)))
+    for owner in OWNERS:
+        for service in (together, alone[owner]):
+            while service.jobs[owner]:
+                service.run(owner)
+        assert together.replies[owner] == alone[owner].replies[owner]
