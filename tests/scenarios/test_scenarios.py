@@ -10,9 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from holdfast.lab.simulation.outcome import RunOutcome
 from holdfast.lab.simulation.schedule import parse_schedule
-from holdfast.lab.simulation.story import story_lines
+from holdfast.lab.simulation.story import RunOutcome, story_lines
 from holdfast.lab.simulation.world import Simulator
 
 STORIES = sorted(Path(__file__).parent.glob("*.story"))

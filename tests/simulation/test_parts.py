@@ -105,8 +105,8 @@ class TestDisk:
         assert unfinished.is_complete
 
 
-def twin() -> ReferenceRun:
-    deeds = tuple(
+def reference_run() -> ReferenceRun:
+    steps = tuple(
         ReferenceStep(
             0 if step == 0 else None,
             np.zeros(1),
@@ -116,21 +116,21 @@ def twin() -> ReferenceRun:
         )
         for step in range(3)
     )
-    return ReferenceRun(deeds, False, "digest")
+    return ReferenceRun(steps, False, "digest")
 
 
-class OneTwin(ReferenceRuns):
+class OneReference(ReferenceRuns):
     """A world in which whatever is sensed again leads to another end."""
 
     def __init__(self) -> None:
         pass
 
     def get(self, trial: int, max_steps: int, repeats: Repeats = ()) -> ReferenceRun:
-        return twin()._replace(digest=f"digest{repeats or ''}")
+        return reference_run()._replace(digest=f"digest{repeats or ''}")
 
 
-def surroundings(*, shows_the_same: bool = False) -> EnvironmentModel:
-    return EnvironmentModel(0, 3, OneTwin(), shows_the_same=shows_the_same)
+def environment(*, shows_the_same: bool = False) -> EnvironmentModel:
+    return EnvironmentModel(0, 3, OneReference(), shows_the_same=shows_the_same)
 
 
 def result(steps: int, digest: str) -> TrialResult:
@@ -149,9 +149,9 @@ def result(steps: int, digest: str) -> TrialResult:
     )
 
 
-class TestSurroundings:
+class TestEnvironmentModel:
     def test_all_as_it_should_be(self) -> None:
-        world = surroundings()
+        world = environment()
         world.sense(0, 0)
         for step in range(3):
             assert not world.done
@@ -168,13 +168,13 @@ class TestSurroundings:
         ],
     )
     def test_another_task_action(self, step: int, value: float, says: str) -> None:
-        world = surroundings()
+        world = environment()
         world.act(0, np.zeros(2))
         with pytest.raises(Violation, match=says):
             world.act(step, np.full(2, value))
 
     def test_another_sensing_action(self) -> None:
-        world = surroundings()
+        world = environment()
         with pytest.raises(Violation, match="the undisturbed run has 0"):
             world.sense(0, 1)
         with pytest.raises(Violation, match="where 0 task actions"):
@@ -184,7 +184,7 @@ class TestSurroundings:
         ("shows_the_same", "ends"), [(True, "digest"), (False, "digest((0, 2),)")]
     )
     def test_what_is_sensed_again(self, shows_the_same: bool, ends: str) -> None:
-        world = surroundings(shows_the_same=shows_the_same)
+        world = environment(shows_the_same=shows_the_same)
         for _ in range(3):
             world.sense(0, 0)
         for step in range(3):
@@ -192,7 +192,7 @@ class TestSurroundings:
         world.check_end(result(3, ends), rewards_are_known=True)
 
     def test_another_end(self) -> None:
-        world = surroundings()
+        world = environment()
         with pytest.raises(Violation, match="ended after 3 steps, 0 of which"):
             world.check_end(result(3, "digest"), rewards_are_known=True)
         world.begin_again([np.full(2, float(step)) for step in range(3)])

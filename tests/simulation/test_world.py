@@ -5,7 +5,6 @@ from __future__ import annotations
 import pytest
 
 from holdfast.lab.simulation.exploration import ExplorationTally, explore
-from holdfast.lab.simulation.outcome import RunOutcome
 from holdfast.lab.simulation.schedule import (
     NUM_TRIALS,
     Crash,
@@ -18,7 +17,7 @@ from holdfast.lab.simulation.schedule import (
     parse_schedule,
 )
 from holdfast.lab.simulation.schedule_draws import draw_schedule
-from holdfast.lab.simulation.story import story_lines
+from holdfast.lab.simulation.story import RunOutcome, story_lines
 from holdfast.lab.simulation.world import Simulator
 
 

@@ -24,8 +24,8 @@ from holdfast.runtime.command_line import (
 
 if TYPE_CHECKING:
     from holdfast.lab.simulation.exploration import ExplorationTally
-    from holdfast.lab.simulation.outcome import RunOutcome
     from holdfast.lab.simulation.schedule import SimulationSchedule
+    from holdfast.lab.simulation.story import RunOutcome
 
 __all__ = ["main"]
 

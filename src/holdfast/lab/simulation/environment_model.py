@@ -13,9 +13,7 @@ from holdfast.lab.errors import Violation
 from holdfast.lab.simulation.reference_runs import ReferenceRuns
 from holdfast.outcome import TrialResult
 
-__all__ = [
-    "EnvironmentModel",
-]
+__all__ = ["EnvironmentModel"]
 
 
 class EnvironmentModel:
@@ -34,12 +32,12 @@ class EnvironmentModel:
     """
 
     def __init__(
-        self, trial: int, max_steps: int, twins: ReferenceRuns, *, shows_the_same: bool
+        self, trial: int, max_steps: int, references: ReferenceRuns, *, shows_the_same: bool
     ) -> None:
         self._trial = trial
         self._max_steps = max_steps
-        self._twins = twins
-        self._twin = twins.get(trial, max_steps)
+        self._references = references
+        self._reference = references.get(trial, max_steps)
         self._shows_the_same = shows_the_same
         self._times: dict[int, int] = {}
         self.performed = 0
@@ -48,8 +46,8 @@ class EnvironmentModel:
     def done(self) -> bool:
         """Whether the task is done."""
         if self.performed == 0:
-            return self._twin.done_at_start
-        return self._twin.deeds[self.performed - 1].done
+            return self._reference.done_at_start
+        return self._reference.steps[self.performed - 1].done
 
     def begin_again(self, actions: list[FloatArray]) -> None:
         """Perform these from the beginning: this world does not outlive the robot's process.
@@ -74,16 +72,16 @@ class EnvironmentModel:
         where = f"trial {self._trial}: sensing action {sensing_action} of step {step}"
         if step != self.performed:
             raise Violation(f"{where}, where {self.performed} task actions have been performed")
-        deeds = self._twin.deeds
-        expected = deeds[step].sensing_action if step < len(deeds) else None
+        steps = self._reference.steps
+        expected = steps[step].sensing_action if step < len(steps) else None
         if sensing_action != expected:
             raise Violation(f"{where}: the undisturbed run has {expected}")
         times = self._times.get(step, 0)
         self._times[step] = times + 1
         if times and not self._shows_the_same:
             repeats = tuple((at, count - 1) for at, count in self._times.items() if count > 1)
-            self._twin = self._twins.get(self._trial, self._max_steps, repeats)
-        shown = self._twin.deeds[step].observation
+            self._reference = self._references.get(self._trial, self._max_steps, repeats)
+        shown = self._reference.steps[step].observation
         assert shown is not None
         return shown
 
@@ -99,15 +97,15 @@ class EnvironmentModel:
         if step != self.performed:
             again = " again" if step < self.performed else ""
             raise Violation(f"{where} performed{again}, where {self.performed} have been performed")
-        if step >= len(self._twin.deeds):
+        if step >= len(self._reference.steps):
             raise Violation(f"{where}: the undisturbed run has ended before")
-        deed = self._twin.deeds[step]
+        due = self._reference.steps[step]
         written = np.asarray(action, dtype="<f8").tobytes()
-        if written != deed.action:
-            expected = np.frombuffer(deed.action, dtype="<f8")
+        if written != due.action:
+            expected = np.frombuffer(due.action, dtype="<f8")
             raise Violation(f"{where}: {action}, the undisturbed run has {expected}")
         self.performed += 1
-        return deed.reward, deed.done
+        return due.reward, due.done
 
     def check_end(self, result: TrialResult, *, rewards_are_known: bool) -> None:
         """Compare what the robot has to say of the trial.
@@ -122,22 +120,22 @@ class EnvironmentModel:
         Violation
             If it is not that of the undisturbed run.
         """
-        twin, steps, digest = self._twin, result.steps, result.digest
-        if not steps == self.performed == len(twin.deeds):
+        reference = self._reference
+        if not result.steps == self.performed == len(reference.steps):
             raise Violation(
-                f"trial {self._trial} ended after {steps} steps, {self.performed} of which were "
-                f"performed: the undisturbed run has {len(twin.deeds)}"
+                f"trial {self._trial} ended after {result.steps} steps, {self.performed} of which "
+                f"were performed: the undisturbed run has {len(reference.steps)}"
             )
-        if digest != twin.digest:
+        if result.digest != reference.digest:
             raise Violation(
-                f"trial {self._trial}: digest of the decisions {digest[:16]}, the undisturbed run "
-                f"has {twin.digest[:16]}"
+                f"trial {self._trial}: digest of the decisions {result.digest[:16]}, the "
+                f"undisturbed run has {reference.digest[:16]}"
             )
-        reward = None if twin.deeds else 0.0
-        for deed in twin.deeds:
-            if deed.reward is not None:
-                reward = (reward or 0.0) + deed.reward
-        sensed = sum(deed.sensing_action is not None for deed in twin.deeds)
+        reward = None if reference.steps else 0.0
+        for step in reference.steps:
+            if step.reward is not None:
+                reward = (reward or 0.0) + step.reward
+        sensed = sum(step.sensing_action is not None for step in reference.steps)
         for name, said, true in (
             ("success", result.success, self.done),
             ("sensing decisions", result.sensing_decisions, sensed),

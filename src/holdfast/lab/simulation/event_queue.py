@@ -59,20 +59,20 @@ class Clock:
         Seconds that it shows for each second.
     """
 
-    def __init__(self, agenda: EventQueue, offset_s: float, rate: float) -> None:
-        self._agenda = agenda
+    def __init__(self, queue: EventQueue, offset_s: float, rate: float) -> None:
+        self._queue = queue
         self._offset_s = offset_s
         self._rate = rate
         self._latest = offset_s
 
     def now(self) -> float:
         """Return what it shows."""
-        self._latest = max(self._latest, self._offset_s + self._rate * self._agenda.now)
+        self._latest = max(self._latest, self._offset_s + self._rate * self._queue.now)
         return self._latest
 
     def until(self, shown: float) -> float:
         """Return the seconds of the world until it will show this; 0 if it has done so."""
-        return max(0.0, (shown - self._offset_s) / self._rate - self._agenda.now)
+        return max(0.0, (shown - self._offset_s) / self._rate - self._queue.now)
 
     def reached(self, shown: float) -> float:
         """Return the time, now that it is no earlier than this whatever rounding says."""

@@ -118,14 +118,14 @@ class Network:
     def __init__(
         self,
         run: RunSettings,
-        agenda: EventQueue,
+        queue: EventQueue,
         faults: list[MessageFault],
         checker: WireChecker,
         deliver: Callable[[int, TransportEvent], None],
         happened: Callable[[MessageFault, float], None],
     ) -> None:
         self._run = run
-        self._agenda = agenda
+        self._queue = queue
         self._faults: dict[tuple[str, str, int], list[MessageFault]] = {}
         for fault in faults:
             key = fault.service, fault.direction, fault.number
@@ -173,8 +173,8 @@ class Network:
         if link.incarnation is not None and not link.cuts["from"]:
             # Through a cut no such news comes: the lease will tell.
             wait_s = min(found_after_s, self._run.lease_s)
-            link.died_at = self._agenda.now + wait_s
-            self._agenda.after(wait_s, self._broke, link, link.token)
+            link.died_at = self._queue.now + wait_s
+            self._queue.after(wait_s, self._broke, link, link.token)
         self.review(service)
 
     def cut(self, name: str, way: Way) -> None:
@@ -209,13 +209,13 @@ class Network:
         )
         if both_hear:
             if link.incarnation != service.incarnation:
-                self._agenda.after(_CONNECT_S, self._connect, link, link.token, service.incarnation)
+                self._queue.after(_CONNECT_S, self._connect, link, link.token, service.incarnation)
             else:
                 link.unhealthy_since = None
         elif link.incarnation is not None and link.unhealthy_since is None:
-            now = self._agenda.now
+            now = self._queue.now
             link.unhealthy_since = now
-            self._agenda.after(self._run.lease_s, self._expire, link, link.token, now)
+            self._queue.after(self._run.lease_s, self._expire, link, link.token, now)
 
     def _connect(self, link: SimulatedLink, token: int, incarnation: int) -> None:
         service = link.service
@@ -232,7 +232,7 @@ class Network:
         before = link.incarnation
         if before is not None:
             # The next process is there before anybody knows that this one is not.
-            self._agenda.at(link.died_at, self._old_broke, link, self._process, before)
+            self._queue.at(link.died_at, self._old_broke, link, self._process, before)
             for held in link.held.values():
                 held.clear()
         link.token += 1
@@ -289,7 +289,7 @@ class Network:
         """Send a request of the robot's present process."""
         link = self._links[name]
         if link.incarnation is None:
-            self._agenda.after(_UNREACHABLE_S, self._deliver, self._process, CallEnded(number))
+            self._queue.after(_UNREACHABLE_S, self._deliver, self._process, CallEnded(number))
             return
         call = _Call(link, self._process, number)
         self._open[number] = call
@@ -365,14 +365,14 @@ class Network:
                 payload = _damaged(payload, fault.bit)
             elif fault.what == "duplicate":
                 copy_s = latency_s + fault.seconds
-                self._agenda.after(copy_s, arrive, payload, *more)
+                self._queue.after(copy_s, arrive, payload, *more)
             elif fault.what == "misroute":
                 late_s = latency_s + fault.seconds
-                self._agenda.after(late_s, self._arrives_elsewhere, payload, link)
+                self._queue.after(late_s, self._arrives_elsewhere, payload, link)
                 return
             else:
                 # Not in line with the others: it is overtaken.
-                self._agenda.after(latency_s + fault.seconds, arrive, payload, *more)
+                self._queue.after(latency_s + fault.seconds, arrive, payload, *more)
                 return
         self._pass(link, way, latency_s, arrive, (payload, *more))
 
@@ -398,9 +398,9 @@ class Network:
         do: Callable[..., None],
         arguments: tuple[object, ...],
     ) -> None:
-        arrives = max(self._agenda.now + latency_s, link.arrived[way])
+        arrives = max(self._queue.now + latency_s, link.arrived[way])
         link.arrived[way] = arrives
-        self._agenda.at(arrives, do, *arguments)
+        self._queue.at(arrives, do, *arguments)
 
     def _request_arrives(
         self, payload: bytes, key: int, owner: str | None, service: ServiceNode, incarnation: int
@@ -426,7 +426,7 @@ class Network:
         call = self._calls.get(key)
         if call is not None:
             call.end_is_lost = True
-            self._agenda.after(_LONGEST_CALL_S, self._end_arrives, b"", key)
+            self._queue.after(_LONGEST_CALL_S, self._end_arrives, b"", key)
 
     def _arrives_elsewhere(self, payload: bytes, link: SimulatedLink) -> None:
         """Deliver a reply to the newest call of its service, whoever made that."""

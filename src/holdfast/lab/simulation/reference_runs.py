@@ -60,7 +60,7 @@ class ReferenceRun(NamedTuple):
         Of all its decisions.
     """
 
-    deeds: tuple[ReferenceStep, ...]
+    steps: tuple[ReferenceStep, ...]
     done_at_start: bool
     digest: str
 
@@ -75,10 +75,10 @@ class _Recorder:
         self._environment = SimulatedEnvironment(problem, seed, trial)
         self._repeats = dict(repeats)
         self._sensed: tuple[int, FloatArray] | None = None
-        self.deeds: list[ReferenceStep] = []
+        self.steps: list[ReferenceStep] = []
 
     def perform_sensing(self, sensing_action: int) -> FloatArray:
-        times = self._repeats.get(len(self.deeds), 0)
+        times = self._repeats.get(len(self.steps), 0)
         environment = self._again(times) if times else self._environment
         shown = np.array(environment.perform_sensing(sensing_action), dtype=np.float64)
         shown.setflags(write=False)
@@ -97,7 +97,7 @@ class _Recorder:
         sensing_action, shown = self._sensed or (None, None)
         written = np.asarray(task_action, dtype="<f8").tobytes()
         done = self._environment.is_done()
-        self.deeds.append(ReferenceStep(sensing_action, shown, written, reward, done))
+        self.steps.append(ReferenceStep(sensing_action, shown, written, reward, done))
         self._sensed = None
         return reward
 
@@ -112,7 +112,7 @@ class ReferenceRuns:
         self._problem = problem
         self._planning = planning
         self._seed = seed
-        self._twins: dict[tuple[int, int, Repeats], ReferenceRun] = {}
+        self._runs: dict[tuple[int, int, Repeats], ReferenceRun] = {}
 
     def get(self, trial: int, max_steps: int, repeats: Repeats = ()) -> ReferenceRun:
         """Return a trial of at most so many steps.
@@ -124,12 +124,12 @@ class ReferenceRuns:
             it now. What is sensed there then shows something else: the trial as it goes from there.
         """
         key = trial, max_steps, repeats
-        twin = self._twins.get(key)
-        if twin is None:
-            if len(self._twins) >= _MOST:
-                self._twins.clear()
-            twin = self._twins[key] = self._run(trial, max_steps, repeats)
-        return twin
+        run = self._runs.get(key)
+        if run is None:
+            if len(self._runs) >= _MOST:
+                self._runs.clear()
+            run = self._runs[key] = self._run(trial, max_steps, repeats)
+        return run
 
     def _run(self, trial: int, max_steps: int, repeats: Repeats) -> ReferenceRun:
         simulator = SimulatorSettings(num_trials=trial + 1, max_steps=max_steps, seed=self._seed)
@@ -142,4 +142,4 @@ class ReferenceRuns:
             max_steps=simulator.max_steps,
             environment=recorder,
         )
-        return ReferenceRun(tuple(recorder.deeds), done_at_start, result.digest)
+        return ReferenceRun(tuple(recorder.steps), done_at_start, result.digest)

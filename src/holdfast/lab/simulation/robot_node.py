@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from holdfast.arrays import FloatArray
 from holdfast.config.settings import (
@@ -55,7 +55,10 @@ from holdfast.protocol.messages import MAX_TASK_ACTIONS, SessionConfiguration
 from holdfast.protocol.records import replay
 from holdfast.protocol.robot import Robot
 
-__all__ = ["SESSION", "Host", "RobotNode", "RobotTask"]
+if TYPE_CHECKING:
+    from holdfast.lab.simulation.world import World
+
+__all__ = ["SESSION", "RobotNode", "RobotTask"]
 
 
 SESSION = bytes(range(16))
@@ -68,7 +71,7 @@ _DECIDES_AFTER_S = 0.003
 """What the robot's own planner takes for a question."""
 
 _SECRET = b"which answers are computed again"
-_DEAF_S = 0.005
+_STALL_S = 0.005
 """As the real process: a loop that did not listen for longer blames nobody for that time."""
 
 
@@ -97,38 +100,6 @@ class RobotTask:
         )
 
 
-class Host(Protocol):
-    """The machine that the robot's process runs on, as far as it has a hand in what happens."""
-
-    def boundary(self, effect: type[RobotEffect]) -> None:
-        """Take note that an effect comes next, and of which kind; the process may end here."""
-        ...
-
-    def launch(self, number: int) -> None:
-        """Start the local service."""
-        ...
-
-    def robot_ended(self) -> None:
-        """Take note that the process has ended in order."""
-        ...
-
-    def stall_s(self) -> float:
-        """Return how long the next write to the journal takes."""
-        ...
-
-    def told(self, name: str, fields: dict[str, object]) -> None:
-        """Take note of a line of the log."""
-        ...
-
-    def decided(self, service: str, status: str, waited_s: float) -> None:
-        """Take note of whose decision is carried out, and how long the robot stood still for it."""
-        ...
-
-    def noted(self, actor: str, text: str, *values: object) -> None:
-        """Take note of what was done, for whoever reads the story; values as in ``%``."""
-        ...
-
-
 class RobotNode:
     """The robot, over all lives of its process.
 
@@ -146,29 +117,29 @@ class RobotNode:
         self,
         task: RobotTask,
         run: RunSettings,
-        agenda: EventQueue,
+        queue: EventQueue,
         clock: Clock,
         disk: Disk,
         network: Network,
-        twins: ReferenceRuns,
-        host: Host,
+        references: ReferenceRuns,
+        world: World,
     ) -> None:
         self._task = task
         self._run = run
-        self._agenda = agenda
+        self._queue = queue
         self._clock = clock
         self._disk = disk
         self._network = network
-        self._twins = twins
-        self._host = host
+        self._references = references
+        self._world = world
         self._offload = OffloadSettings(
             services=run.services,
             lease_ms=max(50.0, 1e3 * run.lease_s),
             decision_deadline_ms=run.deadline_ms,
         )
         self._recovery = RecoverySettings(launch=run.launch, journal_survives=run.journal_survives)
-        self._surroundings: EnvironmentModel | None = None
-        self._surroundings_of = -1
+        self._environment: EnvironmentModel | None = None
+        self._environment_trial = -1
         self._robot: Robot | None = None
         self._statuses = StatusChecker()
         self._asked: dict[int, str] = {}
@@ -176,27 +147,27 @@ class RobotNode:
         # Each with the time at which it came, if that is known.
         self._deferred: deque[tuple[float | None, Callable[..., None], tuple[Any, ...]]] = deque()
         self._came_at: float | None = None
-        self._last_told = float("-inf")
+        self._last_time = float("-inf")
         self._is_ending = False
         self._rewards_are_known = True
-        self._deaf = False
+        self._is_stalled = False
         self._stopped = False
         self._wakes_at: float | None = None
         self._lives = 0
         self._body_obeys = 0
         self._may_doubt = False
-        self._died_in_doubt = False
+        self._is_in_doubt = False
         self._does: dict[type, Callable[[Any], None]] = {
             WriteRecords: self._append,
             Act: self._act,
             Sense: self._sense,
             Send: self._send,
-            Abandon: self._abandon,
+            Abandon: lambda effect: network.abandon(effect.call),
             LogEvent: self._report,
-            Timing: self._decided,
+            Timing: world.decided,
             ComputeOwnAnswer: self._decide,
             VerificationNoted: self._verified,
-            Launch: self._launch,
+            Launch: lambda effect: world.launch(effect.number),
             EndTrial: self._end_trial,
             Paused: self._paused,
             Halt: self._hold_still,
@@ -216,7 +187,7 @@ class RobotNode:
         """Start a new process, which goes on where the journal ends."""
         self._lives += 1
         self.process = self._lives
-        self._deaf = self._stopped = False
+        self._is_stalled = self._stopped = False
         self._wakes_at = None
         self._statuses = StatusChecker()
         self._asked.clear()
@@ -272,13 +243,13 @@ class RobotNode:
         if self._stopped:
             self._stopped = False
             self._network.robot_stopped(stopped=False)
-            if not self._deaf:
+            if not self._is_stalled:
                 self._catch_up()
 
     def _end(self) -> None:
         self._robot = None
         self.process = 0
-        self._stopped = self._deaf = False
+        self._stopped = self._is_stalled = False
         self._todo.clear()
         self._deferred.clear()
         self._network.robot_ended()
@@ -296,7 +267,7 @@ class RobotNode:
     def _happens(self, process: int, do: Callable[..., None], *arguments: Any) -> None:
         if process != self.process or self._robot is None:
             return
-        if self._stopped or self._deaf:
+        if self._stopped or self._is_stalled:
             # What comes during a write is heard of later; to a process that is stopped nothing
             # comes before it goes on.
             came_at = None if self._stopped else self._clock.now()
@@ -307,8 +278,8 @@ class RobotNode:
     def _now(self) -> float:
         """Return the time of what happens: when it came, not when it is heard of."""
         shown = self._clock.now() if self._came_at is None else self._came_at
-        self._last_told = max(self._last_told, shown)
-        return self._last_told
+        self._last_time = max(self._last_time, shown)
+        return self._last_time
 
     def _catch_up(self) -> None:
         """Let everything happen that came while the process did not listen."""
@@ -318,11 +289,11 @@ class RobotNode:
         if not self._deferred and wake_at is not None and wake_at <= now:
             robot.event_loop_stalled(now - wake_at)
             self._wake(wake_at)
-        while self._deferred and not self._deaf and not self._stopped:
+        while self._deferred and not self._is_stalled and not self._stopped:
             self._came_at, do, arguments = self._deferred.popleft()
             do(*arguments)
             self._came_at = None
-        if self._robot is not None and not self._deaf:
+        if self._robot is not None and not self._is_stalled:
             self._set_alarm()
 
     def _heard(self, event: TransportEvent | EnvironmentEvent | OwnAnswer) -> None:
@@ -343,13 +314,13 @@ class RobotNode:
     def _alarm(self, process: int, due: float) -> None:
         if process == self.process and due == self._wakes_at:
             self._wakes_at = None
-            if not self._stopped and not self._deaf:
+            if not self._stopped and not self._is_stalled:
                 self._wake(due)
 
     def _wake(self, due: float) -> None:
         assert self._robot is not None
-        self._last_told = max(self._last_told, self._clock.reached(due))
-        self._carry_out(self._robot.wake(self._last_told))
+        self._last_time = max(self._last_time, self._clock.reached(due))
+        self._carry_out(self._robot.wake(self._last_time))
 
     def _set_alarm(self) -> None:
         robot = self._robot
@@ -358,7 +329,7 @@ class RobotNode:
         due = robot.next_wakeup()
         if due is not None and due != self._wakes_at:
             self._wakes_at = due
-            self._agenda.after(self._clock.until(due), self._alarm, self.process, due)
+            self._queue.after(self._clock.until(due), self._alarm, self.process, due)
         elif due is None:
             self._wakes_at = None
 
@@ -368,87 +339,78 @@ class RobotNode:
         """Carry out effects in order, up to the end of the process or a slow write."""
         todo = self._todo
         todo += effects
-        while todo and not self._deaf:
+        while todo and not self._is_stalled:
             effect = todo[0]
             kind = type(effect)
             if kind not in _WITHOUT_CONSEQUENCES:
-                self._host.boundary(kind)
+                self._world.boundary(kind)
                 if not todo:
                     return  # killed
             todo.popleft()
             do = self._does.get(kind)
             if do is not None:
                 do(effect)
-        if not self._deaf:
+        if not self._is_stalled:
             self._set_alarm()
 
     def _append(self, effect: WriteRecords) -> None:
         self._disk.append(effect.trial, effect.records)
-        stall_s = self._host.stall_s()
+        stall_s = self._world.stall_s()
         if stall_s:
-            self._deaf = True
-            self._agenda.after(stall_s, self._written, self.process, stall_s)
+            self._is_stalled = True
+            self._queue.after(stall_s, self._written, self.process, stall_s)
 
     def _act(self, effect: Act) -> None:
-        self._host.noted("robot", "performs task action %s", effect.step)
-        self._agenda.after(
+        self._world.note("robot", "performs task action %s", effect.step)
+        self._queue.after(
             _PERFORMS_AFTER_S, self._performs, self.process, effect.step, effect.action
         )
 
     def _sense(self, effect: Sense) -> None:
         step, sensing_action = effect
-        self._host.noted("robot", "performs sensing action %s of step %s", sensing_action, step)
-        self._agenda.after(self._run.sense_s, self._senses, self.process, step, sensing_action)
+        self._world.note("robot", "performs sensing action %s of step %s", sensing_action, step)
+        self._queue.after(self._run.sense_s, self._senses, self.process, step, sensing_action)
 
     def _send(self, effect: Send) -> None:
         self._asked[effect.call] = effect.service
-        self._host.noted("robot", "asks %s, call %s", effect.service, effect.call)
+        self._world.note("robot", "asks %s, call %s", effect.service, effect.call)
         self._network.call(effect.service, effect.call, effect.payload)
-
-    def _abandon(self, effect: Abandon) -> None:
-        self._network.abandon(effect.call)
 
     def _report(self, effect: LogEvent) -> None:
         if effect.name == "status":
             self._statuses.changed(effect.fields["from"], effect.fields["to"])
         elif effect.name == "performed_unseen":
             self._rewards_are_known = False
-        self._host.told(effect.name, effect.fields)
-
-    def _decided(self, effect: Timing) -> None:
-        self._host.decided(effect.service, effect.status, 1e-3 * effect.waited_ms)
+        self._world.log_event(effect.name, effect.fields)
 
     def _decide(self, effect: ComputeOwnAnswer) -> None:
         actions, sensing_action, ahead = self._task.planner.decide(effect.state, MAX_TASK_ACTIONS)
         digest = self._task.planner.digest(ahead)
         event = OwnAnswer(effect.number, actions, sensing_action, digest, _DECIDES_AFTER_S)
-        self._agenda.after(_DECIDES_AFTER_S, self._happens, self.process, self._heard, event)
+        self._queue.after(_DECIDES_AFTER_S, self._happens, self.process, self._heard, event)
 
     def _verified(self, effect: VerificationNoted) -> None:
         if effect.verdict not in ("asked", "same"):
             raise Violation(f"{effect.service} is said to have answered wrongly: {effect}")
 
-    def _launch(self, effect: Launch) -> None:
-        self._host.launch(effect.number)
-
     def _end_trial(self, effect: EndTrial) -> None:
         result = effect.result
-        assert self._surroundings is not None
-        self._surroundings.check_end(result, rewards_are_known=self._rewards_are_known)
+        assert self._environment is not None
+        self._environment.check_end(result, rewards_are_known=self._rewards_are_known)
         self._rewards_are_known = True
         self._disk.add(result)
-        self._host.noted("robot", "ends trial %s after %s steps", result.trial, result.steps)
+        self._world.note("robot", "ends trial %s after %s steps", result.trial, result.steps)
         self._begin_next()
 
     def _paused(self, effect: Paused) -> None:
         del effect
         self._end()
-        self._host.robot_ended()
+        self._world.robot_ended()
 
     def _hold_still(self, effect: Halt) -> None:
         """Make sure that the process had a reason to hold still for good."""
         self.stopped_by = error = effect.error
-        if not (isinstance(error, UnknownPerformanceError) and self._died_in_doubt):
+        if not (isinstance(error, UnknownPerformanceError) and self._is_in_doubt):
             raise Violation(f"the robot holds still: {error}")
 
     def _written(self, process: int, stall_s: float) -> None:
@@ -456,21 +418,21 @@ class RobotNode:
             return
         if self._stopped:
             self._deferred.appendleft((None, self._written, (process, stall_s)))
-            self._deaf = False  # what comes waits for the process now, not for the disk
+            self._is_stalled = False  # what comes waits for the process now, not for the disk
             return
-        self._deaf = False
+        self._is_stalled = False
         self._carry_out(())
         if self._robot is not None:
-            if stall_s > _DEAF_S:
+            if stall_s > _STALL_S:
                 self._robot.event_loop_stalled(stall_s)
-            if not self._deaf:
+            if not self._is_stalled:
                 self._catch_up()
 
     def _begin_next(self) -> None:
         if self._is_ending:
             # It was asked to while it performed the last action of a trial.
             self._end()
-            self._host.robot_ended()
+            self._world.robot_ended()
             return
         unfinished = self._disk.unfinished()
         task = self._task
@@ -485,7 +447,7 @@ class RobotNode:
             trial, records, is_complete = following, [], True
         simulator = task.simulator
         history = replay(task.planner, simulator.seed, trial, records)
-        self._agenda.after(
+        self._queue.after(
             _BEGINS_AFTER_S,
             self._happens,
             self.process,
@@ -499,28 +461,28 @@ class RobotNode:
         robot = self._robot
         assert robot is not None
         simulated = self._run.environment == "simulated"
-        if self._surroundings is None or self._surroundings_of != trial:
-            self._surroundings = EnvironmentModel(
-                trial, self._task.simulator.max_steps, self._twins, shows_the_same=simulated
+        if self._environment is None or self._environment_trial != trial:
+            self._environment = EnvironmentModel(
+                trial, self._task.simulator.max_steps, self._references, shows_the_same=simulated
             )
-            self._surroundings_of = trial
-        surroundings = self._surroundings
+            self._environment_trial = trial
+        environment = self._environment
         if simulated:
-            surroundings.begin_again(history.actions)
+            environment.begin_again(history.actions)
         counts = self._run.environment != "not_counting"
         known = history.state.step
         pending = history.pending is not None
         # A process that has ended in order leaves none. Nor does one that was killed in a world
         # that counts: what it did and what it wrote are at most the last action apart.
-        self._died_in_doubt = self._may_doubt and (
-            not is_complete and surroundings.performed not in (known, known + pending)
+        self._is_in_doubt = self._may_doubt and (
+            not is_complete and environment.performed not in (known, known + pending)
             if counts
             else pending or not is_complete
         )
         self._may_doubt = False
-        performed = surroundings.performed if counts else None
-        begun = EnvironmentReady(surroundings.done, performed)
-        self._host.noted("robot", "begins trial %s at step %s", trial, known)
+        performed = environment.performed if counts else None
+        begun = EnvironmentReady(environment.done, performed)
+        self._world.note("robot", "begins trial %s at step %s", trial, known)
         self._carry_out(
             robot.begin_trial(trial, history, begun, self._now(), tail_is_certain=is_complete)
         )
@@ -530,20 +492,20 @@ class RobotNode:
     def _senses(self, process: int, step: int, sensing_action: int) -> None:
         if process != self.process:
             return
-        assert self._surroundings is not None
-        shown = self._surroundings.sense(step, sensing_action)
+        assert self._environment is not None
+        shown = self._environment.sense(step, sensing_action)
         self._happens(process, self._heard, Sensed(step, shown))
 
     def _performs(self, process: int, step: int, action: FloatArray) -> None:
         if process != self.process:
-            if process == self._body_obeys and self._surroundings is not None:
-                self._host.noted("robot", "'s body performs task action %s all the same", step)
-                self._surroundings.act(step, action)
+            if process == self._body_obeys and self._environment is not None:
+                self._world.note("robot", "'s body performs task action %s all the same", step)
+                self._environment.act(step, action)
             return
         if self._stopped:
             self._deferred.append((None, self._performs, (process, step, action)))
             return
-        assert self._surroundings is not None
-        reward, done = self._surroundings.act(step, action)
+        assert self._environment is not None
+        reward, done = self._environment.act(step, action)
         event = Acted(step, reward, done)
-        self._agenda.after(self._run.act_s, self._happens, process, self._heard, event)
+        self._queue.after(self._run.act_s, self._happens, process, self._heard, event)

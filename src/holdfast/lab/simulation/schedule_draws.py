@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import random
 from collections.abc import Callable, Iterable
-from functools import cached_property
 from typing import ClassVar, TypeVar
 
 import msgspec
@@ -51,25 +50,11 @@ class _Draw:
     def __init__(self, seed: int) -> None:
         # Another generator than the planning's: the world must not be of one mind with the robot.
         self._chance = random.Random(f"holdfast simulation {seed}")
-        self._seed = seed
-
-    # Each by a name of its own, so that the other draws of a seed are what they were before.
-
-    @cached_property
-    def _losses(self) -> random.Random:
-        return random.Random(f"holdfast simulation {self._seed}: losses")
-
-    @cached_property
-    def _bodies(self) -> random.Random:
-        return random.Random(f"holdfast simulation {self._seed}: bodies")
-
-    @cached_property
-    def _aims(self) -> random.Random:
-        return random.Random(f"holdfast simulation {self._seed}: aims")
-
-    @cached_property
-    def _certificates(self) -> random.Random:
-        return random.Random(f"holdfast simulation {self._seed}: certificates")
+        # Each by a name of its own, so that the other draws of a seed are what they were before.
+        self._losses, self._bodies, self._aims, self._certificates = (
+            random.Random(f"holdfast simulation {seed}: {name}")
+            for name in ("losses", "bodies", "aims", "certificates")
+        )
 
     def schedule(self) -> SimulationSchedule:
         run = self._run()

@@ -9,7 +9,6 @@ from holdfast.lab.simulation.event_queue import Clock, EventQueue
 from holdfast.lab.simulation.memo_cache import JobCache
 from holdfast.lab.simulation.schedule import RunSettings
 from holdfast.problems.problem import Problem
-from holdfast.protocol.messages import SessionConfiguration
 from holdfast.protocol.service import Service
 from holdfast.protocol.service_jobs import (
     EndCall,
@@ -53,7 +52,7 @@ class ServiceNode:
         self,
         name: str,
         run: RunSettings,
-        agenda: EventQueue,
+        queue: EventQueue,
         clock: Clock,
         network: Network,
         problem: Problem,
@@ -61,7 +60,7 @@ class ServiceNode:
     ) -> None:
         self.name = name
         self._run = run
-        self._agenda = agenda
+        self._queue = queue
         self._clock = clock
         self._network = network
         self._problem = problem
@@ -91,7 +90,7 @@ class ServiceNode:
         if not keeps_memory or self.machine is None:
             self._life += 1
             self._wakes_at = None
-            self.machine = Service(self._make_problem, self._run.workers, self._limits)
+            self.machine = Service(lambda _: self._problem, self._run.workers, self._limits)
         self.go_on()
 
     def end(self, *, keeps_memory: bool = False) -> None:
@@ -114,14 +113,10 @@ class ServiceNode:
         for do, arguments in deferred:
             do(*arguments)
 
-    def _make_problem(self, session_configuration: SessionConfiguration) -> Problem:
-        del session_configuration
-        return self._problem
-
     # -- what it does ----------------------------------------------------------------------------
 
     def receive(self, incarnation: int, call: int, payload: bytes, owner: str | None) -> None:
-        """Take a request that was sent to the process of this boot, with a certificate if any."""
+        """Take a request that was sent to this process, with a certificate if any."""
         if incarnation != self.incarnation or not self.up:
             return
         if self.stopped:
@@ -141,11 +136,11 @@ class ServiceNode:
             elif isinstance(effect, StartJob):
                 machine.started(effect.job, self._clock.now())
                 cost_s = self.slowness * self._cost_s[effect.job.kind]
-                self._agenda.after(cost_s, self._finish, self._life, effect.job)
+                self._queue.after(cost_s, self._finish, self._life, effect.job)
         due = machine.next_wakeup()
         if due is not None and (self._wakes_at is None or due < self._wakes_at):
             self._wakes_at = due
-            self._agenda.after(self._clock.until(due), self._tick, self._life, due)
+            self._queue.after(self._clock.until(due), self._tick, self._life, due)
 
     def _finish(self, life: int, job: Job) -> None:
         if life != self._life:

@@ -8,6 +8,9 @@ longer than it does without faults, and :data:`RECOVERY_S` more.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 from holdfast.config.settings import ParticleFilterSettings, PlanningSettings, SelectorSettings
 from holdfast.errors import HoldfastError, IllegalTransitionError, MessageError
 from holdfast.lab.errors import Violation
@@ -17,7 +20,6 @@ from holdfast.lab.simulation.event_queue import Clock, EventQueue
 from holdfast.lab.simulation.memo_cache import JobCache, MemoizingPlanner
 from holdfast.lab.simulation.network import Network
 from holdfast.lab.simulation.other_robots import OtherRobots
-from holdfast.lab.simulation.outcome import RunOutcome, StoryLine
 from holdfast.lab.simulation.reference_runs import ReferenceRuns
 from holdfast.lab.simulation.robot_node import SESSION, RobotNode, RobotTask
 from holdfast.lab.simulation.schedule import (
@@ -38,6 +40,7 @@ from holdfast.lab.simulation.schedule import (
     Stop,
 )
 from holdfast.lab.simulation.service_node import ServiceNode
+from holdfast.lab.simulation.story import RunOutcome, StoryLine
 from holdfast.planning import Planner
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.protocol.events import (
@@ -47,12 +50,13 @@ from holdfast.protocol.events import (
     RobotEffect,
     Send,
     Sense,
+    Timing,
     TransportEvent,
     WriteRecords,
 )
 from holdfast.protocol.messages import decode_reply
 
-__all__ = ["FAILBACK_S", "RECOVERY_S", "STANDSTILL_S", "Simulator"]
+__all__ = ["FAILBACK_S", "RECOVERY_S", "STANDSTILL_S", "Simulator", "World"]
 
 STANDSTILL_S = 1.5
 """How long the robot may stand still for a decision once the last fault is over."""
@@ -77,9 +81,10 @@ _IS_ASKED_AGAIN_S = 1.0
 """So long after it has memory again a service may still be left alone."""
 
 _LAUNCH_TIMEOUT_S = 5.0
-_SIZES_EACH = 500
-"""Happenings between two looks at all tables."""
 """Of the first launch that is never seen; the robot is more patient with each that follows."""
+
+_SIZES_EACH = 500
+"""Events between two checks of the sizes of all tables."""
 
 _MOMENTS = {WriteRecords: "journal", Send: "send", Sense: "sense", Act: "act"}
 """Effects before which a schedule can kill the robot's process, by their names there."""
@@ -97,7 +102,7 @@ class Simulator:
             particle_filter=ParticleFilterSettings(num_particles=_NUM_PARTICLES),
             selector=SelectorSettings(method="action_entropy", estimator="nearest_neighbor"),
         )
-        self._twins = ReferenceRuns(problem, planning, _SEED)
+        self._references = ReferenceRuns(problem, planning, _SEED)
         self._planner = MemoizingPlanner(Planner(problem, planning))
         self._jobs = JobCache()
         self._others = OtherRobots(self._planner, _SEED)
@@ -111,17 +116,17 @@ class Simulator:
             Whether the story is wanted.
         """
         task = RobotTask(self._planner, schedule.run, _SEED, _MAX_STEPS)
-        return _World(schedule, task, self._twins, self._jobs, self._others, tell=tell).run()
+        return World(schedule, task, self._references, self._jobs, self._others, tell=tell).run()
 
 
-class _World:
-    """See :class:`Simulator`."""
+class World:
+    """One run; see :class:`Simulator`."""
 
     def __init__(
         self,
         schedule: SimulationSchedule,
         task: RobotTask,
-        twins: ReferenceRuns,
+        references: ReferenceRuns,
         jobs: JobCache,
         others: OtherRobots,
         *,
@@ -133,21 +138,23 @@ class _World:
         self._others = others
         self._tell = tell
         self._story: list[StoryLine] = []
-        self._agenda = agenda = EventQueue()
+        self._queue = queue = EventQueue()
         self._disk = Disk(forces_out=run.journal_survives == "power_cut")
         self._checker = WireChecker()
         messages = [fault for fault in schedule.faults if isinstance(fault, MessageFault)]
-        self._network = Network(run, agenda, messages, self._checker, self._deliver, self._happened)
+        self._network = Network(run, queue, messages, self._checker, self._deliver, self._happened)
         self._services: dict[str, ServiceNode] = {}
         for name in (*run.services, LOCAL_SERVICE):
-            clock = Clock(agenda, run.services_clock_offset_s, run.services_clock_rate)
+            clock = Clock(queue, run.services_clock_offset_s, run.services_clock_rate)
             service = ServiceNode(
-                name, run, agenda, clock, self._network, task.planner.problem, jobs
+                name, run, queue, clock, self._network, task.planner.problem, jobs
             )
             self._services[name] = service
             self._network.add(service)
-        clock = Clock(agenda, run.robot_clock_offset_s, run.robot_clock_rate)
-        self._robot = RobotNode(task, run, agenda, clock, self._disk, self._network, twins, self)
+        clock = Clock(queue, run.robot_clock_offset_s, run.robot_clock_rate)
+        self._robot = RobotNode(
+            task, run, queue, clock, self._disk, self._network, references, self
+        )
         self._launches = 0
         self._launch_number = 0
         self._launcher = 0
@@ -158,7 +165,7 @@ class _World:
         self._stalls: list[DiskStall] = []
         self._gone: set[str] = set()
         self._faults: dict[str, int] = {}
-        self._struck: set[int] = set()
+        self._injected: set[int] = set()
         self._crowds = 0
         self._crowded_until: dict[str, float] = {}
         self._silent_launches = 0
@@ -190,9 +197,9 @@ class _World:
         except Exception as error:  # noqa: BLE001 - whatever a machine raises is what we look for
             violation = f"{type(error).__name__} raised: {error}"
         held = self._robot.stopped_by
-        now = self._agenda.now
+        now = self._queue.now
         if violation is not None:
-            self.noted("world", f"VIOLATION: {violation}")
+            self.note("world", f"VIOLATION: {violation}")
         return RunOutcome(
             violation,
             None if held is None or violation is not None else str(held),
@@ -205,7 +212,7 @@ class _World:
         )
 
     def _go(self) -> None:
-        agenda, robot, network = self._agenda, self._robot, self._network
+        queue, robot, network = self._queue, self._robot, self._network
         run = self._run
         step_s = max(run.act_s, 0.0 if run.rate_hz is None else 1.0 / run.rate_hz) + 0.001
         turn_s = 2 * run.latency_s + run.jitter_s + run.task_s + run.sensing_s + run.sense_s
@@ -217,9 +224,9 @@ class _World:
                 self._check_sizes()
             if not self._happens():
                 raise Violation("nothing will ever happen again, and the run has not ended")
-            if agenda.now > self._faults_end_at + nominal_s + RECOVERY_S:
+            if queue.now > self._faults_end_at + nominal_s + RECOVERY_S:
                 raise Violation(
-                    f"stuck: {agenda.now - self._faults_end_at:.1f} s after the last fault the run "
+                    f"stuck: {queue.now - self._faults_end_at:.1f} s after the last fault the run "
                     f"has not ended"
                 )
             if network.messages > _MAX_MESSAGES:
@@ -227,21 +234,21 @@ class _World:
 
     def _happens(self) -> bool:
         """Let the next thing happen; False if there is none."""
-        if self._agenda.count > _MAX_HAPPENINGS:
+        if self._queue.count > _MAX_HAPPENINGS:
             raise Violation("somebody wakes again and again, and no time passes")
-        return self._agenda.step()
+        return self._queue.step()
 
     def _let_services_end(self) -> None:
         """Make sure that the services end all calls of a robot that is gone."""
         if self._robot.process:
             self._robot.kill()
-        until = max(self._agenda.now, self._faults_end_at) + RECOVERY_S
+        until = max(self._queue.now, self._faults_end_at) + RECOVERY_S
         while left := [
             (service.name, count)
             for service in self._services.values()
             if service.up and (count := self._checker.unended(service.name, service.incarnation))
         ]:
-            if not self._happens() or self._agenda.now > until:
+            if not self._happens() or self._queue.now > until:
                 name, count = left[0]
                 raise Violation(f"{name} has not ended {count} calls of a robot that is gone")
 
@@ -253,7 +260,7 @@ class _World:
 
     def _check_failback(self) -> None:
         """Make sure that the first service that is there decides, if there was time for that."""
-        if not self._robot.finished or self._agenda.now < self._faults_end_at + FAILBACK_S:
+        if not self._robot.finished or self._queue.now < self._faults_end_at + FAILBACK_S:
             return
         there = [name for name in self._run.services if name not in self._gone]
         if not there:
@@ -262,65 +269,62 @@ class _World:
         is_back = self._run.deadline_ms is not None or self._decided_by == there[0]
         if self._status == "local_recovery" or not is_back:
             raise Violation(
-                f"{self._agenda.now - self._faults_end_at:.1f} s after the last fault "
+                f"{self._queue.now - self._faults_end_at:.1f} s after the last fault "
                 f"{self._decided_by} decides ({self._status}), and not {there[0]}"
             )
 
     def _deliver(self, process: int, event: TransportEvent) -> None:
         if self._tell and isinstance(event, ReplyReceived | CallEnded):
             heard = _kind_of(event.payload) if isinstance(event, ReplyReceived) else "its end"
-            self.noted("robot", "hears of call %s: %s", event.call, heard)
+            self.note("robot", "hears of call %s: %s", event.call, heard)
         self._robot.deliver(process, event)
 
     # -- faults ----------------------------------------------------------------------------------
 
     def _arrange(self, schedule: SimulationSchedule) -> None:
+        timed: dict[type, Callable[[Any], None]] = {
+            Crash: self._crash,
+            Stop: self._stop,
+            Slow: self._slow,
+            OutOfMemory: self._exhaust,
+            Cut: self._cut,
+            Crowd: self._crowd,
+            PauseRobot: self._pause,
+            KillRobot: self._kill,
+        }
         for fault in schedule.faults:
             if isinstance(fault, MessageFault):
                 continue  # most are; the network has them
-            if isinstance(fault, Crash):
-                self._agenda.at(fault.at, self._crash, fault)
-            elif isinstance(fault, Stop):
-                self._agenda.at(fault.at, self._stop, fault)
-            elif isinstance(fault, Slow):
-                self._agenda.at(fault.at, self._slow, fault)
-            elif isinstance(fault, OutOfMemory):
-                self._agenda.at(fault.at, self._exhaust, fault)
-            elif isinstance(fault, Cut):
-                self._agenda.at(fault.at, self._cut, fault)
-            elif isinstance(fault, Crowd):
-                self._agenda.at(fault.at, self._crowd, fault)
-            elif isinstance(fault, PauseRobot):
-                self._agenda.at(fault.at, self._pause, fault)
-            elif isinstance(fault, DiskStall):
+            if isinstance(fault, DiskStall):
                 self._stalls.append(fault)
-            elif isinstance(fault, KillRobot) and fault.at is not None:
-                self._agenda.at(fault.at, self._kill, fault)
-            elif isinstance(fault, KillRobot):
-                self._kills.setdefault(fault.boundary, fault)
             elif isinstance(fault, LaunchFault):
                 self._launch_faults.setdefault(fault.number, fault)
+            elif isinstance(fault, KillRobot) and fault.at is None:
+                self._kills.setdefault(fault.boundary, fault)
+            else:
+                assert fault.at is not None
+                self._queue.at(fault.at, timed[type(fault)], fault)
         self._stalls.sort(key=lambda fault: -fault.at)
 
     def _happened(self, fault: SimulatedFault, seconds: float) -> None:
         """Take note of a fault that is not over before some time has passed."""
         self._faults[fault.kind] = self._faults.get(fault.kind, 0) + 1
-        self._struck.add(id(fault))
+        self._injected.add(id(fault))
         self._lasts(seconds)
 
     def _never_happened(self) -> tuple[SimulatedFault, ...]:
         if not self._tell:
             return ()
-        return tuple(fault for fault in self._schedule.faults if id(fault) not in self._struck)
+        return tuple(fault for fault in self._schedule.faults if id(fault) not in self._injected)
 
     def _lasts(self, seconds: float) -> None:
-        self._faults_end_at = max(self._faults_end_at, self._agenda.now + seconds)
+        self._faults_end_at = max(self._faults_end_at, self._queue.now + seconds)
 
     def _start_service(self, name: str, *, keeps_memory: bool = False) -> None:
         service = self._services[name]
         self._stopped_until.pop(name, None)
         service.start(keeps_memory=keeps_memory)
-        self.noted(name, "starts, process %s", service.incarnation)
+        self.note(name, "starts, process %s", service.incarnation)
         self._network.review(service)
 
     def _crash(self, fault: Crash) -> None:
@@ -330,16 +334,16 @@ class _World:
             self._gone.add(fault.service)
         if not service.up:
             if fault.for_good and not local:
-                self._struck.add(id(fault))  # it is not started again
+                self._injected.add(id(fault))  # it is not started again
             return
-        self.noted(fault.service, "is killed" + (" for good" if fault.for_good else ""))
+        self.note(fault.service, "is killed" + (" for good" if fault.for_good else ""))
         self._happened(fault, self._run.lease_s + (0.0 if local else fault.down_s))
         if local:
             self._end_local("was ended by SIGKILL")
         else:
             service.end(keeps_memory=fault.keeps_memory)
             self._network.service_died(service, fault.found_after_s)
-            self._agenda.after(fault.down_s, self._restart, fault)
+            self._queue.after(fault.down_s, self._restart, fault)
 
     def _restart(self, fault: Crash) -> None:
         if not self._services[fault.service].up and fault.service not in self._gone:
@@ -350,25 +354,25 @@ class _World:
         if not (self._robot.process if is_robot else self._services[fault.node].up):
             return
         self._happened(fault, fault.for_s)
-        self.noted(fault.node, "is stopped")
-        until = self._agenda.now + fault.for_s
+        self.note(fault.node, "is stopped")
+        until = self._queue.now + fault.for_s
         self._stopped_until[fault.node] = max(until, self._stopped_until.get(fault.node, 0.0))
         if is_robot:
             self._robot.stop()
-            self._agenda.at(until, self._robot_goes_on, self._robot.process)
+            self._queue.at(until, self._robot_goes_on, self._robot.process)
             return
         service = self._services[fault.node]
         self._crowd_takes_longer(service, fault.for_s)
         service.stop()
         self._network.review(service)
-        self._agenda.at(until, self._service_goes_on, service, service.incarnation)
+        self._queue.at(until, self._service_goes_on, service, service.incarnation)
 
     def _is_still_stopped(self, node: str) -> bool:
-        return self._agenda.now < self._stopped_until.get(node, 0.0)
+        return self._queue.now < self._stopped_until.get(node, 0.0)
 
     def _robot_goes_on(self, process: int) -> None:
         if process and process == self._robot.process and not self._is_still_stopped("robot"):
-            self.noted("robot", "goes on")
+            self.note("robot", "goes on")
             self._robot.go_on()
 
     def _service_goes_on(self, service: ServiceNode, incarnation: int) -> None:
@@ -377,7 +381,7 @@ class _World:
             and service.up
             and not self._is_still_stopped(service.name)
         ):
-            self.noted(service.name, "goes on")
+            self.note(service.name, "goes on")
             service.go_on()
             self._network.review(service)
 
@@ -387,14 +391,14 @@ class _World:
             return
         # What was begun in it takes its time beyond it.
         self._happened(fault, fault.for_s + fault.factor * (self._run.task_s + self._run.sensing_s))
-        self.noted(fault.service, "computes %g times as long", fault.factor)
+        self.note(fault.service, "computes %g times as long", fault.factor)
         slownesses = self._slownesses.setdefault(fault.service, [])
         slownesses.append(fault.factor)
         slower = max(slownesses) / service.slowness
         service.slowness = max(slownesses)
-        left_s = self._crowded_until.get(service.name, 0.0) - self._agenda.now
+        left_s = self._crowded_until.get(service.name, 0.0) - self._queue.now
         self._crowd_takes_longer(service, (slower - 1.0) * left_s)
-        self._agenda.after(fault.for_s, self._quicken, service, fault.factor)
+        self._queue.after(fault.for_s, self._quicken, service, fault.factor)
 
     def _quicken(self, service: ServiceNode, factor: float) -> None:
         slownesses = self._slownesses[service.name]
@@ -404,32 +408,32 @@ class _World:
     def _exhaust(self, fault: OutOfMemory) -> None:
         service = self._services[fault.service]
         self._happened(fault, fault.for_s + _IS_ASKED_AGAIN_S)
-        self.noted(fault.service, "has no memory for %s parts", fault.part)
+        self.note(fault.service, "has no memory for %s parts", fault.part)
         service.lacks_memory_for.append(fault.part)
-        self._agenda.after(fault.for_s, self._relieve, service, fault.part)
+        self._queue.after(fault.for_s, self._relieve, service, fault.part)
 
     def _relieve(self, service: ServiceNode, part: str) -> None:
         service.lacks_memory_for.remove(part)
-        self.noted(service.name, "has memory for %s parts again", part)
+        self.note(service.name, "has memory for %s parts again", part)
 
     def _cut(self, fault: Cut) -> None:
         self._happened(fault, fault.for_s + self._run.lease_s)
-        self.noted(fault.service, "is cut off (%s)", fault.direction)
+        self.note(fault.service, "is cut off (%s)", fault.direction)
         for way in ("to", "from"):
             if fault.direction in (way, "both"):
                 self._network.cut(fault.service, way)
-                self._agenda.after(fault.for_s, self._network.heal, fault.service, way)
+                self._queue.after(fault.for_s, self._network.heal, fault.service, way)
 
     def _crowd(self, fault: Crowd) -> None:
         service = self._services[fault.service]
         if not service.up:
             return
         # Each of them is served in turn, after those of an earlier crowd that still wait.
-        begin = max(self._agenda.now, self._crowded_until.get(service.name, 0.0))
+        begin = max(self._queue.now, self._crowded_until.get(service.name, 0.0))
         end = begin + fault.robots * service.slowness * self._run.sensing_s
         self._crowded_until[service.name] = end
-        self._happened(fault, end - self._agenda.now + _CROWD_IS_FELT_S)
-        self.noted(fault.service, "is asked by %s other robots", fault.robots)
+        self._happened(fault, end - self._queue.now + _CROWD_IS_FELT_S)
+        self.note(fault.service, "is asked by %s other robots", fault.robots)
         self._checker.crowded(fault.robots)
         for number in range(fault.robots):
             self._crowds += 1
@@ -441,14 +445,14 @@ class _World:
     def _crowd_takes_longer(self, service: ServiceNode, seconds: float) -> None:
         """Take note that what is left of a crowd is served later, if anything is."""
         end = self._crowded_until.get(service.name, 0.0)
-        if seconds > 0.0 and end > self._agenda.now:
+        if seconds > 0.0 and end > self._queue.now:
             self._crowded_until[service.name] = end + seconds
-            self._lasts(end + seconds - self._agenda.now + _CROWD_IS_FELT_S)
+            self._lasts(end + seconds - self._queue.now + _CROWD_IS_FELT_S)
 
     def _pause(self, fault: PauseRobot) -> None:
         if self._robot.process:
             self._happened(fault, fault.down_s)
-            self.noted("robot", "is asked to end")
+            self.note("robot", "is asked to end")
             self._down_s = fault.down_s
             self._robot.pause()
 
@@ -456,18 +460,18 @@ class _World:
         if not self._robot.process:
             return
         self._happened(fault, fault.down_s)
-        self.noted("robot", "is killed" + (" by a power cut" if fault.power_cut else ""))
+        self.note("robot", "is killed" + (" by a power cut" if fault.power_cut else ""))
         self._robot.kill(
             lost_appends=fault.lost_appends if fault.power_cut else None,
             body_goes_on=fault.body_goes_on,
         )
         self._end_local(None)
-        self._agenda.after(fault.down_s, self._restart_robot)
+        self._queue.after(fault.down_s, self._restart_robot)
 
     def _restart_robot(self) -> None:
         if not self._robot.process:
             self._stopped_until.pop("robot", None)
-            self.noted("robot", "is started again")
+            self.note("robot", "is started again")
             self._robot.start()
 
     # -- what the robot's process asks of its machine --------------------------------------------
@@ -486,18 +490,18 @@ class _World:
 
     def robot_ended(self) -> None:
         """Take note that the robot's process has ended in order."""
-        self.noted("robot", "has ended in order")
+        self.note("robot", "has ended in order")
         self._end_local(None)
         self._lasts(self._down_s)
-        self._agenda.after(self._down_s, self._restart_robot)
+        self._queue.after(self._down_s, self._restart_robot)
 
     def stall_s(self) -> float:
         """Return how long this write to the journal takes."""
-        if self._stalls and self._stalls[-1].at <= self._agenda.now:
+        if self._stalls and self._stalls[-1].at <= self._queue.now:
             fault = self._stalls.pop()
             stall_s = fault.for_s
             self._happened(fault, stall_s)
-            self.noted("robot", "writes to its journal for %g s", stall_s)
+            self.note("robot", "writes to its journal for %g s", stall_s)
             return stall_s
         return 0.0
 
@@ -509,16 +513,16 @@ class _World:
         self._launcher = process = self._robot.process
         fault = self._launch_faults.get(self._launches)
         wait_s = self._run.launch_s
-        self.noted(LOCAL_SERVICE, "is launched")
+        self.note(LOCAL_SERVICE, "is launched")
         if fault is None:
-            self._agenda.after(wait_s, self._launched, process, number)
+            self._queue.after(wait_s, self._launched, process, number)
             return
         self._happened(fault, wait_s + fault.seconds)
         if fault.what == "fails":
             reason = "ended with exit code 1"
-            self._agenda.after(fault.seconds, self._robot.recovery_exited, process, number, reason)
+            self._queue.after(fault.seconds, self._robot.recovery_exited, process, number, reason)
         elif fault.what == "late":
-            self._agenda.after(wait_s + fault.seconds, self._launched, process, number)
+            self._queue.after(wait_s + fault.seconds, self._launched, process, number)
         else:
             # Found by the launch's own limit, after which the next launch follows.
             self._lasts(_LAUNCH_TIMEOUT_S * 2**self._silent_launches)
@@ -537,13 +541,14 @@ class _World:
             local.end()
             self._network.service_died(local, 0.001)
             if reason is not None:
-                self._agenda.after(0.002, self._robot.recovery_exited, process, number, reason)
+                self._queue.after(0.002, self._robot.recovery_exited, process, number, reason)
 
-    def decided(self, service: str, status: str, waited_s: float) -> None:
+    def decided(self, timing: Timing) -> None:
         """Take note of whose decision is carried out, and how long the robot stood still for it."""
-        now = self._agenda.now
-        self._decided_by, self._status = service, status
-        since = max(now - waited_s / self._run.robot_clock_rate, self._faults_end_at)
+        now = self._queue.now
+        self._decided_by, self._status = timing.service, timing.status
+        waited_s = 1e-3 * timing.waited_ms / self._run.robot_clock_rate
+        since = max(now - waited_s, self._faults_end_at)
         # Or the local service is launched first.
         allowed_s = STANDSTILL_S + self._run.launch_s
         if now - since > allowed_s:
@@ -554,18 +559,16 @@ class _World:
 
     # -- the story -------------------------------------------------------------------------------
 
-    def told(self, name: str, fields: dict[str, object]) -> None:
-        """Take note of a line of the robot's log."""
+    def log_event(self, name: str, fields: dict[str, object]) -> None:
+        """Take note of an event of the robot's log."""
         if self._tell:
             shown = " ".join(f"{key}={_short(value)}" for key, value in fields.items())
-            self.noted("robot", f"{name} {shown}".rstrip())
+            self.note("robot", f"{name} {shown}".rstrip())
 
-    def noted(self, actor: str, text: str, *values: object) -> None:
+    def note(self, actor: str, text: str, *values: object) -> None:
         """Take note of what was done."""
         if self._tell:
-            self._story.append(
-                StoryLine(self._agenda.now, actor, text % values if values else text)
-            )
+            self._story.append(StoryLine(self._queue.now, actor, text % values if values else text))
 
 
 def _kind_of(payload: bytes) -> str:
