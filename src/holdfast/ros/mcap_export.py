@@ -280,10 +280,8 @@ class McapSink:
                     now,
                     "/holdfast/estimate",
                     "geometry_msgs/msg/PoseWithCovarianceStamped",
-                    header=self._header(now),
-                    pose=self._make("geometry_msgs/msg/PoseWithCovariance")(
-                        pose=self._pose(pose), covariance=covariance
-                    ),
+                    header=_header(now),
+                    pose=(self._pose(pose), covariance),
                 )
         if true_state is not None:
             self._array(now, "/holdfast/true_state", true_state, "; ".join(self._labels))
@@ -293,7 +291,7 @@ class McapSink:
                     now,
                     "/holdfast/truth",
                     "geometry_msgs/msg/PoseStamped",
-                    header=self._header(now),
+                    header=_header(now),
                     pose=self._pose(pose),
                 )
         if frames:
@@ -313,89 +311,54 @@ class McapSink:
                 now,
                 "/holdfast/particle_cloud",
                 "geometry_msgs/msg/PoseArray",
-                header=self._header(now),
+                header=_header(now),
                 poses=self._poses(self._layout.poses(belief.states)),
             )
 
     def _extend_path(self, now: int, topic: str, pose: FloatArray, *, last: bool) -> None:
         path = self._paths.setdefault(topic, _GrowingPath())
-        stamped = self._make("geometry_msgs/msg/PoseStamped")
-        path.poses.append(stamped(header=self._header(now), pose=self._pose(pose)))
+        stamped = (_header(now), self._pose(pose))
+        path.poses.append(self._message("geometry_msgs/msg/PoseStamped", stamped))
         if last or len(path.poses) >= path.next_length:
             path.next_length = len(path.poses) + 1 + len(path.poses) // _PATH_GROWTH
-            self._write(now, topic, "nav_msgs/msg/Path", header=self._header(now), poses=path.poses)
+            self._write(now, topic, "nav_msgs/msg/Path", header=_header(now), poses=path.poses)
 
     def _transform(
         self, now: int, topic: str, parent: str, children: Mapping[str, FloatArray]
     ) -> None:
-        vector, turn = self._make("geometry_msgs/msg/Vector3"), self._quaternion
         transforms = [
-            self._make("geometry_msgs/msg/TransformStamped")(
-                header=self._header(now, parent),
-                child_frame_id=child,
-                transform=self._make("geometry_msgs/msg/Transform")(
-                    translation=vector(*map(float, pose[:3])), rotation=turn(pose[3:])
-                ),
-            )
-            for child, pose in children.items()
+            (_header(now, parent), child, (pose[:3], pose[3:])) for child, pose in children.items()
         ]
         self._write(now, topic, "tf2_msgs/msg/TFMessage", transforms=transforms)
 
     def _markers(
         self, now: int, topic: str, markers: Sequence[Marker], *, anew: bool = False
     ) -> None:
-        kind = self._make("visualization_msgs/msg/Marker")
         gone = Marker(kind="DELETEALL", frame=TASK_FRAME, namespace="")
         numbers: dict[str, int] = {}
         made = []
         for marker in [gone, *markers] if anew else markers:
             number = numbers[marker.namespace] = numbers.get(marker.namespace, -1) + 1
-            made.append(self._marker(now, kind, marker, number))
+            made.append(self._marker(now, marker, number))
         self._write(now, topic, "visualization_msgs/msg/MarkerArray", markers=made)
 
-    def _marker(self, now: int, kind: Any, marker: Marker, number: int) -> Any:
-        point, vector = (
-            self._make("geometry_msgs/msg/Point"),
-            self._make("geometry_msgs/msg/Vector3"),
-        )
-        color = self._make("std_msgs/msg/ColorRGBA")
-        time, duration = (
-            self._make(f"builtin_interfaces/msg/{name}") for name in ("Time", "Duration")
-        )
-        fields: dict[str, Any] = {
-            "header": self._header(now, marker.frame),
+    def _marker(self, now: int, marker: Marker, number: int) -> dict[str, Any]:
+        kind = self._types["visualization_msgs/msg/Marker"]
+        is_end = marker.kind == "DELETEALL"
+        return {
+            # Time 0: wherever the frame is now.
+            "header": _header(0 if marker.moves_with_frame else now, marker.frame),
             "ns": marker.namespace,
             "id": number,
-            "type": 0 if marker.kind == "DELETEALL" else getattr(kind, marker.kind),
-            "action": kind.DELETEALL if marker.kind == "DELETEALL" else kind.ADD,
+            "type": 0 if is_end else getattr(kind, marker.kind),
+            "action": kind.DELETEALL if is_end else kind.ADD,
             "pose": self._pose(np.asarray(marker.pose)),
-            "scale": vector(*map(float, marker.scale)),
-            "color": color(*map(float, marker.color)),
-            "lifetime": duration(sec=0, nanosec=0),
+            "scale": marker.scale,
+            "color": marker.color,
             "frame_locked": marker.moves_with_frame,
-            "points": [point(*map(float, each)) for each in marker.points],
-            "colors": [],
+            "points": marker.points,
             "text": marker.text,
-            "mesh_resource": "",
-            "mesh_use_embedded_materials": False,
         }
-        if marker.moves_with_frame:
-            # Time 0: wherever the frame is now.
-            header = self._make("std_msgs/msg/Header")
-            fields["header"] = header(stamp=time(sec=0, nanosec=0), frame_id=marker.frame)
-        # There is no texture and no mesh file, but the message has fields for them.
-        compressed = self._make("sensor_msgs/msg/CompressedImage")
-        fields |= {
-            "texture_resource": "",
-            "texture": compressed(
-                header=self._header(0, ""), format="", data=np.zeros(0, dtype=np.uint8)
-            ),
-            "uv_coordinates": [],
-            "mesh_file": self._make("visualization_msgs/msg/MeshFile")(
-                filename="", data=np.zeros(0, dtype=np.uint8)
-            ),
-        }
-        return kind(**fields)
 
     def _diagnose(
         self,
@@ -404,11 +367,11 @@ class McapSink:
         step: int,
         kind: str,
         decider: Decider | None,
-        values: Mapping[str, Any],
+        facts: Mapping[str, Any],
         explained: bool | None,
     ) -> None:
         status = "decided" if decider is None else decider.status
-        entries: dict[str, Any] = {"trial": trial, "step": step, **values}
+        entries: dict[str, Any] = {"trial": trial, "step": step, **facts}
         if decider is not None:
             entries |= decider._asdict()
         level, message = 0, status
@@ -416,25 +379,14 @@ class McapSink:
             level = 1
         if explained is False:
             level, message = 1, f"{status}; no particle explains the observation"
-        value = self._make("diagnostic_msgs/msg/KeyValue")
+        values = [(key, str(entry)) for key, entry in entries.items() if entry is not None]
+        service = "" if decider is None else decider.service
         self._write(
             now,
             "/diagnostics",
             "diagnostic_msgs/msg/DiagnosticArray",
-            header=self._header(now, ""),
-            status=[
-                self._make("diagnostic_msgs/msg/DiagnosticStatus")(
-                    level=level,
-                    name=f"holdfast: {kind} decision",
-                    message=message,
-                    hardware_id="" if decider is None else decider.service,
-                    values=[
-                        value(key=key, value=str(entry))
-                        for key, entry in entries.items()
-                        if entry is not None
-                    ],
-                )
-            ],
+            header=_header(now, ""),
+            status=[(level, f"holdfast: {kind} decision", message, service, values)],
         )
 
     def _log(self, now: int, level: str, text: str, name: str = "robot") -> None:
@@ -442,13 +394,10 @@ class McapSink:
             now,
             "/rosout",
             "rcl_interfaces/msg/Log",
-            stamp=self._time(now),
+            stamp=divmod(now, _NS_PER_S),
             level=_LEVELS[level],
             name=f"holdfast.{name}",
             msg=text,
-            file="",
-            function="",
-            line=0,
         )
 
     def _number(self, now: int, topic: str, kind: str, value: float) -> None:
@@ -456,36 +405,23 @@ class McapSink:
 
     def _array(self, now: int, topic: str, values: FloatArray, columns: str) -> None:
         """Write numbers; of a table the rows are particles."""
-        dimension = self._make("std_msgs/msg/MultiArrayDimension")
         width = values.shape[-1]
-        dims = [dimension(label=columns, size=width, stride=width)]
+        dimensions = [(columns, width, width)]
         if values.ndim == 2:
-            dims.insert(0, dimension(label="particle", size=len(values), stride=values.size))
-        layout = self._make("std_msgs/msg/MultiArrayLayout")(dim=dims, data_offset=0)
+            dimensions.insert(0, ("particle", len(values), values.size))
         data = np.ascontiguousarray(values, dtype=np.float64).reshape(-1)
-        self._write(now, topic, "std_msgs/msg/Float64MultiArray", layout=layout, data=data)
+        self._write(now, topic, "std_msgs/msg/Float64MultiArray",
+                    layout={"dim": dimensions}, data=data)  # fmt: skip
 
     def _poses(self, poses: FloatArray) -> list[Any]:
-        pose = self._make("geometry_msgs/msg/Pose")
-        point = self._make("geometry_msgs/msg/Point")
-        quaternion = self._make("geometry_msgs/msg/Quaternion")
+        # Of a belief there are many: without the detour of _message.
+        pose, point, quaternion = (
+            self._types[f"geometry_msgs/msg/{name}"] for name in ("Pose", "Point", "Quaternion")
+        )
         return [pose(point(x, y, z), quaternion(*turn)) for x, y, z, *turn in poses.tolist()]
 
     def _pose(self, pose: FloatArray) -> Any:
         return self._poses(pose.reshape(1, 7))[0]
-
-    def _quaternion(self, turn: FloatArray) -> Any:
-        return self._make("geometry_msgs/msg/Quaternion")(*map(float, turn))
-
-    def _header(self, now: int, frame: str = TASK_FRAME) -> Any:
-        return self._make("std_msgs/msg/Header")(stamp=self._time(now), frame_id=frame)
-
-    def _time(self, now: int) -> Any:
-        seconds, nanoseconds = divmod(now, _NS_PER_S)
-        return self._make("builtin_interfaces/msg/Time")(sec=seconds, nanosec=nanoseconds)
-
-    def _make(self, kind: str) -> Any:
-        return self._types[kind]
 
     def _write(self, now: int, topic: str, kind: str, **fields: Any) -> None:
         connection = self._connections.get(topic)
@@ -495,8 +431,38 @@ class McapSink:
                 topic, kind, typestore=self._store, offered_qos_profiles=[_qos(latched=latched)]
             )
             self._connections[topic] = connection
-        message = self._types[kind](**fields)
+        message = self._message(kind, fields)
         self._writer.write(connection, now, self._store.serialize_cdr(message, kind))
+
+    def _message(self, kind: str, given: Any) -> Any:
+        """Return a message from plain data: its fields by name, or all of them in their order.
+
+        A field without a name there is zero or empty. What is a message already stays.
+        """
+        if hasattr(given, "__msgtype__"):
+            return given
+        fields = self._store.fielddefs[kind][1]
+        if not isinstance(given, Mapping):
+            given = dict(zip((name for name, _ in fields), given, strict=True))
+        values = {name: self._field(form, given.get(name)) for name, form in fields}
+        return self._types[kind](**values)
+
+    def _field(self, form: Any, value: Any) -> Any:
+        from rosbags.interfaces import Nodetype
+
+        node, detail = form
+        if node is Nodetype.NAME:
+            return self._message(detail, {} if value is None else value)
+        if node is Nodetype.BASE:
+            return ("" if detail[0] == "string" else 0) if value is None else value
+        (node, detail), _ = detail
+        if node is Nodetype.NAME:
+            return [self._message(detail, each) for each in value or ()]
+        return np.zeros(0, dtype=detail[0]) if value is None else value
+
+
+def _header(now: int, frame: str = TASK_FRAME) -> dict[str, Any]:
+    return {"stamp": divmod(now, _NS_PER_S), "frame_id": frame}
 
 
 class _GrowingPath:
