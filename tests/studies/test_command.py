@@ -10,9 +10,8 @@ import pytest
 
 from holdfast.errors import InvalidValueError, OptionError
 from holdfast.lab.errors import TrialFileError
-from holdfast.lab.studies.command import main
+from holdfast.lab.studies.command import main, studies_of, study_names
 from holdfast.lab.studies.published_2017 import published_rows, series_of
-from holdfast.lab.studies.registry import studies_of, study_names
 from holdfast.lab.studies.study import Scale
 from holdfast.lab.studies.trial_batches import problem_of
 

@@ -9,6 +9,7 @@ import pytest
 
 from holdfast.errors import InvalidValueError
 from holdfast.lab.errors import TaskError
+from holdfast.lab.studies.command import studies_of
 from holdfast.lab.studies.published_worlds import (
     BEST,
     COLUMNS,
@@ -17,7 +18,6 @@ from holdfast.lab.studies.published_worlds import (
     published_planners,
     run_vdp_tag,
 )
-from holdfast.lab.studies.registry import studies_of
 from holdfast.lab.studies.study import Report, Results, Scale
 from holdfast.lab.studies.tables import to_csv
 from holdfast.lab.studies.tasks import task_key

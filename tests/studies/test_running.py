@@ -21,8 +21,8 @@ from holdfast import _kernel
 from holdfast.errors import HoldfastError, InvalidValueError, OutputError
 from holdfast.lab.errors import TaskError
 from holdfast.lab.studies import executors, result_cache, tasks
+from holdfast.lab.studies.command import studies_of
 from holdfast.lab.studies.executors import LocalExecutor
-from holdfast.lab.studies.registry import studies_of
 from holdfast.lab.studies.result_cache import ResultCache
 from holdfast.lab.studies.running import Workload, compute, write_report
 from holdfast.lab.studies.statistics import Interval

@@ -13,7 +13,7 @@ import pytest
 from matplotlib.text import Text
 
 from holdfast.lab.studies import offload_break_even, plots, published_2017
-from holdfast.lab.studies.registry import studies_of, study_names
+from holdfast.lab.studies.command import studies_of, study_names
 from holdfast.lab.studies.study import Report, TrialStudy
 from holdfast.lab.studies.tables import to_csv
 from holdfast.lab.studies.trial_files import read_trials

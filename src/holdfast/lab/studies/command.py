@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import difflib
+import importlib.util
 import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -27,7 +29,23 @@ if TYPE_CHECKING:
     from holdfast.lab.studies.running import Workload
     from holdfast.lab.studies.study import Report, Scale, Study
 
-__all__ = ["main"]
+__all__ = ["main", "studies_of", "study_names"]
+
+_ALL = "all"
+
+_PACKAGES = ("scipy", "pandas", "matplotlib", "pyarrow")
+
+_STUDIES: Mapping[str, str] = {
+    "thesis_chapter_6": "holdfast.lab.studies.thesis_chapter_6:ThesisChapter6",
+    "offload_break_even": "holdfast.lab.studies.offload_break_even:OffloadBreakEven",
+    "published_2017": "holdfast.lab.studies.published_2017:Published2017",
+    "published_worlds": "holdfast.lab.studies.published_worlds:PublishedWorlds",
+    "selectors": "holdfast.lab.studies.selectors:Selectors",
+    "parameters": "holdfast.lab.studies.parameters:Parameters",
+}
+"""Where each is; imported when it is needed."""
+
+_RENAMED: Mapping[str, str] = {"cloud_worth": "offload_break_even"}
 
 _DEFAULT_DIRECTORY = Path("runs") / "experiments"
 
@@ -98,10 +116,47 @@ class ExperimentOptions(Options):
     list: bool = flag("--list", help="List the experiments and end.")
 
 
+def study_names() -> list[str]:
+    """Return the names of all studies, in the order in which ``all`` runs them."""
+    return list(_STUDIES)
+
+
+def studies_of(names: Sequence[str]) -> list[Study]:
+    """Return the studies of some names, each once, in the order of :func:`study_names`.
+
+    ``all`` stands for all of them.
+
+    Raises
+    ------
+    InvalidValueError
+        If there is no study of a name.
+    HoldfastError
+        If a package is missing that studies need.
+    """
+    for name in names:
+        if name != _ALL and name not in _STUDIES:
+            close = difflib.get_close_matches(name, [_ALL, *_STUDIES], n=1)
+            close = [_RENAMED[name]] if name in _RENAMED else close
+            hint = f"; did you mean {close[0]}?" if close else ""
+            raise InvalidValueError(
+                f"experiment {name!r}: there are {', '.join(_STUDIES)} and {_ALL}{hint}"
+            )
+    missing = [name for name in _PACKAGES if importlib.util.find_spec(name) is None]
+    if missing:
+        raise HoldfastError(
+            f"experiments need {', '.join(missing)}, not installed here: pip install "
+            "'holdfast[lab]'"
+        )
+    wanted = [name for name in _STUDIES if _ALL in names or name in names]
+    places = (_STUDIES[name].partition(":") for name in wanted)
+    return [
+        getattr(importlib.import_module(module), attribute)() for module, _, attribute in places
+    ]
+
+
 def main(arguments: Sequence[str]) -> int:
     """Run the experiments and return the exit code."""
     options = ExperimentOptions.parse("experiment", arguments)
-    from holdfast.lab.studies.registry import studies_of
     from holdfast.lab.studies.study import Scale
 
     if options.list:

@@ -7,7 +7,7 @@ means themselves.
 Times have long tails, so they are summarised by medians. The interval of a median needs no
 assumption about the distribution.
 
-SciPy and statsmodels take a second to import, so each function imports what it needs.
+SciPy takes a second to import, so each function imports what it needs.
 """
 
 from __future__ import annotations
@@ -400,9 +400,12 @@ def holm(p_values: npt.ArrayLike) -> FloatArray:
 
     Source: S. Holm, "A simple sequentially rejective multiple test procedure", 1979.
     """
-    from statsmodels.stats.multitest import multipletests
-
-    return np.asarray(multipletests(np.asarray(p_values, dtype=np.float64), method="holm")[1])
+    given = np.asarray(p_values, dtype=np.float64)
+    order = np.argsort(given)
+    raised = np.maximum.accumulate(given[order] * np.arange(given.size, 0, -1))
+    adjusted = np.empty(given.size)
+    adjusted[order] = np.minimum(raised, 1.0)
+    return adjusted
 
 
 def add_adjusted(table: pd.DataFrame, *columns: str, compared: Any = None) -> None:
