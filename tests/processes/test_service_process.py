@@ -529,7 +529,7 @@ class TestRefusing:
 class TestTls:
     def test_robot_with_credentials(self, tmp_path: Path) -> None:
         make_credentials(tmp_path)
-        tls = load_credentials(tmp_path / "robot", "robot")
+        tls = load_credentials(tmp_path / "robot", "robot").files
         with served("--listen", "tls/127.0.0.1:0", "--tls", str(tmp_path / "service")) as service:
             with robots_end(service.endpoint, tls=tls) as end:
                 end.appeared()

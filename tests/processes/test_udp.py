@@ -134,7 +134,7 @@ async def test_a_killed_service_is_known_by_its_closed_port(site: Site, keys: Pa
         with Proxy(entry, target, "held open") as stream:
             robot = StreamRobotTransport(
                 {"cloud": ServiceAddress(f"udp/127.0.0.1:{entry}")},
-                tls=load_credentials(keys / "ours" / "robot", "robot"),
+                tls=load_credentials(keys / "ours" / "robot", "robot").files,
                 lease_ms=3.6e6,
             )
             inbox = Inbox()

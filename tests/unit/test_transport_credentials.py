@@ -20,7 +20,7 @@ from cryptography.x509.oid import NameOID
 from holdfast.errors import CredentialsError
 from holdfast.protocol.events import CallEnded, ReplyReceived, ServiceAppeared
 from holdfast.transport.contract import IncomingCall
-from holdfast.transport.credentials import CredentialsWarning, Role, load_credentials
+from holdfast.transport.credentials import Role, load_credentials
 from holdfast.transport.endpoints import ServiceAddress, TlsFiles
 from holdfast.transport.key_ring import make_credentials
 from holdfast.transport.robot_end import StreamRobotTransport
@@ -94,7 +94,7 @@ def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
 class TestLoading:
     @pytest.mark.parametrize("role", ["robot", "service"])
     def test_good_ones_are_found_good(self, keys: Path, role: Role) -> None:
-        files = load_credentials(str(keys / role), role)
+        files = load_credentials(str(keys / role), role).files
         assert [files.authority, files.certificate, files.key] == [
             keys / role / name for name in ("authority.pem", "certificate.pem", "key.pem")
         ]
@@ -177,7 +177,7 @@ class TestLoading:
         assert len(said) == 2
         assert "key.pem: others can read this key (mode 644)" in said[0]
         assert "certificate.pem: expires in 3.0 days, on 20" in said[1]
-        with pytest.warns(CredentialsWarning, match="expires in"):
+        with pytest.warns(UserWarning, match="expires in"):
             load_credentials(tmp_path / "service", "service")
 
     def test_a_key_that_a_service_manager_or_a_cluster_hands_over_is_not_open(
@@ -207,7 +207,7 @@ class TestLoading:
             from holdfast.errors import CredentialsError
             from holdfast.transport.credentials import *
             keys = Path(sys.argv[1])
-            print(load_credentials(keys / "robot", "robot").key)
+            print(load_credentials(keys / "robot", "robot").files.key)
             for attempt in (
                 lambda: load_credentials(keys / "expired_robot", "robot"),
                 lambda: importlib.import_module("holdfast.transport.key_ring"),

@@ -54,7 +54,7 @@ from holdfast.transport.contract import DEFAULT_MAX_MESSAGE_BYTES
 from holdfast.transport.credentials import (
     EXPIRES_SOON_DAYS,
     date_text,
-    read_credentials,
+    load_credentials,
 )
 from holdfast.transport.datagram_cipher import require_cryptography
 from holdfast.transport.endpoints import (
@@ -355,7 +355,7 @@ class _Examination:
             return
         warnings: list[str] = []
         try:
-            own = read_credentials(robot.tls, "robot", warn=warnings.append)
+            own = load_credentials(robot.tls, "robot", warn=warnings.append)
             self._context = client_context(own.files)
         except HoldfastError as error:
             self._ours = str(error)

@@ -85,7 +85,7 @@ def check_services(configuration: Configuration, source: str | None = "") -> Non
         from holdfast.transport.credentials import load_credentials
 
         # Warnings are reported when the run begins.
-        tls = load_credentials(Path(offload.tls), "robot", warn=lambda _: None)
+        tls = load_credentials(Path(offload.tls), "robot", warn=lambda _: None).files
     for index, service in enumerate(offload.services):
         try:
             endpoint = parse_endpoint(service)
@@ -127,7 +127,7 @@ def make_links(configuration: Configuration, log_path: Path | None, events: Even
 
 def _streams(configuration: Configuration, log_path: Path | None, events: EventSink) -> Links:
     # Only a robot that has services needs these.
-    from holdfast.transport.credentials import read_credentials
+    from holdfast.transport.credentials import load_credentials
     from holdfast.transport.endpoints import (
         ServiceAddress,
         check_credentials,
@@ -147,7 +147,7 @@ def _streams(configuration: Configuration, log_path: Path | None, events: EventS
     tls = None
     name = offload.name or _machine_name()
     if offload.tls is not None:
-        own = read_credentials(Path(offload.tls), "robot", warn=tell_credentials)
+        own = load_credentials(Path(offload.tls), "robot", warn=tell_credentials)
         tls = own.files
         name = offload.name or ""
         with contextlib.suppress(TransportError):  # what another program made may have any name

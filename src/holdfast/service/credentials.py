@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from holdfast.errors import HoldfastError
 from holdfast.runtime.events import EventSink
-from holdfast.transport.credentials import date_text, file_versions, read_credentials
+from holdfast.transport.credentials import date_text, file_versions, load_credentials
 from holdfast.transport.endpoints import TlsFiles
 
 if TYPE_CHECKING:
@@ -51,7 +51,7 @@ class ServiceCredentials:
         self._warn = warn
         self._used = self._seen = file_versions(self.files)
         self._failure: str | None = None
-        self.expires_s = read_credentials(directory, "service", warn=warn).expires_s
+        self.expires_s = load_credentials(directory, "service", warn=warn).expires_s
 
     def watch(
         self,
@@ -80,7 +80,7 @@ class ServiceCredentials:
         warnings: list[str] = []
         try:
             # This check names more faults than the transport's.
-            read = read_credentials(self._directory, "service", warn=warnings.append)
+            read = load_credentials(self._directory, "service", warn=warnings.append)
             ended = transport.reload_credentials()
         except HoldfastError as error:
             failure = f"{error}; the previous ones stay in use"

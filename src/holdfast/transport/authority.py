@@ -124,7 +124,7 @@ def new_authority(now: datetime) -> Authority:
     return Authority(certificate, key)
 
 
-def read_authority(home: Path, now: datetime, warn: Callable[[str], None]) -> Authority:
+def read_authority(home: Path, now: datetime, warn: Callable[[str], object]) -> Authority:
     """Read the authority's files; raise CredentialsError if one cannot be used."""
     certificate = read_certificate(home / AUTHORITY_FILE)
     path = home / AUTHORITY_KEY_FILE

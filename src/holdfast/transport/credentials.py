@@ -13,7 +13,6 @@ import os
 import warnings
 from collections.abc import Callable
 from datetime import UTC, datetime
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias
 
@@ -26,14 +25,11 @@ if TYPE_CHECKING:
 
 __all__ = [
     "EXPIRES_SOON_DAYS",
-    "CredentialsWarning",
     "LoadedCredentials",
     "Role",
     "date_text",
     "file_versions",
-    "give_to_warnings",
     "load_credentials",
-    "read_credentials",
     "warn_if_open",
 ]
 
@@ -46,10 +42,6 @@ _OPEN_TO_OTHERS = 0o077
 _GROUP_READS = 0o040
 
 
-class CredentialsWarning(UserWarning):
-    """Credentials work, but need attention."""
-
-
 class LoadedCredentials(NamedTuple):
     """Checked credentials, the certificate's name, and its end in seconds since 1970."""
 
@@ -59,17 +51,16 @@ class LoadedCredentials(NamedTuple):
 
 
 def load_credentials(
-    directory: Path | str, role: Role, *, warn: Callable[[str], None] | None = None
-) -> TlsFiles:
-    """Check a robot's or a service's credentials, and return their files.
+    directory: Path | str, role: Role, *, warn: Callable[[str], object] = warnings.warn
+) -> LoadedCredentials:
+    """Check a robot's or a service's credentials.
 
     Parameters
     ----------
     directory : Path or str
         With ``authority.pem``, ``certificate.pem`` and ``key.pem``.
-    warn : callable or None
-        Takes warnings as text: others can read the key, or the certificate expires soon. None
-        passes them to :mod:`warnings`.
+    warn : callable
+        Takes warnings as text: others can read the key, or the certificate expires soon.
 
     Raises
     ------
@@ -78,15 +69,6 @@ def load_credentials(
         to another certificate, the certificate is not valid now, was signed by another authority,
         is for the other role, or has not exactly one common name.
     """
-    # The warning names the caller of this function.
-    warn = warn or partial(give_to_warnings, stacklevel=4)
-    return read_credentials(directory, role, warn=warn).files
-
-
-def read_credentials(
-    directory: Path | str, role: Role, *, warn: Callable[[str], None]
-) -> LoadedCredentials:
-    """Check credentials as :func:`load_credentials` does; return the certificate's data too."""
     directory = Path(directory)
     files = TlsFiles.of(directory)
     for path in (files.authority, files.certificate, files.key):
@@ -120,11 +102,6 @@ def file_versions(files: TlsFiles) -> list[tuple[int, int, int] | None]:
     return found
 
 
-def give_to_warnings(text: str, stacklevel: int = 3) -> None:
-    """Warn as Python does."""
-    warnings.warn(text, CredentialsWarning, stacklevel=stacklevel)
-
-
 def _unreadable(directory: Path, path: Path, role: Role, error: OSError) -> str:
     text = f"{path}: cannot be read: {error.strerror}"
     if isinstance(error, PermissionError):
@@ -138,7 +115,7 @@ def _unreadable(directory: Path, path: Path, role: Role, error: OSError) -> str:
     return text
 
 
-def warn_if_open(key: Path, warn: Callable[[str], None]) -> None:
+def warn_if_open(key: Path, warn: Callable[[str], object]) -> None:
     """Warn of a key that others can read.
 
     The group may read a key of another owner: systemd and Kubernetes provide credentials that way.

@@ -193,9 +193,9 @@ class DatagramCipher:
             return None
         if not self.window.is_fresh(counter):
             return None
-        header, sealed = datagram[: _HEADER.size], datagram[_HEADER.size :]
+        header, encrypted = datagram[: _HEADER.size], datagram[_HEADER.size :]
         try:
-            message = self._decryptor.decrypt(_NONCE_PREFIX + header, sealed, None)
+            message = self._decryptor.decrypt(_NONCE_PREFIX + header, encrypted, None)
         except self._invalid_tag:
             return None
         # After authentication: a forged counter must not move the window.

@@ -19,6 +19,7 @@ import fcntl
 import os
 import re
 import socket
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -54,7 +55,7 @@ from holdfast.transport.authority import (
     sign_certificate,
     sign_revocations,
 )
-from holdfast.transport.credentials import Role, give_to_warnings
+from holdfast.transport.credentials import Role
 from holdfast.transport.endpoints import AUTHORITY_FILE, CERTIFICATE_FILE, KEY_FILE
 from holdfast.transport.revocation import REVOKED_FILE
 
@@ -152,12 +153,11 @@ class KeyRing(NamedTuple):
 
 
 @contextlib.contextmanager
-def alone_in(directory: Path, *, warn: Callable[[str], None] | None = None) -> Iterator[None]:
+def alone_in(directory: Path, *, warn: Callable[[str], object] = warnings.warn) -> Iterator[None]:
     """Lock a directory against other processes, and restore what a killed one left unfinished.
 
     Takes and raises the same as :func:`make_credentials`.
     """
-    warn = warn or give_to_warnings
     is_new = not directory.exists()
     try:
         directory.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -194,7 +194,7 @@ def make_credentials(
     renew: bool = False,
     rotate: bool = False,
     now: datetime | None = None,
-    warn: Callable[[str], None] | None = None,
+    warn: Callable[[str], object] = warnings.warn,
 ) -> KeyRing:
     """Make keys for robots and services, and their authority if there is none yet.
 
@@ -220,8 +220,8 @@ def make_credentials(
         Whether to replace existing certificates, except revoked ones; or keys as well.
     now : datetime or None
         With its time zone; None is the current time.
-    warn : callable or None
-        Takes warnings as text; None passes them to :mod:`warnings`.
+    warn : callable
+        Takes warnings as text.
 
     Raises
     ------
@@ -230,7 +230,6 @@ def make_credentials(
     OutputError
         If a file cannot be written.
     """
-    warn = warn or give_to_warnings
     # Certificates have whole seconds.
     now = (now or datetime.now(UTC)).replace(microsecond=0)
     if not robots and not services:
@@ -319,7 +318,7 @@ def revoke_credentials(
     names: Sequence[str] = (),
     serials: Sequence[int] = (),
     now: datetime | None = None,
-    warn: Callable[[str], None] | None = None,
+    warn: Callable[[str], object] = warnings.warn,
 ) -> Revocation:
     """Revoke certificates: an end that has the new list refuses them.
 
@@ -343,7 +342,7 @@ def revoke_credentials(
     """
     now = (now or datetime.now(UTC)).replace(microsecond=0)
     home = directory / _AUTHORITY
-    authority = read_authority(home, now, warn or give_to_warnings)
+    authority = read_authority(home, now, warn)
     issued = _read_issued(directory, authority.certificate)
     wanted: dict[int, Issued] = {}
     for name in names:
