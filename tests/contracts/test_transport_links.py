@@ -292,7 +292,7 @@ class TestPeers:
         robot, inbox = tcp.robot("cloud"), Inbox()
         hello = robot.settings.hello()
         other = hello.replace(b"\xa7version\x01", b"\xa7version\x02")
-        robot.settings = robot.settings._replace(hello=lambda: other)
+        robot.settings.hello = lambda: other
         assert other != hello
         robot.start(inbox)
         await until(lambda: bool(tcp.refusals) and bool(tcp.reasons()))

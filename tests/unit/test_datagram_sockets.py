@@ -1,13 +1,14 @@
-"""A service's sockets for datagrams: one at each address, shared by links."""
+"""A service's socket for datagrams, shared by links."""
 
 from __future__ import annotations
 
 import asyncio
 import socket
-from typing import Any
+from typing import Any, cast
 
 from holdfast.transport.datagram_cipher import DatagramCipher
-from holdfast.transport.datagram_sockets import DatagramSockets
+from holdfast.transport.datagram_links import ServiceDatagramLink
+from holdfast.transport.datagram_sockets import DatagramSocket
 
 
 class Receiver:
@@ -21,11 +22,9 @@ class Receiver:
 
 
 async def test_a_datagram_goes_to_the_link_whose_association_it_names() -> None:
-    sockets = DatagramSockets()
-    here = sockets.at(("127.0.0.1", 0))
-    assert sockets.at(("127.0.0.1", 0)) is here
+    here = DatagramSocket(("127.0.0.1", 0))
     first, second = Receiver(), Receiver()
-    keys = [here.add(each) for each in (first, second)]
+    keys = [here.add(cast(ServiceDatagramLink, each)) for each in (first, second)]
     assert keys[0].association != keys[1].association
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as robot:
         robot.bind(("127.0.0.1", 0))
@@ -41,14 +40,13 @@ async def test_a_datagram_goes_to_the_link_whose_association_it_names() -> None:
         assert second.taken.empty()
         here.send(b"reply", address)
         assert robot.recv(100) == b"reply"
-    sockets.close()
-    sockets.close()
+    here.close()
+    here.close()
 
 
 async def test_where_the_port_is_taken_it_takes_another_one() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
         taken.bind(("127.0.0.1", 0))
-        sockets = DatagramSockets()
-        port = sockets.at(taken.getsockname()).port
-        assert port not in (0, taken.getsockname()[1])
-        sockets.close()
+        opened = DatagramSocket(taken.getsockname())
+        assert opened.port not in (0, taken.getsockname()[1])
+        opened.close()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import cast
 
-from holdfast.transport.link_settings import PartialMessageBudget, receive_buffer
+from holdfast.transport.link_settings import LinkSettings, PartialMessageBudget
 from holdfast.transport.links import Link
 
 
@@ -48,7 +48,9 @@ def test_the_owner_that_holds_the_most_loses_its_oldest() -> None:
 
 
 def test_ends_do_not_share_a_buffer() -> None:
-    first, second = receive_buffer(), receive_buffer()
+    first, second = (
+        LinkSettings(bytes, 1000.0, 1000, pauses_for_readers=False).buffer for _ in range(2)
+    )
     first[0] = 7
     assert second[0] == 0
     assert len(first) == 256 * 1024

@@ -9,9 +9,8 @@ from functools import partial
 import pytest
 
 from holdfast.transport.endpoints import Endpoint
-from holdfast.transport.fair_scheduler import FairScheduler
 from holdfast.transport.frames import CALL, LAST, Frame, Hello, Role, encode_hello
-from holdfast.transport.link_settings import LinkSettings, PartialMessageBudget, receive_buffer
+from holdfast.transport.link_settings import LinkSettings
 from holdfast.transport.links import Link, LinkOwner
 from holdfast.transport.ros1 import RosScheme, exchange_name
 
@@ -26,9 +25,6 @@ class End(LinkOwner):
             partial(encode_hello, role, "name", "i1", 30_000.0),
             30_000.0,
             1_000_000,
-            PartialMessageBudget(2_000_000),
-            FairScheduler(),
-            receive_buffer(),
             pauses_for_readers=role == "service",
         )
         self.frames: asyncio.Queue[Frame] = asyncio.Queue()

@@ -65,9 +65,8 @@ from holdfast.transport.endpoints import (
     system_words,
 )
 from holdfast.transport.exchanges import MAX_DATAGRAM_BYTES
-from holdfast.transport.fair_scheduler import FairScheduler
 from holdfast.transport.frames import encode_hello
-from holdfast.transport.link_settings import LinkSettings, PartialMessageBudget, receive_buffer
+from holdfast.transport.link_settings import LinkSettings
 from holdfast.transport.tls import client_context
 
 __all__ = [
@@ -228,9 +227,6 @@ class _Examination:
             partial(encode_hello, "robot", robot.name, os.urandom(8).hex(), _LEASE_MS),
             _LEASE_MS,
             DEFAULT_MAX_MESSAGE_BYTES,
-            PartialMessageBudget(2 * DEFAULT_MAX_MESSAGE_BYTES),
-            FairScheduler(),
-            receive_buffer(),
             pauses_for_readers=False,
         )
 

@@ -32,7 +32,6 @@ from holdfast.transport.datagram_sockets import (
     DATAGRAMS_AT_ONCE,
     LARGEST_DATAGRAM,
     DatagramSocket,
-    DatagramSockets,
 )
 from holdfast.transport.endpoints import Endpoint
 from holdfast.transport.exchanges import (
@@ -110,6 +109,8 @@ _ADDRESS_GONE: Final = frozenset(
 
 class _DatagramLink(Link):
     """Common to both ends."""
+
+    _exchange: RobotExchange | ServiceExchange
 
     def __init__(
         self, owner: LinkOwner, settings: LinkSettings, *, speaks_first: bool, tls: TlsStream
@@ -264,11 +265,15 @@ class _DatagramLink(Link):
         self._due = self._loop.call_at(due_at, self._expire)
 
     def _expire(self) -> None:
-        raise NotImplementedError
+        self._due, self._due_at = None, float("inf")
+        self._exchange.expire(self._loop.time())
+        self._plan(self._exchange.due)
 
 
 class RobotDatagramLink(_DatagramLink):
     """The robot's end: it sends requests."""
+
+    _exchange: RobotExchange
 
     def __init__(self, owner: LinkOwner, settings: LinkSettings, *, tls: TlsStream) -> None:
         super().__init__(owner, settings, speaks_first=True, tls=tls)
@@ -449,11 +454,9 @@ class RobotDatagramLink(_DatagramLink):
                 self._owner.on_datagrams_blocked(self)
 
     def _expire(self) -> None:
-        self._due, self._due_at = None, float("inf")
         if self._exchange.unanswered_probes >= _PROBES_BEFORE_NEW_SOCKET:
             self._open_socket()
-        self._exchange.expire(self._loop.time())
-        self._plan(self._exchange.due)
+        super()._expire()
 
     def _notify_owner(self) -> None:
         self._close_socket()
@@ -463,13 +466,15 @@ class RobotDatagramLink(_DatagramLink):
 class ServiceDatagramLink(_DatagramLink):
     """The service's end: it replies."""
 
+    _exchange: ServiceExchange
+
     def __init__(
         self,
         owner: LinkOwner,
         settings: LinkSettings,
         *,
         tls: TlsStream,
-        sockets: DatagramSockets,
+        sockets: dict[Any, DatagramSocket],
     ) -> None:
         super().__init__(owner, settings, speaks_first=False, tls=tls)
         self._exchange = ServiceExchange(self._paths)
@@ -507,9 +512,10 @@ class ServiceDatagramLink(_DatagramLink):
         assert self._transport is not None and self.peer is not None  # as TLS has proved
         address = self._transport.get_extra_info("sockname")
         try:
-            self._socket = self._sockets.at(address)
+            self._socket = self._sockets.get(address) or DatagramSocket(address)
         except OSError:
             return  # the system has no socket left; the stream carries all
+        self._sockets[address] = self._socket
         keys = self._socket.add(self)
         self._cipher = DatagramCipher(keys, service=True)
         port = self._socket.port
@@ -529,11 +535,6 @@ class ServiceDatagramLink(_DatagramLink):
     def _put(self, datagram: bytes) -> None:
         if self._socket is not None and self._peer_address is not None:
             self._socket.send(datagram, self._peer_address)
-
-    def _expire(self) -> None:
-        self._due, self._due_at = None, float("inf")
-        self._exchange.expire(self._loop.time())
-        self._plan(self._exchange.due)
 
     def _flush(self) -> None:
         self._exchange.flush()
@@ -555,7 +556,9 @@ class DatagramScheme(Scheme):
 
     def __init__(self) -> None:
         require_cryptography()
-        self._sockets = DatagramSockets()
+        # Of a service, one at each address that robots have called: the reply of a socket bound to
+        # all addresses might come from another one, and the robot would ignore it.
+        self._sockets: dict[Any, DatagramSocket] = {}
 
     def make_link(
         self,
@@ -576,4 +579,5 @@ class DatagramScheme(Scheme):
 
     def close(self) -> None:
         """Close the service's sockets. May be repeated."""
-        self._sockets.close()
+        while self._sockets:
+            self._sockets.popitem()[1].close()

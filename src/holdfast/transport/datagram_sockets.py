@@ -1,4 +1,4 @@
-"""A service's sockets for datagrams, each shared by the links of many robots."""
+"""A service's socket for datagrams, shared by the links of many robots."""
 
 from __future__ import annotations
 
@@ -6,11 +6,14 @@ import asyncio
 import contextlib
 import os
 import socket
-from typing import Any, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final
 
 from holdfast.transport.datagram_cipher import AssociationKeys, association_of
 
-__all__ = ["DATAGRAMS_AT_ONCE", "LARGEST_DATAGRAM", "DatagramSocket", "DatagramSockets"]
+if TYPE_CHECKING:
+    from holdfast.transport.datagram_links import ServiceDatagramLink
+
+__all__ = ["DATAGRAMS_AT_ONCE", "LARGEST_DATAGRAM", "DatagramSocket"]
 
 LARGEST_DATAGRAM: Final = 2048
 DATAGRAMS_AT_ONCE: Final = 64
@@ -20,49 +23,18 @@ _RECEIVE_BUFFER_BYTES: Final = 1 << 20
 """Asked of the system, so that a burst of one robot does not push out datagrams of others."""
 
 
-class DatagramReceiver(Protocol):
-    """A link that takes datagrams."""
-
-    def take_datagram(self, datagram: bytes, address: Any) -> None:
-        """Take a datagram that claims to be of this link."""
-        ...
-
-
-class DatagramSockets:
-    """A listening service's sockets for datagrams: one at each address that robots have called.
-
-    A socket bound to all addresses might reply from another one, which the robot would ignore. Each
-    has the port of the stream if that is free.
-    """
-
-    def __init__(self) -> None:
-        self._sockets: dict[Any, DatagramSocket] = {}
-
-    def at(self, address: Any) -> DatagramSocket:
-        """Return the socket at the address of a stream's own end.
-
-        Raises
-        ------
-        OSError
-            If the system has none left.
-        """
-        if address not in self._sockets:
-            self._sockets[address] = DatagramSocket(address)
-        return self._sockets[address]
-
-    def close(self) -> None:
-        """Close all of them. May be repeated."""
-        for each in self._sockets.values():
-            each.close()
-        self._sockets.clear()
-
-
 class DatagramSocket:
-    """A socket at one address, for the links of many robots."""
+    """A socket at one address, on the port of the stream if that is free.
+
+    Raises
+    ------
+    OSError
+        If the system has none left.
+    """
 
     def __init__(self, address: Any) -> None:
         self._loop = asyncio.get_running_loop()
-        self._links: dict[int, DatagramReceiver] = {}
+        self._links: dict[int, ServiceDatagramLink] = {}
         family = socket.AF_INET6 if len(address) == 4 else socket.AF_INET
         self._socket = socket.socket(family, socket.SOCK_DGRAM)
         try:
@@ -78,7 +50,7 @@ class DatagramSocket:
         self.port: int = self._socket.getsockname()[1]
         self._loop.add_reader(self._socket, self._readable)
 
-    def add(self, link: DatagramReceiver) -> AssociationKeys:
+    def add(self, link: ServiceDatagramLink) -> AssociationKeys:
         """Draw keys for a link."""
         # Random: an attacker that sees no datagram cannot guess one.
         while (association := int.from_bytes(os.urandom(4))) in self._links:

@@ -3,24 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final
+
+from holdfast.transport.fair_scheduler import FairScheduler
+from holdfast.transport.frames import HEADER_BYTES
 
 if TYPE_CHECKING:
-    from holdfast.transport.fair_scheduler import FairScheduler
     from holdfast.transport.links import Link
 
-__all__ = ["LinkSettings", "PartialMessageBudget", "receive_buffer"]
+__all__ = ["LinkSettings", "PartialMessageBudget"]
 
 _RECEIVED_AT_ONCE_BYTES: Final = 256 * 1024
-
-
-def receive_buffer() -> memoryview:
-    """Return a receive buffer for all links of one end.
-
-    A link copies its bytes out at once, so links on one event loop can share it. Allocating a
-    buffer takes longer than handling a short message.
-    """
-    return memoryview(bytearray(_RECEIVED_AT_ONCE_BYTES))
 
 
 class PartialMessageBudget:
@@ -57,25 +50,40 @@ class PartialMessageBudget:
             oldest.end("has not finished a message, and others need the memory")
 
 
-class LinkSettings(NamedTuple):
+class LinkSettings:
     """What all links of one end have in common.
 
-    Attributes
+    Parameters
     ----------
     hello : callable
         Returns this end's first bytes.
     lease_ms : float
         This end sends something several times in this time.
-    buffer : memoryview
-        From :func:`receive_buffer`.
     pauses_for_readers : bool
         Whether reading pauses while the other end does not read.
+    pause_s : float
+        Of the :class:`~holdfast.transport.fair_scheduler.FairScheduler`.
+
+    Attributes
+    ----------
+    buffer : memoryview
+        Takes received bytes. A link copies them out at once, so links on one event loop can share
+        it. Allocating a buffer takes longer than handling a short message.
     """
 
-    hello: Callable[[], bytes]
-    lease_ms: float
-    max_message_bytes: int
-    partial_messages: PartialMessageBudget
-    scheduler: FairScheduler
-    buffer: memoryview
-    pauses_for_readers: bool
+    def __init__(
+        self,
+        hello: Callable[[], bytes],
+        lease_ms: float,
+        max_message_bytes: int,
+        *,
+        pauses_for_readers: bool,
+        pause_s: float = 0.0,
+    ) -> None:
+        self.hello = hello
+        self.lease_ms = lease_ms
+        self.max_message_bytes = max_message_bytes
+        self.pauses_for_readers = pauses_for_readers
+        self.partial_messages = PartialMessageBudget(2 * (max_message_bytes + HEADER_BYTES))
+        self.scheduler = FairScheduler(pause_s)
+        self.buffer = memoryview(bytearray(_RECEIVED_AT_ONCE_BYTES))

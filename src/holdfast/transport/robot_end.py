@@ -28,18 +28,16 @@ from holdfast.transport.endpoints import (
     check_endpoint,
     check_name,
 )
-from holdfast.transport.fair_scheduler import FairScheduler
 from holdfast.transport.frames import (
     CALL,
     END,
-    HEADER_BYTES,
     LAST,
     REPLY,
     Frame,
     Hello,
     encode_hello,
 )
-from holdfast.transport.link_settings import LinkSettings, PartialMessageBudget, receive_buffer
+from holdfast.transport.link_settings import LinkSettings
 from holdfast.transport.links import Link, LinkOwner
 from holdfast.transport.listener import Listener, connection_to_drop
 from holdfast.transport.schemes import load_scheme
@@ -122,10 +120,8 @@ class StreamRobotTransport:
             partial(encode_hello, "robot", name, incarnation, lease_ms),
             lease_ms,
             max_message_bytes,
-            PartialMessageBudget(2 * (max_message_bytes + HEADER_BYTES)),
-            FairScheduler(_PAUSE_S),
-            receive_buffer(),
             pauses_for_readers=False,
+            pause_s=_PAUSE_S,
         )
         self.calls = CallTable()
         self.on_unreachable = on_unreachable

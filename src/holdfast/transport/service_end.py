@@ -26,18 +26,16 @@ from holdfast.transport.endpoints import (
     check_endpoint,
     check_name,
 )
-from holdfast.transport.fair_scheduler import FairScheduler
 from holdfast.transport.frames import (
     CALL,
     END,
-    HEADER_BYTES,
     LAST,
     REPLY,
     Frame,
     Hello,
     encode_hello,
 )
-from holdfast.transport.link_settings import LinkSettings, PartialMessageBudget, receive_buffer
+from holdfast.transport.link_settings import LinkSettings
 from holdfast.transport.links import Link, LinkOwner
 from holdfast.transport.listener import MAX_SILENT, Listener, connection_to_drop
 from holdfast.transport.revocation import REVOKED_FILE, revoked_serials
@@ -209,9 +207,6 @@ class StreamServiceTransport(LinkOwner):
             lambda: encode_hello("service", name, incarnation, lease_ms, time.time()),
             lease_ms,
             max_message_bytes,
-            PartialMessageBudget(2 * (max_message_bytes + HEADER_BYTES)),
-            FairScheduler(),
-            receive_buffer(),
             pauses_for_readers=True,
         )
         self._on_event = on_event
