@@ -1,4 +1,4 @@
-"""The page on reliability names every line that a schedule of the simulator can have."""
+"""The page on reliability names each line of a simulated schedule, and each kind of real fault."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import msgspec
 import pytest
 
 from holdfast.lab.simulation.schedule import RunSettings, SimulatedFault, line_of, parse_schedule
+from holdfast.lab.testbed.faults import FaultKind
 
 PAGE = (Path(__file__).parents[2] / "docs" / "reliability.md").read_text(encoding="utf-8")
 SECTION = PAGE.partition("## The lines of a schedule\n")[2].partition("\n## ")[0]
@@ -63,3 +64,9 @@ def test_the_example_is_a_schedule() -> None:
     schedule = parse_schedule(text)
     lines = [line for line in text.splitlines() if not line.startswith("#")]
     assert lines == [line_of(item) for item in (schedule.run, *schedule.faults)]
+
+
+def test_the_table_of_chaos_names_every_kind() -> None:
+    table = PAGE.partition("| kind of trial | injected fault |\n")[2].partition("\n\n")[0]
+    first_cells = "".join(line.split("|")[1] for line in table.splitlines()[1:])
+    assert re.findall(r"`(\w+)`", first_cells) == list(FaultKind)

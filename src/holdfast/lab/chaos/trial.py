@@ -167,7 +167,7 @@ def run_chaos_trial(
         faults=tuple(times_of_faults(testbed.faults, events, decisions)),
         steps=0 if comparison is None else comparison.task_actions,
         sensing_actions=0 if comparison is None else comparison.sensing_actions,
-        robots=0 if robot is None else robot.num_processes,
+        robots=0 if robot is None else len(robot.processes),
         statuses=sum(event.name == "status" for event in events),
         took_s=round(time.monotonic() - began, 3),
     )

@@ -15,7 +15,7 @@ import shutil
 import signal
 import tempfile
 import time
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Self, TypeAlias
@@ -126,6 +126,8 @@ class RobotCommand:
 
     Attributes
     ----------
+    processes : list of Process
+        All that were started.
     events : list of LogEvent
         Of all its processes, in order.
     is_done : bool
@@ -146,21 +148,12 @@ class RobotCommand:
         self.table = DecisionTable(out / TIMINGS_NAME)
         self.events: list[LogEvent] = []
         self.is_done = False
-        self._processes = [start(())]
+        self.processes = [start(())]
 
     @property
     def process(self) -> Process:
         """The process that was started last."""
-        return self._processes[-1]
-
-    @property
-    def num_processes(self) -> int:
-        """How many processes were started."""
-        return len(self._processes)
-
-    def has(self, process: Process) -> bool:
-        """Tell whether a process is or was one of this robot's."""
-        return process in self._processes
+        return self.processes[-1]
 
     @property
     def decisions(self) -> list[Decision]:
@@ -189,7 +182,7 @@ class RobotCommand:
         """Start a process that resumes the run of one that was killed."""
         # Before that its journal is not free, and its events are not all read.
         self.process.close(_END_S)
-        self._processes.append(self._start(("--resume",)))
+        self.processes.append(self._start(("--resume",)))
 
 
 class Testbed:
@@ -234,7 +227,7 @@ class Testbed:
         self._prefix = tuple(prefix)
         self._orderly_end_s = orderly_end_s
         self._happened: SimpleQueue[tuple[Process, LogEvent | Ended]] = SimpleQueue()
-        self._scripts: list[_RunningScript] = []
+        self._scripts: list[Iterator[None]] = []
         self._processes: list[Process] = []
         self.robot_or_none: RobotCommand | None = None
         self._mark = secrets.token_hex(16)
@@ -367,7 +360,7 @@ class Testbed:
 
     def run_script(self, script: Script) -> None:
         """Advance a script in each turn of the loop, beside all others."""
-        self._scripts.append(_RunningScript(script))
+        self._scripts.append(_turns(script))
 
     def note_fault(self, kind: str, target: str, injected_at: float) -> InjectedFault:
         """Note that a fault was injected."""
@@ -405,7 +398,7 @@ class Testbed:
         while True:
             if self.robot_or_none is not None:
                 self.robot_or_none.table.read()
-            self._scripts = [script for script in self._scripts if script.advance()]
+            self._scripts = [turns for turns in self._scripts if next(turns, True) is None]
             self.on_turn()
             if done():
                 return
@@ -425,7 +418,7 @@ class Testbed:
             lambda: robot.is_done,
             f"the next of {robot.steps} steps",
             limit_s,
-            lambda: (robot.num_processes, len(robot.decisions)),
+            lambda: (len(robot.processes), len(robot.decisions)),
         )
         robot.table.read()
 
@@ -440,7 +433,7 @@ class Testbed:
                 process, happened = self._happened.get_nowait()
 
     def _is_robot(self, process: Process) -> bool:
-        return self.robot_or_none is not None and self.robot_or_none.has(process)
+        return self.robot_or_none is not None and process in self.robot_or_none.processes
 
     def _note_end(self, process: Process, code: int) -> None:
         if code == 0 and self._is_robot(process):
@@ -455,21 +448,11 @@ class Testbed:
             )
 
 
-class _RunningScript:
-    """A script and what it waits for."""
-
-    def __init__(self, script: Script) -> None:
-        self._script = script
-        self._is_ready: Callable[[], bool] = lambda: True
-
-    def advance(self) -> bool:
-        """Go on as far as possible; False at the end."""
-        try:
-            while self._is_ready():
-                self._is_ready = next(self._script)
-        except StopIteration:
-            return False
-        return True
+def _turns(script: Script) -> Iterator[None]:
+    """Go on with a script as far as possible in each turn."""
+    for is_ready in script:
+        while not is_ready():
+            yield
 
 
 def after(duration_s: float) -> Callable[[], bool]:

@@ -47,40 +47,6 @@ class FaultKind(StrEnum):
     COMBINATION = "combination"
 
 
-DESCRIPTIONS = {
-    FaultKind.CLOUD_KILLED: "the cloud service is killed (SIGKILL) and started again",
-    FaultKind.CLOUD_STOPPED: "the cloud service is stopped for a while (SIGSTOP, SIGCONT)",
-    FaultKind.LOCAL_KILLED: "the local service is killed while the cloud is away",
-    FaultKind.ROBOT_KILLED: "the robot's process is killed and resumed",
-    FaultKind.ROBOT_STOPPED: "the robot's process is stopped for a while",
-    FaultKind.REPLICAS_KILLED: "of two cloud services, one after the other is killed",
-    FaultKind.LINK_DELAYED: "a proxy adds latency and jitter",
-    FaultKind.LINK_LOSSY: "a proxy delivers late, as after lost packets",
-    FaultKind.LINK_SILENT: "a proxy lets nothing through, and breaks no connection",
-    FaultKind.LINK_SILENT_ONE_WAY: "a proxy lets nothing through in one direction",
-    FaultKind.LINK_CUT: "a proxy resets all connections and refuses new ones",
-    FaultKind.PACKETS_LOST: "nftables drops some packets, at random",
-    FaultKind.PACKETS_DROPPED: "nftables drops all packets",
-    FaultKind.PACKETS_DROPPED_ONE_WAY: "nftables drops all packets in one direction",
-    FaultKind.COMBINATION: "several of these at once",
-}
-
-NEEDS_NAMESPACE = frozenset(
-    {FaultKind.PACKETS_LOST, FaultKind.PACKETS_DROPPED, FaultKind.PACKETS_DROPPED_ONE_WAY}
-)
-"""Kinds that need nftables and a network namespace."""
-
-NEEDS_PROXY = frozenset(
-    {
-        FaultKind.LINK_DELAYED,
-        FaultKind.LINK_LOSSY,
-        FaultKind.LINK_SILENT,
-        FaultKind.LINK_SILENT_ONE_WAY,
-        FaultKind.LINK_CUT,
-    }
-)
-
-
 class Fault(msgspec.Struct, frozen=True, kw_only=True):
     """One fault.
 
@@ -106,25 +72,6 @@ class Fault(msgspec.Struct, frozen=True, kw_only=True):
     latency_ms: float = 0.0
     jitter_ms: float = 0.0
     loss: float = 0.0
-
-
-def inject(testbed: Testbed, fault: Fault) -> None:
-    """Have the testbed inject a fault once its robot has come to the fault's step."""
-    testbed.run_script(_at_its_step(testbed, fault))
-
-
-def _at_its_step(testbed: Testbed, fault: Fault) -> Script:
-    step = int(fault.at * testbed.robot.steps)
-    yield lambda: testbed.robot.steps_done >= step
-    scripts: dict[FaultKind, Callable[[Testbed, Fault], Script]] = {
-        FaultKind.CLOUD_KILLED: _kill_cloud,
-        FaultKind.REPLICAS_KILLED: _kill_cloud,
-        FaultKind.CLOUD_STOPPED: _stop_cloud,
-        FaultKind.LOCAL_KILLED: _kill_local,
-        FaultKind.ROBOT_KILLED: _kill_robot,
-        FaultKind.ROBOT_STOPPED: _stop_robot,
-    }
-    yield from scripts.get(fault.kind, _impair)(testbed, fault)
 
 
 def _kill_cloud(testbed: Testbed, fault: Fault) -> Script:
@@ -201,25 +148,94 @@ def _stop_robot(testbed: Testbed, fault: Fault) -> Script:
         injected.usable_at = process.resume()
 
 
-def _impair(testbed: Testbed, fault: Fault) -> Script:
+def _impair_line(testbed: Testbed, fault: Fault) -> Script:
+    proxy = testbed.services[fault.cloud].proxy
+    assert proxy is not None
+    impairment = Impairment(
+        direction=fault.direction,
+        latency_s=1e-3 * fault.latency_ms,
+        jitter_s=1e-3 * fault.jitter_ms,
+        loss=fault.loss,
+        silent=fault.kind in (FaultKind.LINK_SILENT, FaultKind.LINK_SILENT_ONE_WAY),
+        cut=fault.kind is FaultKind.LINK_CUT,
+    )
+    return _until_healed(testbed, fault, lambda: proxy.impair(impairment))
+
+
+def _drop_packets(testbed: Testbed, fault: Fault) -> Script:
     cloud = testbed.services[fault.cloud]
-    injected = testbed.note_fault(fault.kind.value, cloud.endpoint, time.time())
-    if fault.kind in NEEDS_NAMESPACE:
-        assert cloud.namespace is not None and cloud.port is not None
-        share = fault.loss if fault.kind is FaultKind.PACKETS_LOST else 1.0
-        heal = cloud.namespace.drop(cloud.port, fault.direction, share)
-    else:
-        assert cloud.proxy is not None
-        heal = cloud.proxy.impair(
-            Impairment(
-                direction=fault.direction,
-                latency_s=1e-3 * fault.latency_ms,
-                jitter_s=1e-3 * fault.jitter_ms,
-                loss=fault.loss,
-                silent=fault.kind in (FaultKind.LINK_SILENT, FaultKind.LINK_SILENT_ONE_WAY),
-                cut=fault.kind is FaultKind.LINK_CUT,
-            )
-        )
+    namespace, port = cloud.namespace, cloud.port
+    assert namespace is not None and port is not None
+    share = fault.loss if fault.kind is FaultKind.PACKETS_LOST else 1.0
+    return _until_healed(testbed, fault, lambda: namespace.drop(port, fault.direction, share))
+
+
+def _until_healed(
+    testbed: Testbed, fault: Fault, impair: Callable[[], Callable[[], None]]
+) -> Script:
+    endpoint = testbed.services[fault.cloud].endpoint
+    injected = testbed.note_fault(fault.kind.value, endpoint, time.time())
+    heal = impair()
     yield after(fault.duration_s)
     injected.usable_at = time.time()
     heal()
+
+
+_FAULTS: dict[FaultKind, tuple[str, Callable[[Testbed, Fault], Script]]] = {
+    FaultKind.CLOUD_KILLED: (
+        "the cloud service is killed (SIGKILL) and started again",
+        _kill_cloud,
+    ),
+    FaultKind.CLOUD_STOPPED: (
+        "the cloud service is stopped for a while (SIGSTOP, SIGCONT)",
+        _stop_cloud,
+    ),
+    FaultKind.LOCAL_KILLED: ("the local service is killed while the cloud is away", _kill_local),
+    FaultKind.ROBOT_KILLED: ("the robot's process is killed and resumed", _kill_robot),
+    FaultKind.ROBOT_STOPPED: ("the robot's process is stopped for a while", _stop_robot),
+    FaultKind.REPLICAS_KILLED: (
+        "of two cloud services, one after the other is killed",
+        _kill_cloud,
+    ),
+    FaultKind.LINK_DELAYED: ("a proxy adds latency and jitter", _impair_line),
+    FaultKind.LINK_LOSSY: ("a proxy delivers late, as after lost packets", _impair_line),
+    FaultKind.LINK_SILENT: (
+        "a proxy lets nothing through, and breaks no connection",
+        _impair_line,
+    ),
+    FaultKind.LINK_SILENT_ONE_WAY: (
+        "a proxy lets nothing through in one direction",
+        _impair_line,
+    ),
+    FaultKind.LINK_CUT: ("a proxy resets all connections and refuses new ones", _impair_line),
+    FaultKind.PACKETS_LOST: ("nftables drops some packets, at random", _drop_packets),
+    FaultKind.PACKETS_DROPPED: ("nftables drops all packets", _drop_packets),
+    FaultKind.PACKETS_DROPPED_ONE_WAY: (
+        "nftables drops all packets in one direction",
+        _drop_packets,
+    ),
+}
+
+DESCRIPTIONS = {
+    **{kind: text for kind, (text, _) in _FAULTS.items()},
+    FaultKind.COMBINATION: "several of these at once",
+}
+
+NEEDS_PROXY = frozenset(kind for kind, (_, script) in _FAULTS.items() if script is _impair_line)
+
+NEEDS_NAMESPACE = frozenset(
+    kind for kind, (_, script) in _FAULTS.items() if script is _drop_packets
+)
+"""Kinds that need nftables and a network namespace."""
+
+
+def inject(testbed: Testbed, fault: Fault) -> None:
+    """Have the testbed inject a fault once its robot has come to the fault's step."""
+    _, script = _FAULTS[fault.kind]
+
+    def at_its_step() -> Script:
+        step = int(fault.at * testbed.robot.steps)
+        yield lambda: testbed.robot.steps_done >= step
+        yield from script(testbed, fault)
+
+    testbed.run_script(at_its_step())

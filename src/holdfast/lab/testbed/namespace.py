@@ -15,7 +15,6 @@ import os
 import shutil
 import subprocess
 from collections.abc import Callable, Sequence
-from types import TracebackType
 from typing import Self
 
 from holdfast.lab.errors import CannotStartError
@@ -81,12 +80,7 @@ class NetworkNamespace:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:

@@ -14,21 +14,26 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import math
 import os
+import random
+import select
 import socket
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
-from typing import Literal, NamedTuple, TypeAlias, get_args
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, Generic, Literal, NamedTuple, TypeAlias, TypeVar, get_args
 
 from holdfast.errors import InvalidValueError
 from holdfast.lab.errors import CannotStartError
-from holdfast.lab.testbed.datagrams import Carrier, DelayLine
 from holdfast.lab.testbed.namespace import NetworkNamespace, why_no_namespace
 from holdfast.lab.testbed.processes import free_port
 from holdfast.lab.testbed.proxy import Impairment, Proxy
 
-__all__ = ["Emulation", "Route", "Transport", "lay_route", "why_no_wide_area"]
+__all__ = ["DelayLine", "Emulation", "Route", "Transport", "lay_route", "why_no_wide_area"]
 
 Transport: TypeAlias = Literal["tcp", "tls", "udp"]
 
@@ -41,6 +46,12 @@ _ROBOT, _SERVICE = "10.77.0.1", "10.77.0.2"
 _DEVICE = "wan"
 _LARGEST = 65_536
 _PATIENCE_S = 10.0
+_CAPACITY = 4096
+"""Packets on the way in one direction: 6 MB of the usual size, as a router may hold."""
+
+_LONGEST_DELAY_S = 60.0
+
+Item = TypeVar("Item")
 
 # Run in a namespace: makes its tunnel device and hands over the descriptor.
 _OPEN = f"""
@@ -49,6 +60,63 @@ device = os.open("/dev/net/tun", os.O_RDWR)
 fcntl.ioctl(device, 0x400454CA, struct.pack("16sH", b"{_DEVICE}", 0x0001 | 0x1000))
 socket.send_fds(socket.socket(fileno=int(sys.argv[1])), [b"."], [device])
 """
+
+
+class DelayLine(Generic[Item]):
+    """One direction of a line: items come out later, in order, or never.
+
+    Parameters
+    ----------
+    delay_s : float
+        From 0 to 60.
+    loss : float
+        Share of lost items, from 0 to 1.
+    seed : str
+        Of the losses.
+    capacity : int
+        Items put into a full line are lost, as in a router.
+
+    Attributes
+    ----------
+    lost : int
+        Number of lost items.
+
+    Raises
+    ------
+    InvalidValueError
+        If a number is out of bounds.
+    """
+
+    def __init__(self, delay_s: float, loss: float, seed: str, capacity: int = _CAPACITY) -> None:
+        if not 0.0 <= delay_s <= _LONGEST_DELAY_S:
+            raise InvalidValueError(f"delay_s {delay_s}: must be from 0 to {_LONGEST_DELAY_S:g}")
+        if not 0.0 <= loss <= 1.0:
+            raise InvalidValueError(f"loss {loss}: must be from 0 to 1")
+        self._delay_s = delay_s
+        self._loss = loss
+        self._chance = random.Random(seed)
+        self._capacity = capacity
+        self._waiting: deque[tuple[float, Item]] = deque()
+        self.lost = 0
+
+    def put(self, item: Item, now: float) -> None:
+        """Send an item; ``now``, in seconds, never goes back."""
+        if len(self._waiting) >= self._capacity or self._chance.random() < self._loss:
+            self.lost += 1
+            return
+        self._waiting.append((now + self._delay_s, item))
+
+    def take(self, now: float) -> list[Item]:
+        """Return the items that have arrived, in the order in which they were sent."""
+        arrived = []
+        while self._waiting and self._waiting[0][0] <= now:
+            arrived.append(self._waiting.popleft()[1])
+        return arrived
+
+    @property
+    def due(self) -> float:
+        """When the next item arrives; infinite if there is none."""
+        return self._waiting[0][0] if self._waiting else math.inf
 
 
 class Route(NamedTuple):
@@ -145,6 +213,54 @@ def why_no_wide_area() -> str | None:
         return str(error).partition("\n")[0]
 
 
+class _Way(NamedTuple):
+    """From a readable descriptor, over a line, to a function that sends."""
+
+    receive: Callable[[], Any]
+    line: DelayLine[Any]
+    send: Callable[[Any], object]
+
+
+@contextlib.contextmanager
+def _carried(ways: Mapping[int, _Way]) -> Iterator[None]:
+    """Move packets from descriptors over lines, in a thread; what cannot be sent is lost."""
+    ended, end = os.pipe()
+    thread = threading.Thread(target=_carry, args=(ways, ended), name="wide-area", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        os.close(end)
+        thread.join()
+        os.close(ended)
+
+
+def _carry(ways: Mapping[int, _Way], ended: int) -> None:
+    while True:
+        due = min(way.line.due for way in ways.values())
+        wait_s = None if due == math.inf else max(0.0, due - time.monotonic())
+        # poll has whole milliseconds, which would falsify short delays.
+        ready, _, _ = select.select([ended, *ways], [], [], wait_s)
+        if ended in ready:
+            return
+        for descriptor in ready:
+            _receive(ways[descriptor])
+        for way in ways.values():
+            for packet in way.line.take(time.monotonic()):
+                with contextlib.suppress(OSError):
+                    way.send(packet)
+
+
+def _receive(way: _Way) -> None:
+    # Bounded, because other descriptors have packets too.
+    for _ in range(_CAPACITY):
+        try:
+            packet = way.receive()
+        except OSError:
+            return  # there is no more, or the last one was refused
+        way.line.put(packet, time.monotonic())
+
+
 @contextlib.contextmanager
 def _two_networks(
     up: DelayLine[bytes], down: DelayLine[bytes]
@@ -155,11 +271,11 @@ def _two_networks(
         service = stack.enter_context(NetworkNamespace())
         robot_end = stack.enter_context(_Device(robot, _ROBOT, _SERVICE))
         service_end = stack.enter_context(_Device(service, _SERVICE, _ROBOT))
-        carrier = Carrier("wide-area")
-        stack.callback(carrier.close)
-        carrier.add(robot_end.descriptor, robot_end.receive, up, service_end.send)
-        carrier.add(service_end.descriptor, service_end.receive, down, robot_end.send)
-        carrier.start()
+        ways = {
+            robot_end.descriptor: _Way(robot_end.receive, up, service_end.send),
+            service_end.descriptor: _Way(service_end.receive, down, robot_end.send),
+        }
+        stack.enter_context(_carried(ways))
         yield (
             robot.prefix,
             service.prefix,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from holdfast.errors import InvalidValueError
-from holdfast.lab.testbed.datagrams import DelayLine
+from holdfast.lab.testbed.wide_area import DelayLine
 
 
 class TestDelayLine:
