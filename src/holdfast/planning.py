@@ -194,6 +194,11 @@ class Planner:
         ProblemError
             If the problem breaks its contract: its initial states are not finite, say.
         """
+        for what, number, bits in (("seed", seed, 63), ("trial", trial, 32)):
+            if not isinstance(number, int | np.integer):
+                raise InvalidValueError(
+                    f"{what} {number!r:.80}: allowed are whole numbers from 0 to {2**bits - 1}"
+                )
         problem = self.problem
         count = self.settings.particle_filter.num_particles
         if not 1 <= count <= MAX_PARTICLES:
@@ -217,11 +222,8 @@ class Planner:
         problem = self.problem
         check_problem(problem)
         check_settings(self.settings)
-        count, size = state.belief.states.shape
-        if size != problem.state_size:
-            raise InvalidValueError(
-                f"state of {size} coordinates: {problem.name} has {problem.state_size}"
-            )
+        self._require_size(state)
+        count = state.belief.states.shape[0]
         if count != self.settings.particle_filter.num_particles:
             raise InvalidValueError(
                 f"state of {count} particles: particle_filter.num_particles is "
@@ -230,6 +232,13 @@ class Planner:
         if not 0 <= state.stage < problem.num_stages:
             raise InvalidValueError(
                 f"stage {state.stage}: {problem.name} has 0 to {problem.num_stages - 1}"
+            )
+
+    def _require_size(self, state: PlanningState) -> None:
+        size = state.belief.states.shape[1]
+        if size != self.problem.state_size:
+            raise InvalidValueError(
+                f"state of {size} coordinates: {self.problem.name} has {self.problem.state_size}"
             )
 
     def needs_sensing(self, state: PlanningState) -> bool:
@@ -244,6 +253,7 @@ class Planner:
         InvalidValueError, ProblemError
             As :func:`holdfast.sensing.choose_sensing_action`.
         """
+        self._require_size(state)
         return sensing.choose_sensing_action(
             self.problem,
             self.settings,
@@ -266,13 +276,17 @@ class Planner:
         Raises
         ------
         InvalidValueError
-            If the sensing action does not exist, or the observation is not finite or of the wrong
-            size.
+            If the sensing action does not exist, the observation is not finite or of the wrong
+            size, or the state is another problem's.
         """
         problem = self.problem
-        if not 0 <= sensing_action < len(problem.sensing_actions):
+        self._require_size(state)
+        if not (
+            isinstance(sensing_action, int | np.integer)
+            and 0 <= sensing_action < len(problem.sensing_actions)
+        ):
             raise InvalidValueError(
-                f"sensing action {sensing_action}: {problem.name} has 0 to "
+                f"sensing action {sensing_action!r:.80}: {problem.name} has 0 to "
                 f"{len(problem.sensing_actions) - 1}"
             )
         belief, found = update(problem, state.belief, sensing_action, observation)
@@ -298,6 +312,8 @@ class Planner:
 
         Raises
         ------
+        InvalidValueError
+            If the state is another problem's.
         ProblemError
             If the policy's action is not finite.
         """
@@ -392,6 +408,7 @@ class Planner:
 
     def _estimate(self, state: PlanningState) -> tuple[FloatArray, int]:
         """Return the state that stands for the belief, and the stage that follows from it."""
+        self._require_size(state)
         estimated = estimate(state.belief, self.settings.particle_filter.estimate)
         return estimated, checked.next_stage(self.problem, estimated, state.stage)
 

@@ -27,7 +27,11 @@ def test_a_robots_run(
 
 
 def test_reasons_are_the_last_ones() -> None:
-    reasons = _Reasons()
+    held: list[str] = []
+    reasons = _Reasons(lambda: held.append("once"))
+    reasons.event("holding", step=0, reason="a: has not appeared")
+    reasons.event("holding", step=1, reason="a: has not appeared")
+    assert held == ["once"]
     reasons.event("refused", service="a", final=False, code="busy", reason="later")
     reasons.event("unreachable", service="b", reason="no route")
     reasons.event("unreachable", service="b", reason="no answer")

@@ -32,13 +32,13 @@ class Brew(Options):
     """Make coffee."""
 
     beans: Path = argument("BEANS", "A bag.", location)
-    guests: tuple[str, ...] = argument("GUEST", "Who drinks it.", many=True, required=False)
+    guests: tuple[str, ...] = argument("GUEST", "Who drinks it.", many=True, least=0)
     cups: int = option("--cups", "-c", metavar="N", read=whole_number(1, 9), default=2, help="N.")
     heat: float | None = option("--heat", metavar="C", read=number(50.0, 99.5, "°C"), help="C.")
     mill: str = option(
         "--mill", metavar="M", read=one_of("fine", "coarse"), default="fine", help=""
     )
-    milk: bool = flag("--milk", help="With milk.")
+    milk: bool = flag("--milk", "-m", help="With milk.")
     lid: bool = flag("--lid", default=True, help="With a lid.")
 
 
@@ -84,6 +84,8 @@ def test_a_bad_address_is_named_once() -> None:
         (["bag", "--mill", "corse"], "allowed are fine and coarse; did you mean coarse?"),
         (["bag", "--cups"], "--cups needs a value"),
         (["bag", "--milk=1"], "--milk takes no value"),
+        (["bag", "-m=1"], "--milk takes no value"),
+        (["bag", "-mx"], "'-x' is no option of holdfast brew"),
         (["bag", "--cup", "3"], "'--cup' is no option of holdfast brew; did you mean --cups?"),
         ([""], "BEANS is ''; expected a path (. is the current directory)"),
     ],
@@ -140,3 +142,11 @@ def test_words_give_the_same_options_again(command: str) -> None:
     again = options.parse(command, words)
     assert words
     assert vars(again) == chosen
+
+
+def test_the_usage_line_says_how_many(capsys: pytest.CaptureFixture[str]) -> None:
+    for command, expected in (("compare", "RUN RUN..."), ("run", "CONFIG"), ("doctor", "[CONFIG]")):
+        with pytest.raises(SystemExit):
+            options_of(command).parse(command, ["--help"])
+        usage = capsys.readouterr().out.splitlines()[0]
+        assert usage == f"usage: holdfast {command} [OPTIONS] {expected}"

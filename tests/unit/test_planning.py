@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import NamedTuple
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -369,14 +369,32 @@ class TestBadInput:
             (2**63, 0, f"seed {2**63}: allowed are 0"),
             (0, -1, "trial -1"),
             (0, 2**32, f"trial {2**32}"),
+            (1.5, 0, r"seed 1\.5: allowed are whole numbers from 0 to 9223372036854775807"),
+            (0, "1", "trial '1': allowed are whole numbers from 0 to 4294967295"),
         ],
     )
-    def test_seed_and_trial(self, peg: Problem, seed: int, trial: int, text: str) -> None:
+    def test_seed_and_trial(self, peg: Problem, seed: Any, trial: Any, text: str) -> None:
         with pytest.raises(InvalidValueError, match=text):
             Planner(peg, planning_settings()).init(seed, trial)
 
-    @pytest.mark.parametrize("sensing_action", [-1, 3, 100])
-    def test_sensing_action(self, peg: Problem, sensing_action: int) -> None:
+    def test_state_of_another_problem(self, peg: Problem) -> None:
+        capsule = registry.problem_class("capsule_robot").from_settings({}, {})
+        state = Planner(capsule, planning_settings()).init(SEED, TRIAL)
+        planner = Planner(peg, planning_settings())
+        calls: tuple[Callable[[], object], ...] = (
+            lambda: planner.choose_sensing_action(state),
+            lambda: planner.observe(state, 0, [1.0]),
+            lambda: planner.choose_task_action(state),
+            lambda: planner.advance(state, np.zeros(3)),
+        )
+        for call in calls:
+            with pytest.raises(
+                InvalidValueError, match="state of 2 coordinates: peg_in_hole_2d has 3"
+            ):
+                call()
+
+    @pytest.mark.parametrize("sensing_action", [-1, 3, 100, 1.5])
+    def test_sensing_action(self, peg: Problem, sensing_action: Any) -> None:
         planner = Planner(peg, planning_settings())
         state = planner.init(SEED, TRIAL)
         with pytest.raises(

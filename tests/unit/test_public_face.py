@@ -80,7 +80,20 @@ class TestMake:
         ("name", "settings", "error", "message"),
         [
             ("peg", {}, UnknownProblemError, "peg is not a registered name"),
+            (None, {}, InvalidValueError, "name is None; expected a text: one of capsule_robot"),
             ("peg_in_hole_2d", {"peg_width": -1}, InvalidValueError, "peg_in_hole_2d: .*> 0"),
+            (
+                "peg_in_hole_2d",
+                {"peg_width": "wide"},
+                InvalidValueError,
+                'peg_width is "wide"; expected a number > 0',
+            ),
+            (
+                "peg_in_hole_2d",
+                {"rotation_step_size": []},
+                InvalidValueError,
+                "rotation_step_size is .*; expected a number",
+            ),
             ("peg_in_hole_2d", {"width": 1}, InvalidValueError, "no setting .width."),
             (
                 "holdfast.lab.studies.busy_room:BusyRoom",
@@ -91,7 +104,7 @@ class TestMake:
         ],
     )
     def test_refusals(
-        self, name: str, settings: dict[str, float], error: type[Exception], message: str
+        self, name: Any, settings: dict[str, Any], error: type[Exception], message: str
     ) -> None:
         with pytest.raises(error, match=message):
             hf.make(name, **settings)
@@ -130,7 +143,7 @@ def test_load_configuration(tmp_path: Path) -> None:
         ),
         (lambda: planner_of(particles=0), r"particle_filter\.num_particles"),
         (lambda: planner_of(particles="300"), r"particle_filter\.num_particles"),
-        (lambda: planner_of(method="rnd"), r"selector\.method"),
+        (lambda: planner_of(method="rnd"), r"selector\.method is \"rnd\"; expected one of"),
         (
             lambda: planner_of(
                 hf.PlanningSettings(selector=cast("Any", {"method": "random"}))

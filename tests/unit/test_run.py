@@ -286,6 +286,19 @@ def test_values_instead_of_the_files_are_a_part_of_what_must_be_the_same_to_go_o
     assert "model.init_mean[0] is 3.0 there and 4.0 here" in error
 
 
+def test_a_problem_is_no_file(workplace: Workplace) -> None:
+    error = workplace.fails("run", "capsule_robot")
+    assert "capsule_robot: there is no such file; capsule_robot is a problem" in error
+    assert "'problem: capsule_robot' is enough" in error
+
+
+def test_too_few_particles_are_noted(workplace: Workplace) -> None:
+    options = ("--trials", "2", "--set", "particle_filter.num_particles=10")
+    said = workplace.runs("run", "peg.yaml", "--out", "few", *options)
+    assert workplace.summary("few")["unexplained_observations"]
+    assert "take more particles (particle_filter.num_particles, 10 now)" in said.stderr
+
+
 def test_nothing_to_resume(workplace: Workplace) -> None:
     assert "no run to resume" in workplace.fails("run", "peg.yaml", "--resume")
 

@@ -37,6 +37,7 @@ class CompareOptions(Options):
         "baseline.",
         location,
         many=True,
+        least=2,
     )
     outcomes: bool = flag(
         "--outcomes",

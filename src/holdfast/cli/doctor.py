@@ -40,7 +40,7 @@ class DoctorOptions(Options):
         "CONFIG",
         "Configuration of a run: its decisions are compared with the service's.",
         location,
-        required=False,
+        least=0,
     )
     service: tuple[str, ...] = option(
         "--service",

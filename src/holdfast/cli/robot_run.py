@@ -38,9 +38,16 @@ class RobotRun(NamedTuple):
 
 
 class _Reasons:
-    """An event sink that remembers which services refused for good or could not be reached."""
+    """An event sink that remembers which services refused for good or could not be reached.
 
-    def __init__(self) -> None:
+    Parameters
+    ----------
+    on_first_hold : callable
+        Called when the robot holds still for the first time.
+    """
+
+    def __init__(self, on_first_hold: Callable[[], None]) -> None:
+        self._on_hold: Callable[[], None] | None = on_first_hold
         self.refusals: dict[str, str] = {}
         self.unreachable: dict[str, str] = {}
 
@@ -50,6 +57,9 @@ class _Reasons:
             self.refusals[str(fields["service"])] = f"{fields['code']}: {fields['reason']}"
         elif name == "unreachable":
             self.unreachable[str(fields["service"])] = str(fields["reason"])
+        elif name == "holding" and self._on_hold is not None:
+            self._on_hold()
+            self._on_hold = None
 
     def close(self) -> None:
         """Do nothing."""
@@ -81,6 +91,7 @@ def run_as_robot(
     quiet: bool,
     manager: ServiceManager,
     health: HttpAddress | None,
+    note: Callable[[str], None],
 ) -> RobotRun:
     """Run the missing trials one after another.
 
@@ -100,6 +111,8 @@ def run_as_robot(
         Gets the state of the robot.
     health : HttpAddress or None
         Where HTTP requests get the same.
+    note : callable
+        Shows a hint.
 
     Raises
     ------
@@ -110,10 +123,18 @@ def run_as_robot(
     from holdfast.robot.health import RobotWatch
     from holdfast.runtime.logs import EventLog
 
-    reasons = _Reasons()
-    sinks: list[EventSink] = [reasons]
+    def hint() -> None:
+        if configuration.recovery.launch == "never":
+            note(
+                "the robot goes on when a service answers; with --recovery on_failure "
+                "(recovery.launch) it launches a local service that decides meanwhile"
+            )
+
+    reasons = _Reasons(hint)
+    sinks: list[EventSink] = []
     if not quiet:
         sinks.append(EventLog(sys.stderr, format=log_format, component="robot"))
+    sinks.append(reasons)
     missed_ticks = perform_trials(
         configuration,
         directory,

@@ -48,6 +48,7 @@ from holdfast.estimators import MAX_PRIOR_NEIGHBORS_POINTS
 from holdfast.files import read_bounded
 from holdfast.problem_attributes import resolution_of
 from holdfast.problems.problem import Problem
+from holdfast.problems.registry import names
 
 __all__ = ["Configuration", "load", "settings_keys"]
 
@@ -248,7 +249,13 @@ def _content(path: Path) -> bytes:
     try:
         return read_bounded(path, MAX_BYTES + 1)
     except FileNotFoundError:
-        raise ConfigurationError(f"{path}: there is no such file") from None
+        hint = ""
+        if str(path) in names():
+            hint = (
+                f"; {path} is a problem, and a run needs a configuration file: one with the line "
+                f"'problem: {path}' is enough"
+            )
+        raise ConfigurationError(f"{path}: there is no such file{hint}") from None
     except IsADirectoryError:
         raise ConfigurationError(f"{path}: is a directory, not a configuration file") from None
     except (OSError, ValueError) as error:

@@ -416,9 +416,19 @@ def check_settings(settings: PlanningSettings) -> None:
         If a value is not what its section allows; the message names section and key.
     """
     try:
-        checked = msgspec.convert(msgspec.to_builtins(settings), PlanningSettings)
-    except (msgspec.ValidationError, TypeError) as error:
+        plain = msgspec.to_builtins(settings)
+    except TypeError as error:
         raise InvalidValueError(f"settings: {error}") from error
+    try:
+        checked = msgspec.convert(plain, PlanningSettings)
+    except msgspec.ValidationError as error:
+        from holdfast.config.validation import find_mismatch
+        from holdfast.config.yaml_document import dotted
+
+        found = find_mismatch(plain, PlanningSettings)
+        if found is None or not found.path:
+            raise InvalidValueError(f"settings: {error}") from error
+        raise InvalidValueError(f"settings: {dotted(found.path)} {found.in_words()}") from error
     for name in PlanningSettings.__struct_fields__:
         value, kind = getattr(settings, name), type(getattr(checked, name))
         if not isinstance(value, kind):

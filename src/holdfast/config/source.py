@@ -137,14 +137,7 @@ class Source:
                 raise ConfigurationError(f"{self.path}: {name}: {error}") from error
         if found.unknown:
             raise self.unknown(found.path, found.allowed)
-        if found.missing:
-            raise self.error(found.path, "is missing; it has no default")
-        value = found.value
-        length = f" (a list of {len(value)})" if isinstance(value, list) else ""
-        hint = close_match(value, found.allowed) if isinstance(value, str) else ""
-        if isinstance(value, str) and found.expected.startswith("a list"):
-            hint = f", as in [{value}]"
-        raise self.error(found.path, f"is {shown(value)}{length}; expected {found.expected}{hint}")
+        raise self.error(found.path, found.in_words())
 
     def unknown(self, path: KeyPath, allowed: Collection[str]) -> ConfigurationError:
         """Return an error about a section or key that is not one of ``allowed``."""

@@ -45,6 +45,17 @@ class Mismatch(NamedTuple):
     value: Any = None
     expected: str = ""
 
+    def in_words(self) -> str:
+        """Return what the value is and what is expected."""
+        if self.missing:
+            return "is missing; it has no default"
+        value = self.value
+        length = f" (a list of {len(value)})" if isinstance(value, list) else ""
+        hint = close_match(value, self.allowed) if isinstance(value, str) else ""
+        if isinstance(value, str) and self.expected.startswith("a list"):
+            hint = f", as in [{value}]"
+        return f"is {shown(value)}{length}; expected {self.expected}{hint}"
+
 
 def find_mismatch(value: Any, annotation: Any, path: KeyPath = ()) -> Mismatch | None:
     """Return the first value, the innermost one, that msgspec does not convert to its type.

@@ -80,6 +80,10 @@ def make(name: str, **settings: Any) -> Problem:
     InvalidValueError, ProblemError
         If the problem does not take these settings.
     """
+    if not isinstance(name, str):
+        raise InvalidValueError(
+            f"name is {name!r:.80}; expected a text: one of {', '.join(names())}, or module:Class"
+        )
     kind = problem_class(name)
     planner_keys = getattr(getattr(kind, "StateSpacePlanner", None), "__struct_fields__", ())
     planner = {key: settings.pop(key) for key in planner_keys if key in settings}
@@ -92,6 +96,15 @@ def make(name: str, **settings: Any) -> Problem:
     try:
         problem: Problem = kind.from_settings(settings, planner)
     except msgspec.ValidationError as error:
+        from holdfast.config.validation import find_mismatch
+        from holdfast.config.yaml_document import dotted
+
+        for schema, data in (("Model", settings), ("StateSpacePlanner", planner)):
+            found = find_mismatch(data, getattr(kind, schema, dict))
+            if found is not None and found.path:
+                raise InvalidValueError(
+                    f"{name}: {dotted(found.path)} {found.in_words()}"
+                ) from error
         raise InvalidValueError(f"{name}: {error}") from error
     return problem
 

@@ -74,6 +74,8 @@ class Option(NamedTuple):
         The configuration's ``section.key`` that it replaces.
     hidden : bool
         Whether the help leaves it out.
+    least : int
+        How many of a positional argument there must be.
     """
 
     names: tuple[str, ...]
@@ -84,7 +86,17 @@ class Option(NamedTuple):
     many: bool = False
     key: str | None = None
     hidden: bool = False
-    required: bool = False
+    least: int = 0
+
+    @property
+    def place(self) -> str:
+        """A positional argument in the usage line."""
+        dots = "..." if self.many else ""
+        return (
+            " ".join([self.metavar] * self.least) + dots
+            if self.least
+            else f"[{self.metavar}{dots}]"
+        )
 
     @property
     def is_flag(self) -> bool:
@@ -114,10 +126,10 @@ def argument(
     read: Callable[[str], Any] = str,
     *,
     many: bool = False,
-    required: bool = True,
+    least: int = 1,
 ) -> Any:
     """Declare a positional argument; see :class:`Option`."""
-    return Option((), help, metavar, read, () if many else None, many, required=required)
+    return Option((), help, metavar, read, () if many else None, many, least=least)
 
 
 def option(
@@ -183,7 +195,7 @@ class Options:
         try:
             found, unknown = parser.parse_known_intermixed_args(_marked(arguments))
         except argparse.ArgumentError as error:
-            raise OptionError(_complaint(error)) from None
+            raise OptionError(_complaint(error, command, arguments)) from None
         if unknown:
             word = unknown[0].partition("=")[0]
             if not word.startswith("-"):
@@ -197,7 +209,7 @@ class Options:
             name: tuple(value) if table[name].many else value for name, value in vars(found).items()
         }
         for name, each in table.items():
-            if each.required and values[name] in (None, ()):
+            if each.least and values[name] in (None, ()):
                 raise OptionError(f"{each.metavar} is missing")
         return cls(**values)
 
@@ -243,11 +255,7 @@ class _Help(argparse.HelpFormatter):
 
 def _parser(options: type[Options], program: str) -> _Parser:
     table = options.table()
-    places = [
-        each.metavar if each.required else f"[{each.metavar}{'...' if each.many else ''}]"
-        for each in table.values()
-        if not each.names
-    ]
+    places = [each.place for each in table.values() if not each.names]
     codes = {0: None, 2: None, **options.exit_codes}
     meanings = [f"{code} {codes[code] or _EXIT_CODES[code]}" for code in sorted(codes)]
     parser = _Parser(
@@ -303,12 +311,16 @@ def _help(each: Option) -> str:
     return f"{text} (default: {default})"
 
 
-def _complaint(error: argparse.ArgumentError) -> str:
+def _complaint(error: argparse.ArgumentError, command: str, arguments: Sequence[str]) -> str:
     """Return the message about an argument, with its long name."""
     name = (error.argument_name or "").split("/")[0]
     if error.message == "expected one argument":
         return f"{name} needs a value"
     if error.message.startswith("ignored explicit argument"):
+        value = error.message.partition("'")[2].removesuffix("'")
+        # In -qx the letter is no value of -q.
+        if any(re.fullmatch(rf"-\w+{re.escape(value)}", word) for word in arguments):
+            return f"'-{value[0]}' is no option of holdfast {command}"
         return f"{name} takes no value"
     return f"{name} {error.message}"
 

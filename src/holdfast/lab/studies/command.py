@@ -68,7 +68,7 @@ class ExperimentOptions(Options):
     needs_arguments = True
 
     names: tuple[str, ...] = argument(
-        "NAME", "Names that --list shows, or all.", many=True, required=False
+        "NAME", "Names that --list shows, or all.", many=True, least=0
     )
     quick: bool = flag(
         "--quick", help="Few trials: minutes, to see that everything works. No evidence."
