@@ -21,8 +21,10 @@ from holdfast.lab.studies.thesis_measurements import (
     NEAR,
     PARTICLES,
     PATHS,
-    MeasuredRows,
     NetworkPath,
+    measured,
+    paths_of,
+    select,
 )
 from holdfast.lab.testbed.fault_times import FaultTimes
 from holdfast.lab.testbed.records import DecisionTable
@@ -244,12 +246,12 @@ def test_rows_are_found_by_what_they_say() -> None:
     for number, path in enumerate((NEAR, FAR)):
         tables.append(table.assign(condition=number, particles=100, transport=path.transport,
                      path_round_trip_ms=path.round_trip_ms, loss=path.loss))  # fmt: skip
-    rows = MeasuredRows(pd.concat(tables, ignore_index=True))
-    assert rows.paths == [NEAR, FAR]
-    assert len(set(rows.runs.tolist())) == 2
-    assert rows.where(path=FAR).sum() == len(table)
-    assert np.isnan(rows.round_trips[rows.where(what="sensing")]).all()
-    assert (rows.round_trips[rows.where(what="task")] < 3.4).all()
+    rows = measured(pd.concat(tables, ignore_index=True))
+    assert paths_of(rows) == [NEAR, FAR]
+    assert rows["whole_run"].nunique() == 2
+    assert len(select(rows, path=FAR)) == len(table)
+    assert select(rows, what="sensing")["trip_ms"].isna().all()
+    assert (select(rows, what="task")["trip_ms"] < 3.4).all()
 
 
 @pytest.mark.slow

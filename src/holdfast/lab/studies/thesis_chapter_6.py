@@ -22,7 +22,6 @@ import msgspec
 import numpy as np
 import pandas as pd
 
-from holdfast.arrays import BoolArray, FloatArray
 from holdfast.config.settings import (
     ActiveSensingSettings,
     ParticleFilterSettings,
@@ -45,8 +44,11 @@ from holdfast.lab.studies.thesis_measurements import (
     THESIS_SUCCESS,
     THESIS_SUCCESS_ABOVE_300,
     THESIS_TRIALS,
-    MeasuredRows,
     NetworkPath,
+    clustered_median,
+    measured,
+    paths_of,
+    select,
 )
 from holdfast.lab.studies.trial_batches import TrialSeries, trial_tasks
 from holdfast.recording.tables import wilson_interval
@@ -143,19 +145,19 @@ class ThesisChapter6:
             [results.of(_trial_tasks(count, scale)).assign(particles=count) for count in PARTICLES]
         )
         picture = results.of([_picture_task(scale)])
-        measured, successes = MeasuredRows(rows), _successes(trials)
+        known, successes = measured(rows), _successes(trials)
         return Report(
             summary={
-                "decisions": _decisions(measured),
-                "faults": _faults(measured),
+                "decisions": _decisions(known),
+                "faults": _faults(known),
                 "successes": successes,
             },
             raw={"cloud": rows, "in_process": trials, "cloud_dies": picture},
             figures={
-                name: partial(_draw, drawing, measured, successes, picture)
+                name: partial(_draw, drawing, known, successes, picture)
                 for name, drawing in _DRAWINGS.items()
             },
-            numbers=_numbers(measured, picture),
+            numbers=_numbers(known, picture),
         )
 
 
@@ -244,7 +246,7 @@ _DRAWINGS = {
 
 
 def _draw(
-    drawing: str, measured: MeasuredRows, successes: pd.DataFrame, picture: pd.DataFrame
+    drawing: str, known: pd.DataFrame, successes: pd.DataFrame, picture: pd.DataFrame
 ) -> Figure:
     # Matplotlib is imported there, so only when a figure is wanted.
     from holdfast.lab.studies import thesis_figures, thesis_picture
@@ -253,91 +255,83 @@ def _draw(
         return thesis_figures.successes(successes)
     if drawing == "cloud_dies":
         return thesis_picture.cloud_dies(picture)
-    draw: Callable[[MeasuredRows], Figure] = getattr(thesis_figures, drawing)
-    return draw(measured)
+    draw: Callable[[pd.DataFrame], Figure] = getattr(thesis_figures, drawing)
+    return draw(known)
 
 
 # -- what comes of it ------------------------------------------------------------------------------
 
 
-def _decisions(rows: MeasuredRows) -> pd.DataFrame:
+def _decisions(rows: pd.DataFrame) -> pd.DataFrame:
     """Return a row for each path, number of particles and service that decided."""
     cells: list[dict[str, Cell]] = []
-    for path in rows.paths:
-        for particles in PARTICLES:
-            for service in ("cloud", "local"):
-                here = rows.where(path=path, particles=particles, service=service)
-                sensing = here & rows.where(what="sensing")
-                if not sensing.any():
-                    continue
-                cells.append(
-                    {
-                        **_names(path, rows, here),
-                        "particles": particles,
-                        "service": service,
-                        "runs": len(set(rows.runs[here].tolist())),
-                        "sensing_decisions": int(sensing.sum()),
-                        **cells_of("computed_ms", rows.median(rows.number("computed_ms"), sensing)),
-                        **cells_of(
-                            "answered_ms", rows.median(rows.number("round_trip_ms"), sensing)
-                        ),
-                        **cells_of("round_trip_ms", rows.median(rows.round_trips, here)),
-                        "round_trip_p95_ms": _percentile(rows.round_trips[here], 95.0),
-                        **cells_of("waited_ms", rows.median(rows.number("waited_ms"), sensing)),
-                    }
-                )
+    for (_, particles, service), here in rows.groupby(
+        ["path", "particles", "service"], observed=True
+    ):
+        sensing = select(here, what="sensing")
+        if sensing.empty:
+            continue
+        cells.append(
+            {
+                **_names(here),
+                "particles": particles,
+                "service": service,
+                "runs": here["whole_run"].nunique(),
+                "sensing_decisions": len(sensing),
+                **cells_of("computed_ms", clustered_median(sensing, "computed_ms")),
+                **cells_of("answered_ms", clustered_median(sensing, "round_trip_ms")),
+                **cells_of("round_trip_ms", clustered_median(here, "trip_ms")),
+                "round_trip_p95_ms": _p95(here["trip_ms"]),
+                **cells_of("waited_ms", clustered_median(sensing, "waited_ms")),
+            }
+        )
     return pd.DataFrame(cells)
 
 
-def _faults(rows: MeasuredRows) -> pd.DataFrame:
+def _faults(rows: pd.DataFrame) -> pd.DataFrame:
     """Return a row for each path and number of particles."""
     cells: list[dict[str, Cell]] = []
-    for path in rows.paths:
-        for particles in PARTICLES:
-            here = rows.where(path=path, particles=particles)
-            kills = here & rows.where(what="kill")
-            if not kills.any():
-                continue
-            runs = sorted(set(rows.runs[here].tolist()))
-            cold = kills & ~np.isnan(rows.number("launch_ms"))
-            cells.append(
-                {
-                    **_names(path, rows, here),
-                    "particles": particles,
-                    "runs": len(runs),
-                    "runs_as_their_references": len(runs) - len(_diverged(rows, here)),
-                    "kills": int(kills.sum()),
-                    **cells_of("found_ms", median_interval(rows.number("found_ms")[kills])),
-                    "launches": int(cold.sum()),
-                    **cells_of("launch_ms", median_interval(rows.number("launch_ms")[cold])),
-                    **cells_of(
-                        "first_local_ms", median_interval(rows.number("first_local_ms")[cold])
-                    ),
-                    **cells_of("failback_ms", median_interval(rows.number("failback_ms")[kills])),
-                    **cells_of("longest_wait_ms", median_interval(rows.number("waited_ms")[kills])),
-                }
-            )
+    for (_, particles), here in rows.groupby(["path", "particles"], observed=True):
+        kills = select(here, what="kill")
+        if kills.empty:
+            continue
+        cold = kills[kills["launch_ms"].notna()]
+        runs = here["whole_run"].nunique()
+        cells.append(
+            {
+                **_names(here),
+                "particles": particles,
+                "runs": runs,
+                "runs_as_their_references": runs - _diverged(here),
+                "kills": len(kills),
+                **_median_cells("found_ms", kills["found_ms"]),
+                "launches": len(cold),
+                **_median_cells("launch_ms", cold["launch_ms"]),
+                **_median_cells("first_local_ms", cold["first_local_ms"]),
+                **_median_cells("failback_ms", kills["failback_ms"]),
+                **_median_cells("longest_wait_ms", kills["waited_ms"]),
+            }
+        )
     return pd.DataFrame(cells)
 
 
-def _diverged(rows: MeasuredRows, here: BoolArray) -> set[float]:
-    return set(rows.runs[here & (rows.number("identical") == 0.0)].tolist())
+def _median_cells(name: str, times: pd.Series) -> dict[str, Cell]:
+    return cells_of(name, median_interval(times.to_numpy(float)))
 
 
-def _names(path: NetworkPath, rows: MeasuredRows, here: BoolArray) -> dict[str, Cell]:
-    ways = sorted({str(way) for way in rows.word("emulated_by")[here]})
-    return {
-        "path": path.label,
-        "transport": path.transport,
-        "path_round_trip_ms": path.round_trip_ms,
-        "loss": path.loss,
-        "emulated_by": ", ".join(ways),
-    }
+def _diverged(rows: pd.DataFrame) -> int:
+    """Return how many runs differ from their reference runs."""
+    return int(select(rows, identical=False)["whole_run"].nunique())
 
 
-def _percentile(values: FloatArray, share: float) -> float | None:
-    known = values[~np.isnan(values)]
-    return round(float(np.percentile(known, share)), 4) if known.size else None
+def _names(here: pd.DataFrame) -> dict[str, Cell]:
+    first = here[["path", "transport", "path_round_trip_ms", "loss"]].iloc[0]
+    return {**first.to_dict(), "emulated_by": ", ".join(sorted(set(here["emulated_by"])))}
+
+
+def _p95(values: pd.Series) -> float | None:
+    known = values.dropna()
+    return round(float(np.percentile(known, 95.0)), 4) if len(known) else None
 
 
 def _successes(trials: pd.DataFrame) -> pd.DataFrame:
@@ -368,13 +362,12 @@ def _share(successes: int, count: int, factor: float = 1.0) -> Interval:
     return Interval(*(factor * end for end in ends))
 
 
-def _numbers(rows: MeasuredRows, picture: pd.DataFrame) -> list[Number]:
+def _numbers(rows: pd.DataFrame, picture: pd.DataFrame) -> list[Number]:
     """Return what is pooled over the numbers of particles; the picture's run counts as well."""
-    everywhere = rows.where()
-    runs = len(set(rows.runs.tolist())) + 1
-    same = runs - len(_diverged(rows, everywhere)) - int(not picture["identical"].all())
+    runs = rows["whole_run"].nunique() + 1
+    same = runs - _diverged(rows) - int(not picture["identical"].all())
     kills, sensing = (
-        int(rows.where(what=what).sum() + (picture["what"] == what).sum())
+        len(select(rows, what=what)) + len(select(picture, what=what))
         for what in ("kill", "sensing")
     )
     return [
@@ -390,67 +383,76 @@ def _numbers(rows: MeasuredRows, picture: pd.DataFrame) -> list[Number]:
     ]
 
 
-def _numbers_of_times(rows: MeasuredRows) -> list[Number]:
+def _numbers_of_times(rows: pd.DataFrame) -> list[Number]:
     """Return medians of what was asked, by service."""
-
-    def median(name: str, values: FloatArray, here: BoolArray) -> list[Number]:
-        if not here.any():
-            return []
-        return [Number(name, rows.median(values, here), "ms", int(here.sum()))]
-
-    numbers = []
-    for service in ("cloud", "local"):
-        for count in (PARTICLES[0], PARTICLES[-1]):
-            here = rows.where(what="sensing", service=service, particles=count)
-            name = f"computing a sensing action, {service}, {count} particles"
-            numbers += median(name, rows.number("computed_ms"), here)
+    wanted: list[tuple[str, str, dict[str, object]]] = [
+        (
+            f"computing a sensing action, {service}, {count} particles",
+            "computed_ms",
+            {"what": "sensing", "service": service, "particles": count},
+        )
+        for service in ("cloud", "local")
+        for count in (PARTICLES[0], PARTICLES[-1])
+    ]
     name = "round trip without computation"
-    numbers += median(f"{name}, local", rows.round_trips, rows.where(service="local", what="task"))
-    for path in rows.paths:
-        here = rows.where(path=path, service="cloud", what="task")
-        if path.loss == 0.0:
-            numbers += median(f"{name}, cloud, {path.label}", rows.round_trips, here)
+    wanted.append((f"{name}, local", "trip_ms", {"service": "local", "what": "task"}))
+    wanted += [
+        (
+            f"{name}, cloud, {path.label}",
+            "trip_ms",
+            {"path": path, "service": "cloud", "what": "task"},
+        )
+        for path in paths_of(rows)
+        if path.loss == 0.0
+    ]
     places: dict[str, dict[str, object]] = {
         f"cloud, {FAR.label}": {"service": "cloud", "path": FAR},
         "local": {"service": "local"},
     }
-    for place, wanted in places.items():
-        for what, asked in (("sensing", "a sensing action"), ("task", "task actions")):
-            here = rows.where(what=what, **wanted)
-            numbers += median(f"waiting for {asked}, {place}", rows.number("waited_ms"), here)
-    return numbers
+    wanted += [
+        (f"waiting for {asked}, {place}", "waited_ms", {"what": what, **cells})
+        for place, cells in places.items()
+        for what, asked in (("sensing", "a sensing action"), ("task", "task actions"))
+    ]
+    found = [(name, column, select(rows, **cells)) for name, column, cells in wanted]
+    return [
+        Number(name, clustered_median(here, column), "ms", len(here))
+        for name, column, here in found
+        if len(here)
+    ]
 
 
-def _numbers_of_faults(rows: MeasuredRows) -> list[Number]:
+def _numbers_of_faults(rows: pd.DataFrame) -> list[Number]:
     """Return the times from kill to local recovery and back, and how many beat the thesis's."""
-    kills = rows.where(what="kill")
-    clean = [path for path in rows.paths if path.loss == 0.0]
-    found_ms, failback_ms = rows.number("found_ms"), rows.number("failback_ms")
-    numbers = []
-    for path in clean:
-        here = kills & rows.where(path=path)
-        if here.any():
-            interval = median_interval(found_ms[here])
-            name = f"from the kill until the robot detects it, {path.label}"
-            numbers.append(Number(name, interval, "ms", int(here.sum())))
-    cold = kills & ~np.isnan(rows.number("launch_ms"))
+    kills = select(rows, what="kill")
+    clean = {path.label: select(kills, path=path) for path in paths_of(rows) if path.loss == 0.0}
+    numbers = [
+        Number(
+            f"from the kill until the robot detects it, {label}",
+            median_interval(here["found_ms"].to_numpy(float)),
+            "ms",
+            len(here),
+        )
+        for label, here in clean.items()
+        if len(here)
+    ]
     numbers += _times_and_share(
         "from detection to the first decision of a launched local service",
-        rows.number("first_local_ms")[cold],
+        kills.loc[kills["launch_ms"].notna(), "first_local_ms"],
         THESIS_LAUNCH_MS,
     )
-    for path in clean:
+    for label, here in clean.items():
         numbers += _times_and_share(
-            f"from the ready line of the restarted cloud to its first decision, {path.label}",
-            failback_ms[kills & rows.where(path=path)],
+            f"from the ready line of the restarted cloud to its first decision, {label}",
+            here["failback_ms"],
             THESIS_FAILBACK_MS,
         )
     return numbers
 
 
-def _times_and_share(name: str, times: FloatArray, limit_ms: float) -> list[Number]:
+def _times_and_share(name: str, times: pd.Series, limit_ms: float) -> list[Number]:
     """Return the median of times, and the share below a limit; NaN, of a run that ended, is not."""
-    known = times[~np.isnan(times)]
+    known = times.dropna().to_numpy(float)
     if not known.size:
         return []
     below = _share(int(np.count_nonzero(known < limit_ms)), times.size, 100)
@@ -460,45 +462,42 @@ def _times_and_share(name: str, times: FloatArray, limit_ms: float) -> list[Numb
     ]
 
 
-def _numbers_of_loss(rows: MeasuredRows) -> list[Number]:
+def _numbers_of_loss(rows: pd.DataFrame) -> list[Number]:
     """Return what lost packets do to round trips, and how often the local service answered."""
-    kills = rows.where(what="kill")
-    killed_s = dict(zip(rows.runs[kills], rows.number("at_s")[kills], strict=True))
-    before = rows.number("at_s") < np.array([killed_s.get(run, math.inf) for run in rows.runs])
+    tasks = select(rows, what="task")
+    killed_s = select(rows, what="kill").set_index("whole_run")["at_s"]
+    before = tasks[tasks["at_s"] < tasks["whole_run"].map(killed_s).fillna(math.inf)]
     numbers = []
-    for path in rows.paths:
-        p95_ms = _percentile(
-            rows.round_trips[rows.where(path=path, service="cloud", what="task")], 95.0
-        )
+    for path in paths_of(rows):
+        far = select(tasks, path=path, service="cloud")
+        p95_ms = _p95(far["trip_ms"])
         if path.loss == 0.0 or p95_ms is None:
             continue
-        asked = rows.where(path=path, what="task") & before
-        local = int((asked & rows.where(service="local")).sum())
-        count = int(rows.where(path=path, service="cloud", what="task").sum())
-        total = int(asked.sum())
+        asked = select(before, path=path)
+        local = len(select(asked, service="local"))
         numbers += [
             Number(
                 f"95th percentile of round trips, {path.label}",
                 Interval(*[p95_ms] * 3),
                 "ms",
-                count,
+                len(far),
             ),
             Number(
                 f"answers of the local service before the kill, {path.label}",
-                _share(local, total, 100),
+                _share(local, len(asked), 100),
                 "%",
-                total,
+                len(asked),
             ),
         ]
     return numbers
 
 
-def _numbers_of_load(rows: MeasuredRows) -> list[Number]:
+def _numbers_of_load(rows: pd.DataFrame) -> list[Number]:
     """Return how busy the machine was when runs began, and how slow the slowest robot was."""
-    _, first = np.unique(rows.runs, return_index=True)
-    loads, rates_hz = rows.number("load")[first], rows.number("rate_hz")[first]
-    load = Interval(float(np.nanmedian(loads)), float(np.nanmin(loads)), float(np.nanmax(loads)))
+    runs = rows.drop_duplicates("whole_run")
+    loads = runs["load"]
+    load = Interval(loads.median(), loads.min(), loads.max())
     return [
-        Number("processes that wanted a core (median, least and most)", load, "", loads.size),
-        Number("rate of the slowest robot", Interval(*[float(rates_hz.min())] * 3), "Hz"),
+        Number("processes that wanted a core (median, least and most)", load, "", len(runs)),
+        Number("rate of the slowest robot", Interval(*[float(runs["rate_hz"].min())] * 3), "Hz"),
     ]

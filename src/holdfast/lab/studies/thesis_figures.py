@@ -17,7 +17,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator
 
-from holdfast.arrays import BoolArray, FloatArray
+from holdfast.arrays import FloatArray
 from holdfast.lab.studies.plots import COLORS, MARKERS, figure_of, milliseconds
 from holdfast.lab.studies.statistics import Interval, interval_in, median_interval
 from holdfast.lab.studies.thesis_measurements import (
@@ -28,8 +28,10 @@ from holdfast.lab.studies.thesis_measurements import (
     THESIS_LOCAL_ROUND_TRIP_MS,
     THESIS_TIMEOUT_MS,
     THESIS_TRIALS,
-    MeasuredRows,
     NetworkPath,
+    clustered_median,
+    paths_of,
+    select,
 )
 from holdfast.recording.figure import STYLE
 
@@ -160,15 +162,13 @@ def _legend_below(figure: Figure, panel: Axes, columns: int) -> None:
 # -- figures 9, 10 and 11 --------------------------------------------------------------------------
 
 
-def sensing_times(rows: MeasuredRows) -> Figure:
+def sensing_times(rows: pd.DataFrame) -> Figure:
     """Draw how long it takes to choose a sensing action: in the cloud, locally, side by side."""
     panels = _panels(
         11.0, 4.3, "How long it takes to choose what to sense (Figures 9 to 11)", 3, sharey=True
     )
-    computed = rows.number("computed_ms")
-    answered = rows.number("round_trip_ms")
-    in_cloud = rows.where(what="sensing", service="cloud")
-    locally = rows.where(what="sensing", service="local")
+    in_cloud = select(rows, what="sensing", service="cloud")
+    locally = select(rows, what="sensing", service="local")
     cloud = _Series("computing in the cloud service", COLORS[0], MARKERS[0])
     local = _Series("computing in the local service", COLORS[1], MARKERS[1])
     with mpl.rc_context(STYLE):
@@ -176,14 +176,14 @@ def sensing_times(rows: MeasuredRows) -> Figure:
             (panels[0], in_cloud, cloud, "Fig. 9: in the cloud service"),
             (panels[1], locally, local, "Fig. 10: in local recovery"),
         ):
-            _of_particles(panel, rows, computed, chosen, series, dots=True)
-            panel.set_title(_with_count(title, int(chosen.sum())), loc="left")
-        for series, values, chosen in (
-            (cloud._replace(offset=-6), computed, in_cloud),
-            (local._replace(offset=6), computed, locally),
+            _of_particles(panel, chosen, "computed_ms", series, dots=True)
+            panel.set_title(_with_count(title, len(chosen)), loc="left")
+        for series, name, chosen in (
+            (cloud._replace(offset=-6), "computed_ms", in_cloud),
+            (local._replace(offset=6), "computed_ms", locally),
             (
                 _Series("local, from question to answer", COLORS[1], MARKERS[1], False, 6),
-                answered,
+                "round_trip_ms",
                 locally,
             ),
             *(
@@ -193,13 +193,13 @@ def sensing_times(rows: MeasuredRows) -> Figure:
                         filled=False,
                         offset=-6,
                     ),
-                    answered,
-                    in_cloud & rows.where(path=path),
+                    "round_trip_ms",
+                    select(in_cloud, path=path),
                 )
                 for path, look in _stream_looks(rows).items()
             ),
         ):
-            _of_particles(panels[2], rows, values, chosen, series, dots=False)
+            _of_particles(panels[2], chosen, name, series)
         panels[2].set_title("Fig. 11: side by side, and with the way", loc="left")
         milliseconds(panels[0], "time for a sensing action (ms)")
         for panel in panels:
@@ -209,29 +209,31 @@ def sensing_times(rows: MeasuredRows) -> Figure:
     return _figure(panels)
 
 
-def _stream_looks(rows: MeasuredRows) -> dict[NetworkPath, _Series]:
+def _stream_looks(rows: pd.DataFrame) -> dict[NetworkPath, _Series]:
     """Return how the paths without loss over streams look."""
     return {path: look for path, look in _path_looks(rows).items() if path.transport != "udp"}
 
 
 def _of_particles(
     panel: Axes,
-    rows: MeasuredRows,
-    values: FloatArray,
-    chosen: BoolArray,
+    rows: pd.DataFrame,
+    name: str,
     series: _Series,
     *,
-    dots: bool,
-    median: Callable[[FloatArray, BoolArray], Interval] | None = None,
+    dots: bool = False,
+    median: Callable[[pd.DataFrame, str], Interval] = clustered_median,
 ) -> None:
-    of_some = rows.median if median is None else median
     intervals = []
     for count in PARTICLES:
-        here = chosen & rows.where(particles=count)
-        intervals.append(of_some(values, here))
+        here = select(rows, particles=count)
+        intervals.append(median(here, name))
         if dots:
-            _dots(panel, count + series.offset, values[here], series.color, 30.0)
+            _dots(panel, count + series.offset, here[name].to_numpy(float), series.color, 30.0)
     _medians(panel, PARTICLES, intervals, series)
+
+
+def _median(rows: pd.DataFrame, name: str) -> Interval:
+    return median_interval(rows[name].to_numpy(float))
 
 
 def _with_count(title: str, count: int) -> str:
@@ -241,7 +243,7 @@ def _with_count(title: str, count: int) -> str:
 # -- figure 12 -------------------------------------------------------------------------------------
 
 
-def round_trips(rows: MeasuredRows) -> Figure:
+def round_trips(rows: pd.DataFrame) -> Figure:
     """Draw round trips without the computation: over particles, and over loss."""
     panels = _panels(
         10.5,
@@ -251,21 +253,18 @@ def round_trips(rows: MeasuredRows) -> Figure:
         sharey=True,
         width_ratios=(1.25, 1.0),
     )
-    trips = rows.round_trips
     with mpl.rc_context(STYLE):
-        local = rows.where(service="local")
         _of_particles(
             panels[0],
-            rows,
-            trips,
-            local,
+            select(rows, service="local"),
+            "trip_ms",
             _Series("local service", COLORS[1], MARKERS[1], offset=-9.0),
             dots=True,
         )
         looks = _path_looks(rows)
         for path, series in looks.items():
-            chosen = rows.where(service="cloud", path=path)
-            _of_particles(panels[0], rows, trips, chosen, series, dots=path.round_trip_ms == 0.0)
+            chosen = select(rows, service="cloud", path=path)
+            _of_particles(panels[0], chosen, "trip_ms", series, dots=path.round_trip_ms == 0.0)
         _thesis_line(
             panels[0],
             THESIS_CLOUD_ROUND_TRIP_MS,
@@ -285,10 +284,10 @@ def round_trips(rows: MeasuredRows) -> Figure:
     return _figure(panels)
 
 
-def _path_looks(rows: MeasuredRows) -> dict[NetworkPath, _Series]:
+def _path_looks(rows: pd.DataFrame) -> dict[NetworkPath, _Series]:
     """Return how the cloud's paths without loss look."""
     looks = {}
-    for path in rows.paths:
+    for path in paths_of(rows):
         if path.loss:
             continue
         far = path.round_trip_ms > 0.0
@@ -301,19 +300,19 @@ def _path_looks(rows: MeasuredRows) -> dict[NetworkPath, _Series]:
     return looks
 
 
-def _draw_loss(panel: Axes, rows: MeasuredRows, looks: dict[NetworkPath, _Series]) -> None:
+def _draw_loss(panel: Axes, rows: pd.DataFrame, looks: dict[NetworkPath, _Series]) -> None:
     """Draw medians and 95th percentiles over the share of packets that are lost."""
-    losses = sorted({path.loss for path in rows.paths})
+    losses = sorted({path.loss for path in paths_of(rows)})
     for path, series in looks.items():
         if path.round_trip_ms == 0.0:
             continue
         places, medians, tails = [], [], []
         for number, loss in enumerate(losses):
-            chosen = rows.where(service="cloud", what="task", path=path._replace(loss=loss))
-            if chosen.any():
+            chosen = select(rows, service="cloud", what="task", path=path._replace(loss=loss))
+            if len(chosen):
                 places.append(float(number))
-                medians.append(rows.median(rows.round_trips, chosen))
-                tails.append(float(np.percentile(rows.round_trips[chosen], 95.0)))
+                medians.append(clustered_median(chosen, "trip_ms"))
+                tails.append(float(np.percentile(chosen["trip_ms"], 95.0)))
         shifted = series._replace(offset=series.offset / 90.0)
         _medians(panel, places, medians, shifted)
         at = [place + shifted.offset for place in places]
@@ -381,13 +380,13 @@ def _levels(heights: FloatArray) -> list[tuple[int, int]]:
 # -- figures 14 and 15 -----------------------------------------------------------------------------
 
 
-def launches(rows: MeasuredRows) -> Figure:
+def launches(rows: pd.DataFrame) -> Figure:
     """Draw how soon a loss is found, and how soon the local service decides then."""
     panels = _panels(
         10.5, 4.6, "From the cloud's death to local recovery (Figure 14)", 2, width_ratios=(1, 1.3)
     )
-    kills = rows.where(what="kill")
-    cold = kills & ~np.isnan(rows.number("launch_ms"))
+    kills = select(rows, what="kill")
+    cold = kills[kills["launch_ms"].notna()]
     with mpl.rc_context(STYLE):
         for name, series in (
             (
@@ -405,60 +404,46 @@ def launches(rows: MeasuredRows) -> Figure:
                 ),
             ),
         ):
-            _of_particles(
-                panels[0],
-                rows,
-                rows.number(name),
-                cold,
-                series,
-                dots=True,
-                median=lambda values, here: median_interval(values[here]),
-            )
+            _of_particles(panels[0], cold, name, series, dots=True, median=_median)
         _thesis_line(
             panels[0], THESIS_LAUNCH_MS, f"thesis: under {THESIS_LAUNCH_MS:g} ms after its timeout"
         )
         milliseconds(panels[0], "time (ms)")
         _widen(panels[0])
         _over_particles(panels[0])
-        panels[0].set_title(
-            _with_count("The local service is launched", int(cold.sum())), loc="left"
-        )
+        panels[0].set_title(_with_count("The local service is launched", len(cold)), loc="left")
         _legend_below(_figure(panels), panels[0], 2)
-        _over_paths(panels[1], rows, rows.number("found_ms"), kills)
+        _over_paths(panels[1], kills, "found_ms")
         milliseconds(panels[1], "time from the kill until found (ms)", upright=False)
         _thesis_upright(
             panels[1], THESIS_TIMEOUT_MS, f"thesis: a timeout of {THESIS_TIMEOUT_MS / 1e3:g} s"
         )
         panels[1].set_xlim(right=1.8 * THESIS_TIMEOUT_MS)
-        panels[1].set_title(
-            _with_count("The cloud is found dead, by path", int(kills.sum())), loc="left"
-        )
+        panels[1].set_title(_with_count("The cloud is found dead, by path", len(kills)), loc="left")
     return _figure(panels)
 
 
-def failbacks(rows: MeasuredRows) -> Figure:
+def failbacks(rows: pd.DataFrame) -> Figure:
     """Draw how soon a cloud that was started again is used."""
     panels = _panels(
         10.5, 4.6, "Back to the relaunched cloud (Figure 15)", 2, width_ratios=(1, 1.3)
     )
-    kills = rows.where(what="kill") & ~np.isnan(rows.number("failback_ms"))
-    times = rows.number("failback_ms")
+    kills = select(rows, what="kill").dropna(subset="failback_ms")
     with mpl.rc_context(STYLE):
         for path, look in _stream_looks(rows).items():
             _of_particles(
                 panels[0],
-                rows,
-                times,
-                kills & rows.where(path=path),
+                select(kills, path=path),
+                "failback_ms",
                 look._replace(label=path.label, offset=0.0),
                 dots=True,
-                median=lambda values, here: median_interval(values[here]),
+                median=_median,
             )
         _over_particles(panels[0])
         panels[0].set_title("By particles, over streams without loss", loc="left")
         _legend_below(_figure(panels), panels[0], 3)
-        _over_paths(panels[1], rows, times, kills)
-        panels[1].set_title(_with_count("By path", int(kills.sum())), loc="left")
+        _over_paths(panels[1], kills, "failback_ms")
+        panels[1].set_title(_with_count("By path", len(kills)), loc="left")
         what = "from its ready line until it decides (ms)"
         _thesis_line(panels[0], THESIS_FAILBACK_MS, "thesis: under 1 s")
         _thesis_upright(panels[1], THESIS_FAILBACK_MS, "thesis: under 1 s")
@@ -468,11 +453,11 @@ def failbacks(rows: MeasuredRows) -> Figure:
     return _figure(panels)
 
 
-def _over_paths(panel: Axes, rows: MeasuredRows, values: FloatArray, chosen: BoolArray) -> None:
+def _over_paths(panel: Axes, rows: pd.DataFrame, name: str) -> None:
     """Draw a row for each path: dots, median and interval."""
-    paths = [path for path in rows.paths if (chosen & rows.where(path=path)).any()]
+    paths = paths_of(rows)
     for number, path in enumerate(paths):
-        here = values[chosen & rows.where(path=path)]
+        here = select(rows, path=path)[name].to_numpy(float)
         datagrams = path.transport == "udp"
         color = COLORS[4] if datagrams else COLORS[0]
         _dots(panel, number, here, color, 0.5, upright=False)

@@ -5,10 +5,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import pandas as pd
 
-from holdfast.arrays import BoolArray, FloatArray
 from holdfast.lab.studies.statistics import Interval, clustered_median_interval
 from holdfast.lab.testbed.wide_area import Transport
 
@@ -25,8 +23,11 @@ __all__ = [
     "THESIS_SUCCESS_ABOVE_300",
     "THESIS_TIMEOUT_MS",
     "THESIS_TRIALS",
-    "MeasuredRows",
     "NetworkPath",
+    "clustered_median",
+    "measured",
+    "paths_of",
+    "select",
 ]
 
 PARTICLES = (100, 200, 300, 400, 500)
@@ -83,65 +84,64 @@ PATHS = (
 """Of a full run; all with all numbers of particles."""
 
 
-class MeasuredRows:
-    """Rows of cloud trials as arrays.
+_TIMES = (
+    "at_s",
+    "waited_ms",
+    "round_trip_ms",
+    "computed_ms",
+    "found_ms",
+    "first_local_ms",
+    "launch_ms",
+    "failback_ms",
+    "load",
+    "rate_hz",
+)
+
+
+def measured(table: pd.DataFrame) -> pd.DataFrame:
+    """Return rows of cloud trials with columns for what they are grouped by, and with round trips.
 
     Parameters
     ----------
     table : DataFrame
-        Columns of :data:`~holdfast.lab.studies.cloud_trials.COLUMNS` and, before them, those that
-        say which runs they are: ``condition``, ``particles``, ``transport``,
-        ``path_round_trip_ms`` and ``loss``.
+        Columns of :data:`~holdfast.lab.studies.cloud_trials.COLUMNS` and those that say which runs
+        they are: ``condition``, ``particles``, ``transport``, ``path_round_trip_ms`` and ``loss``.
 
-    Attributes
-    ----------
-    runs : array
-        A number for each run.
+    Returns
+    -------
+    DataFrame
+        With ``whole_run``, a number for each run; ``path``, its label, in the order of
+        :data:`PATHS`; and ``trip_ms``, the round trip of an answer with task actions, without what
+        the service computed. A sensing action comes as the second part of an answer, whose first
+        part was computed and sent meanwhile; so its own time holds more than one round trip.
     """
+    rows = table.astype(dict.fromkeys(_TIMES, float))
+    ends = zip(rows["transport"], rows["path_round_trip_ms"], rows["loss"], strict=True)
+    trips = rows["round_trip_ms"] - rows["computed_ms"]
+    return rows.assign(
+        whole_run=1000.0 * rows["condition"] + rows["run"],
+        path=pd.Categorical(
+            [NetworkPath(*each).label for each in ends], [path.label for path in PATHS]
+        ),
+        trip_ms=trips.where(rows["what"] == "task"),
+    )
 
-    def __init__(self, table: pd.DataFrame) -> None:
-        self._table = table
-        self.runs = 1000.0 * self.number("condition") + self.number("run")
 
-    def number(self, name: str) -> FloatArray:
-        """Return a column of numbers."""
-        return np.asarray(self._table[name].to_numpy(dtype=np.float64))
+def select(rows: pd.DataFrame, **wanted: object) -> pd.DataFrame:
+    """Return the rows with these cells; a path stands for its label."""
+    for name, cell in wanted.items():
+        rows = rows[rows[name] == (cell.label if isinstance(cell, NetworkPath) else cell)]
+    return rows
 
-    def word(self, name: str) -> npt.NDArray[np.object_]:
-        """Return a column of words."""
-        return np.asarray(self._table[name].to_numpy(dtype=object))
 
-    def where(self, **wanted: object) -> BoolArray:
-        """Return which rows have these cells; a path stands for the three columns that name it."""
-        chosen = np.ones(self.runs.shape, dtype=bool)
-        for name, cell in wanted.items():
-            if isinstance(cell, NetworkPath):
-                chosen &= self.where(
-                    transport=cell.transport,
-                    path_round_trip_ms=cell.round_trip_ms,
-                    loss=cell.loss,
-                )
-            else:
-                chosen &= np.asarray(self._table[name] == cell, dtype=bool)
-        return chosen
+def paths_of(rows: pd.DataFrame) -> list[NetworkPath]:
+    """Return the paths that there are, in order."""
+    labels = set(rows["path"])
+    return [path for path in PATHS if path.label in labels]
 
-    @property
-    def paths(self) -> list[NetworkPath]:
-        """Those that there are, in order."""
-        found = self._table[["transport", "path_round_trip_ms", "loss"]].drop_duplicates()
-        names = set(found.itertuples(index=False, name=None))
-        return [path for path in PATHS if tuple(path) in names]
 
-    @property
-    def round_trips(self) -> FloatArray:
-        """Of answers with task actions: from the question, without what the service computed.
-
-        A sensing action comes as the second part of an answer, whose first part was computed and
-        sent meanwhile; so its own time holds more than one round trip.
-        """
-        trips = self.number("round_trip_ms") - self.number("computed_ms")
-        return np.where(self.where(what="task"), trips, np.nan)
-
-    def median(self, values: FloatArray, chosen: BoolArray) -> Interval:
-        """Return the median of some rows' values; those of a run belong together."""
-        return clustered_median_interval(values[chosen], self.runs[chosen])
+def clustered_median(rows: pd.DataFrame, name: str) -> Interval:
+    """Return the median of a column; the values of a run belong together."""
+    return clustered_median_interval(
+        rows[name].to_numpy(np.float64), rows["whole_run"].to_numpy(np.float64)
+    )
