@@ -19,11 +19,12 @@ import struct
 import threading
 from collections.abc import Callable
 from time import monotonic
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import TYPE_CHECKING, Any, Final
 from urllib.parse import urlsplit
 
 import numpy as np
 
+from holdfast.arrays import FloatArray
 from holdfast.errors import CallError, GoneError, TransportError
 from holdfast.protocol.status import Status
 from holdfast.ros.active_sensing import DecisionAnswer, DecisionRequest, ErrorCode, RequestKind
@@ -296,77 +297,7 @@ def _receive_message(stream: socket.socket, max_bytes: int, until: float) -> byt
     return _receive(stream, size, until)
 
 
-class _Talker:
-    """A node on its own thread that publishes a robot's decisions."""
-
-    def __init__(self, name: str, ros_environment: RosEnvironment, client: str) -> None:
-        from rosbags.typesys import Stores, get_typestore
-
-        self._store: Typestore = get_typestore(Stores.ROS1_NOETIC)
-        self._node = RosNode(name, ros_environment)
-        self._waiting = 0
-        self._is_closed = False
-        self._topics: dict[str, tuple[Topic, str]] = {}
-        for topic, kind, latched in (
-            ("status", "std_msgs/msg/String", True),
-            ("decided_by", "std_msgs/msg/String", True),
-            ("sensing_action", "std_msgs/msg/UInt32", False),
-            ("task_actions", "std_msgs/msg/Float64MultiArray", False),
-        ):
-            definition, digest = self._store.generate_msgdef(kind)
-            type_ = TopicType(kind.replace("/msg/", "/"), digest, definition)
-            published = self._node.publish(f"{client}/{topic}", type_, latched=latched)
-            self._topics[topic] = published, kind
-        self._thread = LoopThread("holdfast-ros1")
-        try:
-            self._thread.run(self._node.start(), _START_S)
-        except BaseException:
-            self._thread.close(_START_S)
-            raise
-
-    def topic(self, name: str) -> Topic:
-        """Return a topic by the last part of its name."""
-        return self._topics[name][0]
-
-    def send(self, topic: str, **fields: Any) -> None:
-        """Publish without waiting; messages beyond a limit are dropped."""
-        to, kind = self._topics[topic]
-        message = self._store.types[kind](**fields)
-        data = bytes(self._store.serialize_ros1(message, kind))
-        if self._waiting >= _MAX_WAITING:
-            return
-        self._waiting += 1
-
-        def send() -> None:
-            self._waiting -= 1
-            to.send(data)
-
-        self._thread.call(send)
-
-    def array(self, numbers: np.ndarray[Any, np.dtype[np.float64]]) -> dict[str, Any]:
-        """Return the fields of a Float64MultiArray."""
-        types = self._store.types
-        dimension = types["std_msgs/msg/MultiArrayDimension"]
-        rows, columns = numbers.shape
-        layout = types["std_msgs/msg/MultiArrayLayout"](
-            dim=[
-                dimension(label="action", size=rows, stride=rows * columns),
-                dimension(label="coordinate", size=columns, stride=columns),
-            ],
-            data_offset=0,
-        )
-        return {"layout": layout, "data": np.ascontiguousarray(numbers, np.float64).ravel()}
-
-    def close(self) -> None:
-        """Unregister the node, within a second; may be repeated."""
-        if not self._is_closed:
-            self._is_closed = True
-            with contextlib.suppress(TransportError):
-                self._thread.run(self._node.close(_CLOSE_S), 2 * _CLOSE_S)
-            self._thread.close(_CLOSE_S)
-
-
-class Ros1Client:
+class Ros1Client(ActiveSensingClient):
     """The thesis's client: asks the cloud, and the recovery service if the cloud fails.
 
     It is a node that publishes ``status`` and ``decided_by`` (``std_msgs/String``),
@@ -396,53 +327,92 @@ class Ros1Client:
         ros_environment: RosEnvironment | None = None,
         on_event: Callable[..., None] | None = None,
     ) -> None:
+        from rosbags.typesys import Stores, get_typestore
+
         ros_environment = ros_environment or RosEnvironment.of()
-        self._on_event = on_event
         first, second = (Ros1Service(each, ros_environment, name) for each in (cloud, recovery))
-        self._talker = _Talker(name, ros_environment, name)
-        self._talker.send("status", data=STATUS_WORDS[Status.STANDARD])
-        self._client = ActiveSensingClient(first, second, deadline_s, self._changed)
-        self._decided_by = ""
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self.close()
+        self._store: Typestore = get_typestore(Stores.ROS1_NOETIC)
+        self._node = RosNode(name, ros_environment)
+        self._waiting = 0
+        self._is_unregistered = False
+        self._topics: dict[str, tuple[Topic, str]] = {}
+        for topic, kind, latched in (
+            ("status", "std_msgs/msg/String", True),
+            ("decided_by", "std_msgs/msg/String", True),
+            ("sensing_action", "std_msgs/msg/UInt32", False),
+            ("task_actions", "std_msgs/msg/Float64MultiArray", False),
+        ):
+            definition, digest = self._store.generate_msgdef(kind)
+            type_ = TopicType(kind.replace("/msg/", "/"), digest, definition)
+            published = self._node.publish(f"{name}/{topic}", type_, latched=latched)
+            self._topics[topic] = published, kind
+        self._thread = LoopThread("holdfast-ros1")
+        try:
+            self._thread.run(self._node.start(), _START_S)
+        except BaseException:
+            self._thread.close(_START_S)
+            raise
+        self._send("status", data=STATUS_WORDS[Status.STANDARD])
+        self._published_decider = ""
+        self._own_on_event = on_event
+        super().__init__(first, second, deadline_s, self._tell)
 
     def close(self) -> None:
-        """End all requests, and unregister the node."""
-        self._client.close()
-        self._talker.close()
-
-    @property
-    def status(self) -> Status:
-        """Who decides."""
-        return self._client.status
-
-    @property
-    def decided_by(self) -> str:
-        """Name of the service that gave the last answer."""
-        return self._client.decided_by
+        """End all requests, and unregister the node, within a second; may be repeated."""
+        super().close()
+        if not self._is_unregistered:
+            self._is_unregistered = True
+            with contextlib.suppress(TransportError):
+                self._thread.run(self._node.close(_CLOSE_S), 2 * _CLOSE_S)
+            self._thread.close(_CLOSE_S)
 
     def topic(self, name: str) -> Topic:
-        """Return one of the topics that are published."""
-        return self._talker.topic(name)
+        """Return one of the topics that are published, by the last part of its name."""
+        return self._topics[name][0]
 
     def decide(self, request: DecisionRequest, give_up_s: float | None = None) -> DecisionAnswer:
         """Return a service's answer; see :meth:`ActiveSensingClient.decide`."""
-        answer = self._client.decide(request, give_up_s)
-        if self.decided_by != self._decided_by:
-            self._decided_by = self.decided_by
-            self._talker.send("decided_by", data=self.decided_by)
+        answer = super().decide(request, give_up_s)
+        if self.decided_by != self._published_decider:
+            self._published_decider = self.decided_by
+            self._send("decided_by", data=self.decided_by)
         if answer.error is ErrorCode.OK and request.kind == RequestKind.CHOOSE_SENSING_ACTION:
-            self._talker.send("sensing_action", data=answer.sensing_action)
+            self._send("sensing_action", data=answer.sensing_action)
         elif len(answer.task_actions):
-            self._talker.send("task_actions", **self._talker.array(answer.task_actions))
+            self._send("task_actions", **self._array(answer.task_actions))
         return answer
 
-    def _changed(self, name: str, **fields: object) -> None:
+    def _tell(self, name: str, **fields: object) -> None:
         if name == "status":
-            self._talker.send("status", data=STATUS_WORDS[Status(fields["status"])])
-        if self._on_event is not None:
-            self._on_event(name, **fields)
+            self._send("status", data=STATUS_WORDS[Status(fields["status"])])
+        if self._own_on_event is not None:
+            self._own_on_event(name, **fields)
+
+    def _send(self, topic: str, **fields: Any) -> None:
+        """Publish without waiting; messages beyond a limit are dropped."""
+        to, kind = self._topics[topic]
+        message = self._store.types[kind](**fields)
+        data = bytes(self._store.serialize_ros1(message, kind))
+        if self._waiting >= _MAX_WAITING:
+            return
+        self._waiting += 1
+
+        def send() -> None:
+            self._waiting -= 1
+            to.send(data)
+
+        self._thread.call(send)
+
+    def _array(self, numbers: FloatArray) -> dict[str, Any]:
+        """Return the fields of a Float64MultiArray."""
+        types = self._store.types
+        dimension = types["std_msgs/msg/MultiArrayDimension"]
+        rows, columns = numbers.shape
+        layout = types["std_msgs/msg/MultiArrayLayout"](
+            dim=[
+                dimension(label="action", size=rows, stride=rows * columns),
+                dimension(label="coordinate", size=columns, stride=columns),
+            ],
+            data_offset=0,
+        )
+        return {"layout": layout, "data": np.ascontiguousarray(numbers, np.float64).ravel()}
