@@ -14,7 +14,7 @@ from holdfast.config.loader import Configuration
 from holdfast.planning import Planner
 from holdfast.robot.environment import EnvironmentMaker, SimulatedEnvironment, load_environment
 from holdfast.robot.trial import run_trial
-from holdfast.ros.ros2.run_segment import Ending, RunSegment, SegmentResult
+from holdfast.ros.ros2.run_segment import Ending, RunSegment, SegmentResult, World
 from holdfast.runtime.events import NullEventLog
 
 PATIENCE_S = 60.0
@@ -43,13 +43,12 @@ class Segments:
         segment = RunSegment(
             self.configuration,
             self.path,
-            self.maker,
+            World(self.maker, lambda _: None),
             rate_hz=None,
             sink=NullEventLog(),
             on_order=order,
             on_timing=lambda _: None,
             on_end=lambda _: None,
-            interrupt=lambda _: None,
         )
         return segment
 

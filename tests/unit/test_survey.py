@@ -10,9 +10,8 @@ from xmlrpc.server import SimpleXMLRPCServer
 
 from tests.ports import free_port
 
-from holdfast.ros.master.plan import NodeReport
+from holdfast.ros.master.plan import NodeReport, ask_everyone, snapshot
 from holdfast.ros.master.process import MasterState
-from holdfast.ros.master.survey import ask_everyone, snapshot
 from holdfast.transport.ros1_calls import Connection
 
 

@@ -28,7 +28,14 @@ from time import monotonic
 from urllib.parse import urlsplit
 
 from holdfast.errors import CallError, GoneError, GuardError, SilentError
-from holdfast.ros.master.plan import NodeReport, Reconciled, reconcile, unregistrations
+from holdfast.ros.master.plan import (
+    NodeReport,
+    Reconciled,
+    ask_everyone,
+    reconcile,
+    snapshot,
+    unregistrations,
+)
 from holdfast.ros.master.process import (
     MasterState,
     parameter_names,
@@ -46,7 +53,6 @@ from holdfast.ros.master.roscore import (
 )
 from holdfast.ros.master.settings import GuardLock, GuardSettings, listens_at, own_directory
 from holdfast.ros.master.standby import MasterProcess
-from holdfast.ros.master.survey import ask_everyone, snapshot
 from holdfast.runtime.events import EventSink
 from holdfast.transport.ros1_calls import CALLER, Connection, call
 

@@ -37,7 +37,7 @@ from holdfast.planning import PlanningState
 from holdfast.protocol.events import Act, Sense
 from holdfast.recording.run_directory import RunDirectory
 from holdfast.robot.links import check_services
-from holdfast.ros.executive import DecideCode, DecideRequest, DecisionHandover
+from holdfast.ros.executive import DecideCode, DecideRequest
 from holdfast.ros.poses import PoseLayout, pose_layout
 from holdfast.ros.ros2 import messages
 from holdfast.ros.ros2.diagnostics import Diagnostics
@@ -132,7 +132,6 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
         self._segment: RunSegment | None = None
         self._telemetry: Telemetry | None = None
         self._diagnostics: Diagnostics | None = None
-        self._handover: DecisionHandover | None = None
         self._goal: Any = None
         self._last_result: SegmentResult | None = None
         self._calls = threading.BoundedSemaphore(_MOST_CALLS)
@@ -342,16 +341,13 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
         segment = RunSegment(
             configuration,
             read.run_directory,
-            world.maker,
+            world,
             rate_hz=read.rate_hz,
             sink=_Events(self, diagnostics, telemetry),
             on_order=on_order,
             on_timing=telemetry.time,
             on_end=self._segment_ended,
-            interrupt=world.interrupt,
-            interrupt_at_once=world.interrupt_at_once,
         )
-        self._handover = world.handover
         self._telemetry = telemetry
         self._segment = segment
         segment.start()
@@ -359,8 +355,9 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
 
     def _segment_ended(self, outcome: SegmentResult) -> None:
         with self._changed:
-            telemetry, handover = self._telemetry, self._handover
+            telemetry, segment = self._telemetry, self._segment
             self._last_result = outcome
+        handover = None if segment is None else segment.world.handover
         if handover is not None:
             finished = outcome.ending == Ending.FINISHED
             handover.end(DecideCode.FINISHED if finished else DecideCode.ENDED, outcome.message)
@@ -456,13 +453,12 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
             read, last = self._parameters_read, self._last_result
             reason = self._no_calls()
             segment: RunSegment | None = None
-            handover: DecisionHandover | None = None
             if reason is None and (last is None or last.ending != Ending.FINISHED):
                 segment = self._segment or self._begin_segment()
-                handover = self._handover
         if reason is not None:
             response.code, response.message = DecideCode.INACTIVE, reason
             return response
+        handover = None if segment is None else segment.world.handover
         if handover is None or segment is None or read is None:
             response.code = DecideCode.FINISHED
             response.message = "" if last is None else last.message

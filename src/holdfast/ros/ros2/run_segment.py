@@ -32,10 +32,11 @@ from holdfast.recording.run_directory import RunDirectory
 from holdfast.robot.environment import EnvironmentMaker
 from holdfast.robot.health import Condition
 from holdfast.robot.process import RobotProcess
+from holdfast.ros.executive import DecisionHandover
 from holdfast.ros.ros2.parameters import in_parameters
 from holdfast.runtime.events import EventSink
 
-__all__ = ["MAX_TRIALS_TOLD", "Ending", "RunSegment", "SegmentResult"]
+__all__ = ["MAX_TRIALS_TOLD", "Ending", "RunSegment", "SegmentResult", "World"]
 
 MAX_TRIALS_TOLD = 10_000
 """Of a result; ``trials.csv`` has all."""
@@ -79,6 +80,26 @@ class SegmentResult(NamedTuple):
     num_finished: int = 0
 
 
+class World(NamedTuple):
+    """What a segment acts on.
+
+    Attributes
+    ----------
+    interrupt : callable
+        Ends the environment's current call where possible; given the reason.
+    interrupt_at_once : bool
+        Whether a pause interrupts without waiting for the call to end by itself. It costs nothing
+        only if an interrupted call is repeated later.
+    handover : DecisionHandover or None
+        Where calls of ``~/decide`` meet the run; None where the node itself performs.
+    """
+
+    maker: EnvironmentMaker
+    interrupt: Callable[[str], None]
+    interrupt_at_once: bool = False
+    handover: DecisionHandover | None = None
+
+
 class RunSegment:
     """Runs the remaining trials once :meth:`start` is called.
 
@@ -86,17 +107,10 @@ class RunSegment:
     ----------
     path : Path
         The run's directory.
-    sink : EventSink
-        Gets the robot's events.
     on_order, on_timing : callable
         As of :class:`~holdfast.recording.robot_run.RobotObserver`.
     on_end : callable
         Gets the result, on the segment's thread.
-    interrupt : callable
-        Ends the environment's current call where possible; given the reason.
-    interrupt_at_once : bool
-        Whether a pause interrupts without waiting for the call to end by itself. It costs nothing
-        only if an interrupted call is repeated later.
 
     Attributes
     ----------
@@ -110,26 +124,22 @@ class RunSegment:
         self,
         configuration: Configuration,
         path: Path,
-        maker: EnvironmentMaker,
+        world: World,
         *,
         rate_hz: float | None,
         sink: EventSink,
         on_order: Callable[[PlanningState, Act | Sense], None],
         on_timing: Callable[[Timing], None],
         on_end: Callable[[SegmentResult], None],
-        interrupt: Callable[[str], None],
-        interrupt_at_once: bool = False,
     ) -> None:
         self._configuration = configuration
         self._path = path
-        self._maker = maker
+        self.world = world
         self._rate_hz = rate_hz
         self._sink = sink
         self._on_order = on_order
         self._on_timing = on_timing
         self._on_end = on_end
-        self._interrupt = interrupt
-        self._interrupt_at_once = interrupt_at_once
         self._changed = threading.Lock()
         self._process: RobotProcess | None = None
         self._why_paused: str | None = None
@@ -177,8 +187,8 @@ class RunSegment:
             process = self._process
         if process is not None:
             process.pause(self._pause_within_s)
-        if self._interrupt_at_once:
-            self._interrupt(why)
+        if self.world.interrupt_at_once:
+            self.world.interrupt(why)
         else:
             threading.Thread(
                 target=self._interrupt_later, args=(why, within_s), name="pause", daemon=True
@@ -186,7 +196,7 @@ class RunSegment:
 
     def _interrupt_later(self, why: str, within_s: float) -> None:
         if not self.ended.wait(within_s):
-            self._interrupt(why)
+            self.world.interrupt(why)
 
     def _take_process(self, process: RobotProcess) -> None:
         with self._changed:
@@ -242,7 +252,7 @@ class RunSegment:
             perform_trials(
                 self._configuration,
                 directory,
-                self._maker,
+                self.world.maker,
                 on_result,
                 rate_hz=self._rate_hz,
                 sinks=[self._sink],

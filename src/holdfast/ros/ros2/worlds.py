@@ -3,34 +3,15 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 from holdfast.config.loader import Configuration
 from holdfast.robot.environment import EnvironmentMaker, load_environment
 from holdfast.ros.executive import DecideCode, DecisionHandover, ExecutiveMaker
 from holdfast.ros.ros2.parameters import NodeParameters
+from holdfast.ros.ros2.run_segment import World
 
-__all__ = ["World", "make_world"]
-
-
-class World(NamedTuple):
-    """What one segment of a run acts on.
-
-    Attributes
-    ----------
-    interrupt : callable
-        Ends the call of the environment that goes on, if that can be; given the reason.
-    interrupt_at_once : bool
-        Whether that costs nothing, because an interrupted call is repeated.
-    handover : DecisionHandover or None
-        Where calls of ``~/decide`` meet the run; None where the node itself performs.
-    """
-
-    maker: EnvironmentMaker
-    interrupt: Callable[[str], None]
-    interrupt_at_once: bool = False
-    handover: DecisionHandover | None = None
+__all__ = ["make_world"]
 
 
 def make_world(node: Any, parameters: NodeParameters) -> World:
@@ -43,7 +24,7 @@ def make_world(node: Any, parameters: NodeParameters) -> World:
     """
     configuration = parameters.configuration
     if parameters.environment == "configuration":
-        return World(load_environment(configuration), _nothing)
+        return World(load_environment(configuration), lambda _: None)
     # Other threads than the robot's use it.
     problem = Configuration.from_plain(configuration.plain()).problem
     timeout_ms = configuration.environment.timeout_ms
@@ -63,12 +44,4 @@ def make_world(node: Any, parameters: NodeParameters) -> World:
     make: Any = functools.partial(make_ros_environment, node, parameters.mapping)
     maker = EnvironmentMaker("the robot", problem, configuration.simulator.seed, timeout_ms, make)
 
-    def interrupt(why: str) -> None:
-        del why
-        cancel_ros_environments(node)
-
-    return World(maker, interrupt)
-
-
-def _nothing(why: str) -> None:
-    pass
+    return World(maker, lambda _: cancel_ros_environments(node))
