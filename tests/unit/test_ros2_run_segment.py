@@ -123,7 +123,7 @@ def test_a_robot_that_moves_is_interrupted_when_it_takes_too_long(segments: Segm
 
     segments.maker = EnvironmentMaker("robot", segments.configuration.problem, 3, 60_000.0, Slow)
     segment = segments.make()
-    segment._interrupt = lambda _: stopped.set()
+    segment.world = segment.world._replace(interrupt=lambda _: stopped.set())
     segment.start()
     assert segment.ended.wait(PATIENCE_S)
     assert segment.outcome is not None

@@ -27,21 +27,12 @@ _ELEMENT = re.compile(r"sequence<([^,>]+)(?:, *[0-9]+)?>|(.+)\[[0-9]+\]")
 
 
 def find_type(name: str, key: str, kinds: tuple[str, ...] = ("srv", "action", "msg")) -> Any:
-    """Import a generated type, such as ``std_srvs/srv/Trigger``.
-
-    Parameters
-    ----------
-    name : str
-        Package, ``msg``, ``srv`` or ``action``, and the type's own name.
-    key : str
-        The parameter that names it, for messages.
-    kinds : tuple of str, optional
-        Which of the three may stand there.
+    """Import a generated type, such as ``std_srvs/srv/Trigger``; ``key`` names it in messages.
 
     Raises
     ------
     ConfigurationError
-        If it is written in another way, or cannot be imported.
+        If it is written in another way, is of another kind, or cannot be imported.
     """
     found = _TYPE.fullmatch(name)
     if found is None or found[2] not in kinds:
@@ -213,7 +204,7 @@ def _fitting(old: Any, value: Any) -> Any:
         values = np.array(value, dtype=np.float64)
         if values.shape != old.shape:
             raise ValueError(f"{old.size} numbers are needed")
-        return values.astype(old.dtype) if old.dtype.kind == "f" else _all_whole(values, old.dtype)
+        return np.array(values if old.dtype.kind == "f" else list(map(_whole, values)), old.dtype)
     if isinstance(old, array.array):
         several = value if isinstance(value, list | tuple) else [value]
         return array.array(old.typecode, map(float if old.typecode in "fd" else _whole, several))
@@ -226,10 +217,6 @@ def _whole(value: Any) -> int:
     if float(value) != int(value):
         raise ValueError("a whole number is needed")
     return int(value)
-
-
-def _all_whole(values: Any, dtype: Any) -> Any:
-    return np.array([_whole(value) for value in values], dtype=dtype)
 
 
 def _fields(holder: Any) -> dict[str, str]:

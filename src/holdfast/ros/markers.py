@@ -7,6 +7,7 @@ problem does not define is left out.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -216,27 +217,30 @@ def _outline(scene: Scene) -> FloatArray:
 def _rectangles(scene: Scene, axes: tuple[int, int], frame: str, size: float) -> list[Marker]:
     """Return the obstacles as flat boxes, as far as they are in the part that is to be shown."""
     limits = np.array(scene.limits, dtype=np.float64)
-    markers = []
-    for obstacle in scene.obstacles:
-        low, high = np.maximum(obstacle[:2], limits[:2]), np.minimum(obstacle[2:], limits[2:])
-        if (high > low).all():
-            place = (*_in_space(0.5 * (low + high), axes), 0.0, 0.0, 0.0, 1.0)
-            width, height, depth = _in_space(high - low, axes, _THICKNESS * size)
-            markers.append(
-                Marker("CUBE", frame, "obstacle", place, (width, height, depth), _OBSTACLE)
-            )
-    return markers
+    half = 0.5 * _THICKNESS * size
+    corners = [
+        (
+            _in_space(np.maximum(obstacle[:2], limits[:2]), axes, -half),
+            _in_space(np.minimum(obstacle[2:], limits[2:]), axes, half),
+        )
+        for obstacle in scene.obstacles
+    ]
+    return _cuboids(corners, frame)
 
 
 def _boxes(obstacles: FloatArray, scene: Scene, frame: str) -> list[Marker]:
     """Return the obstacles in space, as far as they are in the part that is to be shown."""
     x_min, z_min, x_max, z_max = scene.limits
-    lowest, highest = np.array([x_min, x_min, z_min]), np.array([x_max, x_max, z_max])
+    lows = np.maximum(obstacles[:, :3], (x_min, x_min, z_min))
+    highs = np.minimum(obstacles[:, 3:], (x_max, x_max, z_max))
+    return _cuboids(zip(lows, highs, strict=True), frame)
+
+
+def _cuboids(corners: Iterable[tuple[Any, Any]], frame: str) -> list[Marker]:
     markers = []
-    for obstacle in obstacles:
-        low, high = np.maximum(obstacle[:3], lowest), np.minimum(obstacle[3:], highest)
-        if (high > low).all():
-            place = (*(0.5 * (low + high)), 0.0, 0.0, 0.0, 1.0)
-            x, y, z = high - low
+    for low, high in corners:
+        x, y, z = np.subtract(high, low)
+        if min(x, y, z) > 0.0:
+            place = (*(0.5 * np.add(low, high)), 0.0, 0.0, 0.0, 1.0)
             markers.append(Marker("CUBE", frame, "obstacle", place, (x, y, z), _OBSTACLE))
     return markers

@@ -30,7 +30,7 @@ import sys
 import threading
 import time
 from pathlib import Path
-from typing import Any, Dict, List, NamedTuple, NoReturn, Optional, Tuple  # noqa: UP035 (older Python)
+from typing import Any, Dict, List, NoReturn, Tuple  # noqa: UP035 (older Python)
 from zlib import crc32
 
 __all__ = [
@@ -55,7 +55,7 @@ _WORKERS = 8
 """Threads that tell nodes of changes. One that a stopped node blocks is lost to the others; stock
 masters have three."""
 
-_TABLES = ("publishers", "subscribers", "services", "types", "parameter_subscribers")
+_TABLES = ("parameters", "publishers", "subscribers", "services", "types", "parameter_subscribers")
 
 
 class MasterState:
@@ -148,12 +148,6 @@ def parameter_names(tree: dict[str, Any], space: str = "/") -> list[str]:
 # -- the journal -----------------------------------------------------------------------------------
 
 
-class _Change(NamedTuple):
-    table: str
-    key: Optional[str]  # noqa: UP045
-    value: Any
-
-
 class _PlainData(pickle.Unpickler):
     """Reads what parameters can be, and no code."""
 
@@ -167,24 +161,19 @@ class _PlainData(pickle.Unpickler):
         raise pickle.UnpicklingError(f"{module}.{name} is no parameter")
 
 
-def _encoded(change: _Change) -> bytes:
-    data = pickle.dumps(tuple(change), protocol=4)
+def _encoded(table: str, key: str | None, value: Any) -> bytes:
+    data = pickle.dumps((table, key, value), protocol=4)
     return _HEAD.pack(len(data), crc32(data)) + data
 
 
-def _decoded(data: bytes) -> _Change:
-    return _Change(*_PlainData(io.BytesIO(data)).load())
-
-
-def _records_of(state: MasterState) -> bytes:
-    changes = [_Change("parameters", None, state.parameters)]
-    changes += [_Change(table, None, getattr(state, table)) for table in _TABLES]
-    return b"".join(map(_encoded, changes))
+def _decoded(data: bytes) -> tuple[str, str | None, Any]:
+    table, key, value = _PlainData(io.BytesIO(data)).load()
+    return table, key, value
 
 
 def journal_of(state: MasterState) -> bytes:
     """Return the content of a journal that holds a state."""
-    return _MAGIC + _records_of(state)
+    return _MAGIC + b"".join(_encoded(table, None, getattr(state, table)) for table in _TABLES)
 
 
 def read_journal(journal: Path | int) -> MasterState | None:
@@ -307,7 +296,7 @@ class MasterJournal:
     def write(self, table: str, key: str | None, value: Any) -> None:
         """Write down one change; never raises."""
         try:
-            record = _encoded(_Change(table, key, value))
+            record = _encoded(table, key, value)
             # A copy, since the master goes on changing what it has; and proof that it can be read.
             change = _decoded(record[_HEAD.size :])
         except Exception as error:  # noqa: BLE001 (whatever it is, the node gets its answer)

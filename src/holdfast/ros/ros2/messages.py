@@ -32,11 +32,6 @@ def floats(values: npt.ArrayLike) -> array.array[float]:
     return array.array("d", np.ascontiguousarray(values, dtype=np.float64).tobytes())
 
 
-def header(frame_id: str, stamp: Time) -> Any:
-    """Return a header."""
-    return Header(frame_id=frame_id, stamp=stamp)
-
-
 def belief_message(state: planning.PlanningState, frame_id: str, stamp: Time) -> Any:
     """Return a state as a message."""
     belief = Belief(
@@ -45,7 +40,7 @@ def belief_message(state: planning.PlanningState, frame_id: str, stamp: Time) ->
         weights=floats(state.belief.weights),
     )
     return BeliefStamped(
-        header=header(frame_id, stamp),
+        header=Header(frame_id=frame_id, stamp=stamp),
         state=PlanningState(
             seed=state.seed,
             trial=state.trial,
@@ -61,7 +56,7 @@ def decision_message(shown: PublishedDecision, problem: Problem, frame_id: str, 
     """Return an order as a message."""
     sensing_action = shown.sensing_action
     return Decision(
-        header=header(frame_id, stamp),
+        header=Header(frame_id=frame_id, stamp=stamp),
         trial=shown.trial,
         step=shown.step,
         stage=shown.stage,
