@@ -19,7 +19,7 @@ from holdfast.runtime.command_line import (
 )
 
 if TYPE_CHECKING:
-    from holdfast.transport.key_ring import Issued, KeyRing, Revocation
+    from holdfast.transport.key_ring import Issued, KeyRing
 
 __all__ = ["main"]
 
@@ -104,10 +104,10 @@ def main(arguments: Sequence[str]) -> int:
     makes = options.robot or options.service or options.renew or options.rotate
     with alone_in(directory, warn=warn):
         if revokes:
-            done = revoke_credentials(
+            revoked = revoke_credentials(
                 directory, names=options.revoke, serials=options.revoke_serial, warn=warn
             )
-            sys.stdout.write(_account_of_revocation(directory, done))
+            sys.stdout.write(_account_of_revocation(directory, revoked))
         if makes or not (revokes or options.list):
             ring = make_credentials(
                 directory,
@@ -126,9 +126,9 @@ def main(arguments: Sequence[str]) -> int:
     return 0
 
 
-def _account_of_revocation(directory: Path, done: Revocation) -> str:
+def _account_of_revocation(directory: Path, revoked: Sequence[Issued]) -> str:
     """Return what was revoked, and where to copy the list."""
-    lines = [f"revoked: {_line_of(each)}" for each in done.revoked]
+    lines = [f"revoked: {_line_of(each)}" for each in revoked]
     if not lines:
         return "All of these were revoked already; nothing was changed.\n"
     lines += [

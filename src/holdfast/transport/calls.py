@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import msgspec
+
 from holdfast.errors import InvalidValueError
 from holdfast.protocol.events import (
     CallEnded,
@@ -34,17 +36,14 @@ def too_large(size_bytes: int, max_message_bytes: int) -> bytes:
     )
 
 
-class PendingCall:
+class PendingCall(msgspec.Struct, eq=False):
     """A call in flight to ``peer``.
 
     Its number may be used again as soon as it is abandoned; this object identifies it.
     """
 
-    __slots__ = ("number", "peer")
-
-    def __init__(self, number: int, peer: object) -> None:
-        self.number = number
-        self.peer = peer
+    number: int
+    peer: object
 
 
 class CallTable:

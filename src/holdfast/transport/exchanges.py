@@ -42,6 +42,8 @@ import math
 import struct
 from typing import Final, NamedTuple, cast
 
+import msgspec
+
 from holdfast.transport.datagram_cipher import KNOWN_AFTER, LOSS_SAMPLE, OVERHEAD
 from holdfast.transport.redundancy import (
     MAX_TIMEOUT_S,
@@ -136,37 +138,22 @@ class ReceivedRequest(NamedTuple):
     payload: bytes
 
 
-class _PendingRequest:
+class _PendingRequest(msgspec.Struct, eq=False):
     """A request of the robot that is not answered in full."""
 
-    __slots__ = (
-        "call",
-        "due_at",
-        "have",
-        "heard",
-        "hedged",
-        "num_sent",
-        "number",
-        "on_stream",
-        "payload",
-        "reordered",
-        "retransmitted_at",
-        "sent_at",
-        "timeout_s",
-    )
-
-    def __init__(self, call: int, number: int, payload: bytes, now: float) -> None:
-        self.call = call
-        self.number = number
-        self.payload = payload
-        self.sent_at = self.retransmitted_at = now
-        self.num_sent = 1
-        self.have = 0
-        self.heard = False
-        self.reordered: dict[int, tuple[bytes | None, bool]] = {}
-        self.on_stream = self.hedged = False
-        self.timeout_s = 0.0
-        self.due_at = math.inf
+    call: int
+    number: int
+    payload: bytes
+    sent_at: float
+    retransmitted_at: float
+    num_sent: int = 1
+    have: int = 0
+    heard: bool = False
+    reordered: dict[int, tuple[bytes | None, bool]] = {}
+    on_stream: bool = False
+    hedged: bool = False
+    timeout_s: float = 0.0
+    due_at: float = math.inf
 
 
 class RobotExchange:
@@ -217,7 +204,7 @@ class RobotExchange:
     def send(self, call: int, payload: bytes, now: float) -> None:
         """Send a request; ``call`` names it in its replies."""
         self._number += 1
-        request = _PendingRequest(call, self._number, payload, now)
+        request = _PendingRequest(call, self._number, payload, now, now)
         self._requests[request.number] = request
         if not self.open or len(payload) > MAX_PAYLOAD_BYTES:
             self._put_on_stream(request)
@@ -392,16 +379,13 @@ class RobotExchange:
         return _REQUEST_HEAD.pack(request.number, settled, request.have) + request.payload
 
 
-class _CachedReplies:
+class _CachedReplies(msgspec.Struct, eq=False):
     """The replies to one request, until the robot has them all."""
 
-    __slots__ = ("bodies", "done", "hedged", "on_stream")
-
-    def __init__(self, on_stream: bool) -> None:
-        self.on_stream = on_stream
-        self.hedged = False
-        self.bodies: list[bytes | None] = []  # None: sent on the stream, which loses nothing
-        self.done = False
+    on_stream: bool
+    hedged: bool = False
+    bodies: list[bytes | None] = []
+    done: bool = False
 
 
 class ServiceExchange:

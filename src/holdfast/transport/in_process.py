@@ -9,6 +9,8 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable, Iterable
 
+import msgspec
+
 from holdfast.errors import InvalidValueError, TransportError
 from holdfast.protocol.events import TransportEvent
 from holdfast.transport.calls import CallTable, PendingCall, too_large
@@ -49,33 +51,26 @@ class InProcessNetwork:
         return next((each for each in reversed(self._services) if each.name == name), None)
 
 
-class _InProcessCall:
+class _InProcessCall(msgspec.Struct, eq=False):
     """A call; both ends hold it."""
 
-    __slots__ = ("_call", "_loop", "_robot_end", "_service_end", "payload", "robot")
+    call: PendingCall
+    robot_end: InProcessRobotTransport
+    service_end: InProcessServiceTransport
+    payload: bytes
 
-    def __init__(
-        self,
-        call: PendingCall,
-        robot_end: InProcessRobotTransport,
-        service_end: InProcessServiceTransport,
-        payload: bytes,
-    ) -> None:
-        self._call = call
-        self._robot_end = robot_end
-        self._service_end = service_end
-        self.payload = payload
-        self.robot = service_end.robot
-        self._loop = asyncio.get_running_loop()
+    @property
+    def robot(self) -> str | None:
+        return self.service_end.robot
 
     def reply(self, payload: bytes) -> None:
-        if len(payload) <= self._service_end.max_message_bytes:
-            calls = self._robot_end.calls
-            self._loop.call_soon(calls.replied, self._call, payload)
+        if len(payload) <= self.service_end.max_message_bytes:
+            calls = self.robot_end.calls
+            asyncio.get_running_loop().call_soon(calls.replied, self.call, payload)
 
     def end(self) -> None:
-        self._loop.call_soon(self._robot_end.calls.ended, self._call)
-        self._service_end.open_calls.discard(self)
+        asyncio.get_running_loop().call_soon(self.robot_end.calls.ended, self.call)
+        self.service_end.open_calls.discard(self)
 
 
 class InProcessRobotTransport:

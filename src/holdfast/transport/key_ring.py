@@ -69,7 +69,6 @@ __all__ = [
     "Issued",
     "KeyRing",
     "MadeCredentials",
-    "Revocation",
     "alone_in",
     "list_credentials",
     "make_credentials",
@@ -123,24 +122,6 @@ class Issued(NamedTuple):
     role: Role | None
     expires: datetime | None
     revoked: datetime | None = None
-
-
-class Revocation(NamedTuple):
-    """The result of :func:`revoke_credentials`.
-
-    Attributes
-    ----------
-    revoked : tuple of Issued
-        The newly revoked certificates.
-    before : int
-        How many were revoked before.
-    copies : tuple of Path
-        The list in each directory of credentials.
-    """
-
-    revoked: tuple[Issued, ...]
-    before: int
-    copies: tuple[Path, ...]
 
 
 class KeyRing(NamedTuple):
@@ -286,9 +267,8 @@ def make_credentials(
     # Recorded first: a certificate without a record could not be revoked by its name.
     issued = _read_issued(directory, authority.certificate)
     _write_issued(home, [*issued, *(_issued(each.certificate) for each in parties)])
-    made = []
     for party in parties:
-        place = directory / party.name
+        place = party.made.directory
         if party.key is None:
             write_atomically(place / CERTIFICATE_FILE, certificate_pem(party.certificate))
         else:
@@ -301,14 +281,11 @@ def make_credentials(
                 files[REVOKED_FILE] = NewFile(read_file(home / REVOKED_FILE), _PUBLIC_FILE)
             put = replace_directory if place.exists() else create_directory_atomically
             put(place, files)
-        made.append(
-            MadeCredentials(party.name, party.role, place, party.hosts, end, party.key is None)
-        )
     return KeyRing(
         home / AUTHORITY_KEY_FILE,
         authority_is_new,
         authority.certificate.not_valid_after_utc,
-        tuple(made),
+        tuple(party.made for party in parties),
     )
 
 
@@ -319,9 +296,10 @@ def revoke_credentials(
     serials: Sequence[int] = (),
     now: datetime | None = None,
     warn: Callable[[str], object] = warnings.warn,
-) -> Revocation:
-    """Revoke certificates: an end that has the new list refuses them.
+) -> tuple[Issued, ...]:
+    """Revoke certificates, and return those that were not revoked before.
 
+    An end that has the new list refuses them.
     The list is written to the authority and beside each party's credentials. Entries are never
     removed.
 
@@ -361,14 +339,12 @@ def revoke_credentials(
     if new:
         content = sign_revocations(listed, [each.serial for each in new], authority, now)
         write_atomically(home / REVOKED_FILE, content)
-    copies = []
     if new or numbers:
         content = read_file(home / REVOKED_FILE)
         for certificate in _certificates_in(directory):
             # Even without a new entry: an earlier call may have been killed before it copied.
-            copies.append(certificate.with_name(REVOKED_FILE))
-            write_atomically(copies[-1], content)
-    return Revocation(tuple(new), len(numbers), tuple(copies))
+            write_atomically(certificate.with_name(REVOKED_FILE), content)
+    return tuple(new)
 
 
 def list_credentials(directory: Path) -> tuple[Issued, ...]:
@@ -430,9 +406,7 @@ def _first_file_of(place: Path) -> Path | None:
 
 
 class _Party(NamedTuple):
-    name: str
-    role: Role
-    hosts: tuple[str, ...]
+    made: MadeCredentials
     certificate: x509.Certificate
     key: ec.EllipticCurvePrivateKey | None  # None: renewed, its key stays as it is
 
@@ -483,7 +457,8 @@ def _party(
         before = _hosts_of_this_machine() if old is None else hosts_of(old)
         reached_at = tuple(dict.fromkeys(map(normal_host, (*before, *hosts))))
     certificate = sign_certificate(place.name, role, reached_at, public_key, authority, now, end)
-    return _Party(place.name, role, reached_at, certificate, key)
+    made = MadeCredentials(place.name, role, place, reached_at, end, key is None)
+    return _Party(made, certificate, key)
 
 
 def _issued(certificate: x509.Certificate) -> Issued:

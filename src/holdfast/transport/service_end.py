@@ -14,6 +14,8 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
+import msgspec
+
 from holdfast.errors import FrameError, TransportError
 from holdfast.transport.calls import too_large
 from holdfast.transport.contract import DEFAULT_MAX_MESSAGE_BYTES, IncomingCall
@@ -64,66 +66,49 @@ MAX_UNKNOWN: Final = MAX_SILENT + _MAX_WITHOUT_HELLO
 """Connections without a hello: the number of sockets beyond the links."""
 
 
-class _StreamCall:
+class _StreamCall(msgspec.Struct, eq=False):
     """A request as the service sees it; see :class:`~holdfast.transport.contract.IncomingCall`."""
 
-    __slots__ = (
-        "_calls",
-        "_link",
-        "_loop",
-        "_number",
-        "_open",
-        "_reply",
-        "is_being_delivered",
-        "payload",
-        "robot",
-    )
+    link: Link
+    number: int
+    payload: bytes
+    calls: set[_StreamCall]
+    is_open: bool = True
+    is_being_delivered: bool = True
+    waiting: bytes | None = None  # a reply
 
-    def __init__(
-        self,
-        link: Link,
-        number: int,
-        payload: bytes,
-        calls: set[_StreamCall],
-        loop: asyncio.AbstractEventLoop,
-    ) -> None:
-        self._link = link
-        self._number = number
-        self._calls = calls
-        self._loop = loop
-        self._reply: bytes | None = None
-        self._open = True
-        self.is_being_delivered = False
-        self.payload = payload
-        self.robot = _certified(link)
+    @property
+    def robot(self) -> str | None:
+        """The name in the robot's certificate."""
+        return _certified(self.link)
 
     def reply(self, payload: bytes) -> None:
         """Send a reply. A robot that is gone is no error."""
-        if not self._open or len(payload) > self._link.max_message_bytes:
+        if not self.is_open or len(payload) > self.link.max_message_bytes:
             return
-        if self._reply is not None:
+        if self.waiting is not None:
             self.flush()
         elif not self.is_being_delivered:
-            self._loop.call_soon(self.flush)
-        self._reply = payload
+            asyncio.get_running_loop().call_soon(self.flush)
+        self.waiting = payload
 
     def end(self) -> None:
         """End the call. May be repeated."""
-        if not self._open:
+        if not self.is_open:
             return
-        self._open = False
-        self._calls.discard(self)
-        reply, self._reply = self._reply, None
+        self.is_open = False
+        self.calls.discard(self)
+        reply, self.waiting = self.waiting, None
         if reply is None:
-            self._link.send_message(END, self._number)
+            self.link.send_message(END, self.number)
         else:
-            self._link.send_message(LAST, self._number, reply)
+            self.link.send_message(LAST, self.number, reply)
 
     def flush(self) -> None:
         """Send the pending reply."""
-        reply, self._reply = self._reply, None
+        reply, self.waiting = self.waiting, None
         if reply is not None:
-            self._link.send_message(REPLY, self._number, reply)
+            self.link.send_message(REPLY, self.number, reply)
 
 
 class StreamServiceTransport(LinkOwner):
@@ -445,9 +430,8 @@ class StreamServiceTransport(LinkOwner):
         if deliver is None:
             link.send_message(END, frame.call)
             return
-        call = _StreamCall(link, frame.call, frame.payload, calls, asyncio.get_running_loop())
+        call = _StreamCall(link, frame.call, frame.payload, calls)
         calls.add(call)
-        call.is_being_delivered = True
         deliver(call)
         call.is_being_delivered = False
         call.flush()
