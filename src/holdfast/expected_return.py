@@ -96,15 +96,6 @@ def expected_returns(
 ) -> Returns:
     """Return the expected return after each sensing action.
 
-    Parameters
-    ----------
-    stage : int
-        Stage of the task.
-    hypotheses : Stream
-        Random numbers of the hypothetical observations.
-    posteriors : callable
-        See :data:`Posteriors`.
-
     Raises
     ------
     ProblemError

@@ -109,13 +109,7 @@ class Decisions(msgspec.Struct, frozen=True):
 
 
 class DecisionLog:
-    """Notes the decisions of a trial while it runs.
-
-    Parameters
-    ----------
-    action_size : int
-        Coordinates of a task action.
-    """
+    """Notes the decisions of a trial while it runs."""
 
     def __init__(self, action_size: int) -> None:
         self._action_size = action_size

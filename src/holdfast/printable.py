@@ -11,13 +11,7 @@ __all__ = ["printable"]
 
 
 def printable(text: str, *, keep: str = "\n\t") -> str:
-    """Return the text with each unprintable character escaped.
-
-    Parameters
-    ----------
-    keep : str
-        Characters that are not escaped.
-    """
+    """Return the text with each unprintable character escaped."""
     if text.isprintable():
         return text
     return "".join(

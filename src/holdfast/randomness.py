@@ -61,18 +61,7 @@ class Stream:
         self.words = words
 
     def normal(self, shape: int | tuple[int, ...] = ()) -> FloatArray:
-        """Return standard normal deviates of the given shape.
-
-        Parameters
-        ----------
-        shape : int or tuple of int
-            The shape of the result; ``()`` gives an array of no dimension.
-
-        Returns
-        -------
-        array of float64
-            The first numbers of the stream, in C order.
-        """
+        """Return standard normal deviates, the first of the stream, in C order."""
         return _kernel.normals(self.words, _size(shape)).reshape(shape)
 
     def uniform(self, shape: int | tuple[int, ...] = ()) -> FloatArray:

@@ -70,11 +70,6 @@ Start with: holdfast run examples/peg_in_hole_2d.yaml
 def run_application(arguments: Sequence[str]) -> int:
     """Run one command and return its exit code.
 
-    Parameters
-    ----------
-    arguments : sequence of str
-        The words after ``holdfast``.
-
     Raises
     ------
     HoldfastError

@@ -43,13 +43,7 @@ EXIT_SIGNAL = 128
 
 
 def print_error(error: HoldfastError, arguments: Sequence[str]) -> None:
-    """Print what ended a command on the standard error: as text, or as the last of its events.
-
-    Parameters
-    ----------
-    arguments : sequence of str
-        The words after ``holdfast``; ``--log json`` among them asks for events.
-    """
+    """Print what ended a command on the standard error: as text, or as the last of its events."""
     if not wants_json(arguments):
         sys.stderr.write(f"holdfast: error: {printable(str(error))}\n")
         return
@@ -70,13 +64,7 @@ def print_error(error: HoldfastError, arguments: Sequence[str]) -> None:
 def print_defect(
     kind: type[BaseException], error: BaseException, trace: TracebackType | None
 ) -> None:
-    """Print an unexpected exception with its traceback, as the interpreter would.
-
-    Parameters
-    ----------
-    kind, error, trace
-        As those of :func:`sys.excepthook`.
-    """
+    """Print an unexpected exception with its traceback, as the interpreter would."""
     import traceback
 
     sys.stderr.write(printable("".join(traceback.format_exception(kind, error, trace))))

@@ -33,12 +33,7 @@ class Override(NamedTuple):
 
 
 def parse_assignment(assignment: str) -> Override:
-    """Read ``SECTION.KEY=VALUE``, as ``--set`` takes it.
-
-    Parameters
-    ----------
-    assignment : str
-        The value is YAML; ``null`` is a value.
+    """Read ``SECTION.KEY=VALUE``, as ``--set`` takes it; the value is YAML.
 
     Raises
     ------
@@ -69,11 +64,6 @@ def parse_assignment(assignment: str) -> Override:
 
 def combined(overrides: Iterable[Override]) -> dict[str, Any]:
     """Return the values by key.
-
-    Parameters
-    ----------
-    overrides : iterable of Override
-        Those that were given, and no others.
 
     Raises
     ------

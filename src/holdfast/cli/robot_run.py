@@ -38,13 +38,7 @@ class RobotRun(NamedTuple):
 
 
 class _Reasons:
-    """An event sink that remembers which services refused for good or could not be reached.
-
-    Parameters
-    ----------
-    on_first_hold : callable
-        Called when the robot holds still for the first time.
-    """
+    """An event sink that remembers which services refused for good or could not be reached."""
 
     def __init__(self, on_first_hold: Callable[[], None]) -> None:
         self._on_hold: Callable[[], None] | None = on_first_hold
@@ -66,13 +60,7 @@ class _Reasons:
 
 
 def is_robot_run(configuration: Configuration, rate_hz: float | None) -> bool:
-    """Return whether a run needs more than a batch of simulated trials does.
-
-    Parameters
-    ----------
-    rate_hz : float or None
-        Task actions a second.
-    """
+    """Return whether a run needs more than a batch of simulated trials does."""
     return (
         bool(configuration.offload.services)
         or configuration.environment.object is not None
@@ -94,25 +82,6 @@ def run_as_robot(
     note: Callable[[str], None],
 ) -> RobotRun:
     """Run the missing trials one after another.
-
-    Parameters
-    ----------
-    directory : RunDirectory
-        Its journal keeps each step.
-    maker : EnvironmentMaker
-        Makes what the robot acts on.
-    on_result : callable
-        Gets each trial's result, and keeps it.
-    log_format : {"text", "json"}
-        Of the events on the standard error.
-    quiet : bool
-        Whether events go to the file alone.
-    manager : ServiceManager
-        Gets the state of the robot.
-    health : HttpAddress or None
-        Where HTTP requests get the same.
-    note : callable
-        Shows a hint.
 
     Raises
     ------

@@ -56,15 +56,7 @@ class ProgressLine(Protocol):
 
 
 def progress_line(total: int, *, quiet: bool, noun: str = "trial") -> ProgressLine:
-    """Return what suits the standard error: a moving line, a line now and then, or nothing.
-
-    Parameters
-    ----------
-    total : int
-        Number of trials.
-    noun : str
-        Name of a trial.
-    """
+    """Return what suits the standard error: a moving line, a line now and then, or nothing."""
     if quiet:
         return _Quiet()
     if sys.stderr.isatty():

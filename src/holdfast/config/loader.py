@@ -120,28 +120,12 @@ class Configuration:
         return comment + write(self._sections())
 
     def plain(self) -> dict[str, Any]:
-        """Return the configuration as plain data, from which another process can rebuild it.
-
-        Returns
-        -------
-        dict
-            Text, numbers, lists and mappings; see :meth:`from_plain`.
-        """
+        """Return the configuration as plain data, from which another process can rebuild it."""
         return {"path": str(self.path.absolute()), "configuration": self._sections()}
 
     @classmethod
     def from_plain(cls, plain: Mapping[str, Any]) -> Configuration:
         """Rebuild a configuration from :meth:`plain`, in another process as well.
-
-        Parameters
-        ----------
-        plain : mapping
-            What :meth:`plain` returned.
-
-        Returns
-        -------
-        Configuration
-            An equal configuration.
 
         Raises
         ------
@@ -196,11 +180,6 @@ def load(
         Further values instead of the file's, by ``section.key`` (``offload.services``). None is a
         value, too. Paths among them are relative to the current directory.
 
-    Returns
-    -------
-    Configuration
-        The problem and the settings.
-
     Raises
     ------
     ConfigurationError
@@ -222,13 +201,7 @@ def load(
 
 
 def settings_keys() -> dict[str, str]:
-    """Return every ``section.key`` whose meaning does not depend on the problem.
-
-    Returns
-    -------
-    dict of str
-        The allowed values and the default, in words.
-    """
+    """Return what is allowed and the default, for each ``section.key`` that no problem changes."""
     keys = {}
     for section, schema in SETTINGS.items():
         defaults = msgspec.to_builtins(schema())

@@ -107,15 +107,6 @@ def build_problem(
 ) -> Problem:
     """Build a problem from plain data that did not come from a file.
 
-    Parameters
-    ----------
-    name : str
-        What the problem is called in messages.
-    problem_class : type
-        As :func:`holdfast.problems.registry.problem_class` returns it.
-    model, state_space_planner : mapping
-        The problem's two sections.
-
     Raises
     ------
     ConfigurationError

@@ -60,11 +60,6 @@ _StructT = TypeVar("_StructT", bound=msgspec.Struct)
 class Source:
     """A configuration before it is checked, which can say where in it something is wrong.
 
-    Parameters
-    ----------
-    overrides : mapping
-        Values that replace those of the document, by section and key.
-
     Attributes
     ----------
     schemas : dict

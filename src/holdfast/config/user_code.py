@@ -47,13 +47,7 @@ _PACKAGE_FOLDERS = frozenset({"site-packages", "dist-packages"})
 
 
 def is_users_file(name: str) -> bool:
-    """Return whether a source file belongs neither to holdfast nor to an installed library.
-
-    Parameters
-    ----------
-    name : str
-        Path of the file, or what Python says where there is none (``<string>``).
-    """
+    """Return whether a source file belongs neither to holdfast nor to an installed library."""
     if name.startswith("<"):
         return False
     path = _place(name)
@@ -72,13 +66,6 @@ def _place(name: str) -> Path:
 
 def account_of_user_error(error: BaseException, name: str) -> str | None:
     """Say what the user's code raised and where, without the frames of anybody else.
-
-    Parameters
-    ----------
-    error : BaseException
-        What was raised, caught in holdfast.
-    name : str
-        What to call the code, usually the problem's name.
 
     Returns
     -------
@@ -140,24 +127,12 @@ def _frames_listed(frames: list[traceback.FrameSummary]) -> str:
 
 
 def describe_problem_error(name: str, error: BaseException) -> str:
-    """Put what a problem raised into words, wherever it came from.
-
-    Parameters
-    ----------
-    name : str
-        Of the problem.
-    """
+    """Put what a problem raised into words, wherever it came from."""
     return account_of_user_error(error, name) or in_words(error)
 
 
 def registered_names(group: str) -> list[str]:
-    """Return the names of a group of entry points, sorted.
-
-    Parameters
-    ----------
-    group : str
-        Such as ``holdfast.problems``.
-    """
+    """Return the names of a group of entry points, sorted."""
     import importlib.metadata
 
     return sorted(

@@ -58,17 +58,7 @@ class Mismatch(NamedTuple):
 
 
 def find_mismatch(value: Any, annotation: Any, path: KeyPath = ()) -> Mismatch | None:
-    """Return the first value, the innermost one, that msgspec does not convert to its type.
-
-    Parameters
-    ----------
-    value : object
-        Plain data.
-    annotation : type
-        As :func:`msgspec.convert` takes it.
-    path : KeyPath
-        Where the value is.
-    """
+    """Return the first value, the innermost one, that msgspec does not convert to its type."""
     try:
         msgspec.convert(value, annotation)
     except msgspec.ValidationError as error:

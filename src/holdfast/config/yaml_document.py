@@ -273,16 +273,7 @@ def _scalar(node: yaml.ScalarNode) -> Any:
 def dotted(path: KeyPath) -> str:
     """Return a path as people write it: ``model.holes[2].center``.
 
-    Parameters
-    ----------
-    path : KeyPath
-        Keys and list indices.
-
-    Returns
-    -------
-    str
-        The keys joined by dots and the indices in brackets; keys from a file may be anything, so
-        long ones are cut and unprintable ones quoted.
+    Keys from a file may be anything, so long ones are cut and unprintable ones quoted.
     """
     text = ""
     for part in path:
@@ -303,11 +294,6 @@ def read(content: bytes, name: str) -> Document:
         The document, in UTF-8.
     name : str
         What to call it in messages, usually its path.
-
-    Returns
-    -------
-    Document
-        The data (None for an empty document) and the lines of its keys.
 
     Raises
     ------
@@ -351,11 +337,6 @@ def _place(mark: yaml.Mark | None) -> str:
 
 def write(data: Mapping[str, Any]) -> str:
     """Write plain data as YAML that :func:`read` gives back unchanged.
-
-    Parameters
-    ----------
-    data : mapping
-        None, bool, int, float, str, and lists and mappings of these.
 
     Returns
     -------

@@ -108,11 +108,6 @@ def compare_runs(first: Path, second: Path) -> Comparison:
     first, second : Path
         The directory of a run, or its journal. Nobody may be using it.
 
-    Returns
-    -------
-    Comparison
-        With the first difference, if there is one.
-
     Raises
     ------
     OutputError

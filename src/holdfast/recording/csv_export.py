@@ -12,7 +12,6 @@ import json
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self, TextIO
 
 from holdfast.arrays import FloatArray
@@ -34,15 +33,7 @@ TABLES = ("trials.csv", "steps.csv", "beliefs.csv", "events.csv")
 
 
 class CsvSink:
-    """Writes the facts of a run as tables; to be used in a ``with`` statement.
-
-    Parameters
-    ----------
-    directory : Path
-        Where the tables are made; it is there, and empty.
-    problem : Problem
-        Of the run: the state's labels are the names of columns.
-    """
+    """Writes the facts of a run as tables; to be used in a ``with`` statement."""
 
     def __init__(self, directory: Path, problem: Problem) -> None:
         self._actions = [str(label) for label in problem.sensing_actions]
@@ -93,12 +84,7 @@ class CsvSink:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self._close.close()
 
     @property

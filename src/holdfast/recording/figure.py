@@ -95,13 +95,6 @@ STYLE: Any = {
 def trial_figure(configuration: Configuration, record: TrialRecord, path: Path) -> None:
     """Draw a trial and write the picture as PNG.
 
-    Parameters
-    ----------
-    configuration : Configuration
-        Of the run.
-    record : TrialRecord
-    path : Path
-
     Raises
     ------
     OutputError

@@ -237,11 +237,6 @@ def connect_to_read(path: Path, close: contextlib.ExitStack) -> sqlite3.Connecti
     SQLite reads a log only where it may write beside it. So if there is a log, both are copied, and
     the copy is read; a file without a log is read in place.
 
-    Parameters
-    ----------
-    close : ExitStack
-        Removes the copy.
-
     Raises
     ------
     OutputError

@@ -10,7 +10,6 @@ import contextlib
 import sqlite3
 from collections.abc import Iterator
 from pathlib import Path
-from types import TracebackType
 from typing import NamedTuple, Self
 
 import msgspec
@@ -133,12 +132,7 @@ class JournalReader:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
     def check(self) -> None:
@@ -306,13 +300,7 @@ class JournalReader:
         return Tally(finished, successes, failures)
 
     def results(self, *, with_decisions: bool = False) -> Iterator[TrialResult]:
-        """Yield the results in the order of their trials.
-
-        Parameters
-        ----------
-        with_decisions : bool
-            Whether to read the decisions as well; else they are None.
-        """
+        """Yield the results in the order of their trials."""
         with self._errors():
             for trial, blob, checksum in self._connection.execute(
                 "SELECT trial, result, result_checksum FROM trials ORDER BY trial"

@@ -282,18 +282,8 @@ def effects_of(
 ) -> tuple[OutcomeEffect, ...]:
     """Compare the results of two runs, the first the baseline.
 
-    Parameters
-    ----------
-    first, second : sequence of TrialResult
-        If paired, of the same trials in the same order.
-    step_limit : int
-        What a trial counts that did not reach the goal.
-    paired : bool
-
-    Returns
-    -------
-    tuple of OutcomeEffect
-        Of each measure that at least two trials have in either run.
+    If ``paired``, they are of the same trials in the same order. A measure that fewer than two
+    trials of a run have is left out.
     """
     effects = (
         _effect_of(measure, (first, second), step_limit, paired=paired) for measure in _MEASURES

@@ -80,11 +80,6 @@ class TrialRecord:
 class Recorder:
     """An observer that records one trial and ignores all others.
 
-    Parameters
-    ----------
-    trial : int
-        Number of the trial to record.
-
     Attributes
     ----------
     record : TrialRecord

@@ -66,14 +66,8 @@ def repeat(
 ) -> Repetition:
     """Run a trial again with the planner in this process.
 
-    Parameters
-    ----------
-    kept : Decisions
-        Of the trial as it was.
-    recorded : RecordedEnvironment or None
-        Its world, from the beginning; None for a simulated one.
-    anew : bool
-        Whether to build the problem anew, as a service does.
+    ``kept`` are its decisions as they were, ``recorded`` its world from the beginning (None for a
+    simulated one). ``anew`` builds the problem anew, as a service does.
     """
     problem = configuration.problem
     if anew:
@@ -116,14 +110,7 @@ def wrong_service(
 ) -> str | None:
     """Return the service that decided otherwise than this process does, if one certainly did.
 
-    Parameters
-    ----------
-    first : Repetition
-        With a deviation.
-    again : callable
-        Runs the trial once more; it is not called where no service decided.
-    timings : Path
-        The run's ``timings.csv``.
+    ``again`` runs the trial once more; it is not called where no service decided.
 
     Returns
     -------

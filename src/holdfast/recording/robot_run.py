@@ -61,27 +61,9 @@ def perform_trials(
     watch: Callable[[EventSink], RobotWatch] | None = None,
     observer: RobotObserver | None = None,
 ) -> int:
-    """Run the missing trials one after another.
+    """Run the missing trials one after another; return how many ticks of the rate were missed.
 
-    Parameters
-    ----------
-    directory : RunDirectory
-        Its journal keeps each step.
-    maker : EnvironmentMaker
-        Makes what the robot acts on.
-    on_result : callable
-        Gets each trial's result, and keeps it.
-    rate_hz : float or None
-        Task actions a second; None acts as soon as possible.
-    sinks : sequence of EventSink
-        Get the events, besides the run's own log; they are closed at the end.
-    watch : callable or None
-        Makes the watch that publishes the robot's state, given the log of events.
-
-    Returns
-    -------
-    int
-        Ticks of the rate that were missed.
+    The ``sinks`` get the events, besides the run's own log, and are closed at the end.
 
     Raises
     ------

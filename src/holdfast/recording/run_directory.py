@@ -13,7 +13,6 @@ import contextlib
 import tempfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 import msgspec
@@ -66,16 +65,6 @@ class RunDirectory:
 
     Use :meth:`create`, :meth:`resume` or :meth:`resume_if_begun`, and close it or use it in a
     ``with`` statement.
-
-    Parameters
-    ----------
-    path : Path
-        The directory.
-    configuration : Configuration
-    journal : Journal
-        Open.
-    services_before : tuple of str or None
-        Those of the earlier part, if the run was resumed.
     """
 
     def __init__(
@@ -228,11 +217,6 @@ class RunDirectory:
         ----------
         wall_time_s : float
             Of this part of the run; that of earlier parts is added.
-
-        Returns
-        -------
-        RunSummary
-            The content of ``summary.json``.
         """
         total_s = self.earlier_wall_time_s + wall_time_s
         self.journal.set_meta("wall_time_s", repr(total_s))
@@ -263,12 +247,7 @@ class RunDirectory:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
 

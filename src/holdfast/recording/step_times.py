@@ -44,13 +44,7 @@ class TrialTimes(NamedTuple):
 
 
 class StepClock:
-    """Assigns times to the moments of one trial after the other; they only grow.
-
-    Parameters
-    ----------
-    period_ns : int
-        Of a step without recorded times.
-    """
+    """Assigns times to the moments of one trial after the other; they only grow."""
 
     def __init__(self, period_ns: int) -> None:
         self._period_ns = max(period_ns, MOMENTS * _LEAST_GAP_NS)
@@ -59,15 +53,7 @@ class StepClock:
     def next_trial(
         self, steps: int, rows: Mapping[tuple[int, str], TimingRow], end_ns: int | None
     ) -> IntArray:
-        """Return the times of all moments of a trial and of its end, in nanoseconds.
-
-        Parameters
-        ----------
-        rows : mapping
-            Recorded times, by step and kind. Moments between two of them are spread evenly.
-        end_ns : int or None
-            When the trial ended, where that is recorded.
-        """
+        """Return the times of all moments of a trial and of its end, in nanoseconds."""
         count = MOMENTS * (steps + 1)
         part_ns = self._period_ns / MOMENTS
         known = [

@@ -126,11 +126,6 @@ def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
     """Return the 95 % interval for a rate, by Wilson's score.
 
     It is right near 0 and 1, too, and never leaves them.
-
-    Parameters
-    ----------
-    successes, trials : int
-        Counts; ``trials`` is at least 1.
     """
     z_squared = _NORMAL_QUANTILE_975**2
     rate = successes / trials
@@ -195,17 +190,7 @@ class SummaryBuilder:
         answers: AnswerCounts | None = None,
         verified: VerificationCounts | None = None,
     ) -> RunSummary:
-        """Return the summary.
-
-        Parameters
-        ----------
-        trials : int
-            Trials that the configuration asks for.
-        answers : AnswerCounts or None
-            Who decided, if known.
-        verified : VerificationCounts or None
-            If services decided.
-        """
+        """Return the summary."""
         count = self._finished
         median = p99 = None
         if self._sensing_ms:

@@ -55,13 +55,6 @@ VERIFICATION_COLUMNS = ("trial", "step", "service", "kind", "verdict", "time")
 class _Table:
     """A file of rows, open for more; its last column says when, as ``events.jsonl`` writes times.
 
-    Parameters
-    ----------
-    path : Path
-        Appended to if it is there.
-    clock : callable
-        Returns nanoseconds since the epoch.
-
     Raises
     ------
     OutputError
@@ -225,11 +218,6 @@ class AnswerCounts(NamedTuple):
 
 def count_answers(path: Path, trials: Container[int]) -> AnswerCounts | None:
     """Count the rows of a run's ``timings.csv``.
-
-    Parameters
-    ----------
-    trials : container of int
-        Those that count.
 
     Returns
     -------

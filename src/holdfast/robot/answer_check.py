@@ -20,17 +20,7 @@ __all__ = ["AnswerChecker"]
 
 
 class AnswerChecker:
-    """Answers questions with a planner, on its own thread.
-
-    Parameters
-    ----------
-    make_planner : callable
-        Builds the planner with its own instance of the problem.
-    describe_error : callable
-        Turns an error of the problem's code into a message.
-    deliver : callable
-        Takes each answer, on that thread.
-    """
+    """Answers questions with a planner, on its own thread."""
 
     def __init__(
         self,

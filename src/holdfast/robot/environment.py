@@ -122,13 +122,7 @@ class SimulatedEnvironment:
 
     @classmethod
     def after(cls, problem: Problem, seed: int, trial: int, actions: Sequence[FloatArray]) -> Self:
-        """Return the world as it is after these task actions: they are performed again.
-
-        Parameters
-        ----------
-        actions : sequence of array of shape (action_size,)
-            Executed task actions from the beginning of the trial on.
-        """
+        """Return the world as it is after these task actions: they are performed again."""
         environment = cls(problem, seed, trial)
         for action in actions:
             environment.perform(action)
@@ -314,11 +308,6 @@ class EnvironmentMaker:
 
 def load_environment(configuration: Configuration) -> EnvironmentMaker:
     """Find the environment that a configuration names.
-
-    Returns
-    -------
-    EnvironmentMaker
-        Calling it with the number of a trial makes the trial's environment.
 
     Raises
     ------

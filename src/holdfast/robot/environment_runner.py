@@ -59,18 +59,7 @@ def make_runner(
     resumed: bool = False,
     performed: Sequence[FloatArray] = (),
 ) -> EnvironmentRunner:
-    """Return the runner of a trial in the configuration's environment.
-
-    Parameters
-    ----------
-    deliver : callable
-        Takes the events. It must not block.
-    resumed : bool, optional
-        Whether the robot's process has died during this trial. Then an environment that counts its
-        task actions is asked for the count.
-    performed : sequence of array, optional
-        Task actions performed in this trial before.
-    """
+    """Return the runner of a trial in the configuration's environment."""
 
     def make() -> Environment:
         return maker(trial, resumed=resumed, performed=performed)
@@ -85,10 +74,7 @@ def make_runner(
 class _CheckedEnvironment:
     """An environment whose results are checked and become events.
 
-    Parameters
-    ----------
-    passed_on : tuple of type
-        Exceptions that are raised and do not become an event.
+    Exceptions of the types ``passed_on`` are raised instead.
     """
 
     def __init__(
@@ -261,18 +247,8 @@ class EnvironmentRunner(abc.ABC):
     """Calls the environment of one trial, one call at a time.
 
     Each call leads to one event: at once, or later from another thread. After a failure every
-    further call fails. After ``close`` no event comes.
-
-    Parameters
-    ----------
-    make : callable
-        Makes the environment.
-    deliver : callable
-        Takes the events. It must not block.
-    name : str
-        Of the environment, for messages.
-    resumed : bool, optional
-        Whether to ask how many task actions have been performed.
+    further call fails. After ``close`` no event comes. ``deliver`` takes the events; it must not
+    block.
     """
 
     _passed_on: tuple[type[BaseException], ...] = ()
@@ -295,13 +271,7 @@ class EnvironmentRunner(abc.ABC):
         self._closed = False
 
     def begin(self, step: int = 0) -> None:
-        """Make the environment: :class:`Begun`. Comes first.
-
-        Parameters
-        ----------
-        step : int
-            At which the trial begins or continues; reported with a failure.
-        """
+        """Make the environment: :class:`Begun`. Comes first."""
         self._call(step, "begin", lambda: self._checked.begin(step))
 
     def sense(self, step: int, sensing_action: int) -> None:

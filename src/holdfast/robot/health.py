@@ -40,15 +40,7 @@ class Condition(NamedTuple):
 
 
 class RobotWatch:
-    """Reports a robot's condition.
-
-    Parameters
-    ----------
-    health : HttpAddress or None
-        Where to answer ``/livez`` and ``/readyz``.
-    events : EventSink
-        Gets the address.
-    """
+    """Reports a robot's condition."""
 
     def __init__(
         self, manager: ServiceManager, health: HttpAddress | None, events: EventSink

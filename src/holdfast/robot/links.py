@@ -103,13 +103,6 @@ def check_services(configuration: Configuration, source: str | None = "") -> Non
 def make_links(configuration: Configuration, log_path: Path | None, events: EventSink) -> Links:
     """Make the links that a configuration asks for.
 
-    Parameters
-    ----------
-    log_path : Path or None
-        Gets what the local service writes.
-    events : EventSink
-        Gets an event of each insecure link.
-
     Raises
     ------
     TransportError

@@ -55,13 +55,7 @@ class MemoCache:
 
 
 class MemoizingPlanner(Planner):
-    """A planner that shares its results with others through a cache.
-
-    Parameters
-    ----------
-    cache : MemoCache
-        For this problem and these settings alone.
-    """
+    """A planner that shares its results with others through a cache."""
 
     def __init__(self, problem: Problem, settings: PlanningSettings, cache: MemoCache) -> None:
         super().__init__(problem, settings)

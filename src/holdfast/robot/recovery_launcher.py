@@ -36,14 +36,8 @@ class RecoveryExited(NamedTuple):
 class RecoveryLauncher:
     """Starts the local service, watches it, and ends it.
 
-    Parameters
-    ----------
-    arguments : sequence of str
-        Of ``holdfast serve``.
-    deliver : callable
-        Called from a thread when a process ends other than by :meth:`launch` or :meth:`close`.
-    log_path : Path or None
-        Gets what the service writes; None for nowhere.
+    ``deliver`` is called from a thread when a process ends other than by :meth:`launch` or
+    :meth:`close`; the file at ``log_path`` gets what the service writes.
     """
 
     def __init__(

@@ -165,11 +165,6 @@ class BoundedEventLog:
     """Limits the rate of events about a service, so that no service can fill a robot's log.
 
     Changes of status always pass.
-
-    Parameters
-    ----------
-    clock : callable
-        Returns seconds.
     """
 
     def __init__(self, sink: EventSink, clock: Callable[[], float] = time.monotonic) -> None:
