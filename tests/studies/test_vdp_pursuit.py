@@ -9,13 +9,12 @@ from holdfast.arrays import FloatArray
 from holdfast.belief import Belief
 from holdfast.config.settings import ActiveSensingSettings, PlanningSettings, SelectorSettings
 from holdfast.lab.studies.vdp_pursuit import (
-    Always,
-    Chance,
-    LookRule,
-    Never,
     Pursuit,
     PursuitSettings,
-    Selector,
+    always,
+    by_chance,
+    by_selector,
+    never,
 )
 from holdfast.lab.studies.vdp_tag import (
     VdpTag,
@@ -28,7 +27,7 @@ from holdfast.lab.studies.vdp_tag import (
     value_of_plan,
     way_length,
 )
-from holdfast.lab.studies.vdp_trials import Intercept, ToNext, run_vdp_tag_trials
+from holdfast.lab.studies.vdp_trials import intercept, run_vdp_tag_trials, to_next
 from holdfast.randomness import Purpose, Stream, stream
 
 SEED = 8101
@@ -102,8 +101,8 @@ def test_a_known_target_is_met_when_it_is_said_to_be() -> None:
 
 
 def test_known_states_are_worth_more() -> None:
-    certain = run_vdp_tag_trials(Intercept(), SEED, range(20), 1, known_state=True)
-    blind = run_vdp_tag_trials(Intercept(), SEED, range(8), 50)
+    certain = run_vdp_tag_trials(intercept, SEED, range(20), 1, known_state=True)
+    blind = run_vdp_tag_trials(intercept, SEED, range(8), 50)
     assert all(result.tagged for result in certain)
     rewards = [np.mean([each.discounted_reward for each in of]) for of in (certain, blind)]
     assert rewards[0] > 60.0 > 20.0 > rewards[1]
@@ -118,26 +117,20 @@ def test_the_known_state_return_is_the_value_of_meeting_the_target() -> None:
     assert known[0] == value_of_plan(1, chance_of_tag(1))
 
 
-class Seen(LookRule):
-    """Keeps what it is asked about."""
-
-    def __init__(self) -> None:
-        self.beliefs: list[Belief] = []
-
-    def looks(self, problem: VdpTag, belief: Belief, draw: Stream) -> bool:
-        self.beliefs.append(belief)
-        return True
-
-
 def belief_of(targets: FloatArray) -> FloatArray:
     return np.concatenate([np.zeros((1, *targets.shape)), targets[np.newaxis]], axis=-1)
 
 
 def test_rules_are_asked_about_the_belief_after_the_step() -> None:
-    rule = Seen()
+    seen: list[Belief] = []
+
+    def rule(problem: VdpTag, belief: Belief, draw: Stream) -> bool:
+        seen.append(belief)
+        return True
+
     targets = np.array([1.5, 0.5]) + 0.01 * DRAW.normal((100, 2))
     steps, looks = Pursuit(rule, SMALL).decide(belief_of(targets), [DRAW])
-    (belief,) = rule.beliefs
+    (belief,) = seen
     np.testing.assert_array_equal(looks, [1])
     np.testing.assert_allclose(belief.states[:, :2], np.tile(steps, (48, 1)), atol=1e-12)
     mean = target_flow(np.array([1.5, 0.5]))
@@ -147,9 +140,9 @@ def test_rules_are_asked_about_the_belief_after_the_step() -> None:
 def test_rules_that_look_at_nothing() -> None:
     problem = VdpTag()
     belief = Belief.uniform(problem.initial_states(DRAW, 10))
-    assert not Never().looks(problem, belief, DRAW)
-    assert Always().looks(problem, belief, DRAW)
-    drawn = [Chance(0.3).looks(problem, belief, DRAW.substream(i)) for i in range(1000)]
+    assert not never(problem, belief, DRAW)
+    assert always(problem, belief, DRAW)
+    drawn = [by_chance(0.3)(problem, belief, DRAW.substream(i)) for i in range(1000)]
     # Five standard errors.
     assert abs(np.mean(drawn) - 0.3) < 5.0 * np.sqrt(0.21 / 1000)
 
@@ -161,8 +154,8 @@ def test_a_selector_looks_for_enough_nats() -> None:
     planning = PlanningSettings(
         selector=SelectorSettings(method="state_entropy"), active_sensing=sensing
     )
-    assert Selector(planning, -50.0).looks(problem, belief, DRAW)
-    assert not Selector(planning, 50.0).looks(problem, belief, DRAW)
+    assert by_selector(planning, -50.0)(problem, belief, DRAW)
+    assert not by_selector(planning, 50.0)(problem, belief, DRAW)
 
 
 def test_a_selector_that_knows_the_price_is_asked_what_is_best() -> None:
@@ -176,7 +169,7 @@ def test_a_selector_that_knows_the_price_is_asked_what_is_best() -> None:
     )
     # Where the target is known, a look is not worth five.
     known = np.tile([1.0, 1.0, -1.5, -0.5], (40, 1))
-    assert not Selector(planning).looks(problem, Belief.uniform(known), DRAW)
+    assert not by_selector(planning)(problem, Belief.uniform(known), DRAW)
 
 
 def test_a_look_is_not_worth_its_price_where_all_is_known() -> None:
@@ -207,7 +200,7 @@ def test_decisions_do_not_depend_on_the_company() -> None:
 
 def test_plans_earn_more_than_heading_for_the_next_place() -> None:
     """Eight trials, and a difference of some seven standard errors."""
-    plans = run_vdp_tag_trials(Pursuit(None, SMALL), SEED, range(8), 200)
-    rival = run_vdp_tag_trials(ToNext(), SEED, range(8), 100)
+    plans = run_vdp_tag_trials(Pursuit(None, SMALL).decide, SEED, range(8), 200)
+    rival = run_vdp_tag_trials(to_next, SEED, range(8), 100)
     means = [np.mean([each.discounted_reward for each in of]) for of in (plans, rival)]
     assert means[0] > means[1] + 20.0

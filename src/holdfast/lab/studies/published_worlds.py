@@ -16,10 +16,9 @@ Seed 8001 chose the thresholds of the rules and how far plans look ahead; seed 8
 
 from __future__ import annotations
 
-import csv
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from importlib import resources
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -41,14 +40,14 @@ from holdfast.lab.studies.study import Number, Report, Results, Scale
 from holdfast.lab.studies.tables import Cell
 from holdfast.lab.studies.tasks import Task
 from holdfast.lab.studies.trial_files import rounded
-from holdfast.lab.studies.vdp_pursuit import Always, Chance, Never, Pursuit, Selector
+from holdfast.lab.studies.vdp_pursuit import Pursuit, always, by_chance, by_selector, never
 from holdfast.lab.studies.vdp_tag import DISCOUNT
 from holdfast.lab.studies.vdp_trials import (
-    Intercept,
-    ManageUncertainty,
-    ToNext,
     VdpTagPolicy,
+    intercept,
+    manage_uncertainty,
     run_vdp_tag_trials,
+    to_next,
 )
 from holdfast.randomness import Stream
 
@@ -79,8 +78,6 @@ class Way(NamedTuple):
 
     Attributes
     ----------
-    policy : callable
-        Makes it.
     trials : int
         As many as its standard error needs.
     published : bool
@@ -89,19 +86,17 @@ class Way(NamedTuple):
         Whether it is told the true state.
     """
 
-    policy: Callable[[], VdpTagPolicy]
+    policy: VdpTagPolicy
     trials: int
     num_particles: int = _PARTICLES
     published: bool = False
     known_state: bool = False
 
 
-def _by_selector(
-    least_nats: float, selector: SelectorSettings, samples: int = 16
-) -> Callable[[], VdpTagPolicy]:
+def _selecting(least_nats: float, selector: SelectorSettings, samples: int = 16) -> VdpTagPolicy:
     sensing = ActiveSensingSettings(num_observation_samples=samples, num_cores=1, discount=DISCOUNT)
-    rule = Selector(PlanningSettings(selector=selector, active_sensing=sensing), least_nats)
-    return lambda: Pursuit(rule)
+    planning = PlanningSettings(selector=selector, active_sensing=sensing)
+    return Pursuit(by_selector(planning, least_nats)).decide
 
 
 _EXPECTED_RETURN = SelectorSettings(
@@ -109,17 +104,17 @@ _EXPECTED_RETURN = SelectorSettings(
 )
 
 WAYS: Mapping[str, Way] = {
-    "to_next": Way(ToNext, 1000, _FEW_PARTICLES, published=True),
-    "manage_uncertainty": Way(ManageUncertainty, 1000, _FEW_PARTICLES, published=True),
-    BEST: Way(Pursuit, 1000),
-    "known state": Way(Intercept, 1000, 1, known_state=True),
-    "always looks": Way(lambda: Pursuit(Always()), 200),
-    "random looks": Way(lambda: Pursuit(Chance(0.4)), 200),
-    "state entropy": Way(_by_selector(0.6, SelectorSettings(method="state_entropy")), 200),
-    "action entropy": Way(_by_selector(0.25, SelectorSettings()), 200),
-    "path entropy": Way(_by_selector(0.4, SelectorSettings(method="path_entropy")), 60),
-    "never looks": Way(lambda: Pursuit(Never()), 60),
-    "expected return": Way(_by_selector(0.0, _EXPECTED_RETURN, 8), 60),
+    "to_next": Way(to_next, 1000, _FEW_PARTICLES, published=True),
+    "manage_uncertainty": Way(manage_uncertainty, 1000, _FEW_PARTICLES, published=True),
+    BEST: Way(Pursuit().decide, 1000),
+    "known state": Way(intercept, 1000, 1, known_state=True),
+    "always looks": Way(Pursuit(always).decide, 200),
+    "random looks": Way(Pursuit(by_chance(0.4)).decide, 200),
+    "state entropy": Way(_selecting(0.6, SelectorSettings(method="state_entropy")), 200),
+    "action entropy": Way(_selecting(0.25, SelectorSettings()), 200),
+    "path entropy": Way(_selecting(0.4, SelectorSettings(method="path_entropy")), 60),
+    "never looks": Way(Pursuit(never).decide, 60),
+    "expected return": Way(_selecting(0.0, _EXPECTED_RETURN, 8), 60),
 }
 """By the names that tables give them. All but the published heuristics and the one that is told the
 true state (a bound) make the same plans, and differ in when they look. Selectors that know no price
@@ -188,7 +183,7 @@ def run_vdp_tag(way: str, seed: int, first_trial: int, num_trials: int) -> pd.Da
     if way not in WAYS:
         raise TaskError(f"way {way!r}: there are {', '.join(WAYS)}")
     chosen = WAYS[way]
-    policy = _Timed(chosen.policy())
+    policy = _Timed(chosen.policy)
     trials = run_vdp_tag_trials(
         policy,
         seed,
@@ -213,9 +208,9 @@ class _Timed:
         self.seconds = 0.0
         self.decisions = 0
 
-    def decide(self, beliefs: FloatArray, draws: Sequence[Stream]) -> tuple[FloatArray, IntArray]:
+    def __call__(self, beliefs: FloatArray, draws: Sequence[Stream]) -> tuple[FloatArray, IntArray]:
         began = time.process_time()
-        decided = self._policy.decide(beliefs, draws)
+        decided = self._policy(beliefs, draws)
         self.seconds += time.process_time() - began
         self.decisions += len(draws)
         return decided
@@ -232,12 +227,11 @@ class PublishedPlanner(NamedTuple):
 def published_planners() -> dict[str, PublishedPlanner]:
     """Return the published figures, by the planners' names."""
     file = resources.files("holdfast.lab.studies") / "data" / "vdp_tag_2018.csv"
-    rows = csv.DictReader(file.read_text().splitlines())
+    with file.open() as lines:
+        rows = pd.read_csv(lines)[["planner", "trials", "mean_discounted_reward", "standard_error"]]
     return {
-        row["planner"]: PublishedPlanner(
-            int(row["trials"]), float(row["mean_discounted_reward"]), float(row["standard_error"])
-        )
-        for row in rows
+        planner: PublishedPlanner(*figures)
+        for planner, *figures in rows.itertuples(index=False, name=None)
     }
 
 

@@ -15,8 +15,8 @@ selectors, say, asked about the belief that the step leads to.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import NamedTuple, Protocol
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -44,7 +44,15 @@ from holdfast.lab.studies.vdp_tag import (
 from holdfast.randomness import Stream
 from holdfast.sensing import choose_sensing_action
 
-__all__ = ["Always", "Chance", "LookRule", "Never", "Pursuit", "PursuitSettings", "Selector"]
+__all__ = [
+    "LookRule",
+    "Pursuit",
+    "PursuitSettings",
+    "always",
+    "by_chance",
+    "by_selector",
+    "never",
+]
 
 
 class PursuitSettings(NamedTuple):
@@ -83,79 +91,43 @@ class PursuitSettings(NamedTuple):
     residual: float = 6.0
 
 
-class LookRule(Protocol):
-    """Whether to look after a step."""
-
-    def looks(self, problem: VdpTag, belief: Belief, draw: Stream) -> bool:
-        """Tell whether to look.
-
-        Parameters
-        ----------
-        belief : Belief
-            That the step leads to.
-        draw : Stream
-            Random numbers of this decision.
-        """
-        ...
+LookRule: TypeAlias = Callable[[VdpTag, Belief, Stream], bool]
+"""Tells whether to look after a step, from the belief that the step leads to and from random
+numbers of this decision."""
 
 
-class Never:
-    """Does not look."""
-
-    def looks(self, problem: VdpTag, belief: Belief, draw: Stream) -> bool:
-        """Return False."""
-        del problem, belief, draw
-        return False
+def never(problem: VdpTag, belief: Belief, draw: Stream) -> bool:
+    """Do not look."""
+    del problem, belief, draw
+    return False
 
 
-class Always:
-    """Looks at each step."""
-
-    def looks(self, problem: VdpTag, belief: Belief, draw: Stream) -> bool:
-        """Return True."""
-        del problem, belief, draw
-        return True
+def always(problem: VdpTag, belief: Belief, draw: Stream) -> bool:
+    """Look at each step."""
+    del problem, belief, draw
+    return True
 
 
-class Chance(NamedTuple):
-    """Looks at some steps, by chance.
+def by_chance(share: float) -> LookRule:
+    """Return the rule that looks at a share of the steps, by chance."""
+    return lambda _problem, _belief, draw: float(draw.uniform()) < share
 
-    Attributes
-    ----------
-    share : float
-        Of the steps.
+
+def by_selector(planning: PlanningSettings, least_nats: float = 0.0) -> LookRule:
+    """Return the rule that looks if one of holdfast's selectors would.
+
+    A selector that knows no price looks if that takes at least so many nats of entropy.
     """
 
-    share: float
-
-    def looks(self, problem: VdpTag, belief: Belief, draw: Stream) -> bool:
-        """Draw."""
-        del problem, belief
-        return float(draw.uniform()) < self.share
-
-
-class Selector(NamedTuple):
-    """Looks if one of holdfast's selectors would.
-
-    Attributes
-    ----------
-    planning : PlanningSettings
-        Of the selector.
-    least_nats : float
-        By how much a look must reduce the entropy of a selector that knows no price.
-    """
-
-    planning: PlanningSettings
-    least_nats: float = 0.0
-
-    def looks(self, problem: VdpTag, belief: Belief, draw: Stream) -> bool:
-        """Ask the selector."""
+    def rule(problem: VdpTag, belief: Belief, draw: Stream) -> bool:
         index, info = choose_sensing_action(
-            problem, self.planning, belief, 0, draw.substream(1), draw.substream(2)
+            problem, planning, belief, 0, draw.substream(1), draw.substream(2)
         )
-        if self.planning.selector.method == "expected_return" or info.entropies is None:
+        if planning.selector.method == "expected_return" or info.entropies is None:
             return index == 1
-        return float(info.entropies[0] - info.entropies[1]) > self.least_nats
+        return float(info.entropies[0] - info.entropies[1]) > least_nats
+
+    return rule
 
 
 class Pursuit:
@@ -183,7 +155,7 @@ class Pursuit:
         self._doubled_widths: FloatArray = np.asarray(
             2.0 * (variance + 0.25 * TAG_RADIUS * TAG_RADIUS), dtype=np.float64
         )
-        self._waits = not isinstance(rule, Never)
+        self._waits = rule is not never
 
     def decide(self, beliefs: FloatArray, draws: Sequence[Stream]) -> tuple[FloatArray, IntArray]:
         """Return the steps of the agents and whether to look after them."""
@@ -256,7 +228,7 @@ class _Decision:
             return best[1], best[2]
         agent = stop_at_barriers(self._agent, best[1])
         belief = self._belief(agent)
-        return best[1], int(by._rule.looks(by._problem, belief, self._draw))
+        return best[1], int(by._rule(by._problem, belief, self._draw))
 
     def _candidate(
         self, agent: FloatArray, tags: FloatArray, first: float, reach: FloatArray
@@ -267,7 +239,7 @@ class _Decision:
         weights = left / numerics.sum(left)
         waits = self._waits(agent) if by._waits else None
         looks = []
-        if by._rule is None or isinstance(by._rule, Always):
+        if by._rule is None or by._rule is always:
             looks = [self._posteriors(agent, weights)]
         found = []
         # Most places cannot be reached in time.

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import NamedTuple, Protocol
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
 from holdfast import _kernel, numerics
 from holdfast.arrays import BoolArray, FloatArray, IntArray
 from holdfast.belief import Belief, resample, uniform_weights
-from holdfast.errors import InvalidValueError
 from holdfast.lab.studies.vdp_tag import (
     DISCOUNT,
     MAX_STEPS,
@@ -26,87 +25,63 @@ from holdfast.lab.studies.vdp_tag import (
 from holdfast.randomness import Purpose, Stream, stream
 
 __all__ = [
-    "Intercept",
-    "ManageUncertainty",
-    "ToNext",
     "VdpTagPolicy",
     "VdpTagTrial",
+    "intercept",
+    "manage_uncertainty",
     "run_vdp_tag_trials",
+    "to_next",
 ]
 
-
-class VdpTagPolicy(Protocol):
-    """Chooses a step and whether to look, both before the step is made."""
-
-    def decide(self, beliefs: FloatArray, draws: Sequence[Stream]) -> tuple[FloatArray, IntArray]:
-        """Return the steps of the agents, shape (b, 2), and the sensing actions after them, (b,).
-
-        Parameters
-        ----------
-        beliefs : array of shape (b, n, 4)
-            Of each of ``b`` trials n equally likely states; all n have the agent at one place.
-        draws : sequence of Stream
-            Random numbers of each decision.
-        """
-        ...
+_LARGEST_AREA = 0.01
+"""Of the target's uncertainty without a look, in the unit of the plane, squared."""
 
 
-class ToNext:
-    """The published heuristic ``to_next``.
+VdpTagPolicy: TypeAlias = Callable[[FloatArray, Sequence[Stream]], tuple[FloatArray, IntArray]]
+"""Chooses a step and whether to look, both before the step is made.
+
+It gets beliefs of shape (b, n, 4), of each of ``b`` trials n equally likely states, which all have
+the agent at one place; and random numbers of each decision. It returns the steps of the agents,
+shape (b, 2), and the sensing actions after them, (b,)."""
+
+
+def to_next(beliefs: FloatArray, draws: Sequence[Stream]) -> tuple[FloatArray, IntArray]:
+    """Decide as the published heuristic ``to_next``.
 
     It heads for where the target of a random particle will be after the next step, and never looks.
     """
-
-    def decide(self, beliefs: FloatArray, draws: Sequence[Stream]) -> tuple[FloatArray, IntArray]:
-        """Return the steps, and 0 for each."""
-        count = beliefs.shape[1]
-        chosen = [int(float(draw.uniform()) * count) for draw in draws]
-        states = beliefs[np.arange(len(draws)), chosen]
-        steps = toward(target_flow(states[:, 2:]) - states[:, :2])
-        return steps, np.zeros(len(draws), dtype=np.int64)
+    count = beliefs.shape[1]
+    chosen = [int(float(draw.uniform()) * count) for draw in draws]
+    states = beliefs[np.arange(len(draws)), chosen]
+    steps = toward(target_flow(states[:, 2:]) - states[:, :2])
+    return steps, np.zeros(len(draws), dtype=np.int64)
 
 
-class Intercept:
-    """Heads for where the target of the first particle can be met first, and never looks.
+def intercept(beliefs: FloatArray, draws: Sequence[Stream]) -> tuple[FloatArray, IntArray]:
+    """Head for where the target of the first particle can be met first, and never look.
 
     With known states: what certainty would be worth.
     """
-
-    def decide(self, beliefs: FloatArray, draws: Sequence[Stream]) -> tuple[FloatArray, IntArray]:
-        """Return the steps, and 0 for each."""
-        steps, _ = interception(beliefs[:, 0, :2], beliefs[:, 0, 2:])
-        return steps, np.zeros(len(draws), dtype=np.int64)
+    steps, _ = interception(beliefs[:, 0, :2], beliefs[:, 0, 2:])
+    return steps, np.zeros(len(draws), dtype=np.int64)
 
 
-class ManageUncertainty:
-    """The published heuristic ``manage_uncertainty``.
+def manage_uncertainty(beliefs: FloatArray, draws: Sequence[Stream]) -> tuple[FloatArray, IntArray]:
+    """Decide as the published heuristic ``manage_uncertainty``.
 
     It heads for where a target at the mean will be after the next step, and looks where the square
     root of the determinant of the target's covariance exceeds a bound.
-
-    Parameters
-    ----------
-    bound : float
-        In the unit of the plane, squared.
     """
-
-    def __init__(self, bound: float = 0.01) -> None:
-        if not bound >= 0.0:
-            raise InvalidValueError(f"bound {bound}: must be at least 0")
-        self.bound = bound
-
-    def decide(self, beliefs: FloatArray, draws: Sequence[Stream]) -> tuple[FloatArray, IntArray]:
-        """Return the steps and whether to look."""
-        weights = np.full(beliefs.shape[1], 1.0 / beliefs.shape[1])
-        means = np.empty((len(draws), 2))
-        looks = np.empty(len(draws), dtype=np.int64)
-        for trial, targets in enumerate(beliefs[..., 2:]):
-            means[trial] = numerics.weighted_mean(targets, weights)
-            x, y = (targets - means[trial]).T
-            products = np.stack([x * x, x * y, y * y], axis=-1)
-            xx, xy, yy = numerics.weighted_mean(products, weights)
-            looks[trial] = np.sqrt(max(xx * yy - xy * xy, 0.0)) > self.bound
-        return toward(target_flow(means) - beliefs[:, 0, :2]), looks
+    weights = np.full(beliefs.shape[1], 1.0 / beliefs.shape[1])
+    means = np.empty((len(draws), 2))
+    looks = np.empty(len(draws), dtype=np.int64)
+    for trial, targets in enumerate(beliefs[..., 2:]):
+        means[trial] = numerics.weighted_mean(targets, weights)
+        x, y = (targets - means[trial]).T
+        products = np.stack([x * x, x * y, y * y], axis=-1)
+        xx, xy, yy = numerics.weighted_mean(products, weights)
+        looks[trial] = np.sqrt(max(xx * yy - xy * xy, 0.0)) > _LARGEST_AREA
+    return toward(target_flow(means) - beliefs[:, 0, :2]), looks
 
 
 class VdpTagTrial(NamedTuple):
@@ -162,7 +137,7 @@ def run_vdp_tag_trials(
         # The true state goes first, and moves in one go with what is believed.
         states = np.stack([run.states for run in going])
         draws = [stream(seed, run.trial, step, Purpose.SELECTION) for run in going]
-        actions, looks = policy.decide(states[:, 1:], draws)
+        actions, looks = policy(states[:, 1:], draws)
         noise = np.empty((len(going), num_particles + 1, 2))
         for run, own in zip(going, noise, strict=True):
             own[:1] = stream(seed, run.trial, step, Purpose.WORLD_MOTION).normal((1, 2))
