@@ -87,11 +87,6 @@ def draw_figures(
 ) -> list[str]:
     """Draw both figures, as PNG and as SVG.
 
-    Returns
-    -------
-    list of str
-        The names of the files.
-
     Raises
     ------
     OutputError

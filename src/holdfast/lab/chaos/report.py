@@ -77,10 +77,6 @@ class ChaosSummary(msgspec.Struct, frozen=True, kw_only=True):
         In all of them.
     steps, sensing_actions : int
         Compared with those of the reference runs and found the same.
-    jobs : int
-        Trials at a time.
-    wires : dict of str to int
-        Trials over each wire.
     left_out : dict of str to str
         Kinds that this machine cannot inject, and why.
     holdfast_version, commit : str
@@ -153,13 +149,7 @@ def summarise(
     jobs: int,
     left_out: Mapping[FaultKind, str],
 ) -> ChaosSummary:
-    """Return the summary of a series.
-
-    Parameters
-    ----------
-    trials : int
-        How many are planned.
-    """
+    """Return the summary of a series."""
     verdicts = [outcome.verdict for outcome in outcomes]
     return ChaosSummary(
         seed=plan.seed,

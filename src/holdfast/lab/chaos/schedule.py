@@ -38,7 +38,6 @@ class Schedule(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes
     ----------
-    wire : {"tcp", "tls", "unix", "udp"}
     world_seed : int
         Of the robot's run.
     launch : {"on_failure", "at_start", "never"}
@@ -117,14 +116,7 @@ def kinds_over(wire: Wire, kinds: Sequence[FaultKind]) -> tuple[FaultKind, ...]:
 def draw_schedule(
     seed: int, trial: int, kind: FaultKind, wire: Wire, combinable: Sequence[FaultKind]
 ) -> Schedule:
-    """Draw the faults of a trial.
-
-    Parameters
-    ----------
-    wire : {"tcp", "tls", "unix", "udp"}
-    combinable : sequence of FaultKind
-        The kinds that this machine can inject, for combinations.
-    """
+    """Draw the faults of a trial; a combination is of kinds that this machine can inject."""
     chance = random.Random(f"holdfast chaos {seed} {trial} {kind.value}")
     faults: list[Fault] = []
     if kind is FaultKind.COMBINATION:

@@ -37,16 +37,12 @@ class SeriesPlan(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes
     ----------
-    first : int
-        Number of the first trial.
     wires : tuple of str
         Trial n is over wire n modulo their number.
     kinds : tuple of FaultKind
         The trials over each wire are of one kind after another; each wire begins with another one.
     possible : tuple of FaultKind
         The kinds that this machine can inject, for combinations.
-    commit : str
-        Of the sources, if known.
     """
 
     seed: int
@@ -79,11 +75,6 @@ class Series:
         An empty one, or with ``resume`` that of a series that was begun.
     keep : bool
         Whether the directories of good trials stay. Those of others always do.
-
-    Attributes
-    ----------
-    outcomes : list of TrialOutcome
-        Of all finished trials, those of an earlier process too.
 
     Raises
     ------
@@ -124,16 +115,7 @@ class Series:
         on_start: Callable[[int, FaultKind], None],
         on_outcome: Callable[[TrialOutcome], None],
     ) -> None:
-        """Run the trials that are missing.
-
-        Parameters
-        ----------
-        trials : int
-            How many there are to be in all.
-        jobs : int
-            How many at the same time.
-        on_start, on_outcome : callable
-            Called with each trial, in this thread.
+        """Run the trials that are missing; the callbacks run in this thread.
 
         Raises
         ------

@@ -77,8 +77,6 @@ class TrialOutcome(msgspec.Struct, frozen=True, kw_only=True):
         ``timed_out``: the robot decided nothing for a minute, or its run took over ten.
     reason : str
         Why it is not ``identical``; otherwise empty.
-    launch : str
-        When the robot launches its local service.
     faults : tuple of FaultTimes
         Those that were injected before the robot's run was over.
     steps, sensing_actions : int
@@ -107,14 +105,7 @@ class TrialOutcome(msgspec.Struct, frozen=True, kw_only=True):
 def run_chaos_trial(
     schedule: Schedule, directory: Path, pace: Pace, cancelled: threading.Event
 ) -> TrialOutcome:
-    """Run a trial.
-
-    Parameters
-    ----------
-    directory : Path
-        An empty one; gets both runs and all logs.
-    cancelled : Event
-        Once set, the trial is given up.
+    """Run a trial in an empty directory, which gets both runs and all logs.
 
     Raises
     ------

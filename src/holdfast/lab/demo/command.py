@@ -109,13 +109,7 @@ def _run(out: Path | None, seed: int, *, quick: bool) -> Findings:
 
 
 def account(findings: Findings, directory: Path) -> str:
-    """Return the findings as text.
-
-    Parameters
-    ----------
-    directory : Path
-        Where the runs are.
-    """
+    """Return the findings as text."""
     from holdfast.lab.demo.scenario import KILLED_RUN_NAME, REFERENCE_RUN_NAME
 
     def row(label: str, *values: float | None) -> str:

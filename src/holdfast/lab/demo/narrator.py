@@ -35,8 +35,6 @@ class Narrator:
 
     Attributes
     ----------
-    statuses : list of list of str
-        The statuses that each process of the robot has had.
     status_at : float
         When the robot's status has changed last, in seconds since the epoch.
     launch_ms : float or None

@@ -144,12 +144,7 @@ class Plan(NamedTuple):
 def run_demo(
     testbed: Testbed, seed: int, plan: Plan, state: DemoState, observer: Observer
 ) -> Findings:
-    """Run the demo in the testbed's directory.
-
-    Returns
-    -------
-    Findings
-        Also written to ``findings.json``.
+    """Run the demo in the testbed's directory, which gets ``findings.json``.
 
     Raises
     ------

@@ -53,10 +53,6 @@ class DemoState:
         How long the demo will take, as far as can be known.
     changes : dict of str to list of Change
         Of each row, in order of time.
-    status : str
-        Of the robot.
-    progress : str
-        How far the robot is.
     """
 
     title: str = ""

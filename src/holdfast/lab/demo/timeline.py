@@ -74,15 +74,7 @@ _MEANINGS = {
 
 
 def timeline(state: DemoState, now_s: float, width: int, characters: Characters) -> Table:
-    """Return a table of the axis and the three bars.
-
-    Parameters
-    ----------
-    now_s : float
-        How far the bars reach.
-    width : int
-        Of the table, in characters.
-    """
+    """Return a table of the axis and the three bars."""
     num_cells = max(_MIN_WIDTH, width) - _LABEL_WIDTH - 1
     # The bars never fill the width while the demo runs.
     cell_s = max(state.expected_s, 1.02 * now_s) / num_cells
@@ -204,13 +196,7 @@ class PlainShow:
 
 
 class LiveShow:
-    """A live timeline on a terminal.
-
-    Parameters
-    ----------
-    console : Console
-        Of rich, on a terminal.
-    """
+    """A live timeline on a terminal."""
 
     def __init__(self, console: Console) -> None:
         self._console = console

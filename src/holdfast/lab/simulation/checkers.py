@@ -4,6 +4,8 @@ Nothing here calls the code that it watches, or reads its types: messages are re
 MessagePack that they are, statuses by the names that people are shown, and what the robot does is
 compared with the run that nothing disturbed (:mod:`holdfast.lab.simulation.environment_model`). A
 checker that shared code with what it checks would share its errors.
+
+A check that fails raises :class:`~holdfast.lab.errors.Violation`.
 """
 
 from __future__ import annotations
@@ -55,13 +57,7 @@ _MAX_ITEMS = 512
 
 
 def check_size(name: str, machine: object) -> None:
-    """Walk through all that a machine holds, whatever it is called.
-
-    Raises
-    ------
-    Violation
-        If a table in it has more than 512 entries.
-    """
+    """Check that no table that a machine holds has more than 512 entries, whatever it is called."""
     seen = set()
     left = [machine]
     while left:
@@ -107,13 +103,7 @@ class StatusChecker:
             self._cloud_has_answered = True
 
     def changed(self, before: object, after: object) -> None:
-        """Take note of a change.
-
-        Raises
-        ------
-        Violation
-            If it does not follow from the one before, is not in the table, or has no reason.
-        """
+        """Check that a change is in the table, follows from the status before, and has a reason."""
         if before != self._status or after not in _FOLLOWS[self._status]:
             raise Violation(f"status {before} -> {after}, where the status was {self._status}")
         if after == "local_recovery":
@@ -153,13 +143,7 @@ class WireChecker:
         self._sent[copy] = self._sent[call]
 
     def arrived(self, service: str, incarnation: int, call: int, payload: bytes) -> None:
-        """Take note of a request that a service's process gets.
-
-        Raises
-        ------
-        Violation
-            If that process has ended too few of those before.
-        """
+        """Take note of a request; its service's process must have ended enough of those before."""
         process = service, incarnation
         self._arrived[call] = process
         unended = self._unended[process] = self._unended.get(process, 0) + 1
@@ -175,14 +159,7 @@ class WireChecker:
         self._newest[place] = max(epoch, self._newest.get(place, 0))
 
     def replied(self, service: str, incarnation: int, call: int, payload: bytes) -> None:
-        """Take note of a reply.
-
-        Raises
-        ------
-        Violation
-            If it comes after the end of its call, answers a robot that has been replaced or a
-            request that was damaged, or is one too many.
-        """
+        """Check a reply: its call is open, its request was whole and of the newest epoch."""
         if call in self._ended:
             raise Violation(f"{service} replies to call {call} after its end")
         count = self._replies[call] = self._replies.get(call, 0) + 1
@@ -201,13 +178,7 @@ class WireChecker:
             )
 
     def ended(self, service: str, call: int) -> None:
-        """Take note of the end of a call.
-
-        Raises
-        ------
-        Violation
-            If it has ended before.
-        """
+        """Take note of the end of a call, which comes once."""
         if call in self._ended:
             raise Violation(f"{service} ends call {call} again")
         self._ended.add(call)
@@ -218,13 +189,7 @@ class WireChecker:
         return self._unended.get((service, incarnation), 0)
 
     def open_calls(self, count: int) -> None:
-        """Take note of how many calls to a service the robot has open.
-
-        Raises
-        ------
-        Violation
-            If these are too many.
-        """
+        """Check how many calls to a service the robot has open."""
         if count > _MAX_OPEN_CALLS:
             raise Violation(
                 f"the robot has {count} calls open to one service: allowed are {_MAX_OPEN_CALLS}"

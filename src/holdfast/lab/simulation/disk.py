@@ -32,13 +32,6 @@ class Disk:
     ----------
     forces_out : bool
         Whether each append is on the disk when it returns.
-
-    Attributes
-    ----------
-    results : dict of int to TrialResult
-        Finished trials.
-    epoch : int
-        The last that was given out.
     """
 
     def __init__(self, *, forces_out: bool) -> None:

@@ -24,11 +24,6 @@ class EnvironmentModel:
     shows_the_same : bool
         Whether what is sensed again shows the same again. In a world outside of the simulation it
         does not: a robot that has forgotten what it sensed will know something else.
-
-    Attributes
-    ----------
-    performed : int
-        Task actions so far.
     """
 
     def __init__(
@@ -50,25 +45,13 @@ class EnvironmentModel:
         return self._reference.steps[self.performed - 1].done
 
     def begin_again(self, actions: list[FloatArray]) -> None:
-        """Perform these from the beginning: this world does not outlive the robot's process.
-
-        Raises
-        ------
-        Violation
-            If these are not the first actions of the undisturbed run.
-        """
+        """Perform these from the beginning: this world does not outlive the robot's process."""
         self.performed = 0
         for step, action in enumerate(actions):
             self.act(step, action)
 
     def sense(self, step: int, sensing_action: int) -> FloatArray:
-        """Perform a sensing action and return what it shows.
-
-        Raises
-        ------
-        Violation
-            If the undisturbed run does not sense this now.
-        """
+        """Perform a sensing action and return what it shows."""
         where = f"trial {self._trial}: sensing action {sensing_action} of step {step}"
         if step != self.performed:
             raise Violation(f"{where}, where {self.performed} task actions have been performed")
@@ -86,13 +69,7 @@ class EnvironmentModel:
         return shown
 
     def act(self, step: int, action: FloatArray) -> tuple[float | None, bool]:
-        """Perform a task action; return its reward and whether the task is done.
-
-        Raises
-        ------
-        Violation
-            If the undisturbed run does not do this now.
-        """
+        """Perform a task action; return its reward and whether the task is done."""
         where = f"trial {self._trial}: task action of step {step}"
         if step != self.performed:
             again = " again" if step < self.performed else ""
@@ -108,18 +85,7 @@ class EnvironmentModel:
         return due.reward, due.done
 
     def check_end(self, result: TrialResult, *, rewards_are_known: bool) -> None:
-        """Compare what the robot has to say of the trial.
-
-        Parameters
-        ----------
-        rewards_are_known : bool
-            Whether it has heard of the reward of each action.
-
-        Raises
-        ------
-        Violation
-            If it is not that of the undisturbed run.
-        """
+        """Compare the robot's result; its reward only if it has heard of that of each action."""
         reference = self._reference
         if not result.steps == self.performed == len(reference.steps):
             raise Violation(

@@ -78,8 +78,6 @@ def explore(
     on_batch : callable
         Gets the seeds of a batch that was run, in their order, and what was seen; returns whether
         to go on.
-    batch : int
-        Seeds in one.
 
     Raises
     ------

@@ -50,13 +50,7 @@ class JobCache:
         self._taken_over = 0
 
     def outcome(self, job: Job) -> JobResult:
-        """Return the outcome of a job.
-
-        Raises
-        ------
-        Violation
-            If it is another one than the last time.
-        """
+        """Return the outcome of a job; another one than the last time is a Violation."""
         state = job.state
         identity = job.identity, None if state is None else self._digests.of(state)
         known = self._outcomes.get(identity)

@@ -98,22 +98,7 @@ class _Call:
 
 
 class Network:
-    """All links of one robot.
-
-    Parameters
-    ----------
-    checker : WireChecker
-        Sees every message.
-    deliver : callable
-        Takes the number of the robot's process and an event for it.
-    happened : callable
-        Takes each fault that has happened to a message, and how long it lasts.
-
-    Attributes
-    ----------
-    messages : int
-        Sent so far.
-    """
+    """All links of one robot."""
 
     def __init__(
         self,

@@ -52,13 +52,7 @@ class ReferenceStep(NamedTuple):
 
 
 class ReferenceRun(NamedTuple):
-    """A trial as it goes when nothing disturbs it.
-
-    Attributes
-    ----------
-    digest : str
-        Of all its decisions.
-    """
+    """A trial as it goes when nothing disturbs it."""
 
     steps: tuple[ReferenceStep, ...]
     done_at_start: bool

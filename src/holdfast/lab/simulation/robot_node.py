@@ -80,13 +80,7 @@ _WITHOUT_CONSEQUENCES = (LogEvent, Timing, ComputeOwnAnswer, VerificationNoted)
 
 
 class RobotTask:
-    """What the robot is to do.
-
-    Attributes
-    ----------
-    first_trial : int
-        The run's trials are this and those that follow.
-    """
+    """What the robot is to do."""
 
     def __init__(self, planner: Planner, run: RunSettings, seed: int, steps: int) -> None:
         self.planner = planner

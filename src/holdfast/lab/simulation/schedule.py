@@ -11,7 +11,8 @@ A schedule as text has one line for each item: what it is, and its values. Times
     message service=cloud-1 direction=from number=7 what=delay seconds=0.05
     kill_robot boundary=57 down_s=0.2
 
-What is left out has the value that it has in a run without faults.
+What is left out has the value that it has in a run without faults. docs/reliability.md explains all
+keys.
 """
 
 from __future__ import annotations
@@ -70,54 +71,7 @@ class _Item(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
 
 class RunSettings(_Item, frozen=True, kw_only=True, tag="run", tag_field="item"):
-    """What a run is like as long as nothing goes wrong.
-
-    Attributes
-    ----------
-    trial : int
-        Names what the robot senses and how it moves.
-    num_trials : int
-        Trials one after another; several are shorter, so that all take as long as one.
-    replicas : int
-        Services of the cloud.
-    launch : {"on_failure", "at_start", "never"}
-        When the local service is started.
-    deadline_ms : float or None
-        A decision that is later is asked of the local service too.
-    rate_hz : float or None
-        Task actions a second.
-    sense_s, act_s : float
-        How long the robot takes.
-    latency_s, jitter_s : float
-        Of a message, one way; the jitter keeps the order.
-    task_s, sensing_s : float
-        How long a service computes on the two parts of an answer.
-    launch_s : float
-        From a launch until the local service can be connected to.
-    workers : int
-        Of each service.
-    sessions_kept : int
-        Robots that each service remembers.
-    answers_kept : int
-        By each service, for each robot.
-    certificates : bool
-        Whether the robot proves who it is, and the others of a crowd that they are another. One of
-        these then asks for the session of the robot that is looked at, as a later process of it.
-    forgets_after_s : float
-        A service forgets a robot that it did not hear for so long.
-    environment : {"simulated", "counting", "not_counting"}
-        ``simulated`` is made anew by each process of the robot; the others are outside of it and
-        do, or do not, say how many task actions were performed.
-    journal_survives : {"process_crash", "power_cut"}
-    lease_s : float
-        A link on which one end hears nothing for so long is closed.
-    bytes_per_s : float or None
-        Messages take longer by their size, and those behind them wait; None: they do not.
-    lost_in_cut : bool
-        Whether messages sent into a cut are lost, or come when it heals.
-    robot_clock_rate, services_clock_rate : float
-        Seconds that a clock shows for each second.
-    """
+    """What a run is like as long as nothing goes wrong."""
 
     trial: Annotated[int, msgspec.Meta(ge=0, lt=NUM_TRIALS)] = 0
     num_trials: Annotated[int, msgspec.Meta(ge=1, le=4)] = 1
@@ -154,17 +108,7 @@ class RunSettings(_Item, frozen=True, kw_only=True, tag="run", tag_field="item")
 
 
 class Crash(_Item, frozen=True, kw_only=True, tag="crash", tag_field="item"):
-    """The process of a service dies and, unless it is the local one, a new one is started.
-
-    Attributes
-    ----------
-    found_after_s : float
-        Until the robot's machine knows that the link is broken; the lease bounds it.
-    keeps_memory : bool
-        The next process is as the one before: what died is every link to it.
-    for_good : bool
-        No other is started: whoever is left has to do.
-    """
+    """The process of a service dies and, unless it is the local one, a new one is started."""
 
     service: Service
     at: Seconds
@@ -213,24 +157,7 @@ class Cut(_Item, frozen=True, kw_only=True, tag="cut", tag_field="item"):
 
 
 class MessageFault(_Item, frozen=True, kw_only=True, tag="message", tag_field="item"):
-    """What happens to one message.
-
-    Attributes
-    ----------
-    service : str
-        From or to which it goes.
-    direction : {"to", "from"}
-        As the service sees it, "to" it are requests, "from" it are replies and the ends of calls.
-    number : int
-        Of the messages of that service and direction, from 0.
-    what : {"drop", "delay", "duplicate", "corrupt", "misroute"}
-        A delayed one is overtaken by those that come after it; a misrouted reply comes to the
-        newest call of the same service, even if another process of the robot has made it.
-    seconds : float
-        By which it, or its copy, is late.
-    bit : int
-        Which one is flipped, modulo the size.
-    """
+    """What happens to one message."""
 
     service: Service
     direction: Literal["to", "from"]
@@ -258,23 +185,7 @@ class Crowd(_Item, frozen=True, kw_only=True, tag="crowd", tag_field="item"):
 
 
 class KillRobot(_Item, frozen=True, kw_only=True, tag="kill_robot", tag_field="item"):
-    """The robot's process dies, between two of its effects or at any moment, and is started again.
-
-    Attributes
-    ----------
-    boundary : int
-        Effects that have been carried out in the run, by all of its processes.
-    at : float or None
-        Instead of the boundary: the time; the process may be waiting for anything then.
-    before : {"anything", "journal", "send", "sense", "act"}
-        The next effect of this kind is what it dies before: some moments are worse than others.
-    power_cut : bool
-        The whole machine dies: what of the journal was not on the disk is gone.
-    lost_appends : int
-        So many of the last appends, at most.
-    body_goes_on : bool
-        What the body was ordered to do it does all the same.
-    """
+    """The robot's process dies, between two of its effects or at any moment, and is restarted."""
 
     boundary: Count = 0
     at: Seconds | None = None
@@ -300,17 +211,7 @@ class DiskStall(_Item, frozen=True, kw_only=True, tag="disk_stall", tag_field="i
 
 
 class LaunchFault(_Item, frozen=True, kw_only=True, tag="launch", tag_field="item"):
-    """What becomes of one launch of the local service.
-
-    Attributes
-    ----------
-    number : int
-        Of all launches of the run, from 1.
-    what : {"late", "fails", "silent"}
-        It takes longer; its process ends; or it lives and is never seen.
-    seconds : float
-        Until then.
-    """
+    """What becomes of one launch of the local service."""
 
     number: Annotated[int, msgspec.Meta(ge=1, le=1000)]
     what: Literal["late", "fails", "silent"]

@@ -29,13 +29,6 @@ __all__ = ["ServiceNode"]
 class ServiceNode:
     """One service.
 
-    Parameters
-    ----------
-    clock : Clock
-        Of its machine.
-    network : Network
-        Carries its replies.
-
     Attributes
     ----------
     incarnation : int

@@ -28,14 +28,7 @@ def shrink(
 ) -> SimulationSchedule:
     """Return a smaller schedule that fails as well; the same one if there is none.
 
-    Ctrl-C ends the search with the smallest one so far.
-
-    Parameters
-    ----------
-    schedule : SimulationSchedule
-        One that fails.
-    fails : callable
-        Tells whether a schedule does; it is asked at most 2,000 times.
+    Ctrl-C, or 2,000 candidates, end the search with the smallest one so far.
     """
     smallest = schedule
     left = _MAX_RUNS

@@ -108,13 +108,7 @@ class Simulator:
         self._others = OtherRobots(self._planner, _SEED)
 
     def run(self, schedule: SimulationSchedule, *, tell: bool = False) -> RunOutcome:
-        """Run a schedule.
-
-        Parameters
-        ----------
-        tell : bool
-            Whether the story is wanted.
-        """
+        """Run a schedule."""
         task = RobotTask(self._planner, schedule.run, _SEED, _MAX_STEPS)
         return World(schedule, task, self._references, self._jobs, self._others, tell=tell).run()
 

@@ -47,24 +47,7 @@ ROBOT_LOG_NAME = "robot.log"
 
 
 class ServiceCommand:
-    """``holdfast serve`` at one endpoint; it may be killed and started again there.
-
-    Parameters
-    ----------
-    start : callable
-        Starts a process.
-    endpoint : str
-        How the robot reaches it.
-    port : int or None
-        Where it listens, if at a port.
-    proxy, namespace
-        What impairs the line to it; None where nothing does.
-
-    Attributes
-    ----------
-    ready_at : float or None
-        When the current process was ready, in seconds since the epoch.
-    """
+    """``holdfast serve`` at one endpoint; it may be killed and started again there."""
 
     def __init__(
         self,
@@ -113,25 +96,8 @@ class ServiceCommand:
 class RobotCommand:
     """``holdfast run`` into one directory: one process, or several that resume the run.
 
-    Parameters
-    ----------
-    start : callable
-        Starts a process, given further options.
-    out : Path
-        The directory of the run.
-    steps_of_trials : sequence of int
-        Task actions of each trial, as the reference run has them.
-    rate_hz : float
-        Task actions per second.
-
-    Attributes
-    ----------
-    processes : list of Process
-        All that were started.
-    events : list of LogEvent
-        Of all its processes, in order.
-    is_done : bool
-        Whether the run has ended well.
+    ``steps_of_trials`` has the task actions of each trial, as in the reference run; ``events`` are
+    those of all its processes, in order.
     """
 
     def __init__(
@@ -204,10 +170,6 @@ class Testbed:
     temporary : Path
         A directory for as long as the testbed lasts, also the processes' own for temporary files.
         Its path is short, because local sockets lie there.
-    robot_or_none : RobotCommand or None
-        The robot that was started last.
-    faults : list of InjectedFault
-        In order of time.
     left_behind : list of int
         Processes that had not ended by themselves after all was over, and were killed.
     """
@@ -274,15 +236,7 @@ class Testbed:
         proxy: Proxy | None = None,
         namespace: NetworkNamespace | None = None,
     ) -> ServiceCommand:
-        """Add a service, which is not started yet.
-
-        Parameters
-        ----------
-        options
-            Of ``holdfast serve``.
-        endpoint : str, optional
-            How the robot reaches it, if not where it listens.
-        """
+        """Add a service, which is not started yet; ``endpoint`` is where the robot reaches it."""
         arguments = ("serve", "--listen", listen, "--log", "json", "--until-stdin-closes", *options)
         port = listen.rpartition(":")[2]
         service = ServiceCommand(
@@ -315,13 +269,7 @@ class Testbed:
         *options: str,
         prefix: Sequence[str] = (),
     ) -> RobotCommand:
-        """Start the robot of a new run; one robot at a time.
-
-        Parameters
-        ----------
-        options
-            Of ``holdfast run``.
-        """
+        """Start the robot of a new run; one robot at a time."""
         if self.robot_or_none is not None:
             self.robot_or_none.process.close(_END_S)
             self.robot_or_none.table.close()

@@ -83,17 +83,7 @@ class FaultTimes(msgspec.Struct, frozen=True, kw_only=True):
 def times_of_faults(
     faults: Sequence[InjectedFault], log: Sequence[LogEvent], decisions: Sequence[Decision]
 ) -> list[FaultTimes]:
-    """Return the times of each fault of a run.
-
-    Parameters
-    ----------
-    faults : sequence of InjectedFault
-        In order of time.
-    log : sequence of LogEvent
-        All events of the robot.
-    decisions : sequence of Decision
-        The robot's table.
-    """
+    """Return the times of each fault of a run."""
     return [
         _times_of(fault, _end_of(fault, faults[index + 1 :]), log, decisions)
         for index, fault in enumerate(faults)

@@ -92,21 +92,7 @@ class NetworkNamespace:
                 stream.close()
 
     def drop(self, port: int, direction: Direction, share: float) -> Callable[[], None]:
-        """Drop packets of a service.
-
-        Parameters
-        ----------
-        port : int
-            Where the service listens.
-        direction : {"both", "to_service", "to_robot"}
-        share : float
-            Of the packets.
-
-        Returns
-        -------
-        callable
-            Lets them through again.
-        """
+        """Drop a share of a service's packets; return what lets them through again."""
         # Each fault has its own chain, so that it can be healed by itself.
         chain = f"{_TABLE} fault_{self._number}"
         self._number += 1
@@ -139,13 +125,7 @@ class NetworkNamespace:
 
 
 def why_no_namespace(find: Callable[[str], str | None] = shutil.which) -> str | None:
-    """Return why packets cannot be dropped on this machine; None if they can.
-
-    Parameters
-    ----------
-    find : callable
-        Finds a program by its name.
-    """
+    """Return why packets cannot be dropped on this machine; None if they can."""
     missing = [tool for tool in _TOOLS if find(tool) is None]
     if missing:
         return _absent(missing)

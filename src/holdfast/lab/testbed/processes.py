@@ -58,8 +58,6 @@ class Process:
 
     Parameters
     ----------
-    command : sequence of str
-        Such as ``(*HOLDFAST, "serve", ...)``.
     log_path : Path or None
         Its output is appended to this file.
     deliver : callable or None
@@ -73,10 +71,6 @@ class Process:
         In seconds since the epoch.
     killed_at : float or None
         When :meth:`kill` was called.
-    lines : list of str
-        Its output that is no event.
-    events : list of LogEvent
-        Its events.
 
     Raises
     ------
@@ -263,13 +257,7 @@ def free_port() -> int:
 
 
 def local_services_of(robot: int) -> list[int]:
-    """Return the processes of the local services that a robot has launched (Linux).
-
-    Parameters
-    ----------
-    robot : int
-        The robot's process.
-    """
+    """Return the processes of the local services that a robot's process has launched (Linux)."""
     found = []
     for folder in Path("/proc").glob("[0-9]*"):
         with contextlib.suppress(OSError):
@@ -282,13 +270,7 @@ def local_services_of(robot: int) -> list[int]:
 
 
 def marked_processes(name: str, value: str) -> list[int]:
-    """Return the living processes that have a variable in their environment (Linux).
-
-    Parameters
-    ----------
-    name, value : str
-        Of the variable. The children of a marked process inherit it.
-    """
+    """Return the living processes with an environment variable, which children inherit (Linux)."""
     needle = os.fsencode(f"{name}={value}")
     found = []
     for folder in Path("/proc").glob("[0-9]*"):
@@ -307,18 +289,7 @@ def _state_and_parent(folder: Path) -> tuple[str, int]:
 
 
 def end_marked_processes(name: str, value: str, patience_s: float) -> list[int]:
-    """Wait until all processes with a variable in their environment have ended, and kill the rest.
-
-    Parameters
-    ----------
-    name, value : str
-        Of the variable; see :func:`marked_processes`.
-
-    Returns
-    -------
-    list of int
-        The processes that had to be killed.
-    """
+    """Wait until all :func:`marked_processes` have ended; kill the rest and return them."""
     deadline = time.monotonic() + patience_s
     while left := marked_processes(name, value):
         if time.monotonic() > deadline:

@@ -61,10 +61,6 @@ class Impairment:
     loss : float
         Share of pieces that are late by TCP's retransmission timeout, and of datagrams that are
         dropped.
-    silent : bool
-        Nothing gets through.
-    cut : bool
-        Connections are reset and refused.
     """
 
     direction: Direction = "both"
@@ -80,12 +76,8 @@ class Proxy:
 
     Parameters
     ----------
-    place : int or Path
-        Where it listens.
     target : int or Path
         Where the service listens. If nothing does, connections are closed at once.
-    seed : str
-        Of the jitter and the losses.
     datagrams : bool
         Whether it carries datagrams between the same ports, too.
 
@@ -127,13 +119,7 @@ class Proxy:
         self.close()
 
     def impair(self, impairment: Impairment) -> Callable[[], None]:
-        """Put an impairment on the line.
-
-        Returns
-        -------
-        callable
-            Takes it away again; may be called more than once.
-        """
+        """Put an impairment on the line; return what takes it away, which may be repeated."""
         number = self._numbers
         self._numbers += 1
         self._call(self._add(number, impairment))

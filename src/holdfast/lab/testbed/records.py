@@ -25,8 +25,6 @@ class LogEvent:
     ----------
     at : float
         In seconds since the epoch.
-    fields : mapping
-        All fields of the line.
     """
 
     at: float
@@ -62,10 +60,6 @@ class Decision(NamedTuple):
         When it was carried out, in seconds since the epoch.
     kind : str
         ``sensing`` or ``task``.
-    service : str
-        The service that decided.
-    status : str
-        Of the robot.
     waited_ms : float
         How long the robot stood still for it.
     round_trip_ms : float
@@ -86,18 +80,7 @@ class Decision(NamedTuple):
 
 
 class DecisionTable:
-    """A robot's ``timings.csv``, read while it grows.
-
-    Parameters
-    ----------
-    path : Path
-        The file need not exist yet.
-
-    Attributes
-    ----------
-    rows : list of Decision
-        The rows read so far.
-    """
+    """A robot's ``timings.csv``, read while it grows; it need not exist yet."""
 
     def __init__(self, path: Path) -> None:
         self._path = path

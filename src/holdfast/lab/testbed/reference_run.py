@@ -32,8 +32,6 @@ class ReferenceRun(NamedTuple):
     ----------
     configuration : Configuration
         With as many trials as were needed.
-    steps_of_trials : tuple of int
-        Task actions of each trial.
     took_s : float
         Of the computation.
     """
@@ -50,15 +48,6 @@ def make_reference_run(
     performed: Path | None = None,
 ) -> ReferenceRun:
     """Run trials until there are enough steps, and write the directory of the run.
-
-    Parameters
-    ----------
-    write_configuration : callable
-        Writes the configuration with a number of trials, and returns its path.
-    min_steps : int
-        Trials are added until they have as many task actions together.
-    performed : Path or None
-        File for the performed task actions: see :class:`WitnessedWorld`.
 
     Raises
     ------

@@ -71,15 +71,8 @@ class DelayLine(Generic[Item]):
         From 0 to 60.
     loss : float
         Share of lost items, from 0 to 1.
-    seed : str
-        Of the losses.
     capacity : int
         Items put into a full line are lost, as in a router.
-
-    Attributes
-    ----------
-    lost : int
-        Number of lost items.
 
     Raises
     ------
@@ -126,14 +119,8 @@ class Route(NamedTuple):
     ----------
     robot_prefix, service_prefix : tuple of str
         Commands that run another one in the namespace of either end.
-    listen : str
-        The endpoint of the service.
-    connect : str
-        The same, as the robot has it.
     host : str
         By which the robot calls the service.
-    emulated_by : str
-        See :data:`Emulation`.
     carried_bytes : callable or None
         Returns the bytes of all packets sent so far, both ways, with headers and lost packets;
         None where no packets are seen.
@@ -156,13 +143,10 @@ def lay_route(
 
     Parameters
     ----------
-    transport : {"tcp", "tls", "udp"}
     round_trip_ms : float
         Half of it for each way. 0 without loss is the machine's own loopback.
     loss : float
         Share of packets that are lost, each way.
-    seed : str
-        Of the losses.
     packets : bool
         False uses a proxy even where namespaces are permitted.
 

@@ -40,12 +40,8 @@ class Performance(NamedTuple):
 
     Attributes
     ----------
-    trial, step : int
-        The step is counted by the world.
     action : str
         The bytes of its numbers, as hexadecimal.
-    process : int
-        The robot's.
     at : float
         In seconds since the epoch.
     """
@@ -60,12 +56,7 @@ class Performance(NamedTuple):
 class WitnessedWorld:
     """The world of one trial: see :class:`~holdfast.robot.environment.CountingEnvironment`.
 
-    Parameters
-    ----------
-    path : str
-        The file of the run's performances; appended to.
-    resumed : bool
-        Whether the trial goes on after the end of another robot's process.
+    A resumed trial goes on after the lines of another robot's process.
 
     Raises
     ------
@@ -116,13 +107,7 @@ class WitnessedWorld:
 
 
 def witnessed_by(path: Path) -> dict[str, Any]:
-    """Return the section ``environment`` of a configuration with this world.
-
-    Parameters
-    ----------
-    path : Path
-        The file for performances.
-    """
+    """Return the section ``environment`` of a configuration with this world."""
     return {
         "object": f"{WitnessedWorld.__module__}:{WitnessedWorld.__qualname__}",
         "arguments": {"path": str(path.resolve())},
@@ -131,11 +116,6 @@ def witnessed_by(path: Path) -> dict[str, Any]:
 
 def performances(path: Path) -> Iterator[Performance]:
     """Yield the performed task actions, in order.
-
-    Parameters
-    ----------
-    path : Path
-        The file of a :class:`WitnessedWorld`.
 
     Raises
     ------
@@ -158,15 +138,8 @@ def performances(path: Path) -> Iterator[Performance]:
 def difference_of_performances(expected: Path, found: Path) -> str | None:
     """Describe the first difference between two worlds' performances; None if there is none.
 
-    Parameters
-    ----------
-    expected, found : Path
-        Their files. A file that does not exist has no lines.
-
-    Returns
-    -------
-    str or None
-        Also names two processes that acted alternately, for only one robot may act at a time.
+    Two processes that acted alternately are one, for only one robot may act at a time. A file that
+    does not exist has no lines.
     """
     first, second = (
         [] if not path.exists() else list(performances(path)) for path in (expected, found)
