@@ -33,21 +33,18 @@ from holdfast.ros.field_paths import Path, check_path, find_type, parse_path
 
 __all__ = ["ROBOT_PARAMETERS", "ObservationTopic", "RobotCall", "RobotInterface"]
 
-ROLES = ("sense", "act", "done", "steps", "reset")
-
 _SENSE, _ACT, _ACT_SERVICE, _TRIAL = (
     f"holdfast_interfaces/{name}" for name in ("srv/Sense", "action/Act", "srv/Act", "srv/Trial")
 )
 
-_DEFAULT_TYPES = {"sense": _SENSE, "act": _ACT, "done": _TRIAL, "steps": _TRIAL, "reset": _TRIAL}
-
-_DEFAULT_NAMES = {
-    "sense": "robot/sense",
-    "act": "robot/act",
-    "done": "robot/trial",
-    "steps": "robot/trial",
-    "reset": "robot/trial",
+_DEFAULTS = {
+    "sense": ("robot/sense", _SENSE),
+    "act": ("robot/act", _ACT),
+    **dict.fromkeys(("done", "steps", "reset"), ("robot/trial", _TRIAL)),
 }
+"""Name and type by role."""
+
+ROLES = tuple(_DEFAULTS)
 
 _OF_ALL: Mapping[str, tuple[object, str]] = {
     "name": (
@@ -142,13 +139,12 @@ _READY_MADE: Mapping[tuple[str, str], Mapping[str, object]] = {
     ("steps", _TRIAL): {"trial": "trial", "steps": "steps"},
     ("reset", _TRIAL): {"trial": "trial", "constants": ["begin: true"]},
 }
-_READY_MADE_ANSWER = {"success": "success", "message": "message"}
 
 _PART = 0.45
 """Of ``environment.timeout_ms``: it is for a task action and for asking whether it was the last."""
 
-_OF_THE_SETTINGS = ("kind", "object", "directory", "timeout_ms")
-"""Keys of the section ``environment`` that are not about ROS; so are those in ``arguments``."""
+_OF_THE_SETTINGS = ("kind", "object", "directory", "timeout_ms", "arguments")
+"""Keys of the section ``environment`` that are not about ROS."""
 
 _REQUEST_KEYS = ("trial", "step", "index", "label", "fields", "action")
 _ANSWER_KEYS = ("success", "message", "reward", "done", "failed", "steps")
@@ -285,19 +281,21 @@ class RobotInterface:
         values, section = self._values, f"environment.{role}."
         type_name = values.text(f"{section}type")
         by_default = own and (not type_name or role in ("done", "steps", "reset"))
-        name = values.text(f"{section}name") or ("" if by_default else _DEFAULT_NAMES[role])
+        default_name, default_type = _DEFAULTS[role]
+        name = values.text(f"{section}name") or ("" if by_default else default_name)
         if name in ("", "none"):
             for key in (*_OF_ALL, *_OWN[role]):
                 if key != "name" and values.is_given(f"{section}{key}"):
                     raise ConfigurationError(f"{section}{key} needs {section}name")
             return None
-        type_name = type_name or _DEFAULT_TYPES[role]
+        type_name = type_name or default_type
         kinds = ("srv", "action", "msg") if role == "done" else ("srv", "action")
         found = find_type(type_name, f"{section}type", kinds)
         kind = type_name.split("/")[1]
         ready: Mapping[str, object] = {}
         if (role, type_name) in _READY_MADE:
-            ready = {**_READY_MADE[role, type_name], **_READY_MADE_ANSWER}
+            answered = {"success": "success", "message": "message"}
+            ready = {**_READY_MADE[role, type_name], **answered}
         texts = {
             key: values.texts(f"{section}{key}", ready.get(key, []))
             for key, (default, _) in (*_OF_ALL.items(), *_OWN[role].items())
@@ -334,14 +332,13 @@ class RobotInterface:
             for path in paths.get(key, ()):
                 check_path(answers, path, f"{section}{key}")
         self._check_observation(answers, texts.get("observation", []), f"{section}observation")
-        default_ms = _PART * self._timeout_ms
         call = RobotCall(
             role,
             name,
             type_name,
             kind,
             found,
-            1e-3 * (values.positive(f"{section}timeout_ms", default_ms) or default_ms),
+            1e-3 * values.positive(f"{section}timeout_ms", _PART * self._timeout_ms),
             paths,
             texts.get("observation", []),
             constants,
@@ -352,9 +349,8 @@ class RobotInterface:
         return call
 
     def _check_sizes(self, call: RobotCall) -> None:
-        for key in (*_OF_ALL, *_OWN[call.role]):
-            many = key in ("fields", "action")
-            if not many and len(call.paths.get(key, ())) > 1:
+        for key, paths in call.paths.items():
+            if len(paths) > 1 and key not in ("fields", "action"):
                 raise ConfigurationError(f"{call.key(key)} must name one field")
         if call.role == "sense":
             fields, values = len(call.paths.get("fields", ())), len(call.values)
@@ -446,10 +442,7 @@ class _Values:
     def __init__(self, given: Mapping[str, object]) -> None:
         self._given = given
         for key in given:
-            if key not in ROBOT_PARAMETERS and key.split(".")[1] not in (
-                *_OF_THE_SETTINGS,
-                "arguments",
-            ):
+            if key not in ROBOT_PARAMETERS and key.split(".")[1] not in _OF_THE_SETTINGS:
                 close = difflib.get_close_matches(key, ROBOT_PARAMETERS, n=1)
                 suggestion = f"; did you mean {close[0]}?" if close else ""
                 raise ConfigurationError(f"{key} is no parameter of a robot{suggestion}")
@@ -462,10 +455,10 @@ class _Values:
             and value != ROBOT_PARAMETERS[key][0]
         )
 
-    def text(self, key: str, default: str = "") -> str:
-        value = self._given.get(key, default)
+    def text(self, key: str) -> str:
+        value = self._given.get(key)
         if value is None:
-            return default
+            return ""
         if not isinstance(value, str):
             raise ConfigurationError(f"{key} is {value!r:.80}; it must be a text")
         return value
