@@ -72,8 +72,6 @@ class _Asker:
 
     Parameters
     ----------
-    outcomes : SimpleQueue
-        Gets the outcome of each request.
     is_last_resort : bool
         Whether no other service is left. Then the deadline doubles with each request that misses
         it, since asking anew would take even longer.

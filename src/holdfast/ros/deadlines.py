@@ -13,13 +13,7 @@ _SUSPENDED_S = 1.0
 
 
 class Deadline:
-    """The end of a wait that is made of short waits.
-
-    Parameters
-    ----------
-    key : str
-        The parameter that sets ``limit_s``, for messages.
-    """
+    """The end of a wait that is made of short waits; messages name the parameter ``key``."""
 
     def __init__(
         self, limit_s: float, key: str, clock: Callable[[], float] = time.monotonic
@@ -49,13 +43,7 @@ class Deadline:
 
 
 class Absence:
-    """How long a service has been missing.
-
-    Parameters
-    ----------
-    is_present : callable
-        Returns whether the service is there.
-    """
+    """How long a service has been missing."""
 
     key = "environment.discovery_timeout_ms"
 

@@ -111,12 +111,7 @@ class DecisionHandover:
 
     It serves one run, until that ends or is held.
 
-    Parameters
-    ----------
-    problem : Problem
-        An instance that only callers' threads use.
-    sensing_interval : int
-        Task actions between two sensing steps.
+    Only callers' threads may use ``problem``.
     """
 
     def __init__(self, problem: Problem, sensing_interval: int) -> None:
@@ -158,10 +153,7 @@ class DecisionHandover:
     def call(self, call: DecideRequest, within_s: float) -> DecideReply:
         """Take the outcome of a decision, and return the next decision.
 
-        Parameters
-        ----------
-        within_s : float
-            Longest wait; the reply is ``HOLDING`` after it.
+        The reply is ``HOLDING`` after ``within_s``.
         """
         deadline = monotonic() + within_s
         named = call.trial, call.number
@@ -239,13 +231,7 @@ class DecisionHandover:
 
 
 class ExecutiveEnvironment:
-    """One trial that an executive performs.
-
-    Parameters
-    ----------
-    step : int
-        Task actions that the journal knows to be performed in it.
-    """
+    """One trial that an executive performs; the journal has ``step`` task actions of it."""
 
     def __init__(
         self, executive: DecisionHandover | None = None, trial: int = 0, step: int = 0
@@ -289,13 +275,7 @@ class ExecutiveEnvironment:
 
 
 class ExecutiveMaker(EnvironmentMaker):
-    """Makes the environment of each trial.
-
-    Parameters
-    ----------
-    timeout_ms : float
-        Longest time that the executive may take for one decision.
-    """
+    """Makes the environment of each trial; a decision may take the executive ``timeout_ms``."""
 
     def __init__(self, executive: DecisionHandover, problem: Problem, timeout_ms: float) -> None:
         super().__init__("the executive", problem, 0, timeout_ms)

@@ -119,12 +119,7 @@ def read_numbers(message: Any, path: Path) -> list[float]:
 
 
 def write(message: Any, path: Path, value: Any) -> None:
-    """Set a field; arrays become as long as the path needs.
-
-    Parameters
-    ----------
-    value : number, str, or list of either
-        It is converted to the type of the field.
+    """Set a field, converted to its type; arrays become as long as the path needs.
 
     Raises
     ------

@@ -16,13 +16,7 @@ _T = TypeVar("_T")
 
 
 class LoopThread:
-    """A loop that runs until it is closed.
-
-    Parameters
-    ----------
-    name : str
-        Of the thread.
-    """
+    """A loop that runs until it is closed."""
 
     def __init__(self, name: str) -> None:
         self._loop = asyncio.new_event_loop()

@@ -76,12 +76,7 @@ def scene_markers(
 ) -> list[Marker]:
     """Return what does not change in a trial: obstacles, landmarks, goal and bodies.
 
-    Parameters
-    ----------
-    frame : str
-        In which its poses are.
-    estimate_frame, truth_frame : str or None
-        In which the body is at the origin.
+    Its poses are in ``frame``; the body is at the origin of the two other frames.
     """
     scene = problem.scene()
     axes = None if scene is None else _position_axes(scene, layout)

@@ -99,8 +99,6 @@ class McapSink:
     ----------
     directory : Path
         Where the file is made, with the ``metadata.yaml`` of a rosbag2; it must not be there yet.
-    configuration : Configuration
-        Of the run.
     notes : mapping of str to str
         What the file's metadata is to say of the run.
 

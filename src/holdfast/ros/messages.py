@@ -101,15 +101,7 @@ def typestore() -> Typestore:
 
 
 def service_types(service: str, definition: str) -> Typesdict:
-    """Return the types that a service consists of, for a store.
-
-    Parameters
-    ----------
-    service : str
-        Its type, as in ``std_srvs/srv/Trigger``.
-    definition : str
-        The text of its ``.srv`` file.
-    """
+    """Return the types of a service, for a store, from the text of its ``.srv`` file."""
     from rosbags.interfaces import Nodetype
     from rosbags.typesys import get_types_from_msg
 
@@ -278,10 +270,7 @@ def answer_message(
 ) -> bytes:
     """Have a service answer a request, both as messages; every failure is an answer, too.
 
-    Parameters
-    ----------
-    on_refused : callable
-        Gets the reason if the bytes are no request.
+    ``on_refused`` gets the reason if the bytes are no request.
     """
     try:
         decoded = decode_request(request, serialization)

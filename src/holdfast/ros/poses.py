@@ -99,12 +99,7 @@ class PoseLayout(NamedTuple):
 
 
 def pose_layout(problem: Any) -> PoseLayout | None:
-    """Return where in a problem's states the pose is.
-
-    Parameters
-    ----------
-    problem : Problem
-        With the optional attributes ``pose`` and ``up``.
+    """Return where in a problem's states the pose is, by its attributes ``pose`` and ``up``.
 
     Returns
     -------

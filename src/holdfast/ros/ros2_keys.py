@@ -127,14 +127,8 @@ def graph_tokens(
 ) -> tuple[str, str]:
     """Return the keys of the tokens that show a node, and its service or its client of one.
 
-    Parameters
-    ----------
-    session : str
-        Zenoh's identifier of the session.
-    name, node : str
-        Of the service and of the node; the node is in the root namespace.
-    serves : bool
-        Whether the node offers the service, or asks it.
+    The node ``node`` of the root namespace offers the service, or with ``serves`` False asks it.
+    ``session`` is Zenoh's identifier.
     """
     identity = f"@ros2_lv/{domain}/{session}/0"
     kind = "SS" if serves else "SC"

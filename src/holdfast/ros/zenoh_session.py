@@ -37,12 +37,8 @@ OnEvent = Callable[..., None]
 class ZenohSession:
     """A Zenoh session, opened as soon as the other end listens.
 
-    Parameters
-    ----------
-    listens : bool
-        Whether the session listens at the endpoint, or connects to it.
-    on_open : callable
-        Declares what the session offers, on the thread that has opened it.
+    It listens at the endpoint or connects to it. ``on_open`` declares what it offers, on the thread
+    that has opened it.
     """
 
     def __init__(

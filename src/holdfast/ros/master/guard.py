@@ -102,10 +102,7 @@ class MasterGuard:
     async def run(self, ready: Callable[[str], None]) -> None:
         """Guard until cancelled, then end a master that was started here.
 
-        Parameters
-        ----------
-        ready : callable
-            Called once when a master answers, with ``started``, ``resumed`` or ``found``.
+        ``ready`` is called once when a master answers, with ``started``, ``resumed`` or ``found``.
 
         Raises
         ------

@@ -265,16 +265,8 @@ def state_of_snapshot(
     Nodes and services without a URI ended between two questions and are left out. No call returns
     the subscribers of parameters.
 
-    Parameters
-    ----------
-    system_state : list
-        Of ``getSystemState``: publishers, subscribers, services.
-    types : list
-        Of ``getTopicTypes``.
-    parameters : mapping
-        Of ``getParam("/")``.
-    node_uris, service_uris : mapping
-        Of ``lookupNode`` and ``lookupService``.
+    The arguments are the answers to ``getSystemState``, ``getTopicTypes`` and ``getParam("/")``,
+    and by name to ``lookupNode`` and ``lookupService``.
     """
     state = MasterState()
     state.parameters = dict(parameters)

@@ -87,17 +87,7 @@ class MasterState:
     __hash__ = None  # type: ignore[assignment]  # it changes
 
     def apply(self, table: str, key: str | None, value: Any) -> None:
-        """Make one change.
-
-        Parameters
-        ----------
-        table : str
-            One of the attributes.
-        key : str or None
-            What in it changes; None for all of it.
-        value
-            What it is from now on; None if it is nothing any more.
-        """
+        """Set a key of a table, or with None all of it; the value None removes the key."""
         if table == "parameters":
             self._set_parameter(key or "/", value)
         elif key is None:
@@ -181,10 +171,7 @@ def read_journal(journal: Path | int) -> MasterState | None:
 
     A last record that is not whole is left out: nobody was told that it is there.
 
-    Parameters
-    ----------
-    journal : Path or int
-        A descriptor, which stays open, needs no other one to be read.
+    A descriptor stays open; while it is, the file is readable even if it is removed.
 
     Raises
     ------
@@ -264,10 +251,7 @@ class MasterJournal:
     is full, the master continues, and every change tries to write the journal anew. The same holds
     if the file is not the one that was written here.
 
-    Parameters
-    ----------
-    state : MasterState
-        The master's state at its start; kept.
+    It keeps ``state``, the master's at its start.
     """
 
     def __init__(self, path: Path, state: MasterState) -> None:

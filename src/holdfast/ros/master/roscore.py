@@ -30,12 +30,7 @@ _VERSION_S = 30.0
 class Rosout:
     """Keeps one ``/rosout`` running.
 
-    Parameters
-    ----------
-    master_uri : str
-        As nodes have it in ``ROS_MASTER_URI``.
-    own_uri : str
-        The master's address for this process.
+    Nodes reach the master at ``master_uri``, this process at ``own_uri``.
     """
 
     def __init__(self, master_uri: str, own_uri: str, events: EventSink) -> None:

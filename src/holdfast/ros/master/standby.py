@@ -28,14 +28,8 @@ class DetachedProcess:
 
     The standard library's subprocess coroutines would end it with the loop.
 
-    Parameters
-    ----------
-    environment : mapping
-        Additions to this process's.
-    pass_fds : sequence of int
-        Descriptors that it inherits.
-    errors : int or None
-        Where its standard error goes; None: where this process's goes.
+    ``environment`` is added to this process's. Without ``errors`` its standard error is this
+    process's.
 
     Attributes
     ----------
@@ -97,10 +91,7 @@ class DetachedProcess:
 class MasterProcess:
     """A process that is a master, or waits to become one.
 
-    Parameters
-    ----------
-    listening : socket
-        Which it inherits; need not be bound yet.
+    It inherits ``listening``, which need not be bound yet.
 
     Raises
     ------

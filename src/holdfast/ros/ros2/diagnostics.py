@@ -49,11 +49,6 @@ class RobotDiagnosis(NamedTuple):
 class Diagnostics:
     """Follows the segments of one run.
 
-    Parameters
-    ----------
-    clock : callable
-        Returns seconds.
-
     Attributes
     ----------
     diverged : bool
@@ -85,17 +80,7 @@ class Diagnostics:
     def tell(
         self, segment: RunSegment | None, last: SegmentResult | None, telemetry: Telemetry | None
     ) -> RobotDiagnosis:
-        """Return the current diagnosis.
-
-        Parameters
-        ----------
-        segment : RunSegment or None
-            The running one.
-        last : SegmentResult or None
-            The result of the previous one.
-        telemetry : Telemetry or None
-            That of the last segment that has begun.
-        """
+        """Return the diagnosis, by the running segment, the last result and the last telemetry."""
         condition = None if segment is None else segment.condition()
         if condition is not None:
             word, level = condition.word, Level.OK

@@ -55,13 +55,7 @@ def usage() -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the node, and return the exit code.
-
-    Parameters
-    ----------
-    arguments : sequence of str, optional
-        Those of the process; ``--ros-args`` is ROS's.
-    """
+    """Run the node, and return the exit code."""
     given = sys.argv[1:] if arguments is None else arguments
     if "--help" in given or "-h" in given:
         sys.stdout.write(usage())

@@ -126,10 +126,7 @@ def in_parameters(text: str) -> str:
 def read_parameters(values: Mapping[str, Any]) -> NodeParameters:
     """Check the parameters, and load the configuration that they make.
 
-    Parameters
-    ----------
-    values : mapping
-        Plain data by the parameter's name; None means not given.
+    ``values`` are plain data by the parameter's name; None means not given.
 
     Raises
     ------

@@ -85,18 +85,14 @@ class Telemetry:
 
     Parameters
     ----------
-    on_order : callable
-        Shows an order.
-    on_belief : callable
-        Shows a belief.
+    on_order, on_belief : callable
+        Show them.
     on_notice : callable
         Is called when there is something else that changed.
     on_failure : callable
         Gets the first error that any of this came to: to look on must not end a run.
     belief_rate_hz : float
         Beliefs shown a second, at most.
-    wants_entropies : callable
-        Returns whether to compute them.
     """
 
     def __init__(
