@@ -20,15 +20,18 @@ import holdfast
 from holdfast import _kernel
 from holdfast.errors import HoldfastError, InvalidValueError, OutputError
 from holdfast.lab.errors import TaskError
-from holdfast.lab.studies import executors, result_cache, tasks
+from holdfast.lab.studies import executors, running, tasks
 from holdfast.lab.studies.command import studies_of
-from holdfast.lab.studies.executors import LocalExecutor
-from holdfast.lab.studies.result_cache import ResultCache
-from holdfast.lab.studies.running import Workload, compute, write_report
+from holdfast.lab.studies.executors import (
+    LocalExecutor,
+    compute_encoded,
+    encode_task,
+    table_of,
+)
+from holdfast.lab.studies.running import ResultCache, Workload, compute, write_report
 from holdfast.lab.studies.statistics import Interval
 from holdfast.lab.studies.study import Number, Report, Results, Scale
 from holdfast.lab.studies.tables import Columns
-from holdfast.lab.studies.task_messages import compute_encoded, encode_task, table_of
 from holdfast.lab.studies.tasks import Task, code_of, run_task, task_key
 from holdfast.lab.studies.trial_batches import TrialSeries, trial_tasks
 
@@ -224,7 +227,7 @@ class TestCache:
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         cache, task = ResultCache(tmp_path), Task(kind="trials", parameters={})
-        monkeypatch.setattr(result_cache, "columns_of", lambda _: Columns({"a": [1], "b": [1, 2]}))
+        monkeypatch.setattr(running, "columns_of", lambda _: Columns({"a": [1], "b": [1, 2]}))
         cache.store(task, pd.DataFrame())
         assert cache.load(task) is None
 

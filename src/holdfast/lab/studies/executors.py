@@ -2,19 +2,25 @@
 
 All places give the same results, since a task is a function of its parameters; only times differ.
 The tasks of a killed process are computed again elsewhere. A task is given up when its process has
-died several times.
+died several times. Only plain data travels, never code: another process must have the same
+holdfast installed, and a request names the code that it wants.
 """
 
 from __future__ import annotations
 
+import socket
+import traceback
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from multiprocessing.connection import Connection, wait
 from typing import TYPE_CHECKING, Protocol
 
-from holdfast.errors import InvalidValueError
-from holdfast.lab.errors import TaskError
-from holdfast.lab.studies.task_messages import compute_encoded, encode_task, table_of
+import msgspec
+
+from holdfast import __version__
+from holdfast.errors import HoldfastError, InvalidValueError
+from holdfast.lab.errors import TaskCrashError, TaskError
+from holdfast.lab.studies.tables import Columns, columns_of, frame_of
 from holdfast.lab.studies.tasks import Task, code_of, run_task
 from holdfast.runtime.command_line import MAX_JOBS
 from holdfast.runtime.workers import WorkerProcess, end_workers
@@ -22,7 +28,14 @@ from holdfast.runtime.workers import WorkerProcess, end_workers
 if TYPE_CHECKING:
     import pandas as pd
 
-__all__ = ["MOST_ATTEMPTS", "Executor", "LocalExecutor"]
+__all__ = [
+    "MOST_ATTEMPTS",
+    "Executor",
+    "LocalExecutor",
+    "compute_encoded",
+    "encode_task",
+    "table_of",
+]
 
 
 MOST_ATTEMPTS = 3
@@ -150,3 +163,84 @@ def _given_up(worker: _Worker) -> TaskError:
         f"{MOST_ATTEMPTS} processes were lost with {worker.task.kind} {worker.task.parameters}, "
         f"and the last one {how}{advice if killed else ''}"
     )
+
+
+# -- tasks and results as bytes --------------------------------------------------------------------
+
+
+class _Request(msgspec.Struct):
+    task: Task
+    code: str
+
+
+class _Computed(msgspec.Struct, tag="computed"):
+    table: Columns
+
+
+class _Refused(msgspec.Struct, tag="refused"):
+    reason: str
+
+
+class _Crashed(msgspec.Struct, tag="crashed"):
+    account: str
+
+
+_REQUEST_DECODER = msgspec.msgpack.Decoder(_Request)
+_Answer = _Computed | _Refused | _Crashed
+
+_ANSWER_DECODER = msgspec.msgpack.Decoder(_Answer)
+
+
+def encode_task(task: Task, code: str) -> bytes:
+    """Return a task as bytes, with the digest of the code that may compute it."""
+    return msgspec.msgpack.encode(_Request(task, code))
+
+
+def compute_encoded(request: bytes) -> bytes:
+    """Compute a task in this process; return its result for :func:`table_of`, or why there is none.
+
+    It always answers, also when it fails, so that an error is the same wherever it happens.
+    """
+    answer: _Answer
+    try:
+        asked = _REQUEST_DECODER.decode(request)
+        _check_code(asked)
+        table = run_task(asked.task)
+        # Modules were imported on the way, and may have been edited just before.
+        _check_code(asked)
+        answer = _Computed(columns_of(table))
+    except HoldfastError as error:
+        answer = _Refused(str(error))
+    except Exception:  # noqa: BLE001 - raised again where it was asked for
+        answer = _Crashed(traceback.format_exc())
+    return msgspec.msgpack.encode(answer)
+
+
+def _check_code(asked: _Request) -> None:
+    kind = asked.task.kind
+    own = code_of(asked.task)
+    if own != asked.code:
+        raise TaskError(
+            f"a process on {socket.gethostname()} has other code for tasks of the kind {kind!r} "
+            f"(digest {own}, of holdfast {__version__}) than the one that asks (digest "
+            f"{asked.code}), so the results would not belong together: install the same holdfast "
+            "on every node, and edit nothing meanwhile"
+        )
+
+
+def table_of(answer: bytes) -> pd.DataFrame:
+    """Return a task's result, from what :func:`compute_encoded` answered.
+
+    Raises
+    ------
+    TaskError
+        If its function refused the parameters, or the code is another.
+    TaskCrashError
+        If anything else went wrong there.
+    """
+    found: _Answer = _ANSWER_DECODER.decode(answer)
+    if isinstance(found, _Refused):
+        raise TaskError(found.reason)
+    if isinstance(found, _Crashed):
+        raise TaskCrashError(f"in another process:\n{found.account}")
+    return frame_of(found.table)

@@ -28,8 +28,12 @@ from typing import TYPE_CHECKING, Any, Self, cast
 
 from holdfast.errors import HoldfastError, InvalidValueError
 from holdfast.lab.errors import TaskError
-from holdfast.lab.studies.executors import MOST_ATTEMPTS
-from holdfast.lab.studies.task_messages import compute_encoded, encode_task, table_of
+from holdfast.lab.studies.executors import (
+    MOST_ATTEMPTS,
+    compute_encoded,
+    encode_task,
+    table_of,
+)
 from holdfast.lab.studies.tasks import Task, code_of
 
 if TYPE_CHECKING:
@@ -71,18 +75,7 @@ class RayExecutor:
 
     @classmethod
     def of(cls, place: str) -> Self:
-        """Return the executor that a person has named.
-
-        Parameters
-        ----------
-        place : str
-            ``ray`` or ``ray://HOST:PORT``.
-
-        Raises
-        ------
-        InvalidValueError
-            If it is something else.
-        """
+        """Return the executor that a person has named: ``ray`` or ``ray://HOST:PORT``."""
         if place == "ray":
             return cls(None)
         found = _ADDRESS.fullmatch(place)
@@ -194,10 +187,7 @@ class _Size:
     def cores(self, tasks_left: int) -> int:
         """Return how many there are, as of late.
 
-        Raises
-        ------
-        TaskError
-            If there has been none for long: Ray itself would wait for ever, and say nothing.
+        It raises if there has been none for long: Ray itself would wait for ever, and say nothing.
         """
         now = monotonic()
         if now > self._looked_at + _LOOK_INTERVAL_S:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import tempfile
+import zlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -10,29 +12,83 @@ import msgspec
 import pandas as pd
 
 from holdfast import __version__
-from holdfast.errors import OutputError
+from holdfast.errors import InvalidValueError, OutputError
 from holdfast.files import remove_unfinished, write_atomically
 from holdfast.lab.errors import TaskError
 from holdfast.lab.studies.executors import Executor, LocalExecutor
-from holdfast.lab.studies.result_cache import ResultCache
 from holdfast.lab.studies.study import Report, Results, Scale, Study
-from holdfast.lab.studies.tables import to_csv
+from holdfast.lab.studies.tables import Columns, columns_of, frame_of, to_csv
 from holdfast.lab.studies.tasks import Task, task_key
 from holdfast.lab.studies.trial_files import TRIALS_NAME, TrialFile
 from holdfast.recording.machine import describe
 
-__all__ = ["Workload", "compute", "write_report"]
+__all__ = ["ResultCache", "Workload", "compute", "write_report"]
 
 _CACHE = "cache"
+_CHECKSUM_BYTES = 4
+
+
+class _Kept(msgspec.Struct, array_like=True, forbid_unknown_fields=True):
+    task: Task
+    table: Columns
+
+
+class ResultCache:
+    """Results of tasks in a directory, under the digest of all that they depend on.
+
+    One file each, written whole or not at all. A file that is damaged, of an earlier format or of
+    another task counts as missing: the task is computed again. The directory is made when something
+    is kept.
+    """
+
+    def __init__(self, directory: Path) -> None:
+        self._directory = directory
+        self._decoder = msgspec.msgpack.Decoder(_Kept)
+
+    def load(self, task: Task) -> pd.DataFrame | None:
+        """Return a task's result; None if it is not known."""
+        path = self._path_of(task)
+        try:
+            content = path.read_bytes()
+        except FileNotFoundError:
+            return None
+        except OSError as error:
+            raise OutputError(f"{path}: cannot be read: {error.strerror}") from error
+        payload, checksum = content[:-_CHECKSUM_BYTES], content[-_CHECKSUM_BYTES:]
+        if zlib.crc32(payload).to_bytes(_CHECKSUM_BYTES, "little") != checksum:
+            return None
+        try:
+            kept = self._decoder.decode(payload)
+        except msgspec.DecodeError:
+            return None
+        if _plain(kept.task) != _plain(task):
+            return None
+        with contextlib.suppress(InvalidValueError):
+            return frame_of(kept.table)
+        return None
+
+    def store(self, task: Task, table: pd.DataFrame) -> None:
+        """Keep a task's result."""
+        path = self._path_of(task)
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise OutputError(f"{path.parent}: cannot be made: {error.strerror}") from error
+        payload = msgspec.msgpack.encode(_Kept(task, columns_of(table)))
+        checksum = zlib.crc32(payload).to_bytes(_CHECKSUM_BYTES, "little")
+        write_atomically(path, payload + checksum)
+
+    def _path_of(self, task: Task) -> Path:
+        key = task_key(task)
+        return self._directory / task.kind / key[:2] / f"{key}.table"
+
+
+def _plain(task: Task) -> bytes:
+    return msgspec.json.encode(task, order="sorted")
 
 
 class Workload:
     """The tasks of some studies, with the results that are known already.
-
-    Parameters
-    ----------
-    directory : Path
-        Where results are kept.
 
     Attributes
     ----------
@@ -96,17 +152,8 @@ class Workload:
 def compute(workload: Workload, executor: Executor, on_progress: Callable[[int], None]) -> None:
     """Compute the pending tasks and keep their results.
 
-    Parameters
-    ----------
-    on_progress : callable
-        Gets how many units of work are finished.
-
-    Raises
-    ------
-    HoldfastError
-        If a task fails; what was finished before is kept.
-    KeyboardInterrupt
-        After everything that was started has been ended; what was finished is kept.
+    ``on_progress`` gets how many units of work are finished.
+    What was finished before a failure or an interruption is kept.
     """
 
     def keep(task: Task, table: pd.DataFrame) -> None:
@@ -151,11 +198,6 @@ def write_report(
     -------
     list of str
         The names of the files.
-
-    Raises
-    ------
-    OutputError
-        If one cannot be written.
     """
     try:
         directory.mkdir(parents=True, exist_ok=True)
