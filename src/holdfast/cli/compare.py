@@ -40,15 +40,13 @@ class CompareOptions(Options):
         least=2,
     )
     outcomes: bool = flag(
-        "--outcomes",
         help="Show which run is better: success, steps, rewards and decision times against the "
         "first run's, with intervals (extra lab).",
     )
     unpaired: bool = flag(
-        "--unpaired",
         help="With --outcomes: take the runs as independent samples, as of other seeds.",
     )
-    json: bool = flag("--json", help="Print the finding as a JSON object.")
+    json: bool = flag(help="Print the finding as a JSON object.")
 
 
 def main(arguments: Sequence[str]) -> int:

@@ -43,19 +43,17 @@ class DoctorOptions(Options):
         least=0,
     )
     service: tuple[str, ...] = option(
-        "--service",
         "-s",
         metavar="ENDPOINT",
         many=True,
         help="The service (tls/cloud.example.org:7447), instead of CONFIG's.",
     )
     tls: Path | None = option(
-        "--tls",
         metavar="DIR",
         read=location,
         help="This robot's credentials, instead of CONFIG's.",
     )
-    json: bool = flag("--json", help="Print each finding as a JSON object, one a line.")
+    json: bool = flag(help="Print each finding as a JSON object, one a line.")
 
 
 def main(arguments: Sequence[str]) -> int:

@@ -62,7 +62,6 @@ class ExportOptions(Options):
 
     run: Path = argument("RUN", "Directory of a run, or its journal.", location)
     mcap: Path | None = option(
-        "--mcap",
         metavar="FILE",
         read=location,
         help="Write FILE: standard ROS 2 messages, for RViz, Foxglove, PlotJuggler and ros2 bag "
@@ -75,19 +74,17 @@ class ExportOptions(Options):
         help="Write DIR: trials.csv, steps.csv, beliefs.csv and events.csv.",
     )
     trials: range | None = option(
-        "--trials",
         metavar="A:B",
         read=_range,
         help="Only the trials from A up to, but without, B (default: all).",
     )
     rate: float = option(
-        "--rate",
         metavar="HZ",
         read=number(_MIN_RATE_HZ, _MAX_RATE_HZ, "Hz"),
         default=10.0,
         help="Steps a second, for a run that was recorded without times.",
     )
-    quiet: bool = flag("--quiet", "-q", help="Show no progress.")
+    quiet: bool = flag("-q", help="Show no progress.")
 
 
 def main(arguments: Sequence[str]) -> int:

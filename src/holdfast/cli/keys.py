@@ -49,41 +49,33 @@ class KeysOptions(Options):
     needs_arguments = True
 
     directory: Path = argument("DIR", "Where they go; made if it is missing.", location)
-    robot: tuple[str, ...] = option(
-        "--robot", metavar="NAME", many=True, help="A robot that gets a key."
-    )
-    service: tuple[str, ...] = option(
-        "--service", metavar="NAME", many=True, help="A service that gets a key."
-    )
+    robot: tuple[str, ...] = option(metavar="NAME", many=True, help="A robot that gets a key.")
+    service: tuple[str, ...] = option(metavar="NAME", many=True, help="A service that gets a key.")
     host: tuple[str, ...] = option(
-        "--host",
         metavar="NAME_OR_IP",
         many=True,
         help="Where robots reach the services, besides this machine.",
     )
     days: int = option(
-        "--days",
         metavar="N",
         read=whole_number(1, _MAX_DAYS),
         default=_DEFAULT_DAYS,
         help="How long they are valid.",
     )
-    renew: bool = flag("--renew", help="New certificates for existing keys.")
-    rotate: bool = flag("--rotate", help="New keys and certificates for those that have some.")
+    renew: bool = flag(help="New certificates for existing keys.")
+    rotate: bool = flag(help="New keys and certificates for those that have some.")
     revoke: tuple[str, ...] = option(
-        "--revoke",
         metavar="NAME",
         many=True,
         help="A robot or service whose certificates are no longer valid.",
     )
     revoke_serial: tuple[int, ...] = option(
-        "--revoke-serial",
         metavar="HEX",
         read=_serial,
         many=True,
         help="The number of one certificate that is no longer valid.",
     )
-    list: bool = flag("--list", help="List what was ever made, and what is revoked.")
+    list: bool = flag(help="List what was ever made, and what is revoked.")
 
 
 def main(arguments: Sequence[str]) -> int:

@@ -45,34 +45,29 @@ class GuardOptions(Options):
     exit_codes: ClassVar = {0: "after SIGTERM"}
 
     port: int | None = option(
-        "--port",
         metavar="N",
         read=whole_number(1, 65_535),
         help="The master's port (default: that of ROS_MASTER_URI, or 11311).",
     )
     silent_s: float = option(
-        "--silent-s",
         metavar="S",
         read=number(0.5, 3600.0, "s"),
         default=3.0,
         help="A master that has not answered for this long is killed and replaced.",
     )
-    rosout: bool = flag("--rosout", default=True, help="Run /rosout, too, as roscore does.")
+    rosout: bool = flag(default=True, help="Run /rosout, too, as roscore does.")
     python: str = option(
-        "--python",
         metavar="FILE",
         default="/usr/bin/python3",
         help="ROS's Python, which has rosmaster.",
     )
     directory: Path | None = option(
-        "--directory",
         metavar="DIR",
         read=location,
         help="Where the master's registrations are written (default: a directory of this user that "
         "is gone after a restart of the machine).",
     )
     log: Literal["text", "json"] = option(
-        "--log",
         metavar="FORMAT",
         read=one_of("text", "json"),
         default="text",

@@ -76,21 +76,18 @@ class RunOptions(Options):
 
     configuration: Path = argument("CONFIG", "Configuration file (YAML) of the run.", location)
     trials: int | None = option(
-        "--trials",
         metavar="N",
         read=whole_number(1, MAX_TRIALS),
         key="simulator.num_trials",
         help="Number of trials, instead of the file's.",
     )
     seed: int | None = option(
-        "--seed",
         metavar="S",
         read=whole_number(0, MAX_SEED),
         key="simulator.seed",
         help="Seed of all random draws, instead of the file's.",
     )
     problem: str | None = option(
-        "--problem",
         metavar="NAME",
         help="Problem to run, instead of the file's: a registered name or module:Class.",
     )
@@ -101,36 +98,30 @@ class RunOptions(Options):
         help="A value instead of the file's, as YAML: selector.method=random.",
     )
     jobs: int | None = option(
-        "--jobs",
         "-j",
         metavar="N",
         read=whole_number(1, MAX_JOBS),
         help="Largest number of processes (default: one for each core). Changes time only.",
     )
     out: Path | None = option(
-        "--out",
         "-o",
         metavar="DIR",
         read=location,
         help="Directory for the results (default: runs/CONFIG-seedS, numbered if taken).",
     )
     resume: bool = flag(
-        "--resume",
         help="Go on with the run in DIR (default: the latest) and run the missing trials; with a "
         "larger --trials, more than it had.",
     )
     resume_if_begun: bool = flag(
-        "--resume-if-begun",
         help="Go on with the run in DIR if it has begun, otherwise begin it; needs --out. For a "
         "unit or container that repeats one command.",
     )
     quiet: bool = flag(
-        "--quiet",
         "-q",
         help="Show no progress and no summary: only errors. The files are the same.",
     )
     service: tuple[str, ...] = option(
-        "--service",
         "-s",
         metavar="ENDPOINT",
         many=True,
@@ -139,40 +130,34 @@ class RunOptions(Options):
         "order.",
     )
     recovery: str | None = option(
-        "--recovery",
         metavar="WHEN",
         key="recovery.launch",
         help="When to launch the local service: on_failure (the default), at_start or never.",
     )
     tls: Path | None = option(
-        "--tls",
         metavar="DIR",
         read=location,
         key="offload.tls",
         help="This robot's credentials, as holdfast keys makes them.",
     )
     environment: str | None = option(
-        "--environment",
         "-e",
         metavar="MODULE:CLASS",
         key="environment.object",
         help="Act on this environment instead of a simulated one.",
     )
     rate: float | None = option(
-        "--rate",
         metavar="HZ",
         read=number(_MIN_RATE_HZ, _MAX_RATE_HZ, "Hz"),
         help="Task actions a second (default: as fast as possible).",
     )
     health: HttpAddress | None = option(
-        "--health",
         metavar="HOST:PORT",
         read=http_address,
         help="Answer http://HOST:PORT/livez, and /readyz while a service or the robot itself "
         "decides; a PORT alone is one of 127.0.0.1.",
     )
     log: Literal["text", "json"] = option(
-        "--log",
         metavar="FORMAT",
         read=one_of("text", "json"),
         default="text",

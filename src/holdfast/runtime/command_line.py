@@ -65,7 +65,7 @@ class Option(NamedTuple):
     Attributes
     ----------
     names : tuple of str
-        The long name first; empty for a positional argument.
+        The long name first, by default that of the attribute; empty for a positional argument.
     read : callable
         Turns the text into the value; see :func:`bad_value`.
     many : bool
@@ -142,13 +142,23 @@ def option(
     key: str | None = None,
     hidden: bool = False,
 ) -> Any:
-    """Declare an option with a value; see :class:`Option`."""
-    return Option(names, help, metavar, read, () if many else default, many, key, hidden)
+    """Declare an option with a value; see :class:`Option`.
+
+    ``names`` are its short name, and a long one that is not the attribute's.
+    """
+    return Option(
+        _with_long(names), help, metavar, read, () if many else default, many, key, hidden
+    )
 
 
 def flag(*names: str, help: str, default: bool = False) -> Any:  # noqa: A002
     """Declare an option without a value; one that is on by default is switched off by ``--no-``."""
-    return Option(names, help, "", str, default)
+    return Option(_with_long(names), help, "", str, default)
+
+
+def _with_long(names: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the names with room for the attribute's, unless one of them is long."""
+    return names if names and names[0].startswith("--") else ("", *names)
 
 
 class Options:
@@ -165,6 +175,12 @@ class Options:
 
     exit_codes: ClassVar[Mapping[int, str | None]] = {}
     needs_arguments: ClassVar[bool] = False
+
+    def __init_subclass__(cls) -> None:
+        for name, each in cls.table().items():
+            if each.names[:1] == ("",):
+                names = (f"--{name.replace('_', '-')}", *each.names[1:])
+                setattr(cls, name, each._replace(names=names))
 
     def __init__(self, **values: Any) -> None:
         for name, each in self.table().items():

@@ -54,66 +54,56 @@ class ServeOptions(Options):
     exit_codes: ClassVar = {0: "after SIGTERM or the end of standard input"}
 
     listen: tuple[str, ...] = option(
-        "--listen",
         many=True,
         metavar="ENDPOINT",
         help=f"Where robots can connect (default: tcp/{_DEFAULT_PLACE}, with --tls over TLS).",
     )
     connect: tuple[str, ...] = option(
-        "--connect",
         many=True,
         metavar="ENDPOINT",
         help="A robot that listens. Then nothing listens here without --listen.",
     )
-    name: str = option("--name", metavar="NAME", default=DEFAULT_NAME, help="Name of the service.")
+    name: str = option(metavar="NAME", default=DEFAULT_NAME, help="Name of the service.")
     tls: Path | None = option(
-        "--tls",
         read=location,
         metavar="DIR",
         help="This service's credentials, as holdfast keys makes them. Robots need theirs of the "
         "same authority.",
     )
     insecure: bool = flag(
-        "--insecure",
         help="Allow an address that other machines can reach without --tls: any of them can then "
         "use the service and read along.",
     )
     processes: int = option(
-        "--processes",
         read=whole_number(1, 256),
         default=1,
         metavar="N",
         help="Processes behind the same address, watched by one more.",
     )
     health: HttpAddress | None = option(
-        "--health",
         read=http_address,
         metavar="HOST:PORT",
         help="Answer http://HOST:PORT/livez and /readyz. A PORT alone is one of 127.0.0.1; 0 takes "
         "a free one.",
     )
     metrics: HttpAddress | None = option(
-        "--metrics",
         read=http_address,
         metavar="HOST:PORT",
         help="Offer metrics for Prometheus at http://HOST:PORT/metrics. The address may be that of "
         "--health.",
     )
     log: Literal["text", "json"] = option(
-        "--log",
         metavar="FORMAT",
         read=one_of("text", "json"),
         default="text",
         help="Form of the ready line and of the log on standard error: text or json.",
     )
     workers: int | None = option(
-        "--workers",
         read=whole_number(1, 256),
         metavar="N",
         help="Decisions that each process computes at a time (default: its share of the cores).",
     )
     lease_ms: float = option(
-        "--lease-ms",
         read=number(50.0, 60_000.0, "ms"),
         default=400.0,
         metavar="MS",
@@ -121,92 +111,79 @@ class ServeOptions(Options):
         "robot, its configuration has offload.lease_ms.",
     )
     max_sessions: int | None = option(
-        "--max-sessions",
         read=whole_number(1, 1_000_000),
         metavar="N",
         help="Robots that each process remembers; the one unused the longest is forgotten first "
         "(default: 1000).",
     )
     drain_s: float = option(
-        "--drain-s",
         read=number(0.0, 3600.0, "s"),
         default=5.0,
         metavar="S",
         help="Time for pending answers after SIGTERM.",
     )
     max_sessions_per_robot: int | None = option(
-        "--max-sessions-per-robot",
         read=whole_number(1, 1_000_000),
         metavar="N",
         help="Runs remembered for the certificate of one robot (default: as many as there is room "
         "for).",
     )
     problem: tuple[str, ...] = option(
-        "--problem",
         many=True,
         metavar="NAME",
         help="A problem to load at the start. Your own, module:Class, is served only if it is "
         "named here.",
     )
     problem_directory: Path | None = option(
-        "--problem-directory",
         read=location,
         metavar="DIR",
         help="Where the modules of --problem are looked for first (default: the current "
         "directory).",
     )
     until_stdin_closes: bool = flag(
-        "--until-stdin-closes",
         help="Stop when standard input ends, as it does when the process that started this one "
         "dies.",
     )
     configuration: Path | None = option(
-        "--configuration",
         read=location,
         metavar="FILE",
         help="Configuration for the nodes of ROS, which have none.",
     )
     ros2_domain: int | None = option(
-        "--ros2-domain",
         read=whole_number(0, 232),
         metavar="N",
         help="Offer a service to ROS 2 nodes of this domain that use rmw_zenoh. It needs no ROS "
         "(pip install 'holdfast[ros]'). Then nothing else listens here without --listen.",
     )
     ros2_name: str = option(
-        "--ros2-name",
         default=DEFAULT_NAME,
         metavar="NAME",
         help="Name of that service in ROS 2.",
     )
     ros2_router: str | None = option(
-        "--ros2-router",
         metavar="ENDPOINT",
         help=f"Where rmw_zenohd listens (default: {_DEFAULT_ROUTER}). It may start later, and go "
         "away.",
     )
     ros2_listen: str | None = option(
-        "--ros2-listen",
         metavar="ENDPOINT",
         help="Where nodes of ROS 2 can connect, instead of a router.",
     )
     ros1: bool = flag(
-        "--ros1",
         help="Offer a service in ROS 1, at the address of ROS_MASTER_URI and the like. It needs no "
         "ROS (pip install 'holdfast[ros]'). Then nothing else listens here without --listen.",
     )
     ros1_name: str = option(
-        "--ros1-name",
         default=DEFAULT_NAME,
         metavar="NAME",
         help="Name of that service and of its node in ROS 1.",
     )
     # For the processes that a supervisor starts: its number, and the descriptors they inherit.
     supervised: tuple[int, int] | None = option(
-        "--supervised", metavar="N,N", read=_descriptors, help="", hidden=True
+        metavar="N,N", read=_descriptors, help="", hidden=True
     )
     sockets: tuple[int, ...] = option(
-        "--sockets", metavar="N,N", read=_descriptors, default=(), help="", hidden=True
+        metavar="N,N", read=_descriptors, default=(), help="", hidden=True
     )
 
     @property

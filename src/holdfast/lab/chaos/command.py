@@ -77,21 +77,18 @@ class ChaosOptions(Options):
     }
 
     trials: int = option(
-        "--trials",
         metavar="N",
         read=whole_number(1, _MAX_TRIALS),
         default=_DEFAULT_TRIALS,
         help="Number of trials.",
     )
     seed: int = option(
-        "--seed",
         metavar="S",
         read=whole_number(0, MAX_SEED),
         default=0,
         help="Seed of all that happens.",
     )
     out: Path | None = option(
-        "--out",
         "-o",
         metavar="DIR",
         read=location,
@@ -105,13 +102,11 @@ class ChaosOptions(Options):
         help="Only trials of this kind, as --list names them (default: all that can be done here).",
     )
     wire: tuple[str, ...] = option(
-        "--wire",
         metavar="WIRE",
         many=True,
         help="Only trials over this wire: tcp, tls, unix or udp (default: all in turns).",
     )
     jobs: int = option(
-        "--jobs",
         "-j",
         metavar="N",
         read=whole_number(1, _MAX_JOBS),
@@ -119,22 +114,20 @@ class ChaosOptions(Options):
         help="Trials at the same time; each has four or five processes, so times get longer.",
     )
     first: int = option(
-        "--first",
         metavar="T",
         read=whole_number(0, MAX_TRIALS),
         default=0,
         help="Number of the first trial.",
     )
-    resume: bool = flag("--resume", help="Go on with the series in DIR.")
-    keep: bool = flag("--keep", help="Keep the files of good trials as well.")
+    resume: bool = flag(help="Go on with the series in DIR.")
+    keep: bool = flag(help="Keep the files of good trials as well.")
     log: Literal["text", "json"] = option(
-        "--log",
         metavar="FORMAT",
         read=one_of("text", "json"),
         default="text",
         help="Show a bar (text), or events (json).",
     )
-    list: bool = flag("--list", help="List the kinds of fault, and which can be done here.")
+    list: bool = flag(help="List the kinds of fault, and which can be done here.")
 
 
 def main(arguments: Sequence[str]) -> int:

@@ -49,20 +49,18 @@ class DemoOptions(Options):
     }
 
     out: Path | None = option(
-        "--out",
         "-o",
         metavar="DIR",
         read=location,
         help="Directory for both runs and the logs (default: runs/demo, numbered if taken).",
     )
     seed: int = option(
-        "--seed",
         metavar="S",
         read=whole_number(0, MAX_SEED),
         default=0,
         help="Seed of all random draws.",
     )
-    quick: bool = flag("--quick", help="A shorter run: about half the time.")
+    quick: bool = flag(help="A shorter run: about half the time.")
 
 
 def main(arguments: Sequence[str]) -> int:

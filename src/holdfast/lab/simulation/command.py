@@ -63,21 +63,18 @@ class SimulateOptions(Options):
     exit_codes: ClassVar = {0: "no such seed", 1: "there is one"}
 
     seeds: range | None = option(
-        "--seeds",
         metavar="A:B",
         read=_seeds,
         help="Run the schedules of the seeds from A up to, but not, B (default: 0:1000; with "
         "--story 0:1).",
     )
     schedule: Path | None = option(
-        "--schedule",
         metavar="FILE",
         read=location,
         help="Run the schedule in a file instead and print its story; without --seeds, --story.",
     )
-    story: bool = flag("--story", help="Print the events under each seed; for a few of them.")
+    story: bool = flag(help="Print the events under each seed; for a few of them.")
     jobs: int = option(
-        "--jobs",
         "-j",
         metavar="N",
         read=whole_number(0, MAX_JOBS),
@@ -85,7 +82,6 @@ class SimulateOptions(Options):
         help="Processes; 0: one for each core. Changes time only.",
     )
     shrink: bool = flag(
-        "--shrink",
         default=True,
         help="Make the schedule of the first finding as small as possible.",
     )

@@ -70,11 +70,8 @@ class ExperimentOptions(Options):
     names: tuple[str, ...] = argument(
         "NAME", "Names that --list shows, or all.", many=True, least=0
     )
-    quick: bool = flag(
-        "--quick", help="Few trials: minutes, to see that everything works. No evidence."
-    )
+    quick: bool = flag(help="Few trials: minutes, to see that everything works. No evidence.")
     out: Path = option(
-        "--out",
         "-o",
         metavar="DIR",
         read=location,
@@ -82,7 +79,6 @@ class ExperimentOptions(Options):
         help="Directory for the results.",
     )
     seed: int = option(
-        "--seed",
         metavar="S",
         read=whole_number(0, MAX_SEED),
         default=2017,
@@ -90,7 +86,6 @@ class ExperimentOptions(Options):
         "that judge the choice have the next seed.",
     )
     jobs: int = option(
-        "--jobs",
         "-j",
         metavar="N",
         read=whole_number(0, MAX_JOBS),
@@ -98,7 +93,6 @@ class ExperimentOptions(Options):
         help="Processes; 0: one for each core. Changes time only.",
     )
     executor: str = option(
-        "--executor",
         metavar="WHERE",
         default="local",
         help="Where it runs: local (processes of this machine), ray (the Ray cluster of this "
@@ -113,7 +107,7 @@ class ExperimentOptions(Options):
         help="Run nothing: make the tables and figures of selectors or parameters anew from their "
         "trials in FILE (trials.parquet).",
     )
-    list: bool = flag("--list", help="List the experiments and end.")
+    list: bool = flag(help="List the experiments and end.")
 
 
 def study_names() -> list[str]:
