@@ -64,6 +64,9 @@ def main() -> None:
 def _print_defect(
     kind: type[BaseException], error: BaseException, trace: TracebackType | None
 ) -> None:
-    from holdfast.cli.exit_codes import print_defect
+    """Print an unexpected exception with its traceback, as the interpreter would."""
+    import traceback
 
-    print_defect(kind, error, trace)
+    from holdfast.printable import printable
+
+    sys.stderr.write(printable("".join(traceback.format_exception(kind, error, trace))))

@@ -6,7 +6,6 @@ import contextlib
 import signal
 import sys
 from collections.abc import Iterator, Sequence
-from types import TracebackType
 
 from holdfast.errors import HoldfastError, RunError
 from holdfast.printable import printable
@@ -21,7 +20,6 @@ __all__ = [
     "EndedBySignal",
     "ended_by_signals",
     "interrupted_by",
-    "print_defect",
     "print_error",
     "signal_of",
 ]
@@ -59,15 +57,6 @@ def print_error(error: HoldfastError, arguments: Sequence[str]) -> None:
         fields["resume_command"] = error.command
     component = {"serve": "service", "chaos": "chaos"}.get(arguments[0], "robot")
     write_event(component, "error", **fields)
-
-
-def print_defect(
-    kind: type[BaseException], error: BaseException, trace: TracebackType | None
-) -> None:
-    """Print an unexpected exception with its traceback, as the interpreter would."""
-    import traceback
-
-    sys.stderr.write(printable("".join(traceback.format_exception(kind, error, trace))))
 
 
 class EndedBySignal(KeyboardInterrupt):

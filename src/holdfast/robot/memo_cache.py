@@ -10,8 +10,9 @@ Large states are not cached: keeping hundreds of them costs more memory than the
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Hashable
-from typing import Any
+from collections.abc import Callable, Hashable
+from functools import partial
+from typing import Any, TypeVar, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -23,6 +24,8 @@ from holdfast.problems.problem import Problem
 
 __all__ = ["MemoCache", "MemoizingPlanner"]
 
+_Result = TypeVar("_Result")
+
 _MAX_RESULTS = 512
 """A few turns of the longest interval between two sensing steps."""
 
@@ -33,25 +36,28 @@ class MemoCache:
     """Results by key, the latest 512; several threads may use it."""
 
     def __init__(self) -> None:
-        self._results: dict[Hashable, tuple[object, Any]] = {}
+        self._results: dict[Hashable, tuple[PlanningState, Any]] = {}
         self._keys: deque[Hashable] = deque()
 
-    def get(self, key: Hashable) -> Any:
-        """Return the cached result, or None."""
-        known = self._results.get(key)
-        return None if known is None else known[1]
+    def once(
+        self, key: Hashable, state: PlanningState | None, compute: Callable[[], _Result]
+    ) -> _Result:
+        """Return the result for a key, computed unless it is cached.
 
-    def keep(self, key: Hashable, state: PlanningState, result: object) -> None:
-        """Cache a result unless ``state`` is large.
-
-        The state is kept alive, because its identity is part of the key.
+        The state is kept alive, because its identity is part of the key. Without one the result is
+        a state itself.
         """
-        if state.belief.states.nbytes > _LARGE_BYTES:
-            return
-        self._results[key] = state, result
-        self._keys.append(key)
-        if len(self._keys) > _MAX_RESULTS:
-            self._results.pop(self._keys.popleft(), None)
+        if (known := self._results.get(key)) is not None:
+            cached: _Result = known[1]
+            return cached
+        result = compute()
+        kept = cast("PlanningState", result) if state is None else state
+        if kept.belief.states.nbytes <= _LARGE_BYTES:
+            self._results[key] = kept, result
+            self._keys.append(key)
+            if len(self._keys) > _MAX_RESULTS:
+                self._results.pop(self._keys.popleft(), None)
+        return result
 
 
 class MemoizingPlanner(Planner):
@@ -59,16 +65,11 @@ class MemoizingPlanner(Planner):
 
     def __init__(self, problem: Problem, settings: PlanningSettings, cache: MemoCache) -> None:
         super().__init__(problem, settings)
-        self._cache = cache
+        self._once = cache.once
 
     def init(self, seed: int, trial: int = 0) -> PlanningState:
         """Return the state before the first step."""
-        key = "initial", seed, trial
-        state: PlanningState | None = self._cache.get(key)
-        if state is None:
-            state = super().init(seed, trial)
-            self._cache.keep(key, state, state)
-        return state
+        return self._once(("initial", seed, trial), None, partial(super().init, seed, trial))
 
     def observe(
         self, state: PlanningState, sensing_action: int, observation: npt.ArrayLike
@@ -76,26 +77,13 @@ class MemoizingPlanner(Planner):
         """Fold an observation into the belief."""
         shown = np.asarray(observation, dtype=np.float64)
         key = id(state), sensing_action, shown.tobytes()
-        known: tuple[PlanningState, ObservationInfo] | None = self._cache.get(key)
-        if known is None:
-            known = super().observe(state, sensing_action, shown)
-            self._cache.keep(key, state, known)
-        return known
+        return self._once(key, state, partial(super().observe, state, sensing_action, shown))
 
     def advance(self, state: PlanningState, task_action: FloatArray) -> PlanningState:
         """Predict the belief and go to the next step."""
         key = id(state), task_action.tobytes()
-        after: PlanningState | None = self._cache.get(key)
-        if after is None:
-            after = super().advance(state, task_action)
-            self._cache.keep(key, state, after)
-        return after
+        return self._once(key, state, partial(super().advance, state, task_action))
 
     def digest(self, state: PlanningState) -> bytes:
         """Return 32 bytes that are equal for equal states only."""
-        key = id(state)
-        found: bytes | None = self._cache.get(key)
-        if found is None:
-            found = super().digest(state)
-            self._cache.keep(key, state, found)
-        return found
+        return self._once(id(state), state, partial(super().digest, state))
