@@ -187,27 +187,29 @@ async def examine(
     await _Examination(endpoint, robot, tell).run()
 
 
-class _LayerIssue(Exception):  # noqa: N818 - it ends a layer's check, and may be no error
-    """The finding of a layer that does not simply work.
+class _Seen(NamedTuple):
+    """What the check of a layer at one address has found.
 
-    Parameters
+    Attributes
     ----------
-    seen, advice, state : str
-        As of a :class:`LayerFinding`.
+    state : str
+        Empty: :data:`OK`, or :data:`WARNS` if there is advice.
     goes_on : bool
-        Whether the layers above are checked nevertheless.
+        Whether the layers above a failed one are checked nevertheless.
     """
 
-    def __init__(
-        self, seen: str, advice: str = "", state: str = FAILS, *, goes_on: bool = False
-    ) -> None:
-        super().__init__(seen)
-        self.finding = LayerFinding("", state, printable(seen), printable(advice))
-        self.goes_on = goes_on or state != FAILS
+    text: str
+    advice: str = ""
+    state: str = ""
+    goes_on: bool = False
 
 
-_Look: TypeAlias = Callable[[AddressPath], Awaitable[tuple[str, str] | None]]
-"""Describes a layer that works, with advice if it may soon fail; None if another path did."""
+_Look: TypeAlias = Callable[[AddressPath], Awaitable[_Seen | None]]
+"""Checks a layer; None if another path did."""
+
+
+def _fails(text: str, advice: str = "", *, goes_on: bool = False) -> _Seen:
+    return _Seen(text, advice, FAILS, goes_on)
 
 
 class _Examination:
@@ -271,14 +273,12 @@ class _Examination:
     async def _follow(self, path: AddressPath, look: _Look) -> bool:
         """Check one layer at one address; return whether to check those above."""
         address = path.text if len(self._paths) > 1 else ""
-        try:
-            seen = await look(path)
-        except _LayerIssue as found:
-            self._report(found.finding._replace(layer=self._layer, address=address))
-            return found.goes_on
-        if seen is not None:
-            self._tell(WARNS if seen[1] else OK, *seen, address)
-        return True
+        seen = await look(path)
+        if seen is None:
+            return True
+        state = seen.state or (WARNS if seen.advice else OK)
+        self._tell(state, seen.text, seen.advice, address)
+        return seen.goes_on or state != FAILS
 
     def _tell(self, state: str, seen: str, advice: str = "", address: str = "") -> None:
         self._report(LayerFinding(self._layer, state, printable(seen), printable(advice), address))
@@ -307,23 +307,23 @@ class _Examination:
         self._tell(OK, f"{host} is {'an address' if listed == host else listed}")
         return paths
 
-    async def _route(self, path: AddressPath) -> tuple[str, str]:
+    async def _route(self, path: AddressPath) -> _Seen:
         with socket.socket(path.family, socket.SOCK_DGRAM) as probe:
             try:
                 probe.connect(path.address)
             except OSError as error:
-                raise _LayerIssue(
+                return _fails(
                     f"no way there: {system_words(error.errno)}",
                     "is the network up, and the VPN? 'ip route' lists what there is",
-                ) from None
+                )
             local = str(probe.getsockname()[0])
             mtu = probe.getsockopt(*_IP_MTU[path.family])
         least = MAX_DATAGRAM_BYTES + _DATAGRAM_HEADERS_BYTES
         short = self._endpoint.protocol == "udp" and mtu < least
         cut = f"datagrams of up to {least} bytes are cut to pieces: raise the MTU, or use tls/..."
-        return f"from {local} ({interface_of(local)}MTU {mtu})", cut if short else ""
+        return _Seen(f"from {local} ({interface_of(local)}MTU {mtu})", cut if short else "")
 
-    async def _port(self, path: AddressPath) -> tuple[str, str]:
+    async def _port(self, path: AddressPath) -> _Seen:
         endpoint = self._endpoint
         what = "the socket" if endpoint.is_local_socket else f"TCP port {endpoint.port}"
         path.stream = stream = socket.socket(path.family, socket.SOCK_STREAM)
@@ -333,15 +333,15 @@ class _Examination:
                 await asyncio.get_running_loop().sock_connect(stream, path.address)
         except TimeoutError:
             advice = f"is the machine on, and the port right? {_OPEN_IT}"
-            raise _LayerIssue(f"{what}: nothing answers within {_CONNECT_S:g} s", advice) from None
+            return _fails(f"{what}: nothing answers within {_CONNECT_S:g} s", advice)
         except ConnectionRefusedError:
             own = endpoint.is_local_socket or endpoint.is_loopback
             at = endpoint if own else f"{endpoint.protocol}/0.0.0.0:{endpoint.port}"
             advice = f"start the service there: holdfast serve --listen {at}"
-            raise _LayerIssue(f"{what}: refused, nothing listens there", advice) from None
+            return _fails(f"{what}: refused, nothing listens there", advice)
         except OSError as error:
-            raise _LayerIssue(f"{what}: {system_words(error.errno)}", _OPEN_IT) from None
-        return f"{what} is open", ""
+            return _fails(f"{what}: {system_words(error.errno)}", _OPEN_IT)
+        return _Seen(f"{what} is open")
 
     def _read_own(self) -> None:
         robot = self._robot
@@ -359,69 +359,67 @@ class _Examination:
         self._ours = f"{own.name}, {_until(own.expires_s)}"
         self._ours_advice = "; ".join(warnings)
 
-    async def _tls(self, path: AddressPath) -> tuple[str, str]:
+    async def _tls(self, path: AddressPath) -> _Seen:
         endpoint = self._endpoint
         tls = None
         if endpoint.is_encrypted:
             if self._context is None:
                 _, why_not = await certificate_at(path)
                 if why_not:
-                    raise _LayerIssue(why_not, _NO_TLS)
-                return "TLS 1.3", ""
+                    return _fails(why_not, _NO_TLS)
+                return _Seen("TLS 1.3")
             tls = path.tls = WatchedTls(self._context, endpoint.host)
         await path.greet(self._settings, endpoint, tls)
         if tls is None:
             none = f"none, as {endpoint.protocol}/... has: "
             if endpoint.is_loopback:
-                return f"{none}only this machine can connect", ""
+                return _Seen(f"{none}only this machine can connect")
             advice = "use tls/... or udp/... with credentials ('holdfast keys DIR' makes them)"
-            return f"{none}whoever is on the way can read along, and answer", advice
+            return _Seen(f"{none}whoever is on the way can read along, and answer", advice)
         if not tls.established and not isinstance(tls.error, ssl.SSLCertVerificationError):
-            raise _LayerIssue(path.why_not or CLOSES_AT_TLS, _NO_TLS)
-        return "TLS 1.3", ""
+            return _fails(path.why_not or CLOSES_AT_TLS, _NO_TLS)
+        return _Seen("TLS 1.3")
 
-    async def _certificate(self, path: AddressPath) -> tuple[str, str]:
+    async def _certificate(self, path: AddressPath) -> _Seen:
         ours = f"ours: {self._ours}"
         tls, link = path.tls, path.link
         if tls is None or link is None:
-            raise _LayerIssue(ours, self._ours_advice)
+            return _fails(ours, self._ours_advice)
         if not tls.established:
             shown, _ = await certificate_at(path)
             fault = path.why_not.removeprefix("has a certificate that ")
-            raise _LayerIssue(f"theirs: {fault}", account_of(shown))
+            return _fails(f"theirs: {fault}", account_of(shown))
         if link.hello is None and "certificate" in path.why_not:
-            raise _LayerIssue(f"{ours}: {path.why_not}")
+            return _fails(f"{ours}: {path.why_not}")
         if link.peer is None:
-            raise _LayerIssue(f"theirs: {path.why_not}")
+            return _fails(f"theirs: {path.why_not}")
         ends, advice = link.peer.expires_at, [self._ours_advice] * bool(self._ours_advice)
         if ends < time.time() + 86_400.0 * EXPIRES_SOON_DAYS:
             renew = f"'holdfast keys DIR --renew --service {link.peer.name}'"
             advice.append(f"the service's ends soon: {renew} makes another")
         theirs = f"theirs: {link.peer.name}, {_until(ends)}, for {tls.hosts()}"
-        return f"{ours}; {theirs}", "; ".join(advice)
+        return _Seen(f"{ours}; {theirs}", "; ".join(advice))
 
-    async def _protocol(self, path: AddressPath) -> tuple[str, str]:
+    async def _protocol(self, path: AddressPath) -> _Seen:
         hello = None if path.link is None else path.link.hello
         if hello is None:
             reason = path.why_not or "closes the connection without a hello"
-            raise _LayerIssue(
-                reason, "" if "install" in reason or "--tls" in reason else _NO_HOLDFAST
-            )
+            return _fails(reason, "" if "install" in reason or "--tls" in reason else _NO_HOLDFAST)
         try:
             replies = await path.ask(self._echo(), _REPLY_S)
         except TimeoutError:
             advice = "its process stands still, or has far too much to do"
-            raise _LayerIssue(f"has not answered within {_REPLY_S:g} s", advice) from None
+            return _fails(f"has not answered within {_REPLY_S:g} s", advice)
         except HoldfastError as error:
-            raise _LayerIssue(str(error)) from None
+            return _fails(str(error))
         for reply in replies:
             if isinstance(reply, Refused):
                 advice = "install the same release at both ends"
-                raise _LayerIssue(f"{reply.code}: {reply.text}", advice)
+                return _fails(f"{reply.code}: {reply.text}", advice)
         seen = f"{hello.name}, holdfast {hello.release}, messages of version {PROTOCOL_VERSION}"
-        return seen, ""
+        return _Seen(seen)
 
-    async def _datagrams(self, path: AddressPath) -> tuple[str, str]:
+    async def _datagrams(self, path: AddressPath) -> _Seen:
         assert path.link is not None
         try:
             async with asyncio.timeout(_DATAGRAMS_S):
@@ -430,33 +428,34 @@ class _Examination:
         except TimeoutError:
             seen = f"none gets through within {_DATAGRAMS_S:g} s, so everything goes on TLS"
             advice = f"UDP port {self._endpoint.port}: {_OPEN_IT}"
-            raise _LayerIssue(seen, advice, goes_on=True) from None
-        return "get through in both directions", ""
+            return _fails(seen, advice, goes_on=True)
+        return _Seen("get through in both directions")
 
-    async def _clock(self, path: AddressPath) -> tuple[str, str]:
+    async def _clock(self, path: AddressPath) -> _Seen:
         ahead_s = path.clock_ahead_s
         now = f"it is {date_text(time.time())} here"
         if ahead_s is None:
-            raise _LayerIssue(f"the service does not tell its own; {now}", state=NOT_REACHED)
+            return _Seen(f"the service does not tell its own; {now}", state=NOT_REACHED)
         size = f"{abs(ahead_s):.0f} s" if abs(ahead_s) >= 1.0 else "less than a second"
         if abs(ahead_s) < _CLOCKS_APART_S:
-            return f"{size} from the service's", ""
+            return _Seen(f"{size} from the service's")
         advice = "set both ('timedatectl' tells whether they are): certificates are judged by them"
-        return f"{size} {'ahead of' if ahead_s > 0 else 'behind'} the service's; {now}", advice
+        where = "ahead of" if ahead_s > 0 else "behind"
+        return _Seen(f"{size} {where} the service's; {now}", advice)
 
-    async def _problem(self, path: AddressPath) -> tuple[str, str] | None:
+    async def _problem(self, path: AddressPath) -> _Seen | None:
         if path is not next((each for each in self._paths if each.is_greeted), path):
             return None
         if self._robot.decisions is None:
             seen = "not asked: with CONFIG, decisions are compared"
-            raise _LayerIssue(seen, state=NOT_REACHED)
+            return _Seen(seen, state=NOT_REACHED)
         try:
             own = await waited_for(self._robot.decisions, _DECISION_S)
         except TimeoutError:
             seen = f"not asked: two decisions take longer than {_DECISION_S:g} s here"
-            raise _LayerIssue(seen, state=NOT_REACHED) from None
+            return _Seen(seen, state=NOT_REACHED)
         except HoldfastError as error:
-            raise _LayerIssue(f"this robot's own planner fails: {error}", goes_on=True) from None
+            return _fails(f"this robot's own planner fails: {error}", goes_on=True)
         session, took_s = os.urandom(16), 0.0
         for turn in own.turns:
             session_configuration = None if turn.observations else own.session_configuration
@@ -467,15 +466,16 @@ class _Examination:
             except TimeoutError:
                 advice = "it is too slow for this problem, or has too much to do"
                 seen = f"no decision within {_DECISION_S:g} s"
-                raise _LayerIssue(seen, advice, goes_on=True) from None
+                return _fails(seen, advice, goes_on=True)
             except HoldfastError as error:
-                raise _LayerIssue(str(error), goes_on=True) from None
+                return _fails(str(error), goes_on=True)
             took_s = time.perf_counter() - began
-            _compare(replies, turn)
+            if (fault := _fault_of(replies, turn)) is not None:
+                return fault
         self._decision_s = took_s, own.turns[-1].took_s
         problem = own.session_configuration.problem
         seen = f"{problem}: the same code and settings; {len(own.turns)} decisions are"
-        return f"{seen} the robot's own, bit for bit", ""
+        return _Seen(f"{seen} the robot's own, bit for bit")
 
     async def _decided(
         self,
@@ -503,7 +503,7 @@ class _Examination:
                 return replies
             await asyncio.sleep(1e-3 * busy.retry_after_ms)
 
-    async def _round_trip(self, path: AddressPath) -> tuple[str, str]:
+    async def _round_trip(self, path: AddressPath) -> _Seen:
         assert path.link is not None and path.link.hello is not None
         took_ms: list[float] = []
         with contextlib.suppress(TimeoutError, HoldfastError):
@@ -513,7 +513,7 @@ class _Examination:
                     await path.ask(self._echo(), _REPLY_S)
                     took_ms.append(1e3 * (time.perf_counter() - began))
         if not took_ms:
-            raise _LayerIssue(f"no echo within {_REPLY_S:g} s", "its process stands still")
+            return _fails(f"no echo within {_REPLY_S:g} s", "its process stands still")
         worst_ms = max(took_ms)
         seen = f"{len(took_ms)} echoes: median {statistics.median(took_ms):.1f} ms, "
         seen += f"worst {worst_ms:.1f} ms"
@@ -531,7 +531,7 @@ class _Examination:
             for key, limit_ms in limits_ms.items()
             if 2.0 * worst_ms > limit_ms
         ]
-        return seen, "; ".join(advice)
+        return _Seen(seen, "; ".join(advice))
 
     def _echo(self) -> Request:
         """Return a request of an unknown session, which is answered at once."""
@@ -539,18 +539,19 @@ class _Examination:
         return Request(PROTOCOL_VERSION, unknown, 1, number, 0, 0, False, bytes(DIGEST_SIZE))
 
 
-def _compare(replies: list[Reply], own: ReferenceTurn) -> None:
-    """Raise if an answer differs from the robot's own in any bit."""
+def _fault_of(replies: list[Reply], own: ReferenceTurn) -> _Seen | None:
+    """Return what is wrong with answers; None if they are the robot's own, bit for bit."""
     for reply in replies:
         if isinstance(reply, Refused):
             advice = "deploy the same holdfast and problem at both ends"
-            raise _LayerIssue(f"{reply.code}: {reply.text}", advice, goes_on=True)
+            return _fails(f"{reply.code}: {reply.text}", advice, goes_on=True)
         if isinstance(reply, NeedState):
             seen = "the service comes to another state than this robot, with the same code"
-            raise _LayerIssue(seen, _DISTRUST, goes_on=True)
+            return _fails(seen, _DISTRUST, goes_on=True)
     if not own.agrees_with(replies):
         seen = "the service answers otherwise than this robot's own planner, with the same code"
-        raise _LayerIssue(seen, _DISTRUST, goes_on=True)
+        return _fails(seen, _DISTRUST, goes_on=True)
+    return None
 
 
 def _until(expires_s: float) -> str:
