@@ -19,7 +19,8 @@ from hypothesis import strategies as st
 from tests.unit.test_key_ring import run_keys
 
 from holdfast.errors import CredentialsError, TransportError
-from holdfast.transport.credentials import Role, load_credentials
+from holdfast.transport.credentials import load_credentials
+from holdfast.transport.endpoints import Role
 from holdfast.transport.key_ring import list_credentials, make_credentials, revoke_credentials
 from holdfast.transport.revocation import REVOKED_FILE, refuse_revoked, revoked_serials
 

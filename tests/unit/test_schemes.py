@@ -10,7 +10,7 @@ import sys
 import pytest
 
 from holdfast.errors import TransportError
-from holdfast.transport.endpoints import SCHEMES, Endpoint, check_direction
+from holdfast.transport.endpoints import SCHEMES, Endpoint, check_endpoint
 from holdfast.transport.schemes import Scheme, load_scheme
 
 
@@ -26,13 +26,13 @@ def test_each_is_implemented_by_a_class_with_the_same_methods(name: str) -> None
 
 @pytest.mark.parametrize("name", SCHEMES)
 def test_who_may_listen(name: str) -> None:
-    endpoint = Endpoint(name, "there", 0)
-    check_direction(endpoint, service_listens=True)
+    endpoint = str(Endpoint(name, "there", 0))
+    check_endpoint(endpoint, "service", listens=True)
     if SCHEMES[name].services_listen:
         with pytest.raises(TransportError, match=f"endpoint {name}/there.*service"):
-            check_direction(endpoint, service_listens=False)
+            check_endpoint(endpoint, "robot", listens=True)
     else:
-        check_direction(endpoint, service_listens=False)
+        check_endpoint(endpoint, "robot", listens=True)
 
 
 def test_streams_are_looked_up_as_they_are_written() -> None:
@@ -40,7 +40,7 @@ def test_streams_are_looked_up_as_they_are_written() -> None:
     scheme = load_scheme("tls")
     assert scheme.look_up(endpoint) == ("planner.example", 7447, socket.AF_UNSPEC)
     assert scheme.listening_endpoint(endpoint) == endpoint
-    assert scheme.bound_endpoint(endpoint, endpoint.with_port(9)) == endpoint.with_port(9)
+    assert scheme.bound_endpoint(endpoint, endpoint._replace(port=9)) == endpoint._replace(port=9)
 
 
 def test_what_no_endpoint_uses_is_not_imported() -> None:

@@ -20,8 +20,8 @@ from cryptography.x509.oid import NameOID
 from holdfast.errors import CredentialsError
 from holdfast.protocol.events import CallEnded, ReplyReceived, ServiceAppeared
 from holdfast.transport.contract import IncomingCall
-from holdfast.transport.credentials import Role, load_credentials
-from holdfast.transport.endpoints import ServiceAddress, TlsFiles
+from holdfast.transport.credentials import load_credentials
+from holdfast.transport.endpoints import Role, ServiceAddress, TlsFiles
 from holdfast.transport.key_ring import make_credentials
 from holdfast.transport.robot_end import StreamRobotTransport
 from holdfast.transport.service_end import StreamServiceTransport

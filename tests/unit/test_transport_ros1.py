@@ -8,8 +8,8 @@ from functools import partial
 
 import pytest
 
-from holdfast.transport.endpoints import Endpoint
-from holdfast.transport.frames import CALL, LAST, Frame, Hello, Role, encode_hello
+from holdfast.transport.endpoints import Endpoint, Role
+from holdfast.transport.frames import CALL, LAST, Frame, Hello, encode_hello
 from holdfast.transport.link_settings import LinkSettings
 from holdfast.transport.links import Link, LinkOwner
 from holdfast.transport.ros1 import RosScheme, exchange_name
@@ -90,4 +90,4 @@ def test_a_service_listens_where_ros_says_and_keeps_its_name() -> None:
     scheme = RosScheme()
     listening = scheme.listening_endpoint(HERE)
     assert listening == Endpoint("tcp", "127.0.0.1", 0)
-    assert scheme.bound_endpoint(HERE, listening.with_port(7)) == HERE
+    assert scheme.bound_endpoint(HERE, listening._replace(port=7)) == HERE

@@ -161,7 +161,7 @@ def check(service: str, tls: Path | None) -> Endpoint:
     TransportError
         If it is none, or credentials are given that it does not use.
     """
-    endpoint = check_endpoint(service, listens=False)
+    endpoint = check_endpoint(service, "robot", listens=False)
     if endpoint.is_ros1:
         raise TransportError(
             f"endpoint {endpoint}: of a service in ROS 1, 'rosservice info "

@@ -97,7 +97,7 @@ class SharedEndpoints:
         bound.bind(where)
         bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 0)
         bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
-        return endpoint.with_port(bound.getsockname()[1])
+        return endpoint._replace(port=bound.getsockname()[1])
 
 
 def _listen(family: int, bound: socket.socket) -> socket.socket:

@@ -268,15 +268,14 @@ def checked_endpoints(options: ServeOptions) -> list[Endpoint]:
     InvalidValueError
         If health or metrics are to be offered, or a router of ROS 2 is, at the same port.
     """
-    from holdfast.transport.endpoints import check_direction, check_endpoint
+    from holdfast.transport.endpoints import check_endpoint
 
     listen = []
     for name, texts in (("--listen", options.listen), ("--connect", options.connect)):
         listens = name == "--listen"
         for text in texts:
             try:
-                endpoint = check_endpoint(text, listens=listens)
-                check_direction(endpoint, service_listens=listens)
+                endpoint = check_endpoint(text, "service", listens=listens)
             except TransportError as error:
                 raise TransportError(f"{name}: {error}") from None
             # Of an encrypted one without credentials the transport says that they are missing.

@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from holdfast.errors import CredentialsError
-from holdfast.transport.credentials import Role, date_text, warn_if_open
-from holdfast.transport.endpoints import AUTHORITY_FILE
+from holdfast.transport.credentials import date_text, warn_if_open
+from holdfast.transport.endpoints import AUTHORITY_FILE, Role
 from holdfast.transport.revocation import REVOKED_FILE
 
 try:

@@ -14,10 +14,10 @@ import warnings
 from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, NamedTuple
 
 from holdfast.errors import CredentialsError, TransportError
-from holdfast.transport.endpoints import AUTHORITY_FILE, TlsFiles
+from holdfast.transport.endpoints import AUTHORITY_FILE, Role, TlsFiles
 from holdfast.transport.revocation import REVOKED_FILE, refuse_revoked
 
 if TYPE_CHECKING:
@@ -26,14 +26,11 @@ if TYPE_CHECKING:
 __all__ = [
     "EXPIRES_SOON_DAYS",
     "LoadedCredentials",
-    "Role",
     "date_text",
     "file_versions",
     "load_credentials",
     "warn_if_open",
 ]
-
-Role: TypeAlias = Literal["robot", "service"]
 
 EXPIRES_SOON_DAYS = 14
 """With fewer days left, loading a certificate warns."""

@@ -33,7 +33,7 @@ from holdfast.transport.datagram_sockets import (
     LARGEST_DATAGRAM,
     DatagramSocket,
 )
-from holdfast.transport.endpoints import Endpoint
+from holdfast.transport.endpoints import Endpoint, Role
 from holdfast.transport.exchanges import (
     MESSAGE_OVERHEAD,
     ReceivedReply,
@@ -51,7 +51,6 @@ from holdfast.transport.frames import (
     REPLY,
     Frame,
     FrameDecoder,
-    Role,
     encode_frame,
 )
 from holdfast.transport.link_settings import LinkSettings

@@ -13,7 +13,7 @@ import os
 import re
 import socket
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, TypeAlias
 
 import msgspec
 
@@ -26,10 +26,10 @@ __all__ = [
     "MAX_SOCKET_PATH_BYTES",
     "SCHEMES",
     "Endpoint",
+    "Role",
     "ServiceAddress",
     "TlsFiles",
     "check_credentials",
-    "check_direction",
     "check_endpoint",
     "check_name",
     "host_and_port",
@@ -38,6 +38,9 @@ __all__ = [
     "system_words",
     "why_not_bound",
 ]
+
+Role: TypeAlias = Literal["robot", "service"]
+"""Of an end of a link."""
 
 MAX_SOCKET_PATH_BYTES = 107
 """Bound on the path of a local socket, from the system's ``sockaddr_un``."""
@@ -190,10 +193,6 @@ class Endpoint(NamedTuple):
         addresses = [_address_of(str(entry[4][0])) for entry in found]
         return all(each is not None and _is_loopback_address(each) for each in addresses)
 
-    def with_port(self, port: int) -> Endpoint:
-        """Return the same endpoint with another port."""
-        return self._replace(port=port)
-
 
 class ServiceAddress(NamedTuple):
     """How a robot and a service find each other.
@@ -333,28 +332,25 @@ def why_not_bound(error: OSError) -> str:
     return reason
 
 
-def check_endpoint(text: str, *, listens: bool) -> Endpoint:
-    """Read the endpoint of one end of a link; port 0 is only for listening.
+def check_endpoint(text: str, role: Role, *, listens: bool) -> Endpoint:
+    """Read the endpoint at which the end of this role listens, or to which it connects.
 
     Raises
     ------
     TransportError
-        If it is malformed, or has port 0 to connect to.
+        If it is malformed, has port 0 to connect to, or a protocol with which the other end
+        listens.
     """
     endpoint = parse_endpoint(text)
     if not listens and endpoint.port == 0 and SCHEMES[endpoint.protocol].place == "address":
         raise TransportError(
             f"endpoint {endpoint}: port 0 is for listening; to connect, give the port, "
-            f"as in {endpoint.with_port(7447)}"
+            f"as in {endpoint._replace(port=7447)}"
         )
-    return endpoint
-
-
-def check_direction(endpoint: Endpoint, *, service_listens: bool) -> None:
-    """Raise TransportError if the robot cannot listen with this protocol, and should."""
     reason = SCHEMES[endpoint.protocol].services_listen
-    if reason and not service_listens:
+    if reason and listens != (role == "service"):
         raise TransportError(f"endpoint {endpoint}: {reason}")
+    return endpoint
 
 
 def check_name(what: str, name: str) -> None:

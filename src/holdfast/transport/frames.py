@@ -11,14 +11,14 @@ from __future__ import annotations
 import re
 import struct
 from collections.abc import Mapping
-from typing import Final, Literal, NamedTuple, TypeAlias, cast
+from typing import Final, NamedTuple, cast
 
 import msgspec
 
 from holdfast import __version__
 from holdfast.errors import FrameError, TransportError
 from holdfast.printable import printable
-from holdfast.transport.endpoints import check_name
+from holdfast.transport.endpoints import Role, check_name
 
 __all__ = [
     "CALL",
@@ -37,15 +37,12 @@ __all__ = [
     "Frame",
     "FrameDecoder",
     "Hello",
-    "Role",
     "decode_hello",
     "encode_frame",
     "encode_goodbye",
     "encode_hello",
     "read_goodbye",
 ]
-
-Role: TypeAlias = Literal["robot", "service"]
 
 WIRE_VERSION: Final = 1
 """Of the frames and the hello; the protocol's messages have another version."""

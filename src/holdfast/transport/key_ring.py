@@ -55,8 +55,7 @@ from holdfast.transport.authority import (
     sign_certificate,
     sign_revocations,
 )
-from holdfast.transport.credentials import Role
-from holdfast.transport.endpoints import AUTHORITY_FILE, CERTIFICATE_FILE, KEY_FILE
+from holdfast.transport.endpoints import AUTHORITY_FILE, CERTIFICATE_FILE, KEY_FILE, Role
 from holdfast.transport.revocation import REVOKED_FILE
 
 if TYPE_CHECKING:

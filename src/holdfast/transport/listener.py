@@ -99,7 +99,7 @@ class Listener:
         self.endpoint = endpoint
         self._socket_file: os.stat_result | None = None
         if not endpoint.is_local_socket:
-            self.endpoint = endpoint.with_port(self._socket.getsockname()[1])
+            self.endpoint = endpoint._replace(port=self._socket.getsockname()[1])
         elif listening is None:
             self._socket_file = Path(endpoint.host).stat()
         self._silent: dict[socket.socket, bytes] = {}

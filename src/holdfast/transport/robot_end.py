@@ -24,7 +24,6 @@ from holdfast.transport.endpoints import (
     ServiceAddress,
     TlsFiles,
     check_credentials,
-    check_direction,
     check_endpoint,
     check_name,
 )
@@ -129,9 +128,8 @@ class StreamRobotTransport:
         self._services: dict[str, _ServiceLinks] = {}
         credentials: ClientCredentials | None = None
         for service, address in services.items():
-            endpoint = check_endpoint(address.endpoint, listens=address.listens)
+            endpoint = check_endpoint(address.endpoint, "robot", listens=address.listens)
             check_credentials(endpoint, tls)
-            check_direction(endpoint, service_listens=not address.listens)
             if address.name is not None:
                 check_name("name of a service", address.name)
             if credentials is None and tls is not None and endpoint.is_encrypted:

@@ -17,8 +17,7 @@ import struct
 from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 from holdfast.errors import CallError, GoneError, TransportError
-from holdfast.transport.endpoints import Endpoint
-from holdfast.transport.frames import Role
+from holdfast.transport.endpoints import Endpoint, Role
 from holdfast.transport.link_settings import LinkSettings
 from holdfast.transport.links import Link, LinkOwner
 from holdfast.transport.ros1_calls import call

@@ -13,8 +13,7 @@ import socket
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, ClassVar
 
-from holdfast.transport.endpoints import SCHEMES, Endpoint
-from holdfast.transport.frames import Role
+from holdfast.transport.endpoints import SCHEMES, Endpoint, Role
 from holdfast.transport.links import Link, LinkOwner
 
 if TYPE_CHECKING:

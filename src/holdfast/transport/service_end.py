@@ -24,7 +24,6 @@ from holdfast.transport.endpoints import (
     Endpoint,
     TlsFiles,
     check_credentials,
-    check_direction,
     check_endpoint,
     check_name,
 )
@@ -168,12 +167,10 @@ class StreamServiceTransport(LinkOwner):
             raise TransportError(
                 f"service {name} has no endpoint: give one, as in tcp/127.0.0.1:7447"
             )
-        self._listen = [check_endpoint(text, listens=True) for text in listen]
-        self._connect = [check_endpoint(text, listens=False) for text in connect]
+        self._listen = [check_endpoint(text, "service", listens=True) for text in listen]
+        self._connect = [check_endpoint(text, "service", listens=False) for text in connect]
         for endpoint in (*self._listen, *self._connect):
             check_credentials(endpoint, tls)
-        for endpoint in self._connect:
-            check_direction(endpoint, service_listens=False)
         self._listening: Sequence[socket.socket | None] = listening or [None] * len(listen)
         self._schemes = {
             endpoint.protocol: load_scheme(endpoint.protocol)
