@@ -36,7 +36,7 @@ from holdfast.planning import Planner
 from holdfast.problems.registry import BUILT_IN
 from holdfast.protocol.records import ActingRecord, ObservedRecord
 from holdfast.recording.journal import Journal
-from holdfast.robot.trial import NullObserver, SensingStep, TaskStep, run_trial
+from holdfast.robot.trial import SensingStep, TaskStep, TrialObserver, run_trial
 from holdfast.ros.poses import PoseLayout, pose_layout
 
 PEG = """\
@@ -110,7 +110,7 @@ class Step(NamedTuple):
     action: np.ndarray
 
 
-class Seen(NullObserver):
+class Seen(TrialObserver):
     """Keeps all of a trial."""
 
     def __init__(self) -> None:

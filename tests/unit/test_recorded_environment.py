@@ -22,10 +22,10 @@ from holdfast.protocol.records import (
 from holdfast.recording.figure import trial_figure
 from holdfast.recording.recorded_environment import RecordedEnvironment
 from holdfast.recording.recorder import Recorder
-from holdfast.robot.trial import NullObserver, SensingStep, TaskStep, run_trial
+from holdfast.robot.trial import SensingStep, TaskStep, TrialObserver, run_trial
 
 
-class _Journalling(NullObserver):
+class _Journalling(TrialObserver):
     """Writes down what a robot writes down."""
 
     def __init__(self) -> None:

@@ -14,7 +14,7 @@ from tests.command_line import run_here
 import holdfast as hf
 from holdfast.errors import OutputError
 from holdfast.recording.reading import RunArrays
-from holdfast.robot.trial import NullObserver, SensingStep, TaskStep
+from holdfast.robot.trial import SensingStep, TaskStep, TrialObserver
 
 Recorded = Callable[..., RunArrays]
 
@@ -39,7 +39,7 @@ class Robot:
 """
 
 
-class Seen(NullObserver):
+class Seen(TrialObserver):
     """Keeps what the loop of a trial shows."""
 
     def __init__(self) -> None:

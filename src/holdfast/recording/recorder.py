@@ -11,7 +11,7 @@ from holdfast.belief import Belief, estimate, standard_deviation
 from holdfast.outcome import TrialResult
 from holdfast.planning import PlanningState
 from holdfast.robot.environment import Environment
-from holdfast.robot.trial import SensingStep, TaskStep
+from holdfast.robot.trial import SensingStep, TaskStep, TrialObserver
 
 __all__ = [
     "Recorder",
@@ -77,7 +77,7 @@ class TrialRecord:
     result: TrialResult | None = None
 
 
-class Recorder:
+class Recorder(TrialObserver):
     """An observer that records one trial and ignores all others.
 
     Attributes

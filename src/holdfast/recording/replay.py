@@ -45,7 +45,7 @@ from holdfast.recording.run_directory import EVENTS_NAME, TIMINGS_NAME
 from holdfast.recording.step_times import NS_PER_S, StepClock, TrialTimes, read_events, trial_ends
 from holdfast.recording.timings import rows_by_trial
 from holdfast.robot.environment import Environment, SimulatedEnvironment
-from holdfast.robot.trial import SensingStep, TaskStep, run_trial
+from holdfast.robot.trial import SensingStep, TaskStep, TrialObserver, run_trial
 
 __all__ = ["RecordedRun"]
 
@@ -241,7 +241,7 @@ class RecordedRun:
         return TrialTimes(times, deciders)
 
 
-class _Replay:
+class _Replay(TrialObserver):
     """Observes a trial that is run again: compares its decisions and writes its facts."""
 
     def __init__(

@@ -11,7 +11,7 @@ An observer sees every step (to draw a figure, say). The default one does nothin
 from __future__ import annotations
 
 from time import perf_counter
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
@@ -36,7 +36,6 @@ from holdfast.robot.environment import (
 
 __all__ = [
     "NULL_OBSERVER",
-    "NullObserver",
     "SensingStep",
     "TaskStep",
     "TrialObserver",
@@ -65,43 +64,26 @@ class TaskStep(NamedTuple):
     reward: float | None
 
 
-class TrialObserver(Protocol):
-    """Observes a trial; it must change nothing, and copy what it keeps."""
+class TrialObserver:
+    """Observes a trial: derive from it, and define what is of interest; the rest does nothing.
+
+    It must change nothing, and copy what it keeps.
+    """
 
     def trial_began(self, environment: Environment, state: PlanningState) -> None:
         """Take note of the first state."""
-        ...
 
     def sensed(self, step: SensingStep) -> None:
         """Take note of a sensing action."""
-        ...
 
     def acted(self, step: TaskStep) -> None:
         """Take note of a task action."""
-        ...
 
     def trial_ended(self, state: PlanningState, result: TrialResult) -> None:
         """Take note of the last state and of the outcome."""
-        ...
 
 
-class NullObserver:
-    """An observer that looks away."""
-
-    def trial_began(self, environment: Environment, state: PlanningState) -> None:
-        """Do nothing."""
-
-    def sensed(self, step: SensingStep) -> None:
-        """Do nothing."""
-
-    def acted(self, step: TaskStep) -> None:
-        """Do nothing."""
-
-    def trial_ended(self, state: PlanningState, result: TrialResult) -> None:
-        """Do nothing."""
-
-
-NULL_OBSERVER = NullObserver()
+NULL_OBSERVER = TrialObserver()
 
 
 def run_trial(

@@ -36,7 +36,6 @@ from holdfast.planning import Planner
 from holdfast.problems.problem import Problem
 from holdfast.robot.trial import (
     NULL_OBSERVER,
-    NullObserver,
     SensingStep,
     TaskStep,
     TrialObserver,
@@ -77,7 +76,7 @@ class _TrialIsLongError(Exception):
     """Not an error: the trial that runs in this process is worth starting workers for."""
 
 
-class _Watch(NullObserver):
+class _Watch(TrialObserver):
     """Gives a trial up once it has taken longer than workers need to start."""
 
     def __init__(self) -> None:
