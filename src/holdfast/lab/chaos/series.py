@@ -9,6 +9,7 @@ from __future__ import annotations
 import shutil
 import threading
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import NamedTuple
@@ -126,23 +127,14 @@ class Series:
         """
         finished = {outcome.trial for outcome in self.outcomes}
         numbers = range(self._plan.first, self._plan.first + trials)
-        missing: SimpleQueue[int] = SimpleQueue()
-        left = 0
-        for trial in numbers:
-            if trial not in finished:
-                missing.put(trial)
-                left += 1
+        missing = [trial for trial in numbers if trial not in finished]
         news: SimpleQueue[_Started | TrialOutcome | BaseException] = SimpleQueue()
         cancelled = threading.Event()
-        workers = [
-            threading.Thread(
-                target=self._work, args=(missing, news, cancelled), name=f"chaos-{number}"
-            )
-            for number in range(min(jobs, left))
-        ]
+        pool = ThreadPoolExecutor(jobs, thread_name_prefix="chaos")
         try:
-            for worker in workers:
-                worker.start()
+            for trial in missing:
+                pool.submit(self._work, trial, news, cancelled)
+            left = len(missing)
             while left:
                 try:
                     received = news.get(timeout=_LOOK_S)
@@ -158,29 +150,24 @@ class Series:
                     raise received
         finally:
             cancelled.set()
-            for worker in workers:
-                if worker.ident is not None:
-                    worker.join()
+            pool.shutdown(cancel_futures=True)
 
     def _work(
         self,
-        missing: SimpleQueue[int],
+        trial: int,
         news: SimpleQueue[_Started | TrialOutcome | BaseException],
         cancelled: threading.Event,
     ) -> None:
-        while not cancelled.is_set():
-            try:
-                trial = missing.get_nowait()
-            except Empty:
-                return
-            news.put(_Started(trial, self._plan.of(trial)[1]))
-            try:
-                news.put(self._run_trial(trial, cancelled))
-            except CancelledTrialError:
-                return
-            except BaseException as error:  # noqa: BLE001 - raised again where it is read
-                news.put(error)
-                return
+        if cancelled.is_set():
+            return
+        news.put(_Started(trial, self._plan.of(trial)[1]))
+        try:
+            news.put(self._run_trial(trial, cancelled))
+        except CancelledTrialError:
+            pass
+        except BaseException as error:  # noqa: BLE001 - raised again where it is read
+            cancelled.set()
+            news.put(error)
 
     def _run_trial(self, trial: int, cancelled: threading.Event) -> TrialOutcome:
         directory = self.directory_of(trial)

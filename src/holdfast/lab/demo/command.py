@@ -73,7 +73,7 @@ def main(arguments: Sequence[str]) -> int:
 
 def _run(out: Path | None, seed: int, *, quick: bool) -> Findings:
     from holdfast.files import claim_directory
-    from holdfast.lab.demo.scenario import Plan, run_demo
+    from holdfast.lab.demo.scenario import Demo, Plan
     from holdfast.lab.demo.state import DemoState
     from holdfast.lab.demo.timeline import make_show
     from holdfast.lab.testbed.driver import Testbed
@@ -88,7 +88,7 @@ def _run(out: Path | None, seed: int, *, quick: bool) -> Findings:
         with Testbed(directory, orderly_end_s=_ORDERLY_END_S) as testbed:
             show.start(state)
             try:
-                findings = run_demo(testbed, seed, plan, state, show)
+                findings = Demo(testbed, seed, plan, state, show).run()
             finally:
                 # The terminal comes first; after SIGHUP there is none.
                 with contextlib.suppress(OSError):

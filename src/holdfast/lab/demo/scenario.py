@@ -30,10 +30,10 @@ from holdfast.robot.links import RECOVERY_SERVICE
 __all__ = [
     "KILLED_RUN_NAME",
     "REFERENCE_RUN_NAME",
+    "Demo",
     "Findings",
     "Outage",
     "Plan",
-    "run_demo",
 ]
 
 CONFIGURATION_NAME = "demo.yaml"
@@ -141,22 +141,9 @@ class Plan(NamedTuple):
     duration_s: float = 16.0
 
 
-def run_demo(
-    testbed: Testbed, seed: int, plan: Plan, state: DemoState, observer: Observer
-) -> Findings:
-    """Run the demo in the testbed's directory, which gets ``findings.json``.
+class Demo:
+    """The demo in a testbed's directory."""
 
-    Raises
-    ------
-    NoProgressError
-        If something does not happen in time.
-    ProcessEndedError
-        If a process ends that should not.
-    """
-    return _Scenario(testbed, seed, plan, state, observer).run()
-
-
-class _Scenario:
     def __init__(
         self, testbed: Testbed, seed: int, plan: Plan, state: DemoState, observer: Observer
     ) -> None:
@@ -169,6 +156,15 @@ class _Scenario:
         testbed.on_turn = self._narrator.update
 
     def run(self) -> Findings:
+        """Run it; the findings are also written to ``findings.json``.
+
+        Raises
+        ------
+        NoProgressError
+            If something does not happen in time.
+        ProcessEndedError
+            If a process ends that should not.
+        """
         testbed = self._testbed
         directory = testbed.directory
         reference = self._make_reference_run()

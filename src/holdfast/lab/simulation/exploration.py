@@ -8,6 +8,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from functools import cache
 
 import msgspec
 
@@ -102,7 +103,13 @@ def _explore_in_processes(
     batches: Iterator[range], jobs: int, on_batch: Callable[[range, ExplorationTally], bool]
 ) -> None:
     others = set(multiprocessing.active_children())
-    pool = ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn"), initializer=_begin)
+    pool = ProcessPoolExecutor(
+        jobs,
+        multiprocessing.get_context("spawn"),
+        # Ctrl-C reaches every process of the terminal; the first one alone answers it.
+        initializer=signal.signal,
+        initargs=(signal.SIGINT, signal.SIG_IGN),
+    )
     try:
         running: deque[tuple[range, Future[ExplorationTally]]] = deque()
         while True:
@@ -125,19 +132,13 @@ def _explore_in_processes(
             process.kill()
 
 
-_simulator: Simulator | None = None
-
-
-def _begin() -> None:
-    # Ctrl-C reaches every process of the terminal; the first one alone answers it.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+@cache
+def _simulator_of_this_process() -> Simulator:
+    return Simulator()
 
 
 def _run_here(seeds: range) -> ExplorationTally:
-    global _simulator
-    if _simulator is None:
-        _simulator = Simulator()
-    return _run(seeds, _simulator)
+    return _run(seeds, _simulator_of_this_process())
 
 
 def _run(seeds: range, simulator: Simulator) -> ExplorationTally:

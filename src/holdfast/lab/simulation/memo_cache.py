@@ -7,6 +7,9 @@ is taken over, a share is computed again, and must come to the same.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Generic, TypeVar
+
 import numpy as np
 import numpy.typing as npt
 
@@ -15,57 +18,68 @@ from holdfast.lab.errors import Violation
 from holdfast.planning import Decision, ObservationInfo, Planner, PlanningState, digest
 from holdfast.protocol.service_jobs import Job, JobResult
 
-__all__ = ["JobCache", "MemoizingPlanner"]
-
+__all__ = ["JobCache", "Memo", "MemoizingPlanner"]
 
 _MOST = 20_000
-"""Kept of each kind; then all is forgotten."""
-
 _COMPUTED_AGAIN = 61
 """One of so many that are known is computed all the same."""
 
+Key = TypeVar("Key")
+Value = TypeVar("Value")
 
-class RememberedDigests:
-    """Digests of states, by the identity of the state, which is kept with its own."""
 
-    def __init__(self) -> None:
-        self._digests: dict[int, tuple[PlanningState, bytes]] = {}
+class Memo(Generic[Key, Value]):
+    """Results by key. Once there are ``most`` of them, all are forgotten.
 
-    def of(self, state: PlanningState) -> bytes:
-        """Return the digest of a state."""
-        known = self._digests.get(id(state))
+    ``check`` gets a result that is taken over and, now and then, the same computed again.
+    """
+
+    def __init__(
+        self, most: int = _MOST, check: Callable[[Value, Value], None] | None = None
+    ) -> None:
+        self._most = most
+        self._check = check
+        self._known: dict[Key, Value] = {}
+        self._taken_over = 0
+
+    def get(self, key: Key, compute: Callable[[], Value]) -> Value:
+        """Return the result of a key, computed if it is not known."""
+        known = self._known.get(key)
         if known is None:
-            if len(self._digests) >= _MOST:
-                self._digests.clear()
-            known = self._digests[id(state)] = state, digest(state)
-        return known[1]
+            if len(self._known) >= self._most:
+                self._known.clear()
+            result = self._known[key] = compute()
+            return result
+        if self._check is not None:
+            self._taken_over += 1
+            if self._taken_over % _COMPUTED_AGAIN == 0:
+                self._check(known, compute())
+        return known
 
 
 class JobCache:
     """Outcomes of the services' jobs, by what the jobs were made with."""
 
     def __init__(self) -> None:
-        self._outcomes: dict[tuple[object, ...], JobResult] = {}
-        self._digests = RememberedDigests()
-        self._taken_over = 0
+        self._outcomes: Memo[tuple[object, ...], tuple[str, JobResult]]
+        self._outcomes = Memo(check=_check_outcomes)
+        self._digests: Memo[int, tuple[PlanningState, bytes]] = Memo()
 
     def outcome(self, job: Job) -> JobResult:
         """Return the outcome of a job; another one than the last time is a Violation."""
         state = job.state
-        identity = job.identity, None if state is None else self._digests.of(state)
-        known = self._outcomes.get(identity)
-        if known is None:
-            if len(self._outcomes) >= _MOST:
-                self._outcomes.clear()
-            outcome = self._outcomes[identity] = job.run()
-            return outcome
-        self._taken_over += 1
-        if self._taken_over % _COMPUTED_AGAIN == 0 and _said(job.run()) != _said(known):
-            raise Violation(f"a {job.kind} job came to another outcome than before")
-        return known
+        known = None
+        if state is not None:
+            known = self._digests.get(id(state), lambda: (state, digest(state)))[1]
+        return self._outcomes.get((job.identity, known), lambda: (job.kind, job.run()))[1]
 
 
-def _said(outcome: JobResult) -> tuple[object, ...]:
+def _check_outcomes(known: tuple[str, JobResult], now: tuple[str, JobResult]) -> None:
+    if _comparable(now[1]) != _comparable(known[1]):
+        raise Violation(f"a {now[0]} job came to another outcome than before")
+
+
+def _comparable(outcome: JobResult) -> tuple[object, ...]:
     states = (outcome.state, outcome.ahead)
     return (
         *(None if state is None else digest(state) for state in states),
@@ -79,75 +93,50 @@ class MemoizingPlanner(Planner):
     def __init__(self, planner: Planner) -> None:
         super().__init__(planner.problem, planner.settings)
         self._planner = planner
-        self._digests = RememberedDigests()
-        self._initial: dict[tuple[int, int], PlanningState] = {}
-        # By the identity of the state, which is kept with it and so cannot be another one's.
-        self._observed: dict[
+        self._initial: Memo[tuple[int, int], PlanningState] = Memo()
+        # By the identity of the state, which is kept with the result and so stays the state's own.
+        self._digests: Memo[int, tuple[PlanningState, bytes]] = Memo()
+        self._observed: Memo[
             tuple[int, int, bytes], tuple[PlanningState, PlanningState, ObservationInfo]
-        ] = {}
-        self._advanced: dict[tuple[int, bytes], tuple[PlanningState, PlanningState]] = {}
-        self._decided: dict[int, tuple[PlanningState, Decision]] = {}
-        self._taken_over = 0
+        ] = Memo(check=lambda known, now: _check_states(known[1], now[1]))
+        self._advanced: Memo[tuple[int, bytes], tuple[PlanningState, PlanningState]] = Memo(
+            check=lambda known, now: _check_states(known[1], now[1])
+        )
+        self._decided: Memo[int, tuple[PlanningState, Decision]] = Memo()
 
     def init(self, seed: int, trial: int = 0) -> PlanningState:
         """Return the state before the first step."""
-        state = self._initial.get((seed, trial))
-        if state is None:
-            state = self._initial[seed, trial] = self._planner.init(seed, trial)
-        return state
+        return self._initial.get((seed, trial), lambda: self._planner.init(seed, trial))
 
     def observe(
         self, state: PlanningState, sensing_action: int, observation: npt.ArrayLike
     ) -> tuple[PlanningState, ObservationInfo]:
         """Fold an observation into the belief."""
         shown = np.asarray(observation, dtype=np.float64)
-        key = id(state), sensing_action, shown.tobytes()
-        known = self._observed.get(key)
-        if known is None:
-            self._make_room()
-            after, info = self._planner.observe(state, sensing_action, shown)
-            self._observed[key] = state, after, info
-            return after, info
-        if self._is_checked():
-            self._compare(known[1], self._planner.observe(state, sensing_action, shown)[0])
-        return known[1], known[2]
+        _, after, info = self._observed.get(
+            (id(state), sensing_action, shown.tobytes()),
+            lambda: (state, *self._planner.observe(state, sensing_action, shown)),
+        )
+        return after, info
 
     def advance(self, state: PlanningState, task_action: FloatArray) -> PlanningState:
         """Predict the belief and go to the next step."""
-        key = id(state), task_action.tobytes()
-        known = self._advanced.get(key)
-        if known is None:
-            self._make_room()
-            after = self._planner.advance(state, task_action)
-            self._advanced[key] = state, after
-            return after
-        if self._is_checked():
-            self._compare(known[1], self._planner.advance(state, task_action))
-        return known[1]
+        return self._advanced.get(
+            (id(state), task_action.tobytes()),
+            lambda: (state, self._planner.advance(state, task_action)),
+        )[1]
 
     def decide(self, state: PlanningState, max_actions: int) -> Decision:
         """Decide all that can be decided before something is sensed again."""
-        known = self._decided.get(id(state))
-        if known is None:
-            if len(self._decided) >= _MOST:
-                self._decided.clear()
-            known = self._decided[id(state)] = state, self._planner.decide(state, max_actions)
-        return known[1]
+        return self._decided.get(
+            id(state), lambda: (state, self._planner.decide(state, max_actions))
+        )[1]
 
     def digest(self, state: PlanningState) -> bytes:
         """Return 32 bytes that are equal for equal states only."""
-        return self._digests.of(state)
+        return self._digests.get(id(state), lambda: (state, digest(state)))[1]
 
-    def _make_room(self) -> None:
-        if len(self._advanced) + len(self._observed) >= _MOST:
-            self._advanced.clear()
-            self._observed.clear()
 
-    def _is_checked(self) -> bool:
-        self._taken_over += 1
-        return self._taken_over % _COMPUTED_AGAIN == 0
-
-    @staticmethod
-    def _compare(before: PlanningState, now: PlanningState) -> None:
-        if digest(before) != digest(now):
-            raise Violation(f"the same events lead to another state of step {now.step} than before")
+def _check_states(known: PlanningState, now: PlanningState) -> None:
+    if digest(known) != digest(now):
+        raise Violation(f"the same events lead to another state of step {now.step} than before")

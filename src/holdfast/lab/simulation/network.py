@@ -359,21 +359,10 @@ class Network:
                 # Not in line with the others: it is overtaken.
                 self._queue.after(latency_s + fault.seconds, arrive, payload, *more)
                 return
-        self._pass(link, way, latency_s, arrive, (payload, *more))
-
-    def _pass(
-        self,
-        link: SimulatedLink,
-        way: Way,
-        latency_s: float,
-        do: Callable[..., None],
-        arguments: tuple[object, ...],
-    ) -> None:
-        if link.cuts[way]:
-            if not self._run.lost_in_cut:
-                link.held[way].append((do, arguments))
-            return
-        self._carry(link, way, latency_s, do, arguments)
+        if not link.cuts[way]:
+            self._carry(link, way, latency_s, arrive, (payload, *more))
+        elif not self._run.lost_in_cut:
+            link.held[way].append((arrive, (payload, *more)))
 
     def _carry(
         self,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from holdfast.lab.simulation.memo_cache import Memo
 from holdfast.planning import Planner
 from holdfast.protocol.messages import (
     DIGEST_SIZE,
@@ -14,7 +15,6 @@ from holdfast.protocol.messages import (
 __all__ = ["OtherRobots"]
 
 _MOST = 5_000
-"""Requests kept; then all are forgotten."""
 
 
 class OtherRobots:
@@ -26,17 +26,12 @@ class OtherRobots:
         self._session_configuration = SessionConfiguration(
             planner.problem.name, {}, {}, planner.settings, seed
         )
-        self._requests: dict[tuple[int, int], bytes] = {}
+        self._requests: Memo[tuple[int, int], bytes] = Memo(_MOST)
 
     def first_request(self, robot: int, trial: int) -> bytes:
         """Return the request of a robot, numbered from 1, for the start of a trial."""
-        key = robot, trial
-        request = self._requests.get(key)
-        if request is None:
-            if len(self._requests) >= _MOST:
-                self._requests.clear()
-            request = self._requests[key] = self._encoded(robot.to_bytes(16, "big"), trial)
-        return request
+        session = robot.to_bytes(16, "big")
+        return self._requests.get((robot, trial), lambda: self._encoded(session, trial))
 
     def impostors_request(self, session: bytes, trial: int) -> bytes:
         """Return the same for a session that is another's, as its next process would ask."""

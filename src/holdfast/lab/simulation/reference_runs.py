@@ -14,6 +14,7 @@ import numpy as np
 
 from holdfast.arrays import FloatArray
 from holdfast.config.settings import PlanningSettings, SimulatorSettings
+from holdfast.lab.simulation.memo_cache import Memo
 from holdfast.planning import Planner
 from holdfast.problems.problem import Problem
 from holdfast.robot.environment import SimulatedEnvironment
@@ -26,7 +27,6 @@ Repeats: TypeAlias = tuple[tuple[int, int], ...]
 """Steps, and how often something was sensed in them before."""
 
 _MOST = 2_000
-"""Kept; then all is forgotten."""
 
 
 class ReferenceStep(NamedTuple):
@@ -106,7 +106,7 @@ class ReferenceRuns:
         self._problem = problem
         self._planning = planning
         self._seed = seed
-        self._runs: dict[tuple[int, int, Repeats], ReferenceRun] = {}
+        self._runs: Memo[tuple[int, int, Repeats], ReferenceRun] = Memo(_MOST)
 
     def get(self, trial: int, max_steps: int, repeats: Repeats = ()) -> ReferenceRun:
         """Return a trial of at most so many steps.
@@ -118,12 +118,7 @@ class ReferenceRuns:
             it now. What is sensed there then shows something else: the trial as it goes from there.
         """
         key = trial, max_steps, repeats
-        run = self._runs.get(key)
-        if run is None:
-            if len(self._runs) >= _MOST:
-                self._runs.clear()
-            run = self._runs[key] = self._run(trial, max_steps, repeats)
-        return run
+        return self._runs.get(key, lambda: self._run(trial, max_steps, repeats))
 
     def _run(self, trial: int, max_steps: int, repeats: Repeats) -> ReferenceRun:
         simulator = SimulatorSettings(num_trials=trial + 1, max_steps=max_steps, seed=self._seed)
