@@ -18,7 +18,6 @@ INTERPRETED = {
     "protocol/messages.py",
     "protocol/records.py",
     "protocol/service_limits.py",
-    "protocol/service_statistics.py",
     "lab/simulation/command.py",
     "lab/simulation/exploration.py",
     "lab/simulation/schedule.py",

@@ -27,8 +27,8 @@ from holdfast.lab.simulation.world import Simulator
 from holdfast.protocol import requests, service
 from holdfast.protocol.dispatcher import Dispatcher
 from holdfast.protocol.failure_detector import FailureDetector
+from holdfast.protocol.local_service import RestartPolicy
 from holdfast.protocol.question import Question
-from holdfast.protocol.restart_policy import RestartPolicy
 from holdfast.protocol.robot import Robot
 from holdfast.protocol.service import Service
 from holdfast.protocol.service_jobs import Job

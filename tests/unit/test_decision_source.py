@@ -6,9 +6,8 @@ import inspect
 
 import pytest
 
-from holdfast.protocol.decision_source import DecisionSource
+from holdfast.protocol.decision_source import DecisionSource, InProcessSource
 from holdfast.protocol.dispatcher import Dispatcher
-from holdfast.robot.in_process_planner import InProcessSource
 
 METHODS = [
     name

@@ -19,6 +19,7 @@ from holdfast.config.loader import Configuration
 from holdfast.errors import HeldError, ProblemError, TrialError
 from holdfast.outcome import SensingDecision, TrialResult
 from holdfast.planning import Planner, PlanningState
+from holdfast.protocol.decision_source import InProcessSource
 from holdfast.protocol.events import (
     Act,
     Acted,
@@ -37,7 +38,6 @@ from holdfast.recording.run_directory import RunDirectory
 from holdfast.robot import in_process_planner
 from holdfast.robot import process as robot_process
 from holdfast.robot.environment import EnvironmentMaker, load_environment
-from holdfast.robot.in_process_planner import InProcessSource
 from holdfast.robot.links import Links, make_links
 from holdfast.robot.process import RobotProcess
 from holdfast.robot.recovery_launcher import RecoveryExited

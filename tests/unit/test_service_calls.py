@@ -10,9 +10,8 @@ from holdfast.protocol.expected_time import ExpectedTimes
 from holdfast.protocol.messages import Busy, Progress, Refused, Reply, decode_reply
 from holdfast.protocol.service_calls import WaitingCalls
 from holdfast.protocol.service_jobs import EndCall, SendReply, ServiceEffect
-from holdfast.protocol.service_limits import ServiceLimits
+from holdfast.protocol.service_limits import ServiceLimits, ServiceStatistics
 from holdfast.protocol.service_sessions import PendingTask, Session
-from holdfast.protocol.service_statistics import ServiceStatistics
 
 
 class Replies:

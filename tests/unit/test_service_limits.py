@@ -1,11 +1,17 @@
-"""Limits of a service."""
+"""Limits of a service, and what it counts."""
 
 from __future__ import annotations
 
 import pytest
 
 from holdfast.protocol.messages import MAX_OBSERVATIONS
-from holdfast.protocol.service_limits import ServiceLimits
+from holdfast.protocol.service_limits import ServiceLimits, ServiceStatistics
+
+
+def test_each_service_counts_its_own_refusals() -> None:
+    first, second = ServiceStatistics(), ServiceStatistics()
+    first.refusals["invalid"] = 1
+    assert second.refusals == {}
 
 
 def test_a_request_of_the_largest_size_is_within_the_limits() -> None:

@@ -12,7 +12,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from holdfast import __version__
 from holdfast.protocol.messages import PROTOCOL_VERSION
-from holdfast.protocol.service_statistics import ServiceStatistics
+from holdfast.protocol.service_limits import ServiceStatistics
 from holdfast.service.metrics import BUCKETS_S, DecisionTimes, Exposition, ServiceReport, summed
 
 Samples = dict[tuple[str, tuple[tuple[str, str], ...]], float]

@@ -18,25 +18,23 @@ from collections.abc import Collection, Sequence
 from holdfast.config.settings import OffloadSettings, RecoverySettings
 from holdfast.errors import HoldfastError, OwnDecisionError, ServiceRefusedError, StaleEpochError
 from holdfast.problems.problem import Problem
+from holdfast.protocol.decision_source import DecisionSource
 from holdfast.protocol.events import (
     CallEnded,
-    Effects,
     Halt,
     Launch,
     OwnAnswer,
     Planned,
     ReplyReceived,
-    RobotEffect,
     ServiceAppeared,
     ServiceVanished,
     TransportEvent,
 )
-from holdfast.protocol.hedging import HedgingBudget
+from holdfast.protocol.local_service import HedgingBudget, RestartPolicy
 from holdfast.protocol.messages import SessionConfiguration
 from holdfast.protocol.question import Question
 from holdfast.protocol.replica_set import Replica, ReplicaSet
 from holdfast.protocol.requests import OpenRequest, OpenRequests, ReplyHandler, ReplyOutcome
-from holdfast.protocol.restart_policy import RestartPolicy
 from holdfast.protocol.stall_reporter import StallReporter
 from holdfast.protocol.status import Cause, Status, StatusTracker
 from holdfast.protocol.verification import Verification
@@ -46,10 +44,10 @@ __all__ = [
 ]
 
 
-class Dispatcher:
+class Dispatcher(DecisionSource):
     """Gets one question at a time answered by the services.
 
-    It lives as long as the run. See :class:`~holdfast.protocol.decision_source.DecisionSource`.
+    It lives as long as the run.
 
     Parameters
     ----------
@@ -78,12 +76,12 @@ class Dispatcher:
         secret: bytes,
         distrusted: Collection[str] = (),
     ) -> None:
+        super().__init__()
         timeout_s = 1e-3 * offload.detection_timeout_ms
         wanted = recovery_settings.launch != "never"
         self._timeout_s = timeout_s
         self._limit_s = 1e-3 * offload.decision_timeout_ms
         self._launch_at_start = recovery_settings.launch == "at_start"
-        self.effects: Effects[RobotEffect] = Effects()
         self._services = ReplicaSet(
             services,
             local_service_name if wanted else None,
@@ -100,8 +98,6 @@ class Dispatcher:
         self._hedging = HedgingBudget(offload)
         self._stalls = StallReporter(timeout_s, self.effects)
         self._woke_at = float("-inf")
-        self.stopped = False
-        self.question: Question | None = None
         self._tracker = StatusTracker()
 
     # -- what the robot's loop asks for ----------------------------------------------------------
@@ -142,11 +138,6 @@ class Dispatcher:
             self.question.wait(now)
             self.wake(now)
 
-    def go_on(self) -> None:
-        """Note that the robot no longer waits."""
-        if self.question is not None:
-            self.question.stop_waiting()
-
     # -- what happens ----------------------------------------------------------------------------
 
     def handle(self, event: TransportEvent | Planned, now: float) -> None:
@@ -166,13 +157,7 @@ class Dispatcher:
         self.wake(now)
 
     def decided(self, event: OwnAnswer, performed: int, now: float) -> None:
-        """Take the answer of the robot's own planner.
-
-        Parameters
-        ----------
-        performed : int
-            Task actions of the current question that are performed or ordered.
-        """
+        """Take the answer of the robot's own planner."""
         try:
             usable = self._verification.decided(event, self.question, performed)
         except OwnDecisionError as error:

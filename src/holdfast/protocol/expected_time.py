@@ -26,8 +26,6 @@ class TypicalTime:
         Infinite before the first computation.
     """
 
-    __slots__ = ("seconds",)
-
     def __init__(self) -> None:
         self.seconds = math.inf
 
@@ -48,8 +46,6 @@ class ExpectedTimes:
     task_s, sensing_s : float
         Initial means.
     """
-
-    __slots__ = ("_inertia", "sensing_s", "task_s", "typical_sensing", "typical_task")
 
     def __init__(self, inertia: float, task_s: float, sensing_s: float) -> None:
         self._inertia = inertia

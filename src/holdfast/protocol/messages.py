@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import hashlib
 import zlib
-from typing import Annotated, TypeAlias
+from typing import Annotated, Any, TypeAlias
 
 import msgspec
 import numpy as np
@@ -144,7 +144,25 @@ class SessionConfiguration(msgspec.Struct, array_like=True, frozen=True):
     problem_digest: Annotated[str, msgspec.Meta(max_length=200)] = ""
 
 
-class Request(msgspec.Struct, array_like=True, frozen=True):
+class _Named(msgspec.Struct, array_like=True, frozen=True):
+    """What a request names; the first fields of both of its forms."""
+
+    version: int
+    session: Session
+    epoch: Word
+    number: Word
+    trial: Word
+    step: Word
+    sensed: bool
+    digest: Digest
+    observations: Annotated[tuple[Observed, ...], msgspec.Meta(max_length=MAX_OBSERVATIONS)] = ()
+
+    def named(self) -> dict[str, Any]:
+        """Return these fields by name."""
+        return {name: getattr(self, name) for name in _Named.__struct_fields__}
+
+
+class Request(_Named, array_like=True, frozen=True):
     """A robot's question: what to do from this state until it has sensed again.
 
     Encode it with :func:`encode` only: on the wire the session configuration has another form.
@@ -175,20 +193,11 @@ class Request(msgspec.Struct, array_like=True, frozen=True):
         decoded one is a view of the message.
     """
 
-    version: int
-    session: Session
-    epoch: Word
-    number: Word
-    trial: Word
-    step: Word
-    sensed: bool
-    digest: Digest
-    observations: Annotated[tuple[Observed, ...], msgspec.Meta(max_length=MAX_OBSERVATIONS)] = ()
     session_configuration: SessionConfiguration | None = None
     checkpoint: bytes | memoryview | None = None
 
 
-class _SentRequest(msgspec.Struct, array_like=True, frozen=True, forbid_unknown_fields=True):
+class _SentRequest(_Named, array_like=True, frozen=True, forbid_unknown_fields=True):
     """A request on the wire.
 
     Its session configuration is bytes inside the message, so each field's length precedes the field
@@ -196,15 +205,6 @@ class _SentRequest(msgspec.Struct, array_like=True, frozen=True, forbid_unknown_
     whatever their size.
     """
 
-    version: int
-    session: Session
-    epoch: Word
-    number: Word
-    trial: Word
-    step: Word
-    sensed: bool
-    digest: Digest
-    observations: Annotated[tuple[Observed, ...], msgspec.Meta(max_length=MAX_OBSERVATIONS)] = ()
     # Larger than allowed, so that the refusal can name the size.
     session_configuration: (
         Annotated[bytes, msgspec.Meta(max_length=16 * MAX_CONFIGURATION_BYTES)] | None
@@ -425,17 +425,7 @@ def decode_request(payload: bytes) -> Request:
     if sent.checkpoint is not None and sent.observations:
         raise MessageError("malformed", "a request has a checkpoint and observations as well")
     return Request(
-        sent.version,
-        sent.session,
-        sent.epoch,
-        sent.number,
-        sent.trial,
-        sent.step,
-        sent.sensed,
-        sent.digest,
-        sent.observations,
-        session_configuration,
-        sent.checkpoint,
+        **sent.named(), session_configuration=session_configuration, checkpoint=sent.checkpoint
     )
 
 
@@ -477,19 +467,11 @@ def decode_floats(data: bytes, size: int) -> FloatArray:
 
 def _sent(request: Request, session_configuration: bytes) -> _SentRequest:
     return _SentRequest(
-        request.version,
-        request.session,
-        request.epoch,
-        request.number,
-        request.trial,
-        request.step,
-        request.sensed,
-        request.digest,
-        request.observations,
-        session_configuration,
-        None if request.checkpoint is None else memoryview(request.checkpoint),
+        **request.named(),
+        session_configuration=session_configuration,
+        checkpoint=None if request.checkpoint is None else memoryview(request.checkpoint),
         # What a service will make of them, not what they were before: an int where a float belongs.
-        settings_digest(unpack_configuration(session_configuration)),
+        settings=settings_digest(unpack_configuration(session_configuration)),
     )
 
 

@@ -58,8 +58,6 @@ class AnswerPart:
         Whether it was compared with the own planner's answer.
     """
 
-    __slots__ = ("judged", "outside_limits", "sensing", "service", "task_actions")
-
     def __init__(
         self, service: str, task_actions: list[FloatArray] | None, sensing: SensingAnswer | None
     ) -> None:
@@ -126,26 +124,6 @@ class Question:
     own_is_certain : bool or None
         Whether the own planner, asked twice, agreed with itself; None if asked once.
     """
-
-    __slots__ = (
-        "_checkpoint",
-        "check_decided",
-        "digest",
-        "disputed",
-        "needed_at",
-        "num_observations",
-        "observations",
-        "own",
-        "own_is_certain",
-        "parts",
-        "sensing",
-        "sensing_provenance",
-        "sensing_step",
-        "state",
-        "task_actions",
-        "task_count",
-        "task_provenance",
-    )
 
     def __init__(
         self,

@@ -105,28 +105,6 @@ class Replica:
         The next delay.
     """
 
-    __slots__ = (
-        "acknowledged",
-        "backoff_s",
-        "complaint",
-        "detector",
-        "distrusted",
-        "last_incarnation",
-        "late_after_s",
-        "late_at",
-        "late_soonest_s",
-        "late_times",
-        "name",
-        "num_busy",
-        "opened",
-        "refusal",
-        "refusal_code",
-        "retry_at",
-        "sensing_refusals",
-        "task_refusals",
-        "times_differed",
-    )
-
     def __init__(
         self, name: str, detection_timeout_s: float, late_after_s: float = math.inf
     ) -> None:

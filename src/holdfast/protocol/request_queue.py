@@ -77,8 +77,6 @@ class _RoundRobin:
 class _Load:
     """Number, bytes and expected time of tasks."""
 
-    __slots__ = ("cost_s", "num", "num_bytes")
-
     def __init__(self) -> None:
         self.num = 0
         self.num_bytes = 0
@@ -94,8 +92,6 @@ class _Load:
 
 class _Loads:
     """The load of known robots and of newcomers."""
-
-    __slots__ = ("known", "newcomers")
 
     def __init__(self) -> None:
         self.known = _Load()

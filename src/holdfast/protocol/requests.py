@@ -66,19 +66,6 @@ class OpenRequest:
         Whether that part of the answer has come.
     """
 
-    __slots__ = (
-        "call_number",
-        "has_sensing_part",
-        "has_task_part",
-        "heard",
-        "number",
-        "opens",
-        "question",
-        "replica",
-        "restores",
-        "sent_at",
-    )
-
     def __init__(
         self,
         call_number: int,

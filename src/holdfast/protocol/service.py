@@ -53,7 +53,7 @@ from holdfast.protocol.service_jobs import (
     ServiceEffect,
     StartJob,
 )
-from holdfast.protocol.service_limits import ServiceLimits
+from holdfast.protocol.service_limits import ServiceLimits, ServiceStatistics
 from holdfast.protocol.service_sessions import (
     REQUESTED,
     CachedAnswer,
@@ -63,7 +63,6 @@ from holdfast.protocol.service_sessions import (
     SessionKey,
     SessionTable,
 )
-from holdfast.protocol.service_statistics import ServiceStatistics
 
 __all__ = ["Service"]
 

@@ -24,9 +24,8 @@ from holdfast.protocol.messages import (
     encode,
 )
 from holdfast.protocol.service_jobs import EndCall, SendReply, ServiceEffect
-from holdfast.protocol.service_limits import ServiceLimits
+from holdfast.protocol.service_limits import ServiceLimits, ServiceStatistics
 from holdfast.protocol.service_sessions import CachedAnswer, PendingTask, WaitingCall
-from holdfast.protocol.service_statistics import ServiceStatistics
 
 __all__ = ["WaitingCalls"]
 

@@ -122,19 +122,6 @@ class Job:
         Where to start; None for the trial's beginning.
     """
 
-    __slots__ = (
-        "_configuration",
-        "_describe_error",
-        "_limits",
-        "_make_problem",
-        "_planning",
-        "_problem",
-        "_request",
-        "_seed",
-        "_state",
-        "kind",
-    )
-
     def __init__(
         self,
         kind: Literal["task", "sensing"],

@@ -16,9 +16,9 @@ from __future__ import annotations
 
 import hashlib
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import lru_cache
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import msgspec
 
@@ -26,7 +26,6 @@ from holdfast.config.settings import PlanningSettings
 from holdfast.planning import PlanningState
 from holdfast.problems.registry import BUILT_IN
 from holdfast.protocol.expected_time import ExpectedTimes
-from holdfast.protocol.forgotten_epochs import ForgottenEpochs, Owner, SessionKey
 from holdfast.protocol.messages import Request, SessionConfiguration, pack_configuration
 from holdfast.protocol.service_limits import ServiceLimits
 
@@ -34,6 +33,7 @@ __all__ = [
     "PREFETCHED",
     "REQUESTED",
     "CachedAnswer",
+    "ForgottenEpochs",
     "Owner",
     "PendingTask",
     "Session",
@@ -50,6 +50,12 @@ _TYPICAL_STEPS = 32
 
 _SETTINGS_KEPT = 128
 """Bound on the settings that are shared between sessions."""
+
+Owner: TypeAlias = str | None
+"""Name in the robot's verified certificate; None without one."""
+
+SessionKey: TypeAlias = tuple[Owner, bytes]
+"""Owner and session id."""
 
 REQUESTED, PREFETCHED = 0, 1
 """A session's slots: the robot waits for the first kind of task; the second is ahead of it."""
@@ -72,8 +78,6 @@ class CachedAnswer(NamedTuple):
 
 class WaitingCall:
     """A call that waits for a task."""
-
-    __slots__ = ("call", "last_sign_at", "number", "task")
 
     def __init__(self, call: int, number: int, task: PendingTask, last_sign_at: float) -> None:
         self.call = call
@@ -103,23 +107,6 @@ class PendingTask:
     since : float
         When it was queued.
     """
-
-    __slots__ = (
-        "calls",
-        "cost_s",
-        "digest",
-        "newcomer",
-        "request",
-        "running",
-        "sensing",
-        "session",
-        "since",
-        "size",
-        "slot",
-        "started_at",
-        "state",
-        "urgent",
-    )
 
     def __init__(
         self,
@@ -218,30 +205,6 @@ class Session:
     closed : bool
         Whether the session was dropped.
     """
-
-    __slots__ = (
-        "acknowledged",
-        "ahead",
-        "ahead_digest",
-        "answers",
-        "built",
-        "built_in",
-        "closed",
-        "configuration",
-        "epoch",
-        "key",
-        "newcomer",
-        "num_bytes",
-        "number",
-        "pending",
-        "planning",
-        "planning_single",
-        "problem_key",
-        "seed",
-        "served",
-        "times",
-        "used_at",
-    )
 
     def __init__(
         self,
@@ -355,10 +318,53 @@ class Session:
         return _size_of(self.acknowledged) + _size_of(self.ahead) + answers
 
 
+class ForgottenEpochs:
+    """Epochs of sessions that are no longer held, so that a replaced process stays replaced.
+
+    Parameters
+    ----------
+    most : int
+        So many are kept; beyond that the oldest of the owner with the most is dropped.
+    """
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self._count = 0
+        # Owners in the order in which they were noted last.
+        self._of: OrderedDict[Owner, OrderedDict[bytes, int]] = OrderedDict()
+
+    def __iter__(self) -> Iterator[SessionKey]:
+        return ((owner, session) for owner, epochs in self._of.items() for session in epochs)
+
+    def get(self, key: SessionKey) -> int:
+        """Return a session's epoch; 0 if unknown."""
+        owner, session = key
+        epochs = self._of.get(owner)
+        return 0 if epochs is None else epochs.get(session, 0)
+
+    def note(self, key: SessionKey, epoch: int) -> None:
+        """Keep an epoch."""
+        owner, session = key
+        self.forget(key)
+        self._of.setdefault(owner, OrderedDict())[session] = epoch
+        self._of.move_to_end(owner)
+        self._count += 1
+        if self._count > self._most:
+            largest = max(self._of, key=lambda each: len(self._of[each]))
+            self.forget((largest, next(iter(self._of[largest]))))
+
+    def forget(self, key: SessionKey) -> None:
+        """Drop the epoch of a session that is held again."""
+        owner, session = key
+        epochs = self._of.get(owner)
+        if epochs is not None and epochs.pop(session, None) is not None:
+            self._count -= 1
+            if not epochs:
+                del self._of[owner]
+
+
 class _Holding:
     """What all sessions of one owner take."""
-
-    __slots__ = ("configuration_bytes", "sessions", "state_bytes", "unserved")
 
     def __init__(self) -> None:
         self.sessions = 0

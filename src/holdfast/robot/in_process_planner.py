@@ -17,116 +17,15 @@ from time import perf_counter
 
 from holdfast.errors import HoldfastError
 from holdfast.planning import Planner
-from holdfast.protocol.events import (
-    Effects,
-    Halt,
-    OwnAnswer,
-    Plan,
-    Planned,
-    RobotEffect,
-    TransportEvent,
-)
+from holdfast.protocol.events import Plan, Planned
 from holdfast.protocol.expected_time import TypicalTime
-from holdfast.protocol.messages import DIGEST_SIZE, MAX_TASK_ACTIONS, SensingAnswer
-from holdfast.protocol.question import Provenance, Question
-from holdfast.protocol.status import Status
-from holdfast.protocol.verification import OWN_PLANNER
+from holdfast.protocol.messages import MAX_TASK_ACTIONS
 from holdfast.service.pool import ThreadPool
 
-__all__ = ["InProcessPlanner", "InProcessSource"]
+__all__ = ["InProcessPlanner"]
 
 _BRIEF_S = 0.001
 """Work that may take longer goes to a thread: the loop handles no event meanwhile."""
-
-
-class InProcessSource:
-    """A :class:`~holdfast.protocol.decision_source.DecisionSource` without services.
-
-    Its only effects are :class:`Plan` and :class:`Halt`; the shell passes each :class:`Plan` to an
-    :class:`InProcessPlanner` and the result back to :meth:`handle`.
-    """
-
-    limits_are_reliable = True
-    is_holding = False
-    num_unverified = 0
-
-    def __init__(self) -> None:
-        self.effects: Effects[RobotEffect] = Effects()
-        self.status = Status.STANDARD
-        self.question: Question | None = None
-        self.stopped = False
-        self.recoveries = 0
-        self._number = 0
-        self._asked_at = 0.0
-
-    def start(self, now: float) -> None:
-        """Begin the run."""
-
-    def ask(self, question: Question, now: float) -> None:
-        """Ask a new question; the one before is forgotten."""
-        self.question = question
-        self._number += 1
-        self._asked_at = now
-        self.effects.append(Plan(self._number, question.state, question.task_count == 0))
-
-    def drop(self) -> None:
-        """Forget the question: the trial is over."""
-        self.question = None
-
-    def need(self, now: float) -> None:
-        """Note that the robot stands still until the rest of the answer is there."""
-        if self.question is not None:
-            self.question.wait(now)
-
-    def go_on(self) -> None:
-        """Note that the robot moves again."""
-        if self.question is not None:
-            self.question.stop_waiting()
-
-    def check(self) -> None:
-        """Do nothing: the planner's own answer needs no check."""
-
-    def dispute(self) -> None:
-        """Do nothing: there is no other answer."""
-
-    def handle(self, event: TransportEvent | Planned, now: float) -> None:
-        """Take a part of the answer; results of earlier questions are ignored."""
-        question = self.question
-        if not isinstance(event, Planned) or event.number != self._number or question is None:
-            return
-        if event.error is not None:
-            self.stopped = True
-            self.effects.append(Halt(event.error))
-            return
-        source = Provenance(OWN_PLANNER, now - self._asked_at, event.computed_s)
-        if event.sensing_action is None:
-            question.task_actions = event.actions
-            question.task_provenance = source
-            if question.sensing_step is not None:
-                self.effects.append(Plan(self._number, event.ahead, sensing=True))
-        else:
-            assert question.sensing_step is not None
-            digest = event.ahead_digest[:DIGEST_SIZE]
-            question.sensing = SensingAnswer(
-                0, question.sensing_step, event.sensing_action, digest, 0
-            )
-            question.sensing_provenance = source
-
-    def decided(self, event: OwnAnswer, performed: int, now: float) -> None:
-        """Do nothing: no answer is verified."""
-
-    def recovery_exited(self, launch: int, reason: str, now: float) -> None:
-        """Do nothing: there is no local service."""
-
-    def wake(self, now: float) -> None:
-        """Do nothing: no timer is set."""
-
-    def next_wakeup(self) -> float | None:
-        """Return None."""
-        return None
-
-    def event_loop_stalled(self, seconds: float) -> None:
-        """Do nothing: no service is timed."""
 
 
 class InProcessPlanner:

@@ -27,7 +27,7 @@ from holdfast.errors import HeldError, HoldfastError, TrialError
 from holdfast.outcome import TrialResult
 from holdfast.planning import Planner, PlanningState
 from holdfast.problems.problem import Problem
-from holdfast.protocol.decision_source import DecisionSource
+from holdfast.protocol.decision_source import DecisionSource, InProcessSource
 from holdfast.protocol.dispatcher import Dispatcher
 from holdfast.protocol.events import (
     Abandon,
@@ -60,7 +60,7 @@ from holdfast.robot.ending_signals import ending_signals
 from holdfast.robot.environment import EnvironmentMaker
 from holdfast.robot.environment_runner import EnvironmentRunner, make_runner
 from holdfast.robot.health import Condition, RobotWatch
-from holdfast.robot.in_process_planner import InProcessPlanner, InProcessSource
+from holdfast.robot.in_process_planner import InProcessPlanner
 from holdfast.robot.recovery_launcher import RecoveryExited
 from holdfast.robot.session_configuration import session_configuration_of
 from holdfast.robot.step_journal import StepJournal

@@ -17,7 +17,7 @@ import msgspec
 from holdfast import __version__
 from holdfast.errors import MetricsError
 from holdfast.protocol.messages import PROTOCOL_VERSION
-from holdfast.protocol.service_statistics import ServiceStatistics
+from holdfast.protocol.service_limits import ServiceStatistics
 
 if TYPE_CHECKING:
     from prometheus_client.core import Metric

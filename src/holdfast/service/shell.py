@@ -36,7 +36,7 @@ from holdfast.protocol.service_jobs import (
     ServiceEffect,
     StartJob,
 )
-from holdfast.protocol.service_statistics import ServiceStatistics
+from holdfast.protocol.service_limits import ServiceStatistics
 from holdfast.runtime.events import EventRates, EventSink, NullEventLog
 from holdfast.service.pool import ThreadPool
 from holdfast.transport.contract import IncomingCall, ServiceTransport

@@ -1,4 +1,4 @@
-"""When the local service is launched, and when it is launched again.
+"""When the local service is launched, launched again, and asked as well as the cloud.
 
 It is first launched when it is wanted. It may then fail to come up, exit or hang. The next launch
 follows at once the first time, since most failures are transient, and after a growing delay later.
@@ -10,9 +10,13 @@ progress, so each later launch gets more time; else it would never come up on a 
 
 from __future__ import annotations
 
-from holdfast.config.settings import RecoverySettings
+from holdfast.config.settings import OffloadSettings, RecoverySettings
+from holdfast.protocol.question import Question
 
-__all__ = ["RestartPolicy"]
+__all__ = ["HedgingBudget", "RestartPolicy"]
+
+_HEDGING_BURST = 3.0
+"""Hedges that may be made at once."""
 
 _LONG_LIFE_S = 1.0
 """A process that lived longer did not fail at its start."""
@@ -110,3 +114,31 @@ class RestartPolicy:
     def _allowed_s(self) -> float:
         factor: int = min(2**self._late, _MOST_TIME)
         return self._timeout_s * factor
+
+
+class HedgingBudget:
+    """Decides when a late question is sent to the local service as well, and bounds how often.
+
+    Both services give the same answer, so hedging costs only computation. Each question adds a
+    share of a hedge to the budget and each hedge takes one, so in the long run at most that share
+    of the questions is asked twice.
+    """
+
+    def __init__(self, settings: OffloadSettings) -> None:
+        self._deadline_ms = settings.decision_deadline_ms
+        self._share = settings.max_hedged_share
+        self._budget = _HEDGING_BURST
+
+    def earn(self) -> None:
+        """Count a new question."""
+        self._budget = min(_HEDGING_BURST, self._budget + self._share)
+
+    def spend(self) -> None:
+        """Count a hedge."""
+        self._budget -= 1.0
+
+    def due_at(self, question: Question) -> float | None:
+        """Return when a question is late; None if it is not awaited, or nothing is left."""
+        if self._deadline_ms is None or question.needed_at is None or self._budget < 1.0:
+            return None
+        return question.needed_at + 1e-3 * self._deadline_ms
