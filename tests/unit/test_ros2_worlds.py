@@ -9,8 +9,7 @@ import numpy as np
 
 from holdfast.ros.executive import DecideCode, DecideRequest, ExecutiveEnvironment
 from holdfast.ros.ros2.parameters import NodeParameters, read_parameters
-from holdfast.ros.ros2.run_segment import World
-from holdfast.ros.ros2.worlds import make_world
+from holdfast.ros.ros2.run_segment import World, make_world
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "peg_in_hole_2d.yaml"
 

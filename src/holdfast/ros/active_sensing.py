@@ -152,16 +152,6 @@ class ActiveSensing:
         self._max_actions = configuration.planning.sensing_interval + 1
         self.configuration = configuration_digest(configuration)
 
-    @property
-    def action_size(self) -> int:
-        """Coordinates of a task action."""
-        return self._planner.problem.action_size
-
-    @property
-    def state_size(self) -> int:
-        """Coordinates of a state."""
-        return self._planner.problem.state_size
-
     def refusal(self, error: ErrorCode, message: str) -> DecisionAnswer:
         """Return an answer with an error."""
         return DecisionAnswer(error, message[:_MAX_MESSAGE], self.configuration)
@@ -224,7 +214,7 @@ class ActiveSensing:
             "",
             self.configuration,
             ahead,
-            task_actions=np.reshape(actions, (len(actions), self.action_size)),
+            task_actions=np.reshape(actions, (len(actions), planner.problem.action_size)),
         )
 
 

@@ -76,14 +76,7 @@ class DueDecision(NamedTuple):
 
 
 class DecideRequest(NamedTuple):
-    """The outcome of a decision.
-
-    Attributes
-    ----------
-    trial, number : int
-        Of the decision; number 0 reports no outcome.
-    observation : array of shape (n,)
-    """
+    """The outcome of a decision; number 0 reports none. The observation has shape ``(n,)``."""
 
     trial: int = 0
     number: int = 0
@@ -93,13 +86,7 @@ class DecideRequest(NamedTuple):
 
 
 class DecideReply(NamedTuple):
-    """The reply to a call.
-
-    Attributes
-    ----------
-    message : str
-        Why there is no decision.
-    """
+    """The reply to a call; the message says why there is no decision."""
 
     code: DecideCode
     message: str = ""

@@ -242,15 +242,7 @@ def _left(until: float) -> float:
 
 
 def _address(host: str, until: float) -> str:
-    """Return the address of a host; a name's look-up, which nothing can break off, is left behind.
-
-    Raises
-    ------
-    TimeoutError
-        If it takes too long.
-    TransportError
-        If there is none.
-    """
+    """Return the address of a host; its look-up, which nothing can break off, is left behind."""
     with contextlib.suppress(ValueError):
         return str(ipaddress.ip_address(host))
     found: queue.SimpleQueue[str] = queue.SimpleQueue()

@@ -249,13 +249,7 @@ class Ros2Environment:
         return None if np.isnan(reward) else reward
 
     def _wait_until_it_stands(self) -> None:
-        """Wait for the end of a goal sent by an earlier process: until then the count may change.
-
-        Raises
-        ------
-        EnvironmentFailedError
-            If it has not ended within the time for a task action.
-        """
+        """Wait for the end of a goal of an earlier process: until then the count may change."""
         act = self._interface.calls["act"]
         if act.kind != "action":
             return

@@ -31,15 +31,7 @@ class Level(enum.IntEnum):
 
 
 class RobotDiagnosis(NamedTuple):
-    """A robot's state for ``/diagnostics``.
-
-    Attributes
-    ----------
-    word : str
-        The robot's condition.
-    facts : dict
-        Value by key.
-    """
+    """A robot's state for ``/diagnostics``: its condition in a word, and facts by key."""
 
     level: Level
     word: str

@@ -48,9 +48,8 @@ from holdfast.ros.ros2.parameters import (
     known_parameters,
     read_parameters,
 )
-from holdfast.ros.ros2.run_segment import Ending, RunSegment, SegmentResult
+from holdfast.ros.ros2.run_segment import Ending, RunSegment, SegmentResult, make_world
 from holdfast.ros.ros2.telemetry import PublishedDecision, Telemetry
-from holdfast.ros.ros2.worlds import make_world
 from holdfast.runtime.log_lines import fields_as_text
 
 __all__ = ["NUM_THREADS", "HoldfastNode"]

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import contextlib
 import enum
+import functools
 import itertools
 import threading
 import traceback
 from collections.abc import Callable
 from pathlib import Path
 from time import perf_counter
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from holdfast.config.loader import Configuration
 from holdfast.errors import (
@@ -29,14 +30,14 @@ from holdfast.planning import PlanningState
 from holdfast.protocol.events import Act, Sense, Timing
 from holdfast.recording.robot_run import RobotObserver, perform_trials
 from holdfast.recording.run_directory import RunDirectory
-from holdfast.robot.environment import EnvironmentMaker
+from holdfast.robot.environment import EnvironmentMaker, load_environment
 from holdfast.robot.health import Condition
 from holdfast.robot.process import RobotProcess
-from holdfast.ros.executive import DecisionHandover
-from holdfast.ros.ros2.parameters import in_parameters
+from holdfast.ros.executive import DecideCode, DecisionHandover, ExecutiveMaker
+from holdfast.ros.ros2.parameters import NodeParameters, in_parameters
 from holdfast.runtime.events import EventSink
 
-__all__ = ["MAX_TRIALS_TOLD", "Ending", "RunSegment", "SegmentResult", "World"]
+__all__ = ["MAX_TRIALS_TOLD", "Ending", "RunSegment", "SegmentResult", "World", "make_world"]
 
 MAX_TRIALS_TOLD = 10_000
 """Of a result; ``trials.csv`` has all."""
@@ -98,6 +99,39 @@ class World(NamedTuple):
     interrupt: Callable[[str], None]
     interrupt_at_once: bool = False
     handover: DecisionHandover | None = None
+
+
+def make_world(node: Any, parameters: NodeParameters) -> World:
+    """Make what the parameters name, for one segment of a run.
+
+    Raises
+    ------
+    HoldfastError
+        If that cannot be; the message names the parameter.
+    """
+    configuration = parameters.configuration
+    if parameters.environment == "configuration":
+        return World(load_environment(configuration), lambda _: None)
+    # Other threads than the robot's use it.
+    problem = Configuration.from_plain(configuration.plain()).problem
+    timeout_ms = configuration.environment.timeout_ms
+    if parameters.environment == "executive":
+        handover = DecisionHandover(problem, configuration.planning.sensing_interval)
+        return World(
+            ExecutiveMaker(handover, configuration.problem, timeout_ms),
+            functools.partial(handover.end, DecideCode.ENDED),
+            interrupt_at_once=True,
+            handover=handover,
+        )
+    from holdfast.ros.robot_interface import RobotInterface
+    from holdfast.ros.ros2_environment import cancel_ros_environments, make_ros_environment
+
+    # Invalid parameters are reported now, not when a trial begins.
+    RobotInterface(parameters.mapping, problem.sensing_actions, problem.action_size)
+    make: Any = functools.partial(make_ros_environment, node, parameters.mapping)
+    maker = EnvironmentMaker("the robot", problem, configuration.simulator.seed, timeout_ms, make)
+
+    return World(maker, lambda _: cancel_ros_environments(node))
 
 
 class RunSegment:
