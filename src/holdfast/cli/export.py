@@ -93,26 +93,12 @@ def main(arguments: Sequence[str]) -> int:
     if options.mcap is None and options.tables is None:
         raise OptionError("nothing to write: give --mcap FILE or --csv DIR, or both")
     with ended_by_signals():
-        _export(
-            options.run,
-            options.mcap,
-            options.tables,
-            options.trials,
-            options.rate,
-            quiet=options.quiet,
-        )
+        _export(options)
     return 0
 
 
-def _export(
-    path: Path,
-    mcap: Path | None,
-    tables: Path | None,
-    wanted: range | None,
-    rate_hz: float,
-    *,
-    quiet: bool,
-) -> None:
+def _export(options: ExportOptions) -> None:
+    path, mcap, tables, wanted = options.run, options.mcap, options.tables, options.trials
     if mcap is not None:
         from holdfast.ros.mcap_export import require_rosbags
 
@@ -128,8 +114,8 @@ def _export(
         trials = [trial for trial in recorded.trials if wanted is None or trial in wanted]
         if not trials:
             raise OutputError(f"{path}: {_nothing_there(recorded, wanted)}")
-        notes = _write(recorded, trials, mcap, tables, rate_hz, quiet=quiet)
-    for note in () if quiet else notes:
+        notes = _write(recorded, trials, options)
+    for note in () if options.quiet else notes:
         sys.stderr.write(f"note: {printable(note)}\n")
     for place in (mcap, tables):
         if place is not None:
@@ -148,20 +134,13 @@ def _nothing_there(recorded: RecordedRun, wanted: range | None) -> str:
     )
 
 
-def _write(
-    recorded: RecordedRun,
-    trials: Sequence[int],
-    mcap: Path | None,
-    tables: Path | None,
-    rate_hz: float,
-    *,
-    quiet: bool,
-) -> list[str]:
+def _write(recorded: RecordedRun, trials: Sequence[int], options: ExportOptions) -> list[str]:
     """Write all of it beside its places, and move it there when all is whole; return notes."""
     from holdfast.recording.csv_export import CsvSink
 
+    mcap, tables, rate_hz = options.mcap, options.tables, options.rate
     notes = _notes(recorded, trials, rate_hz)
-    line = progress_line(len(trials), quiet=quiet)
+    line = progress_line(len(trials), quiet=options.quiet)
     with contextlib.ExitStack() as stack:
         made: list[tuple[Path, Path]] = []
         sinks: list[FactSink] = []

@@ -7,14 +7,13 @@ from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
+    from holdfast.cli.run import RunOptions
     from holdfast.config.loader import Configuration
     from holdfast.outcome import TrialResult
     from holdfast.recording.run_directory import RunDirectory
     from holdfast.robot.environment import EnvironmentMaker
     from holdfast.runtime.events import EventSink
-    from holdfast.runtime.logs import LogFormat
     from holdfast.runtime.service_manager import ServiceManager
-    from holdfast.service.health import HttpAddress
 
 __all__ = ["RobotRun", "is_robot_run", "run_as_robot"]
 
@@ -69,16 +68,12 @@ def is_robot_run(configuration: Configuration, rate_hz: float | None) -> bool:
 
 
 def run_as_robot(
+    options: RunOptions,
     configuration: Configuration,
     directory: RunDirectory,
     maker: EnvironmentMaker,
     on_result: Callable[[TrialResult], None],
-    *,
-    rate_hz: float | None,
-    log_format: LogFormat,
-    quiet: bool,
     manager: ServiceManager,
-    health: HttpAddress | None,
     note: Callable[[str], None],
 ) -> RobotRun:
     """Run the missing trials one after another.
@@ -101,16 +96,16 @@ def run_as_robot(
 
     reasons = _Reasons(hint)
     sinks: list[EventSink] = []
-    if not quiet:
-        sinks.append(EventLog(sys.stderr, format=log_format, component="robot"))
+    if not options.quiet:
+        sinks.append(EventLog(sys.stderr, format=options.log, component="robot"))
     sinks.append(reasons)
     missed_ticks = perform_trials(
         configuration,
         directory,
         maker,
         on_result,
-        rate_hz=rate_hz,
+        rate_hz=options.rate,
         sinks=sinks,
-        watch=lambda events: RobotWatch(manager, health, events),
+        watch=lambda events: RobotWatch(manager, options.health, events),
     )
     return RobotRun(missed_ticks, reasons.refusals, reasons.unreachable)

@@ -257,16 +257,7 @@ def _run(options: RunOptions) -> int:
             try:
                 if maker is not None:
                     robot = run_as_robot(
-                        configuration,
-                        directory,
-                        maker,
-                        on_result,
-                        rate_hz=options.rate,
-                        log_format=options.log,
-                        quiet=quiet,
-                        manager=manager,
-                        health=options.health,
-                        note=notes.note,
+                        options, configuration, directory, maker, on_result, manager, notes.note
                     )
                 else:
                     manager.ready()
