@@ -112,16 +112,6 @@ class Kind(NamedTuple):
         parts += ["mixture"] if self.estimator != _ESTIMATORS[0] else []
         return ", ".join(parts)
 
-    def names(self) -> dict[str, Cell]:
-        """Return the cells of a table that name it."""
-        return {
-            "problem": self.problem,
-            "sensing_actions": self.sensing_actions,
-            "estimator": self.estimator,
-            "samples": self.samples,
-            "horizon": self.horizon,
-        }
-
 
 def _all(kind: Kind) -> int:
     return _actions_of(kind.problem)
@@ -156,7 +146,7 @@ class OffloadBreakEven:
         times, exchange = times_table(of_beliefs), _exchange_table(asked)
         scalings, exchange_ms = scalings_of(times), exchange_ms_of(exchange)
         lines = break_even_table(scalings, exchange_ms)
-        raw = [table.assign(**kind.names()) for kind, table in of_beliefs.items()]
+        raw = [table.assign(**kind._asdict()) for kind, table in of_beliefs.items()]
         return Report(
             raw={"sensing_times": pd.concat(raw, ignore_index=True)},
             summary={
@@ -283,7 +273,7 @@ def times_table(of_beliefs: Mapping[Kind, pd.DataFrame]) -> pd.DataFrame:
             share = cells_of("divided_share", median_interval(one["share"].to_numpy(float)))
             rows += [
                 {
-                    **kind.names(),
+                    **kind._asdict(),
                     "particles": particles,
                     "threads": threads,
                     "beliefs": len(those),
@@ -302,7 +292,7 @@ def scalings_of(times: pd.DataFrame) -> dict[Kind, Scaling]:
     """Return the times on one thread and the divided shares by kind, from :func:`times_table`."""
     found: dict[Kind, Scaling] = {}
     one = times[times["threads"] == 1]
-    for _, rows in one.groupby(list(SHOWN.names()), sort=False):
+    for _, rows in one.groupby(list(Kind._fields), sort=False):
         records = rows.to_dict("records")
         kind = kind_of(records[0])
         found[kind] = Scaling(
@@ -316,7 +306,7 @@ def scalings_of(times: pd.DataFrame) -> dict[Kind, Scaling]:
 
 def kind_of(row: Mapping[Any, Any]) -> Kind:
     """Return the kind of decision that a row of a table is about."""
-    return Kind(**{name: row[name] for name in SHOWN.names()})
+    return Kind(**{name: row[name] for name in Kind._fields})
 
 
 def _unbounded(interval: Interval) -> Interval:
@@ -357,51 +347,36 @@ def exchange_ms_of(exchange: pd.DataFrame) -> float:
 
 def _growth_table(of_beliefs: Mapping[Kind, pd.DataFrame]) -> pd.DataFrame:
     """Return the exponents of the time on one thread, in particles, M, J and H."""
+    tables = [table.assign(**kind._asdict()) for kind, table in of_beliefs.items()]
+    every = pd.concat(tables, ignore_index=True)
+    one = every[every["threads"] == 1]
     cells: list[dict[str, Cell]] = []
-    for kind, table in of_beliefs.items():
+    for _, rows in one.groupby(list(Kind._fields), sort=False):
         for start in (100, _STEADY_FROM):
-            points = _one_thread(table)
-            mine = {
-                belief: {n: ms for n, ms in times.items() if n >= start}
-                for belief, times in points.items()
-            }
-            cells += _exponents("particles", kind, mine, f"from {start:,} on")
+            larger = rows[rows["particles"] >= start]
+            cells += _exponents("particles", larger, f"from {start:,} on")
     for changed in ("samples", "sensing_actions", "horizon"):
-        for kind in of_beliefs:
-            family = [
-                other
-                for other in of_beliefs
-                if other._replace(**{changed: getattr(kind, changed)}) == kind
-            ]
-            if len(family) < 2 or family[0] != kind:
-                continue
-            common = set.intersection(*(set(of_beliefs[other]["particles"]) for other in family))
-            at = max((n for n in common if n <= _STEADY_FROM), default=None)
-            if at is None:
-                continue
-            of_each: dict[int, dict[int, float]] = {}
-            for other in family:
-                for belief, times in _one_thread(of_beliefs[other]).items():
-                    if at in times:
-                        of_each.setdefault(belief, {})[getattr(other, changed)] = times[at]
-            cells += _exponents(changed, kind, of_each, f"at {at:,} particles")
+        others = [name for name in Kind._fields if name != changed]
+        for _, family in one.groupby(others, sort=False):
+            tried = family.groupby("particles")[changed].nunique()
+            common = tried.index[(tried == family[changed].nunique()) & (tried > 1)]
+            common = common[common <= _STEADY_FROM]
+            if len(common):
+                here = family[family["particles"] == common.max()]
+                cells += _exponents(changed, here, f"at {common.max():,} particles")
     return pd.DataFrame(cells)
 
 
-def _exponents(
-    what: str, kind: Kind, points: dict[int, dict[int, float]], where: str
-) -> list[dict[str, Cell]]:
+def _exponents(what: str, rows: pd.DataFrame, where: str) -> list[dict[str, Cell]]:
     """Return a row with the median exponent over the beliefs, each fitted alone; none if few."""
-    most = max((len(times) for times in points.values()), default=0)
-    slopes = [
-        power_law(np.array(list(times), dtype=float), np.array(list(times.values())))[1].value
-        for times in points.values()
-        if len(times) == most and most > 1
-    ]
-    if not slopes:
+    beliefs = [(own[what].to_numpy(float), own["median_ms"]) for _, own in rows.groupby("belief")]
+    most = max((sizes.size for sizes, _ in beliefs), default=0)
+    if most < 2:
         return []
-    sizes = sorted(next(times for times in points.values() if len(times) == most))
-    names = kind.names()
+    whole = [(sizes, times.to_numpy()) for sizes, times in beliefs if sizes.size == most]
+    slopes = [power_law(sizes, times)[1].value for sizes, times in whole]
+    smallest, largest = int(whole[0][0].min()), int(whole[0][0].max())
+    names = rows[list(Kind._fields)].iloc[0].to_dict()
     if what != "particles":
         names[what] = None
     return [
@@ -409,13 +384,11 @@ def _exponents(
             "grows_with": what,
             **names,
             "where": where,
-            "smallest": sizes[0],
-            "largest": sizes[-1],
+            "smallest": smallest,
+            "largest": largest,
             "beliefs": len(slopes),
             **cells_of("exponent", median_interval(np.array(slopes))),
-            "n_log_n": _exponent_of_n_log_n(sizes[0], sizes[-1])
-            if what == "particles"
-            else math.nan,
+            "n_log_n": _exponent_of_n_log_n(smallest, largest) if what == "particles" else math.nan,
         }
     ]
 
@@ -423,15 +396,6 @@ def _exponents(
 def _exponent_of_n_log_n(smallest: int, largest: int) -> float:
     """Return the exponent that n log n would have between two sizes."""
     return 1.0 + math.log(math.log(largest) / math.log(smallest)) / math.log(largest / smallest)
-
-
-def _one_thread(table: pd.DataFrame) -> dict[int, dict[int, float]]:
-    """Return the times of each belief on one thread, by particles."""
-    one = table[table["threads"] == 1]
-    return {
-        belief: dict(zip(rows["particles"], rows["median_ms"], strict=True))
-        for belief, rows in one.groupby("belief")
-    }
 
 
 class Line(NamedTuple):
@@ -454,13 +418,25 @@ def line_of(
     return Line(*found)
 
 
-def _line_cells(line: Line) -> dict[str, Cell]:
+def _line_cells(
+    scaling: Scaling,
+    robot_cores: int,
+    cores: int,
+    path_ms: float,
+    exchange_ms: float,
+    ahead_ms: float = 0.0,
+) -> dict[str, Cell]:
+    line = line_of(scaling, robot_cores, cores, path_ms + exchange_ms, ahead_ms)
     return {
+        "robot_cores": robot_cores,
+        "service_cores": cores,
+        "path_ms": path_ms,
         "particles": _whole(line.value),
         "particles_low": _whole(line.first),
         "particles_high": _whole(line.last),
         "particles_if_divided_evenly": _whole(line.even),
         "words": line.value.words,
+        "measured_to": scaling.particles[-1],
     }
 
 
@@ -472,14 +448,8 @@ def break_even_table(scalings: Mapping[Kind, Scaling], exchange_ms: float) -> pd
     """Return the break-even of a robot that waits for each decision."""
     return pd.DataFrame(
         {
-            **kind.names(),
-            "robot_cores": robot_cores,
-            "service_cores": times * robot_cores,
-            "path_ms": path_ms,
-            **_line_cells(
-                line_of(scaling, robot_cores, times * robot_cores, path_ms + exchange_ms)
-            ),
-            "measured_to": scaling.particles[-1],
+            **kind._asdict(),
+            **_line_cells(scaling, robot_cores, times * robot_cores, path_ms, exchange_ms),
         }
         for kind, scaling in scalings.items()
         for robot_cores in _ROBOT_CORES
@@ -492,14 +462,10 @@ def _ahead_table(scalings: Mapping[Kind, Scaling], exchange_ms: float) -> pd.Dat
     """Return the break-even of a robot that decides ahead, by its rate."""
     return pd.DataFrame(
         {
-            **kind.names(),
+            **kind._asdict(),
             "rate_hz": rate_hz,
             "ahead_ms": ahead_ms_of(rate_hz),
-            "robot_cores": 1,
-            "service_cores": cores,
-            "path_ms": path_ms,
-            **_line_cells(line_of(scaling, 1, cores, path_ms + exchange_ms, ahead_ms_of(rate_hz))),
-            "measured_to": scaling.particles[-1],
+            **_line_cells(scaling, 1, cores, path_ms, exchange_ms, ahead_ms_of(rate_hz)),
         }
         for kind, scaling in scalings.items()
         for rate_hz in RATES_HZ
@@ -516,7 +482,7 @@ def ahead_ms_of(rate_hz: float) -> float:
 def numbers_of(times: pd.DataFrame, exchange: pd.DataFrame, lines: pd.DataFrame) -> list[Number]:
     """Return the break-even of the thesis's settings, the divided shares, and the exchange."""
     numbers = []
-    of_shown = (lines[list(SHOWN.names())] == pd.Series(SHOWN.names())).all(axis=1)
+    of_shown = (lines[list(Kind._fields)] == pd.Series(SHOWN._asdict())).all(axis=1)
     for row in lines[of_shown & (lines["robot_cores"] == 1)].to_dict("records"):
         name = (
             f"a service with {row['service_cores']} cores at {row['path_ms']:g} ms is faster from"

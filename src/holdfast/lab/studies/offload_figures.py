@@ -65,10 +65,7 @@ def sensing_time(scalings: Mapping[Kind, Scaling], exchange_ms: float) -> Figure
         row[0].set_ylabel("time until the sensing action is there (ms)")
     for panel in panels[-1]:
         panel.set_xlabel("particles")
-    handles, labels = panels[0][0].get_legend_handles_labels()
-    figure.legend(
-        handles, labels, loc="outside lower center", ncols=2, handlelength=3.2, frameon=False
-    )
+    plots.legend_below(figure, panels[0][0], 2, handlelength=3.2, frameon=False)
     return figure
 
 
@@ -263,8 +260,7 @@ def break_even_lines(lines: pd.DataFrame) -> Figure:
     for place, end in enumerate(ends.values()):
         panel.plot([end, end], [place - 0.4, place + 0.4], color="#8A9099", linewidth=1.2)
     panel.set_xlabel("particles at break-even, with bounds; grey: measured up to here")
-    handles, labels = panel.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False)
+    plots.legend_below(figure, panel, 4, frameon=False)
     return figure
 
 
@@ -298,8 +294,5 @@ def waiting(scalings: Mapping[Kind, Scaling], exchange_ms: float) -> Figure:
         panel.set_title(way, loc="left")
         panel.set_xlabel("particles")
     panels[0].set_ylabel("waiting at each turn (ms)")
-    handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(
-        handles, labels, loc="outside lower center", ncols=3, handlelength=3.2, frameon=False
-    )
+    plots.legend_below(figure, panels[0], 3, handlelength=3.2, frameon=False)
     return figure

@@ -9,7 +9,7 @@ import io
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import matplotlib as mpl
 import pandas as pd
@@ -32,6 +32,7 @@ __all__ = [
     "font_size_of",
     "grid_of_panels",
     "label_grid",
+    "legend_below",
     "line_with_intervals",
     "make_legible",
     "mark",
@@ -68,6 +69,14 @@ class Dots(NamedTuple):
     values: Sequence[float]
     lows: Sequence[float]
     highs: Sequence[float]
+
+    @property
+    def errors(self) -> list[list[float]]:
+        """How far the intervals reach below and above the values."""
+        return [
+            [value - low for value, low in zip(self.values, self.lows, strict=True)],
+            [high - value for value, high in zip(self.values, self.highs, strict=True)],
+        ]
 
 
 def dots_of(label: str, rows: pd.DataFrame, name: str, factor: float = 1.0) -> Dots:
@@ -143,9 +152,16 @@ def label_grid(figure: Figure, panels: Mapping[str, Axes], x_label: str, y_label
         panel.tick_params(axis="x", labelbottom=True)
     if y_label:
         figure.supylabel(y_label, fontsize=10.0)
-    handles, labels = next(iter(panels.values())).get_legend_handles_labels()
+    first = next(iter(panels.values()))
+    labels = first.get_legend_handles_labels()[1]
     if any(labels):
-        figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize=9.0)
+        legend_below(figure, first, len(labels), fontsize=9.0)
+
+
+def legend_below(figure: Figure, panel: Axes, columns: int, **looks: Any) -> None:
+    """Give a figure one legend below, with what a panel shows."""
+    handles, labels = panel.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=columns, **looks)
 
 
 def line_with_intervals(
@@ -160,12 +176,10 @@ def line_with_intervals(
     offset : float
         By which all are moved to the right, so that intervals do not cover each other.
     """
-    below = [value - low for value, low in zip(line.values, line.lows, strict=True)]
-    above = [high - value for value, high in zip(line.values, line.highs, strict=True)]
     panel.errorbar(
         [place + offset for place in places],
         line.values,
-        yerr=[below, above],
+        yerr=line.errors,
         fmt=MARKERS[number] + "-",
         color=COLORS[number],
         markersize=4.2,
@@ -195,12 +209,10 @@ def dot_rows(
         offset = step * (number - 0.5 * (len(kinds) - 1))
         color = COLORS[number]
         places = [row + offset for row in range(len(labels))]
-        below = [value - low for value, low in zip(kind.values, kind.lows, strict=True)]
-        above = [high - value for value, high in zip(kind.values, kind.highs, strict=True)]
         panel.errorbar(
             kind.values,
             places,
-            xerr=[below, above],
+            xerr=kind.errors,
             fmt=MARKERS[number],
             color=color,
             markerfacecolor="white" if number == 0 else color,

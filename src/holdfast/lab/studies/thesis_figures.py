@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator
 
 from holdfast.arrays import FloatArray
-from holdfast.lab.studies.plots import COLORS, MARKERS, figure_of, milliseconds
+from holdfast.lab.studies.plots import COLORS, MARKERS, figure_of, legend_below, milliseconds
 from holdfast.lab.studies.statistics import Interval, interval_in, median_interval
 from holdfast.lab.studies.thesis_measurements import (
     PARTICLES,
@@ -152,13 +152,6 @@ def _thesis_line(panel: Axes, height: float, text: str, *, above: bool = True) -
     )
 
 
-def _legend_below(figure: Figure, panel: Axes, columns: int) -> None:
-    handles, labels = panel.get_legend_handles_labels()
-    figure.legend(
-        handles=handles, labels=labels, loc="outside lower center", ncols=columns, fontsize=8.5
-    )
-
-
 # -- figures 9, 10 and 11 --------------------------------------------------------------------------
 
 
@@ -205,7 +198,7 @@ def sensing_times(rows: pd.DataFrame) -> Figure:
         for panel in panels:
             _over_particles(panel)
             panel.grid(axis="y")
-        _legend_below(_figure(panels), panels[2], 3)
+        legend_below(_figure(panels), panels[2], 3, fontsize=8.5)
     return _figure(panels)
 
 
@@ -280,7 +273,7 @@ def round_trips(rows: pd.DataFrame) -> Figure:
         _over_particles(panels[0])
         panels[0].set_title("Nothing lost: medians with 95 % intervals", loc="left")
         _draw_loss(panels[1], rows, looks)
-        _legend_below(_figure(panels), panels[0], 3)
+        legend_below(_figure(panels), panels[0], 3, fontsize=8.5)
     return _figure(panels)
 
 
@@ -412,7 +405,7 @@ def launches(rows: pd.DataFrame) -> Figure:
         _widen(panels[0])
         _over_particles(panels[0])
         panels[0].set_title(_with_count("The local service is launched", len(cold)), loc="left")
-        _legend_below(_figure(panels), panels[0], 2)
+        legend_below(_figure(panels), panels[0], 2, fontsize=8.5)
         _over_paths(panels[1], kills, "found_ms")
         milliseconds(panels[1], "time from the kill until found (ms)", upright=False)
         _thesis_upright(
@@ -441,7 +434,7 @@ def failbacks(rows: pd.DataFrame) -> Figure:
             )
         _over_particles(panels[0])
         panels[0].set_title("By particles, over streams without loss", loc="left")
-        _legend_below(_figure(panels), panels[0], 3)
+        legend_below(_figure(panels), panels[0], 3, fontsize=8.5)
         _over_paths(panels[1], kills, "failback_ms")
         panels[1].set_title(_with_count("By path", len(kills)), loc="left")
         what = "from its ready line until it decides (ms)"
