@@ -141,15 +141,8 @@ class CloudTrials(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
 def run_cloud_trials(**trials: Any) -> pd.DataFrame:
     """Run them; the function of tasks of the kind ``cloud_trials``.
 
-    Parameters
-    ----------
-    **trials
-        The fields of :class:`CloudTrials`.
-
-    Returns
-    -------
-    DataFrame
-        With the columns of :data:`COLUMNS`.
+    It gets the fields of :class:`CloudTrials`, and returns a table with the columns of
+    :data:`COLUMNS`.
 
     Raises
     ------
@@ -195,18 +188,10 @@ def rows_of_run(
 
     Parameters
     ----------
-    table : DecisionTable
-        The robot's.
     killed_at : float or None
         When the cloud was killed, in seconds since the epoch.
     identical : bool
         Whether all decisions and actions are those of the reference run.
-    load : float or None
-        Of the machine.
-    rate_hz : float or None
-        Of the robot.
-    carried_bytes : int or None
-        Between the robot and the cloud.
     performed : iterable of Performance
         Task actions to be listed.
     """

@@ -140,13 +140,7 @@ def emulate(
 
 
 def run_emulation(first_trial: int, **series: Any) -> pd.DataFrame:
-    """Emulate some trials of a series; the function of tasks of the kind ``emulation_2017``.
-
-    Parameters
-    ----------
-    **series
-        The fields of :class:`~holdfast.lab.studies.trial_batches.TrialSeries`.
-    """
+    """Emulate some trials of a series; the function of tasks of the kind ``emulation_2017``."""
     wanted = msgspec.convert(series, TrialSeries)
     problem = problem_of(wanted.problem, wanted.model, wanted.state_space_planner)
     emulation = emulate(

@@ -102,15 +102,8 @@ class _Turn(NamedTuple):
 def measure_exchange(**exchange: Any) -> pd.DataFrame:
     """Put questions and time the answers; the function of tasks of the kind ``exchange_times``.
 
-    Parameters
-    ----------
-    **exchange
-        The fields of :class:`Exchange`.
-
-    Returns
-    -------
-    DataFrame
-        With the columns of :data:`COLUMNS`.
+    It gets the fields of :class:`Exchange`, and returns a table with the columns of
+    :data:`COLUMNS`.
 
     Raises
     ------

@@ -51,14 +51,7 @@ class Executor(Protocol):
         ...
 
     def run(self, tasks: Sequence[Task], on_result: Callable[[Task, pd.DataFrame], None]) -> None:
-        """Compute tasks.
-
-        Parameters
-        ----------
-        tasks : sequence of Task
-            Begun in this order.
-        on_result : callable
-            Called in this process with each task and its result, in any order.
+        """Compute tasks, begun in this order; pass each with its result, in any order.
 
         Raises
         ------
@@ -75,13 +68,7 @@ class Executor(Protocol):
 
 
 class LocalExecutor:
-    """Computes tasks in processes of this machine.
-
-    Parameters
-    ----------
-    processes : int
-        1 computes all of them in this one.
-    """
+    """Computes tasks in processes of this machine; a single one is this process."""
 
     def __init__(self, processes: int) -> None:
         if not 1 <= processes <= MAX_JOBS:

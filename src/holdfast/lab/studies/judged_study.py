@@ -54,13 +54,7 @@ class JudgedStudy(ABC):
 
     @abstractmethod
     def report_of(self, trials: pd.DataFrame) -> Report:
-        """Return the report on all trials.
-
-        Raises
-        ------
-        InvalidValueError
-            If they are not those of this study.
-        """
+        """Return the report on all trials; InvalidValueError if they are not of this study."""
 
     def tasks(self, scale: Scale) -> list[Task]:
         """Return all tasks, in the order in which to begin."""

@@ -201,13 +201,7 @@ class Parameters(JudgedStudy):
         )
 
     def report_of(self, trials: pd.DataFrame) -> Report:
-        """Return the report on all trials.
-
-        Raises
-        ------
-        InvalidValueError
-            If they are not those of this study.
-        """
+        """Return the report on all trials; InvalidValueError if they are not of this study."""
         found = cells_of_trials(trials, ("purpose", "problem", "way", "parameter", "value"))
         # A quick run leaves some out.
         tried = {cell[2:] for cell in found}

@@ -116,16 +116,8 @@ def grid_of_panels(
 ) -> tuple[Figure, dict[str, Axes]]:
     """Return a figure with a panel for each name, row by row, each with its name on top.
 
-    Parameters
-    ----------
-    columns : int
-        Panels in a row.
-    width : float
-        Of the figure, in inches.
-    row_height : float
-        Of a row of panels, in inches.
-    same_rows : bool
-        All panels have the same rows, which are named once, and one scale.
+    ``width`` is that of the figure, ``row_height`` that of a row of panels, in inches. With
+    ``same_rows`` all panels have the same rows, which are named once, and one scale.
     """
     rows = -(-len(names) // columns)
     figure = figure_of(width, row_height * rows + 0.8, title)
@@ -169,12 +161,8 @@ def line_with_intervals(
 ) -> None:
     """Draw values over places, joined, each with its interval.
 
-    Parameters
-    ----------
-    number : int
-        Which colour and mark.
-    offset : float
-        By which all are moved to the right, so that intervals do not cover each other.
+    ``number`` is that of the colour and mark. The offset moves all to the right, so that intervals
+    do not cover each other.
     """
     panel.errorbar(
         [place + offset for place in places],
@@ -193,16 +181,9 @@ def line_with_intervals(
 def dot_rows(
     panel: Axes, labels: Sequence[str], kinds: Sequence[Dots], *, legend: bool = True
 ) -> None:
-    """Draw rows of values with intervals, a mark for each kind, the first row on top.
+    """Draw labelled rows of values with intervals, a mark for each kind, the first row on top.
 
-    Parameters
-    ----------
-    labels : sequence of str
-        Of the rows.
-    kinds : sequence of Dots
-        The first one's marks are hollow.
-    legend : bool
-        Whether there is one, above the rows, if a kind has a label.
+    The first kind's marks are hollow. The legend is above the rows, if a kind has a label.
     """
     step = 0.7 / len(kinds)
     for number, kind in enumerate(kinds):
@@ -289,18 +270,7 @@ def font_size_of(text: Text) -> float:
 
 
 def save(figure: Figure, directory: Path, name: str) -> list[str]:
-    """Write a figure as PNG and as SVG, legible where a page shows it.
-
-    Returns
-    -------
-    list of str
-        The names of the files.
-
-    Raises
-    ------
-    OutputError
-        If one cannot be written.
-    """
+    """Write a figure as PNG and as SVG, legible where a page shows it; return the files' names."""
     names = []
     make_legible(figure)
     # Without a date and with fixed ids the same results give the same file.

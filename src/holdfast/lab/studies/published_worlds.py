@@ -143,13 +143,7 @@ class PublishedWorlds:
         return self.report_of(pd.concat(tables, ignore_index=True))
 
     def report_of(self, trials: pd.DataFrame) -> Report:
-        """Return the report on all trials.
-
-        Raises
-        ------
-        InvalidValueError
-            If they are not those of this study.
-        """
+        """Return the report on all trials; InvalidValueError if they are not of this study."""
         if list(trials.columns) != ["way", *COLUMNS] or set(trials["way"]) != set(WAYS):
             raise InvalidValueError(f"{self.name}: these are trials of something else")
         tables = {way: trials[trials["way"] == way] for way in WAYS}
@@ -165,20 +159,8 @@ class PublishedWorlds:
 def run_vdp_tag(way: str, seed: int, first_trial: int, num_trials: int) -> pd.DataFrame:
     """Run some trials; the function of tasks of the kind ``vdp_tag``.
 
-    Parameters
-    ----------
-    way : str
-        One of :data:`WAYS`.
-
-    Returns
-    -------
-    DataFrame
-        With the columns of :data:`COLUMNS`. All but the times are the same wherever it is run.
-
-    Raises
-    ------
-    TaskError
-        If there is no such way.
+    ``way`` is one of :data:`WAYS`. The table has the columns of :data:`COLUMNS`; all but the times
+    are the same wherever it is run.
     """
     if way not in WAYS:
         raise TaskError(f"way {way!r}: there are {', '.join(WAYS)}")

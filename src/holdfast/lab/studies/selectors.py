@@ -171,13 +171,7 @@ class Selectors(JudgedStudy):
         )
 
     def report_of(self, trials: pd.DataFrame) -> Report:
-        """Return the report on all trials.
-
-        Raises
-        ------
-        InvalidValueError
-            If they are not those of this study.
-        """
+        """Return the report on all trials; InvalidValueError if they are not of this study."""
         found = cells_of_trials(trials, ("purpose", "problem", "sensing_interval", "way"))
         every = list(self.cells())
         require_cells(

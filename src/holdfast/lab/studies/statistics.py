@@ -344,14 +344,7 @@ def cells_across_problems(
 ) -> dict[str, Cell]:
     """Return the cells of how two ways differ over these problems, and over all such problems.
 
-    Parameters
-    ----------
-    pairs : sequence of (array, array)
-        Of each problem: a number of each trial, of one way and of the other.
-    least_difference : float
-        See :func:`across_problems`.
-    shown : callable
-        What is shown of a difference.
+    The arguments are those of :func:`across_problems`, and what is shown of a difference.
 
     Returns
     -------

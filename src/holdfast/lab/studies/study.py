@@ -59,13 +59,7 @@ class Scale(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Results:
-    """The tables that tasks returned.
-
-    Parameters
-    ----------
-    tables : mapping of str to DataFrame
-        By the tasks' keys.
-    """
+    """The tables that tasks returned, by the tasks' keys."""
 
     def __init__(self, tables: Mapping[str, pd.DataFrame], key_of: Callable[[Task], str]) -> None:
         self._tables = tables
@@ -152,11 +146,5 @@ class TrialStudy(Study, Protocol):
     """A study whose report follows from a table of its trials, which is kept."""
 
     def report_of(self, trials: pd.DataFrame) -> Report:
-        """Return the report on all trials.
-
-        Raises
-        ------
-        InvalidValueError
-            If they are not those of this study.
-        """
+        """Return the report on all trials; InvalidValueError if they are not of this study."""
         ...

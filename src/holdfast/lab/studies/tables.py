@@ -29,13 +29,7 @@ def columns_of(table: pd.DataFrame) -> Columns:
 
 
 def frame_of(plain: Columns | Mapping[str, Any]) -> pd.DataFrame:
-    """Return plain data as a data frame.
-
-    Raises
-    ------
-    InvalidValueError
-        If the columns differ in length.
-    """
+    """Return plain data as a data frame; InvalidValueError if the columns differ in length."""
     import pandas as pd
 
     try:

@@ -94,15 +94,8 @@ def trial_tasks(series: TrialSeries, trials_in_each: int, kind: str = "trials") 
 def run_trials_of(first_trial: int, **series: Any) -> pd.DataFrame:
     """Run some trials of a series in this process; the function of tasks of the kind ``trials``.
 
-    Parameters
-    ----------
-    **series
-        The fields of :class:`TrialSeries`.
-
-    Returns
-    -------
-    DataFrame
-        With the columns of :data:`COLUMNS`. All but the times are the same wherever it is run.
+    It gets the fields of :class:`TrialSeries`, and returns a table with the columns of
+    :data:`COLUMNS`. All but the times are the same wherever it is run.
     """
     import pandas as pd  # here, so that problems and cases can be had without it
 

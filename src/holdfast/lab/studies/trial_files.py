@@ -70,13 +70,7 @@ class TrialFile(msgspec.Struct, kw_only=True):
 
 
 def read_trials(path: Path) -> TrialFile:
-    """Return the content of a file of trials.
-
-    Raises
-    ------
-    TrialFileError
-        If it cannot be read, or holds something else.
-    """
+    """Return the content of a file of trials; TrialFileError if it holds something else."""
     import pyarrow as pa
     from pyarrow import parquet
 
@@ -129,13 +123,7 @@ def kept_trials(table: pd.DataFrame, cells: IntArray) -> pd.DataFrame:
 
 
 def cells_of_trials(trials: pd.DataFrame, names: Sequence[str]) -> dict[Any, pd.DataFrame]:
-    """Return the trials of each cell, by the cell's values in the columns ``names``.
-
-    Raises
-    ------
-    InvalidValueError
-        If a column is missing.
-    """
+    """Return the trials of each cell, by the cell's values in the columns ``names``."""
     missing = [name for name in (*names, *_KEPT) if name not in trials.columns]
     if missing:
         raise InvalidValueError(f"trials without the columns {', '.join(missing)}")
@@ -146,13 +134,7 @@ def cells_of_trials(trials: pd.DataFrame, names: Sequence[str]) -> dict[Any, pd.
 def require_cells(
     study: str, cells: Mapping[Any, pd.DataFrame], expected: Collection[tuple[Any, ...]]
 ) -> None:
-    """Make sure that there are trials of all cells that a study compares, and of no others.
-
-    Raises
-    ------
-    InvalidValueError
-        If a cell is missing or unknown.
-    """
+    """Make sure that there are trials of all cells that a study compares, and of no others."""
     for each in expected:
         if each not in cells:
             raise InvalidValueError(f"{study}: there are no trials of {', '.join(map(str, each))}")

@@ -135,7 +135,7 @@ class Pursuit:
 
     Parameters
     ----------
-    rule : LookRule, optional
+    rule : callable, optional
         Decides about looks after the direction is chosen. Without it direction and look are chosen
         together, by the expected return of both.
     """
