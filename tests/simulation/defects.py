@@ -404,7 +404,7 @@ _defect(
 
 _defect(
     "act_before_journal",
-    "A task action is ordered first and written down then.",
+    "The robot performs a task action before it writes it to the journal.",
     Edit(
         Robot,
         "_next_action",
@@ -420,12 +420,12 @@ _defect(
 )
 _defect(
     "observation_not_written",
-    "What was sensed is used, but only the task actions are written down.",
+    "The journal gets the task actions, but not the observations.",
     Edit(Robot, "_sensed", "self._write(record)", "pass"),
 )
 _defect(
     "performance_not_written",
-    "That an action was performed is not written down, as the next one says so.",
+    "The journal does not record that an action was performed; the next action implies it.",
     Edit(
         Robot,
         "_performed",
@@ -435,7 +435,7 @@ _defect(
 )
 _defect(
     "pending_action_assumed_done",
-    "A restarted robot takes the action that it last wrote down as performed.",
+    "A restarted robot assumes that the last action in its journal was performed.",
     Edit(
         Robot,
         "_settle_pending_action",
@@ -445,8 +445,8 @@ _defect(
 )
 _defect(
     "pending_action_repeated",
-    "A restarted robot performs the action that it last wrote down, without asking whether it was "
-    "performed.",
+    "A restarted robot performs the last action in its journal without asking whether it "
+    "was performed.",
     Edit(
         Robot,
         "_settle_pending_action",
@@ -466,7 +466,7 @@ _defect(
 )
 _defect(
     "journal_tail_trusted",
-    "After a power cut the journal is taken for complete.",
+    "After a power cut the robot assumes that its journal is complete.",
     Edit(Robot, "_settle_pending_action", "(history.paused or tail_is_certain)", "True"),
 )
 _defect(
@@ -484,7 +484,7 @@ _defect(
 
 _defect(
     "both_answers_performed",
-    "An answer that comes is performed, also the second one to a question that was asked twice.",
+    "The robot performs each answer, also the second one to a request that it sent twice.",
     Edit(
         Robot,
         "handle",
@@ -498,7 +498,8 @@ _defect(
 )
 _defect(
     "suspected_never_asked",
-    "A service that is suspected is asked nothing, so it can never show that it lives.",
+    "The robot asks a suspected service nothing, so the service can never answer and be trusted "
+    "again.",
     Edit(Dispatcher, "_hold_and_retry", "replica.detector.present\n", "replica.detector.trusted\n"),
     Edit(
         requests.OpenRequests,
@@ -509,8 +510,8 @@ _defect(
 )
 _defect(
     "given_up_cloud_never_tried",
-    "A cloud that was given up is asked no more, neither with the turns that follow nor when it "
-    "appears again: the local service decides well enough.",
+    "The robot never asks a cloud again that it considers lost, neither periodically nor "
+    "when the cloud reappears, because the local service decides.",
     Edit(Dispatcher, "_try_others", "if at is not None and at <= now:", "if False:"),
     Edit(
         Dispatcher,
@@ -521,7 +522,7 @@ _defect(
 )
 _defect(
     "old_process_taken_for_new",
-    "The news that a service's process is gone is believed of the process that took its place.",
+    "A report that a service's process has ended is applied to the process that replaced it.",
     Edit(
         FailureDetector,
         "vanished",
@@ -531,12 +532,12 @@ _defect(
 )
 _defect(
     "launch_tried_once",
-    "A local service that could not be started is not started again.",
+    "A local service that failed to start is not started again.",
     Edit(RestartPolicy, "failed", "if self._launch_after is not None:", "if True:"),
 )
 _defect(
     "silence_not_timed",
-    "No alarm is set while a service is being asked, for sooner or later it will answer.",
+    "The robot sets no timeout for a request, because sooner or later an answer will come.",
     Edit(
         Dispatcher,
         "next_wakeup",
@@ -547,7 +548,7 @@ _defect(
 )
 _defect(
     "retry_not_timed",
-    "No alarm is set for when a service may be asked again.",
+    "The robot sets no timer for asking a service again.",
     Edit(
         Dispatcher,
         "next_wakeup",
@@ -557,7 +558,7 @@ _defect(
 )
 _defect(
     "cloud_back_when_seen",
-    "The status says that the cloud decides again as soon as it is seen, before it has answered.",
+    "The status returns to the cloud when a cloud service appears, before it has answered.",
     Edit(
         Dispatcher,
         "_appeared",
@@ -567,12 +568,12 @@ _defect(
 )
 _defect(
     "session_of_anybody",
-    "A session is known by its bytes alone, whoever asks.",
+    "A service identifies a session by its bytes alone, and does not compare the certificate.",
     Edit(Service, "receive_request", "(owner, request.session)", "(None, request.session)"),
 )
 _defect(
     "any_answer_ends_recovery",
-    "The answer of the local service, too, is taken for the cloud's return.",
+    "An answer of the local service also counts as the cloud's return.",
     Edit(
         Dispatcher,
         "_replied",
@@ -582,7 +583,7 @@ _defect(
 )
 _defect(
     "cloud_lost_twice",
-    "That the cloud is lost is noticed whatever the status is.",
+    "The robot reports the loss of the cloud in every status.",
     Edit(Dispatcher, "_note_lost_cloud", "and not self._tracker.is_recovering", ""),
 )
 

@@ -1,7 +1,7 @@
 """What the robot acts on: a world that goes on when the robot's process does not.
 
-It knows how the undisturbed run went, and lets nothing else happen in it: whoever senses or does
-something else, again, too early or too late, is told so at once, as a :class:`Violation`.
+It knows how the undisturbed run went, and lets nothing else happen in it: to sense or do something
+else, again, too early or too late raises a :class:`Violation` at once.
 """
 
 from __future__ import annotations

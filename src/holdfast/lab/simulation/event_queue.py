@@ -1,7 +1,7 @@
 """Virtual time: what is to happen, and in which order.
 
-Time passes only from one happening to the next, so a second of silence costs nothing. Happenings of
-the same time come in the order in which they were put down, so a run goes one way only.
+Time passes only from one event to the next, so a second of silence costs nothing. Events of the
+same time come in the order in which they were added, so a run is reproducible.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ __all__ = ["Clock", "EventQueue"]
 
 
 class EventQueue:
-    """Happenings in the order of their time.
+    """Events in the order of their time.
 
     Attributes
     ----------
     now : float
         Seconds since the beginning.
     count : int
-        Of all happenings that were put down.
+        Of all events that were added.
     """
 
     def __init__(self) -> None:

@@ -138,7 +138,7 @@ class Slow(_Item, frozen=True, kw_only=True, tag="slow", tag_field="item"):
 class OutOfMemory(_Item, frozen=True, kw_only=True, tag="out_of_memory", tag_field="item"):
     """A service has no memory for one part of an answer, for a while.
 
-    It is told in stories and never drawn: for long enough it ends a run whose services have none.
+    No seed draws it, only written schedules have it: a long one ends a run.
     """
 
     service: Service
