@@ -28,6 +28,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from tests.ports import free_port
 from tests.processes.faults import PATIENT
 
+from holdfast.lab.testbed.in_process import InProcessNetwork
 from holdfast.protocol.events import (
     CallEnded,
     ReplyReceived,
@@ -38,7 +39,6 @@ from holdfast.protocol.messages import Refused, decode_reply
 from holdfast.transport import frames
 from holdfast.transport.contract import IncomingCall, RobotTransport, ServiceTransport
 from holdfast.transport.endpoints import ServiceAddress, TlsFiles
-from holdfast.transport.in_process import InProcessNetwork
 from holdfast.transport.robot_end import StreamRobotTransport
 from holdfast.transport.service_end import StreamServiceTransport
 

@@ -7,6 +7,7 @@ import asyncio
 import pytest
 
 from holdfast.errors import InvalidValueError, TransportError
+from holdfast.lab.testbed.in_process import InProcessNetwork
 from holdfast.protocol.events import (
     CallEnded,
     ReplyReceived,
@@ -15,7 +16,6 @@ from holdfast.protocol.events import (
     TransportEvent,
 )
 from holdfast.transport.contract import IncomingCall
-from holdfast.transport.in_process import InProcessNetwork
 
 
 async def turns(number: int = 5) -> None:

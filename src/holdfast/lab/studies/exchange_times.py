@@ -27,6 +27,7 @@ from holdfast.lab.studies.sensing_times import Sensed, history_of
 from holdfast.lab.studies.tables import Cell
 from holdfast.lab.studies.trial_batches import problem_of
 from holdfast.lab.testbed.driver import Testbed
+from holdfast.lab.testbed.in_process import InProcessNetwork
 from holdfast.lab.testbed.processes import free_port
 from holdfast.planning import Planner, digest
 from holdfast.problems.registry import problem_class, problem_module
@@ -50,7 +51,6 @@ from holdfast.service.shell import ServiceShell
 from holdfast.source_digest import core_version, problem_digest
 from holdfast.transport.contract import RobotTransport
 from holdfast.transport.endpoints import ServiceAddress
-from holdfast.transport.in_process import InProcessNetwork
 from holdfast.transport.robot_end import StreamRobotTransport
 
 __all__ = ["COLUMNS", "Exchange", "measure_exchange"]
