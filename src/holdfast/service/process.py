@@ -25,14 +25,11 @@ from holdfast.service.options import ServeOptions, checked_endpoints, parse_opti
 if TYPE_CHECKING:
     import asyncio
 
-    from holdfast.runtime.logs import EventLog
-    from holdfast.runtime.service_manager import ServiceManager
     from holdfast.service.credentials import ServiceCredentials
     from holdfast.service.extensions import Extension, MakeExtensions
-    from holdfast.service.metrics import DecisionTimes, ServiceReport
+    from holdfast.service.metrics import ServiceReport
     from holdfast.service.shell import ServiceShell
     from holdfast.service.supervisor import Supervised
-    from holdfast.transport.service_end import StreamServiceTransport
 
 __all__ = ["main"]
 
@@ -152,194 +149,197 @@ def _serve(
     if credentials is None:
         _import_without_openssl()
     extensions = make_extensions(options) if make_extensions and options.has_extensions else ()
-
-    from holdfast.runtime.descriptors import NEEDED, allow_descriptors
-    from holdfast.transport.service_end import MAX_LINKS, MAX_UNKNOWN, StreamServiceTransport
-
-    def end_for_ros(reason: str) -> None:
-        """End because ROS asks for it, as after SIGTERM."""
-        shell.note("ros_shutdown", reason=reason)
-        os.kill(os.getpid(), signal.SIGTERM)
-
-    reserved = NEEDED + MAX_UNKNOWN
-    allowed = allow_descriptors(reserved + MAX_LINKS)
-    incarnation = os.urandom(8).hex()
-    transport = StreamServiceTransport(
-        options.name,
-        incarnation=incarnation,
-        listen=options.listen,
-        connect=options.connect,
-        listening=[socket.socket(fileno=each) for each in options.sockets],
-        lease_ms=options.lease_ms,
-        # Otherwise robots with many links would leave no descriptor for a new one.
-        max_links=min(MAX_LINKS, max(allowed // 4, allowed - reserved)),
-        tls=None if credentials is None else credentials.files,
-        on_event=lambda event, **fields: shell.note(event, **fields),
-        on_shutdown=end_for_ros,
-        needs_endpoint=not extensions,
-    )
+    process = _ServiceProcess(options, credentials, extensions, supervised)
 
     import asyncio
 
-    import msgspec
-
-    from holdfast.protocol.service import Service
-    from holdfast.protocol.service_limits import ServiceLimits
-    from holdfast.runtime.logs import EventLog
-    from holdfast.runtime.service_manager import ServiceManager
-    from holdfast.service.allocator import limit_arenas
-    from holdfast.service.metrics import DecisionTimes
-    from holdfast.service.problem_factory import ProblemFactory
-    from holdfast.service.shell import ServiceShell
-
-    limit_arenas()
-    limits = ServiceLimits(max_sessions_per_robot=options.max_sessions_per_robot)
-    if options.max_sessions is not None:
-        limits = msgspec.structs.replace(limits, max_sessions=options.max_sessions)
-    workers = options.workers or len(os.sched_getaffinity(0))
-    problems = ProblemFactory(options.problem, options.problem_directory or Path.cwd())
-
-    def describe_error(error: BaseException) -> str:
-        from holdfast.config.user_code import describe_problem_error
-
-        return describe_problem_error("the problem", error)
-
-    service = Service(problems, workers, limits, describe_error)
-    events = EventLog(sys.stderr, format=options.log, component=options.name)
-    times = DecisionTimes()
-    shell = ServiceShell(service, transport, workers, events, times.add)
-    manager = ServiceManager()
     sys.setswitchinterval(_SWITCH_INTERVAL_S)
     try:
-        status = asyncio.run(
-            _run(
-                options,
-                incarnation,
-                transport,
-                credentials,
-                shell,
-                events,
-                times,
-                supervised,
-                manager,
-                extensions,
-            )
-        )
+        status = asyncio.run(process.run())
     finally:
-        events.close()
-    if shell.is_computing or any(each.is_busy for each in extensions):
+        process.events.close()
+    if process.is_computing:
         # A thread that returns from native code during interpreter shutdown would abort the
         # process.
         _end_at_once(status)
     return status
 
 
-async def _run(
-    options: ServeOptions,
-    incarnation: str,
-    transport: StreamServiceTransport,
-    credentials: ServiceCredentials | None,
-    shell: ServiceShell,
-    events: EventLog,
-    times: DecisionTimes,
-    supervised: Supervised | None,
-    manager: ServiceManager,
-    extensions: Sequence[Extension],
-) -> int:
-    """Serve until there is a reason to stop; return the exit status."""
-    import asyncio
+class _ServiceProcess:
+    """The parts of a service's process, from its start to its end."""
 
-    from holdfast.service.metrics import ServiceReport
+    def __init__(
+        self,
+        options: ServeOptions,
+        credentials: ServiceCredentials | None,
+        extensions: Sequence[Extension],
+        supervised: Supervised | None,
+    ) -> None:
+        # First the transport, which refuses options.
+        from holdfast.runtime.descriptors import NEEDED, allow_descriptors
+        from holdfast.transport.service_end import MAX_LINKS, MAX_UNKNOWN, StreamServiceTransport
 
-    loop = asyncio.get_running_loop()
-    is_serving = False
+        self._options = options
+        self._credentials = credentials
+        self._extensions = extensions
+        self._supervised = supervised
+        self._is_serving = False
+        self._incarnation = os.urandom(8).hex()
+        reserved = NEEDED + MAX_UNKNOWN
+        allowed = allow_descriptors(reserved + MAX_LINKS)
+        self._transport = StreamServiceTransport(
+            options.name,
+            incarnation=self._incarnation,
+            listen=options.listen,
+            connect=options.connect,
+            listening=[socket.socket(fileno=each) for each in options.sockets],
+            lease_ms=options.lease_ms,
+            # Otherwise robots with many links would leave no descriptor for a new one.
+            max_links=min(MAX_LINKS, max(allowed // 4, allowed - reserved)),
+            tls=None if credentials is None else credentials.files,
+            on_event=lambda event, **fields: self._shell.note(event, **fields),
+            on_shutdown=self._end_for_ros,
+            needs_endpoint=not extensions,
+        )
 
-    def why_not_ready() -> str | None:
-        return "draining" if shell.is_draining else None if is_serving else "starting"
+        import msgspec
 
-    def report() -> ServiceReport:
-        expires_s = None if credentials is None else credentials.expires_s
-        return ServiceReport(shell.statistics(), times, certificate_expires_s=expires_s)
+        from holdfast.protocol.service import Service
+        from holdfast.protocol.service_limits import ServiceLimits
+        from holdfast.runtime.logs import EventLog
+        from holdfast.runtime.service_manager import ServiceManager
+        from holdfast.service.allocator import limit_arenas
+        from holdfast.service.metrics import DecisionTimes
+        from holdfast.service.problem_factory import ProblemFactory
+        from holdfast.service.shell import ServiceShell
 
-    async def reported() -> ServiceReport:
-        return report()
+        limit_arenas()
+        limits = ServiceLimits(max_sessions_per_robot=options.max_sessions_per_robot)
+        if options.max_sessions is not None:
+            limits = msgspec.structs.replace(limits, max_sessions=options.max_sessions)
+        workers = options.workers or len(os.sched_getaffinity(0))
+        problems = ProblemFactory(options.problem, options.problem_directory or Path.cwd())
+        service = Service(problems, workers, limits, _describe_error)
+        self.events = EventLog(sys.stderr, format=options.log, component=options.name)
+        self._times = DecisionTimes()
+        self._shell = ServiceShell(service, self._transport, workers, self.events, self._times.add)
+        self._manager = ServiceManager()
 
-    def reload() -> None:
-        assert credentials is not None
-        manager.reloading()
-        credentials.reload(transport, events)
-        manager.ready()
+    @property
+    def is_computing(self) -> bool:
+        """Whether a thread is still computing."""
+        return self._shell.is_computing or any(each.is_busy for each in self._extensions)
 
-    def note(event: str, /, **fields: object) -> None:
+    async def run(self) -> int:
+        """Serve until there is a reason to stop; return the exit status."""
+        import asyncio
+
+        loop = asyncio.get_running_loop()
+        options, shell, supervised = self._options, self._shell, self._supervised
+        async with _watched(options, lambda: None, self._why_not_ready, self._reported) as watched:
+            try:
+                for number in options.ending_signals:
+                    loop.add_signal_handler(number, shell.stop, number.name)
+                if self._credentials is not None:
+                    loop.add_signal_handler(signal.SIGHUP, self._reload, self._credentials)
+                await shell.start()
+                if self._credentials is not None:
+                    self._credentials.watch(loop, self._transport, self.events)
+                offered: dict[str, object] = {}
+                for each in self._extensions:
+                    offered |= each.start(functools.partial(self._note, loop))
+                if options.until_stdin_closes:
+                    _watch_stdin(loop, shell)
+                # Loaded modules stay; the collector need not scan them.
+                gc.freeze()
+                gc.set_threshold(_BETWEEN_COLLECTIONS)
+                gc.enable()
+                self._is_serving = True
+                if supervised is None:
+                    where: dict[str, object] = {"boot": self._incarnation, **watched, **offered}
+                    where["listen"] = list(self._transport.endpoints)
+                    if options.connect:
+                        where["connect"] = list(options.connect)
+                    _say_ready(options, where)
+                    self._manager.watch(loop, self._status)
+                    self._manager.ready()
+                else:
+                    supervised.start(self._report, lambda: shell.stop("the supervisor is gone"))
+                reason = await shell.wait()
+                if supervised is None:
+                    self.events.event("stopping", reason=reason)
+                    self._manager.stopping(options.drain_s + 2 * _CLOSE_TIMEOUT_S)
+                else:
+                    supervised.not_ready()
+                if reason == signal.SIGTERM.name:
+                    draining = loop.create_task(self._drain())
+                    for number in options.ending_signals:
+                        loop.add_signal_handler(number, draining.cancel)
+                    await asyncio.wait((draining,))
+            finally:
+                try:
+                    await shell.close(_CLOSE_TIMEOUT_S)
+                finally:
+                    for each in self._extensions:
+                        each.close(_CLOSE_TIMEOUT_S)
+                if supervised is not None:
+                    supervised.close()
+        return _exit_status(reason)
+
+    def _why_not_ready(self) -> str | None:
+        return "draining" if self._shell.is_draining else None if self._is_serving else "starting"
+
+    def _status(self) -> str:
+        sessions = self._shell.statistics().sessions
+        serving = f"serving, {sessions} session{'' if sessions == 1 else 's'}"
+        return self._why_not_ready() or serving
+
+    def _report(self) -> ServiceReport:
+        from holdfast.service.metrics import ServiceReport
+
+        expires_s = None if self._credentials is None else self._credentials.expires_s
+        return ServiceReport(self._shell.statistics(), self._times, certificate_expires_s=expires_s)
+
+    async def _reported(self) -> ServiceReport:
+        return self._report()
+
+    def _reload(self, credentials: ServiceCredentials) -> None:
+        self._manager.reloading()
+        credentials.reload(self._transport, self.events)
+        self._manager.ready()
+
+    def _note(self, loop: asyncio.AbstractEventLoop, event: str, /, **fields: object) -> None:
         """Log an event, from any thread."""
         with contextlib.suppress(RuntimeError):  # the loop is closed
-            loop.call_soon_threadsafe(functools.partial(shell.note, event, **fields))
+            loop.call_soon_threadsafe(functools.partial(self._shell.note, event, **fields))
 
-    async def drain_extensions() -> None:
-        for each in extensions:
-            each.take_no_more()
-        while any(each.is_busy for each in extensions):
-            await asyncio.sleep(_CHECK_INTERVAL_S)
+    def _end_for_ros(self, reason: str) -> None:
+        """End because ROS asks for it, as after SIGTERM."""
+        self._shell.note("ros_shutdown", reason=reason)
+        os.kill(os.getpid(), signal.SIGTERM)
 
-    async def drain() -> None:
+    async def _drain(self) -> None:
+        import asyncio
+
+        drain_s = self._options.drain_s
         with contextlib.suppress(TimeoutError):
             await asyncio.wait_for(
-                asyncio.gather(shell.drain(options.drain_s), drain_extensions()), options.drain_s
+                asyncio.gather(self._shell.drain(drain_s), self._drain_extensions()), drain_s
             )
 
-    def status() -> str:
-        sessions = shell.statistics().sessions
-        return why_not_ready() or f"serving, {sessions} session{'' if sessions == 1 else 's'}"
+    async def _drain_extensions(self) -> None:
+        import asyncio
 
-    async with _watched(options, lambda: None, why_not_ready, reported) as watched:
-        try:
-            for number in options.ending_signals:
-                loop.add_signal_handler(number, shell.stop, number.name)
-            if credentials is not None:
-                loop.add_signal_handler(signal.SIGHUP, reload)
-            await shell.start()
-            if credentials is not None:
-                credentials.watch(loop, transport, events)
-            offered: dict[str, object] = {}
-            for each in extensions:
-                offered |= each.start(note)
-            if options.until_stdin_closes:
-                _watch_stdin(loop, shell)
-            # Loaded modules stay; the collector need not scan them.
-            gc.freeze()
-            gc.set_threshold(_BETWEEN_COLLECTIONS)
-            gc.enable()
-            is_serving = True
-            if supervised is None:
-                where: dict[str, object] = {"boot": incarnation, **watched, **offered}
-                where["listen"] = list(transport.endpoints)
-                if options.connect:
-                    where["connect"] = list(options.connect)
-                _say_ready(options, where)
-                manager.watch(loop, status)
-                manager.ready()
-            else:
-                supervised.start(report, lambda: shell.stop("the supervisor is gone"))
-            reason = await shell.wait()
-            if supervised is None:
-                events.event("stopping", reason=reason)
-                manager.stopping(options.drain_s + 2 * _CLOSE_TIMEOUT_S)
-            else:
-                supervised.not_ready()
-            if reason == signal.SIGTERM.name:
-                draining = loop.create_task(drain())
-                for number in options.ending_signals:
-                    loop.add_signal_handler(number, draining.cancel)
-                await asyncio.wait((draining,))
-        finally:
-            try:
-                await shell.close(_CLOSE_TIMEOUT_S)
-            finally:
-                for each in extensions:
-                    each.close(_CLOSE_TIMEOUT_S)
-            if supervised is not None:
-                supervised.close()
-    return _exit_status(reason)
+        for each in self._extensions:
+            each.take_no_more()
+        while any(each.is_busy for each in self._extensions):
+            await asyncio.sleep(_CHECK_INTERVAL_S)
+
+
+def _describe_error(error: BaseException) -> str:
+    from holdfast.config.user_code import describe_problem_error
+
+    return describe_problem_error("the problem", error)
 
 
 def _credentials(options: ServeOptions) -> ServiceCredentials | None:
