@@ -364,7 +364,7 @@ class ForgottenEpochs:
 
 
 class _Holding:
-    """What all sessions of one owner take."""
+    """What all sessions take, or all of one owner."""
 
     def __init__(self) -> None:
         self.sessions = 0
@@ -372,26 +372,32 @@ class _Holding:
         self.state_bytes = 0
         self.configuration_bytes = 0
 
+    def count(self, session: Session, sign: int) -> None:
+        """Add a session without states, or subtract it."""
+        self.sessions += sign
+        self.unserved += 0 if session.served else sign
+        self.configuration_bytes += sign * len(session.configuration)
+
 
 class SessionTable:
-    """All sessions, least recently used first.
-
-    Attributes
-    ----------
-    state_bytes : int
-        Of all states and answers, as counted by :meth:`update_size`.
-    configuration_bytes : int
-        Of all packed session configurations.
-    """
+    """All sessions, least recently used first."""
 
     def __init__(self, limits: ServiceLimits) -> None:
         self._limits = limits
         self._sessions: OrderedDict[SessionKey, Session] = OrderedDict()
         self._holdings: dict[Owner, _Holding] = {}
         self._epochs = ForgottenEpochs(max(4 * limits.max_sessions, _LEAST_EPOCHS))
-        self._num_unserved = 0
-        self.state_bytes = 0
-        self.configuration_bytes = 0
+        self._total = _Holding()
+
+    @property
+    def state_bytes(self) -> int:
+        """Bytes of all states and answers, as counted by :meth:`update_size`."""
+        return self._total.state_bytes
+
+    @property
+    def configuration_bytes(self) -> int:
+        """Bytes of all packed session configurations."""
+        return self._total.configuration_bytes
 
     def __len__(self) -> int:
         return len(self._sessions)
@@ -417,8 +423,8 @@ class SessionTable:
     def mark_served(self, session: Session) -> None:
         """Note that a robot got an answer."""
         if not session.served:
-            self._num_unserved -= 1
-            self._holdings[session.owner].unserved -= 1
+            for holding in self._holdings_with(session):
+                holding.unserved -= 1
         session.served = True
         session.newcomer = False
 
@@ -426,12 +432,9 @@ class SessionTable:
         """Add a session."""
         session.newcomer = self.is_newcomer(session.owner)
         self._sessions[session.key] = session
-        holding = self._holdings.setdefault(session.owner, _Holding())
-        holding.sessions += 1
-        holding.unserved += 1
-        holding.configuration_bytes += len(session.configuration)
-        self._num_unserved += 1
-        self.configuration_bytes += len(session.configuration)
+        self._holdings.setdefault(session.owner, _Holding())
+        for holding in self._holdings_with(session):
+            holding.count(session, 1)
         self._epochs.forget(session.key)
 
     def use(self, session: Session, now: float) -> None:
@@ -443,14 +446,10 @@ class SessionTable:
         """Drop all of a session but its epoch. Nothing may wait for it."""
         session.closed = True
         del self._sessions[session.key]
-        holding = self._holdings[session.owner]
-        holding.sessions -= 1
-        holding.unserved -= not session.served
-        holding.configuration_bytes -= len(session.configuration)
-        self._num_unserved -= not session.served
-        self.configuration_bytes -= len(session.configuration)
         self._count_state(session, 0)
-        if not holding.sessions:
+        for holding in self._holdings_with(session):
+            holding.count(session, -1)
+        if not self._holdings[session.owner].sessions:
             del self._holdings[session.owner]
         self.note_epoch(session.key, session.epoch)
 
@@ -478,7 +477,7 @@ class SessionTable:
         if self._is_full_for(session.owner):
             owner = session.owner
             return self._first_unused(lambda each: each.owner == owner)
-        only_unserved = 2 * self._num_unserved >= self._limits.max_sessions
+        only_unserved = 2 * self._total.unserved >= self._limits.max_sessions
         if self._is_full:
             return self._unused_of_most(
                 lambda holding: holding.sessions, only_unserved=only_unserved
@@ -563,9 +562,12 @@ class SessionTable:
         self._count_state(session, 0)
 
     def _count_state(self, session: Session, num_bytes: int) -> None:
-        self.state_bytes += num_bytes - session.num_bytes
-        self._holdings[session.owner].state_bytes += num_bytes - session.num_bytes
+        for holding in self._holdings_with(session):
+            holding.state_bytes += num_bytes - session.num_bytes
         session.num_bytes = num_bytes
+
+    def _holdings_with(self, session: Session) -> tuple[_Holding, _Holding]:
+        return self._total, self._holdings[session.owner]
 
 
 def _digest_of(data: object) -> bytes:

@@ -24,7 +24,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from time import monotonic
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
@@ -33,7 +33,10 @@ from holdfast.runtime.events import EventSink
 from holdfast.runtime.service_manager import ServiceManager
 from holdfast.service.metrics import ServiceReport, summed
 
-__all__ = ["ListeningSockets", "Supervised", "Supervisor", "supervise"]
+if TYPE_CHECKING:
+    from holdfast.service.listening import SharedEndpoints
+
+__all__ = ["Supervised", "Supervisor", "supervise"]
 
 _REPORT_EVERY_S = 1.0
 _FRESH_WITHIN_S = 1.0
@@ -53,22 +56,6 @@ _KEPT_S = 1.0
 
 _MAX_MESSAGE_BYTES = 65_536
 _MAX_TEXT = 4000
-
-
-class ListeningSockets(Protocol):
-    """The sockets at which processes listen."""
-
-    def of(self, index: int) -> Sequence[socket.socket]:
-        """Return those of a process, one for each endpoint; opened again if they were released."""
-        ...
-
-    def release(self, index: int) -> None:
-        """Close a process's own sockets, and so refuse the connections that wait there."""
-        ...
-
-    def close(self) -> None:
-        """Close all sockets; may be repeated."""
-        ...
 
 
 class _StatusReport(msgspec.Struct, tag="told"):
@@ -184,7 +171,7 @@ class Supervisor:
     ----------
     arguments : sequence of str
         Of ``holdfast serve``, for every process.
-    listening : ListeningSockets
+    listening : SharedEndpoints
         Closed when the processes are to end.
     """
 
@@ -192,7 +179,7 @@ class Supervisor:
         self,
         arguments: Sequence[str],
         processes: int,
-        listening: ListeningSockets,
+        listening: SharedEndpoints,
         events: EventSink,
     ) -> None:
         # -P: modules in the current directory are not imported.
