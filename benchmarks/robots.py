@@ -221,9 +221,9 @@ def run_robot(
 
         robot = RobotProcess(
             configuration,
-            links.services,
-            links.recovery,
-            None if links.transport is None else _NotedTransport(links.transport, notebook),
+            links
+            if links.transport is None
+            else links._replace(transport=_NotedTransport(links.transport, notebook)),
             run.journal,
             load_environment(configuration),
             notebook,
@@ -231,8 +231,6 @@ def run_robot(
             notebook.add_timing,
             lambda _: None,
             rate_hz,
-            links.offload,
-            make_planner=links.make_planner,
         )
         launcher = None if links.launcher is None else links.launcher(robot.deliver)
         with contextlib.suppress(_EnoughError):

@@ -76,17 +76,13 @@ class Robots:
         self.links = make_links(configuration, None, NullEventLog())
         return RobotProcess(
             configuration,
-            self.links.services,
-            self.links.recovery,
-            self.links.transport,
+            self.links,
             self.directory.journal,
             self.maker,
             self,
             self._on_result,
             lambda timing: self.on_timing(timing),
             lambda _: None,
-            offload=self.links.offload,
-            make_planner=self.links.make_planner,
             on_order=self.on_order,
         )
 

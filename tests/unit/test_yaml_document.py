@@ -9,7 +9,8 @@ import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from holdfast.config.yaml_document import dotted, read, write
+from holdfast.config.validation import dotted
+from holdfast.config.yaml_document import read, write
 from holdfast.errors import ConfigurationError
 
 TEXT = st.one_of(

@@ -422,8 +422,7 @@ def check_settings(settings: PlanningSettings) -> None:
     try:
         checked = msgspec.convert(plain, PlanningSettings)
     except msgspec.ValidationError as error:
-        from holdfast.config.validation import find_mismatch
-        from holdfast.config.yaml_document import dotted
+        from holdfast.config.validation import dotted, find_mismatch
 
         found = find_mismatch(plain, PlanningSettings)
         if found is None or not found.path:

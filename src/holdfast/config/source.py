@@ -22,8 +22,15 @@ from holdfast.config.settings import (
     SelectorSettings,
     SimulatorSettings,
 )
-from holdfast.config.validation import close_match, field_names, find_mismatch, shown
-from holdfast.config.yaml_document import Document, KeyPath, dotted
+from holdfast.config.validation import (
+    KeyPath,
+    close_match,
+    dotted,
+    field_names,
+    find_mismatch,
+    shown,
+)
+from holdfast.config.yaml_document import Document
 from holdfast.errors import ConfigurationError
 
 __all__ = ["SECTIONS", "SETTINGS", "Source", "module_directory"]

@@ -18,9 +18,20 @@ import msgspec
 import msgspec.inspect
 from msgspec.inspect import FloatType, IntType, ListType, StrType, VarTupleType
 
-from holdfast.config.yaml_document import KeyPath
+__all__ = [
+    "KeyPath",
+    "Mismatch",
+    "close_match",
+    "described",
+    "dotted",
+    "field_names",
+    "find_mismatch",
+    "shown",
+]
 
-__all__ = ["Mismatch", "close_match", "described", "field_names", "find_mismatch", "shown"]
+
+KeyPath = tuple[str | int, ...]
+"""Keys and list indices that lead from the top of a document to a value."""
 
 
 class Mismatch(NamedTuple):
@@ -185,6 +196,21 @@ def _lengths(items: ListType | VarTupleType | StrType, unit: str = "") -> str:
     bounds = (("at least", items.min_length), ("at most", items.max_length))
     given = [f"{sign} {bound}" for sign, bound in bounds if bound is not None]
     return f" of {' and '.join(given)}{unit}" if given else ""
+
+
+def dotted(path: KeyPath) -> str:
+    """Return a path as people write it: ``model.holes[2].center``.
+
+    Keys from a file may be anything, so long ones are cut and unprintable ones quoted.
+    """
+    text = ""
+    for part in path:
+        if isinstance(part, int):
+            text += f"[{part}]"
+        else:
+            key = part if part.isprintable() else repr(part)
+            text += f".{key:.80}" if text else f"{key:.80}"
+    return text
 
 
 def close_match(text: str, allowed: Iterable[str]) -> str:

@@ -19,9 +19,10 @@ from typing import Any, cast
 
 import yaml
 
+from holdfast.config.validation import KeyPath, dotted
 from holdfast.errors import ConfigurationError
 
-__all__ = ["MAX_BYTES", "MAX_DEPTH", "MAX_VALUES", "Document", "KeyPath", "dotted", "read", "write"]
+__all__ = ["MAX_BYTES", "MAX_DEPTH", "MAX_VALUES", "Document", "read", "write"]
 
 MAX_BYTES = 1024 * 1024
 """Largest document, in bytes."""
@@ -31,9 +32,6 @@ MAX_DEPTH = 32
 
 MAX_VALUES = 100_000
 """Most keys and values in a document, those that an alias repeats counted each time."""
-
-KeyPath = tuple[str | int, ...]
-"""Keys and list indices that lead from the top of a document to a value."""
 
 _NULL = "tag:yaml.org,2002:null"
 _BOOL = "tag:yaml.org,2002:bool"
@@ -268,21 +266,6 @@ def _scalar(node: yaml.ScalarNode) -> Any:
     if not abs(number) < float("inf"):
         raise _RefusedError(f"{text:.80} is not a finite number", node.start_mark)
     return number
-
-
-def dotted(path: KeyPath) -> str:
-    """Return a path as people write it: ``model.holes[2].center``.
-
-    Keys from a file may be anything, so long ones are cut and unprintable ones quoted.
-    """
-    text = ""
-    for part in path:
-        if isinstance(part, int):
-            text += f"[{part}]"
-        else:
-            key = part if part.isprintable() else repr(part)
-            text += f".{key:.80}" if text else f"{key:.80}"
-    return text
 
 
 def read(content: bytes, name: str) -> Document:

@@ -96,8 +96,7 @@ def make(name: str, **settings: Any) -> Problem:
     try:
         problem: Problem = kind.from_settings(settings, planner)
     except msgspec.ValidationError as error:
-        from holdfast.config.validation import find_mismatch
-        from holdfast.config.yaml_document import dotted
+        from holdfast.config.validation import dotted, find_mismatch
 
         for schema, data in (("Model", settings), ("StateSpacePlanner", planner)):
             found = find_mismatch(data, getattr(kind, schema, dict))

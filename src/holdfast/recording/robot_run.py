@@ -94,9 +94,7 @@ def perform_trials(
 
         robot = RobotProcess(
             configuration,
-            links.services,
-            links.recovery,
-            links.transport,
+            links,
             directory.journal,
             maker,
             events,
@@ -104,9 +102,7 @@ def perform_trials(
             on_timing,
             on_verified,
             rate_hz,
-            links.offload,
             distrusted,
-            make_planner=links.make_planner,
             watch=None if watch is None else watch(events),
             on_order=None if observer is None else observer.order,
         )

@@ -16,12 +16,11 @@ import os
 import signal
 import sys
 from collections import deque
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator
 from time import monotonic
 from typing import Any, NamedTuple, Protocol, TypeAlias
 
 from holdfast.config.loader import Configuration
-from holdfast.config.settings import OffloadSettings, PlanningSettings
 from holdfast.config.user_code import account_of_user_error, describe_problem_error
 from holdfast.errors import HeldError, HoldfastError, TrialError
 from holdfast.outcome import TrialResult
@@ -61,11 +60,11 @@ from holdfast.robot.environment import EnvironmentMaker
 from holdfast.robot.environment_runner import EnvironmentRunner, make_runner
 from holdfast.robot.health import Condition, RobotWatch
 from holdfast.robot.in_process_planner import InProcessPlanner
+from holdfast.robot.links import Links
 from holdfast.robot.recovery_launcher import RecoveryExited
 from holdfast.robot.session_configuration import session_configuration_of
 from holdfast.robot.step_journal import StepJournal
 from holdfast.runtime.events import EventSink
-from holdfast.transport.contract import RobotTransport
 
 __all__ = ["Launcher", "RobotProcess"]
 
@@ -114,20 +113,14 @@ class RobotProcess:
 
     Parameters
     ----------
-    services : sequence of str
-        Names of the services in order of preference, as the transport knows them.
-    recovery : str or None
-        Name of the local service.
-    transport : RobotTransport or None
-        Not started yet; it is closed at the end. Without one the robot's own planner decides.
+    links : Links
+        Their transport is closed at the end. Without one the robot's own planner decides.
     on_result : callable
         Stores the result of each trial.
     on_verified : callable
         Gets the result of each verified answer.
     rate_hz : float or None
         Task actions a second; None acts as soon as possible.
-    offload : OffloadSettings or None
-        Replaces the configuration's.
     distrusted : collection of str
         Services that answered wrongly earlier in the run.
     watch : RobotWatch or None
@@ -140,9 +133,7 @@ class RobotProcess:
     def __init__(
         self,
         configuration: Configuration,
-        services: Sequence[str],
-        recovery: str | None,
-        transport: RobotTransport | None,
+        links: Links,
         journal: StepJournal,
         maker: EnvironmentMaker,
         events: EventSink,
@@ -150,17 +141,15 @@ class RobotProcess:
         on_timing: Callable[[Timing], None],
         on_verified: Callable[[VerificationNoted], None],
         rate_hz: float | None = None,
-        offload: OffloadSettings | None = None,
         distrusted: Collection[str] = (),
-        make_planner: Callable[[Problem, PlanningSettings], Planner] = Planner,
         watch: RobotWatch | None = None,
         on_order: Callable[[PlanningState, Act | Sense], None] | None = None,
     ) -> None:
         self._watch = watch
         self._on_order = on_order
         self._configuration = configuration
-        self._transport = transport
-        self._turn_s = _TURN_WITHOUT_WIRE_S if transport is None else _TURN_S
+        self._transport = links.transport
+        self._turn_s = _TURN_WITHOUT_WIRE_S if links.transport is None else _TURN_S
         self._journal = journal
         self._maker = maker
         self._events = events
@@ -190,13 +179,13 @@ class RobotProcess:
         simulator = configuration.simulator
         epoch = journal.raise_epoch()
         dispatcher: DecisionSource
-        if transport is None:
+        if links.transport is None:
             dispatcher = InProcessSource()
         else:
             dispatcher = Dispatcher(
-                services,
-                recovery,
-                offload or configuration.offload,
+                links.services,
+                links.recovery,
+                links.offload,
                 configuration.recovery,
                 journal.session(),
                 epoch,
@@ -215,12 +204,12 @@ class RobotProcess:
             self.deliver,
         )
         self._in_process = InProcessPlanner(
-            lambda: make_planner(another_problem(), configuration.planning),
+            lambda: links.make_planner(another_problem(), configuration.planning),
             self._happens,
             self._fail,
             may_be_brief=":" not in configuration.problem_name,
         )
-        self._planner = make_planner(problem, configuration.planning)
+        self._planner = links.make_planner(problem, configuration.planning)
         self._robot = Robot(self._planner, simulator, dispatcher, rate_hz)
 
     @property
