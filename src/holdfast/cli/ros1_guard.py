@@ -7,18 +7,19 @@ import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import TYPE_CHECKING, ClassVar
 
 from holdfast.printable import printable
 from holdfast.runtime.command_line import (
     Options,
     flag,
     location,
+    log_option,
     number,
-    one_of,
     option,
     whole_number,
 )
+from holdfast.runtime.log_lines import LogFormat
 
 if TYPE_CHECKING:
     from holdfast.ros.master.settings import GuardSettings
@@ -67,12 +68,7 @@ class GuardOptions(Options):
         help="Where the master's registrations are written (default: a directory of this user that "
         "is gone after a restart of the machine).",
     )
-    log: Literal["text", "json"] = option(
-        metavar="FORMAT",
-        read=one_of("text", "json"),
-        default="text",
-        help="Form of the ready line and of the log on standard error: text or json.",
-    )
+    log: LogFormat = log_option()
 
 
 def main(arguments: Sequence[str]) -> int:

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import TYPE_CHECKING, ClassVar
 
 from holdfast.cli.exit_codes import (
     EXIT_CAN_GO_ON,
@@ -30,11 +30,12 @@ from holdfast.runtime.command_line import (
     argument,
     flag,
     location,
+    log_option,
     number,
-    one_of,
     option,
     whole_number,
 )
+from holdfast.runtime.log_lines import LogFormat
 from holdfast.service.options import http_address
 
 if TYPE_CHECKING:
@@ -157,12 +158,7 @@ class RunOptions(Options):
         help="Answer http://HOST:PORT/livez, and /readyz while a service or the robot itself "
         "decides; a PORT alone is one of 127.0.0.1.",
     )
-    log: Literal["text", "json"] = option(
-        metavar="FORMAT",
-        read=one_of("text", "json"),
-        default="text",
-        help="Format of the events shown: text or json.",
-    )
+    log: LogFormat = log_option("Format of the events shown: text or json.")
 
     def resume_command(self, directory: Path) -> str:
         """Return the command that goes on."""

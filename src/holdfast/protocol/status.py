@@ -14,7 +14,7 @@ from types import MappingProxyType
 
 from holdfast.errors import IllegalTransitionError
 
-__all__ = ["TRANSITIONS", "Cause", "Status", "StatusTracker", "diagram", "next_status"]
+__all__ = ["MEANINGS", "TRANSITIONS", "Cause", "Status", "StatusTracker", "diagram", "next_status"]
 
 
 class Status(Enum):
@@ -28,6 +28,16 @@ class Status(Enum):
 
     KEEP_ALIVE = "keep_alive"
     """A cloud service again; the local one stays ready."""
+
+
+MEANINGS: Mapping[Status, str] = MappingProxyType(
+    {
+        Status.STANDARD: "the cloud decides, the local service was never needed",
+        Status.LOCAL_RECOVERY: "the local service decides, the cloud is tried again",
+        Status.KEEP_ALIVE: "the cloud decides, the local service stays ready",
+    }
+)
+"""The statuses in a few words, for a screen."""
 
 
 class Cause(Enum):

@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Literal, TypeAlias
 
 import msgspec
 
 from holdfast.printable import printable
 
-__all__ = ["MAX_LINE_BYTES", "LogFormat", "fields_as_text", "json_line", "text_line"]
+__all__ = ["LINES", "MAX_LINE_BYTES", "LogFormat", "fields_as_text", "json_line", "text_line"]
 
 LogFormat: TypeAlias = Literal["text", "json"]
 
@@ -174,3 +174,10 @@ def _readable(text: str, limit: int = MAX_VALUE_CHARACTERS) -> str:
     """Return a text on one line, with control characters escaped."""
     text = _bounded(text, limit)
     return printable(text.replace("\n", " ").replace("\t", " "), keep="")
+
+
+LINES: dict[LogFormat, Callable[[int, str, str, Mapping[str, object]], str]] = {
+    "text": text_line,
+    "json": json_line,
+}
+"""The formats of a log, with what makes a line of each."""

@@ -25,7 +25,7 @@ from queue import SimpleQueue
 from typing import Self, TextIO
 
 from holdfast.errors import OutputError
-from holdfast.runtime.log_lines import LogFormat, json_line, text_line
+from holdfast.runtime.log_lines import LINES, LogFormat
 
 __all__ = ["EventLog", "LogFormat", "write_event"]
 
@@ -67,7 +67,7 @@ class EventLog:
         component: str,
         clock: Callable[[], int] = time.time_ns,
     ) -> None:
-        self._line = json_line if format == "json" else text_line
+        self._line = LINES[format]
         self._component = component
         self._clock = clock
         self._stream: TextIO | None = None

@@ -6,18 +6,19 @@ import argparse
 import signal
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import TYPE_CHECKING, ClassVar
 
 from holdfast.errors import HealthError, InvalidValueError, TransportError
 from holdfast.runtime.command_line import (
     Options,
     flag,
     location,
+    log_option,
     number,
-    one_of,
     option,
     whole_number,
 )
+from holdfast.runtime.log_lines import LogFormat
 
 if TYPE_CHECKING:
     from holdfast.service.health import HttpAddress
@@ -92,12 +93,7 @@ class ServeOptions(Options):
         help="Offer metrics for Prometheus at http://HOST:PORT/metrics. The address may be that of "
         "--health.",
     )
-    log: Literal["text", "json"] = option(
-        metavar="FORMAT",
-        read=one_of("text", "json"),
-        default="text",
-        help="Form of the ready line and of the log on standard error: text or json.",
-    )
+    log: LogFormat = log_option()
     workers: int | None = option(
         read=whole_number(1, 256),
         metavar="N",

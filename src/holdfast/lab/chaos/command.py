@@ -8,7 +8,7 @@ import shlex
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import TYPE_CHECKING, ClassVar
 
 from holdfast.cli.exit_codes import EXIT_DIFFERENT, ended_by_signals, interrupted_by
 from holdfast.errors import HoldfastError, OptionError, RunError
@@ -20,10 +20,11 @@ from holdfast.runtime.command_line import (
     close_match,
     flag,
     location,
-    one_of,
+    log_option,
     option,
     whole_number,
 )
+from holdfast.runtime.log_lines import LogFormat
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -121,12 +122,7 @@ class ChaosOptions(Options):
     )
     resume: bool = flag(help="Go on with the series in DIR.")
     keep: bool = flag(help="Keep the files of good trials as well.")
-    log: Literal["text", "json"] = option(
-        metavar="FORMAT",
-        read=one_of("text", "json"),
-        default="text",
-        help="Show a bar (text), or events (json).",
-    )
+    log: LogFormat = log_option("Show a bar (text), or events (json).")
     list: bool = flag(help="List the kinds of fault, and which can be done here.")
 
 

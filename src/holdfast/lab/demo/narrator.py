@@ -60,7 +60,7 @@ class Narrator:
     @property
     def cloud_decides(self) -> bool:
         """Whether the robot's decisions are the cloud's."""
-        return self._state.status != Status.LOCAL_RECOVERY.value
+        return self._state.status is not Status.LOCAL_RECOVERY
 
     # -- what the demo does --------------------------------------------------------------------
 
@@ -80,7 +80,7 @@ class Narrator:
     def started_robot(self, process: Process, *options: str) -> None:
         """Note a start of the robot."""
         self.statuses.append([Status.STANDARD.value])
-        self._state.status = Status.STANDARD.value
+        self._state.status = Status.STANDARD
         self._is_held = False
         self._mark("robot", "start", process.spawned_at)
         command = " ".join(["holdfast run CONFIG --service ...", *options])
@@ -134,7 +134,7 @@ class Narrator:
         name = event.name
         if name == "status":
             self.status_at = event.at
-            self._state.status = str(event["to"])
+            self._state.status = Status(event["to"])
             self.statuses[-1].append(str(event["to"]))
         elif name == "launch":
             self._local = "starting"

@@ -63,7 +63,7 @@ class DemoState:
     )
     marks: list[Mark] = field(default_factory=list)
     lines: list[Line] = field(default_factory=list)
-    status: str = Status.STANDARD.value
+    status: Status = Status.STANDARD
     progress: str = ""
 
     @property

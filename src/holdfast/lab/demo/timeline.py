@@ -19,6 +19,7 @@ from rich.text import Text
 
 from holdfast.lab.demo.state import Activity, DemoState, Line, Row
 from holdfast.printable import printable
+from holdfast.protocol.status import MEANINGS
 
 __all__ = ["ASCII", "UNICODE", "Characters", "LiveShow", "PlainShow", "legend", "make_show"]
 __all__ += ["plain_line", "timeline"]
@@ -65,12 +66,6 @@ _STYLES: Mapping[Activity, str] = {
 _START_STYLE, _KILL_STYLE = "bold cyan", "bold white on red"
 _ROW_STYLES: Mapping[Row, str] = {"cloud": "green", "local": "yellow", "robot": ""}
 _LINE_STYLES = {"demo": "bold", "cloud": "green", "local": "yellow"}
-
-_MEANINGS = {
-    "standard": "the cloud decides, the local service was never needed",
-    "local_recovery": "the local service decides, the cloud is tried again",
-    "keep_alive": "the cloud decides, the local service stays ready",
-}
 
 
 def timeline(state: DemoState, now_s: float, width: int, characters: Characters) -> Table:
@@ -244,8 +239,8 @@ class LiveShow:
         facts = Table.grid()
         facts.add_column(width=_LABEL_WIDTH, style="dim")
         facts.add_column()
-        meaning = _MEANINGS.get(state.status, "")
-        facts.add_row("status", Text(f"{state.status}: {meaning}", style="bold", no_wrap=True))
+        status = f"{state.status.value}: {MEANINGS[state.status]}"
+        facts.add_row("status", Text(status, style="bold", no_wrap=True))
         facts.add_row("robot", Text(state.progress, no_wrap=True))
         room = max(1, self._console.size.height - _AROUND_LINES - 1)
         lines = [_styled(line) for line in _in_order(state)[-room:]]
