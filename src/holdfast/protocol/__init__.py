@@ -6,7 +6,8 @@ sockets, within one process and in the fault simulator.
 
 The robot's end: :mod:`robot` is the loop (sense, decide, write down, act), :mod:`dispatcher`
 chooses the service to ask, :mod:`requests` tracks requests in flight, :mod:`replica_set` what is
-known of each service, :mod:`verification` recomputes answers. The service's end: :mod:`service`
-handles requests, :mod:`service_sessions` remembers robots, :mod:`request_queue` orders their work,
-:mod:`service_jobs` computes, :mod:`service_calls` replies. Both speak :mod:`messages`.
+known of each service, :mod:`local_service` when the local one is launched, :mod:`verification`
+recomputes answers. The service's end: :mod:`service` handles requests, :mod:`service_sessions`
+remembers robots, :mod:`request_queue` orders their work, :mod:`service_jobs` computes,
+:mod:`service_calls` replies. Both speak :mod:`messages`.
 """

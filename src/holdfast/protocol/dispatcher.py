@@ -55,8 +55,6 @@ class Dispatcher(DecisionSource):
         The cloud's services in order of preference, at least one.
     local_service_name : str or None
         Name of the local service; None if there is none.
-    problem : Problem
-        To check answers.
     secret : bytes
         Known only to this robot; selects the answers that are recomputed.
     distrusted : collection of str

@@ -112,8 +112,6 @@ class OpenRequests:
     ----------
     timeout_s : float
         From one request to the next of a service that may not hear the robot.
-    effects : Effects
-        Receives what is to be sent, abandoned and logged.
     """
 
     def __init__(
@@ -288,17 +286,7 @@ class ReplyOutcome(enum.Enum):
 
 
 class ReplyHandler:
-    """Records what replies say.
-
-    Parameters
-    ----------
-    problem : Problem
-        To check answers.
-    verification : Verification
-        Takes each part of an answer.
-    effects : Effects
-        Receives log events.
-    """
+    """Records what replies say."""
 
     def __init__(
         self,

@@ -81,10 +81,6 @@ class Robot:
 
     Parameters
     ----------
-    simulator : SimulatorSettings
-        Seed and maximum number of steps.
-    source : DecisionSource
-        Answers the questions of this robot.
     rate_hz : float or None
         Task actions per second; None for as soon as possible.
 
@@ -187,8 +183,6 @@ class Robot:
         ----------
         history : TrialHistory
             From :func:`~holdfast.protocol.records.replay`; of no records for a new trial.
-        begun : EnvironmentReady
-            State of the environment.
         tail_is_certain : bool
             Whether no record can be missing: no power was cut and no file removed since the last.
         """

@@ -40,15 +40,7 @@ _RETRY_SPREAD = 0.25
 
 
 class WaitingCalls:
-    """The calls that wait, and the replies to any call.
-
-    Parameters
-    ----------
-    statistics : ServiceStatistics
-        Counts replies.
-    effects : Effects
-        Receives the replies.
-    """
+    """The calls that wait, and the replies to any call."""
 
     def __init__(
         self, limits: ServiceLimits, statistics: ServiceStatistics, effects: Effects[ServiceEffect]

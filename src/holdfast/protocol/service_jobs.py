@@ -71,10 +71,6 @@ class JobResult(NamedTuple):
         The requested state, verified.
     restored : bool
         It came from a checkpoint.
-    num_actions : int
-        Task actions.
-    actions : bytes
-        Encoded task actions.
     ahead : PlanningState or None
         The state that they lead to.
     ahead_digest : bytes

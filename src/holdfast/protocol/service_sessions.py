@@ -165,15 +165,6 @@ class Session:
     Its methods change its states, answers, tasks, epoch and number; :class:`SessionTable` writes
     ``served``, ``newcomer``, ``closed``, ``used_at`` and ``num_bytes``.
 
-    Parameters
-    ----------
-    request : Request
-        The request that opens it.
-    max_threads : int
-        Per decision.
-    times : ExpectedTimes
-        Of this robot's parts.
-
     Attributes
     ----------
     number : int
@@ -182,8 +173,6 @@ class Session:
         Packed session configuration.
     problem_key : bytes
         Digest that identifies the problem among those kept for reuse.
-    built : bool
-        Whether the problem was built.
     built_in : bool
         Whether the problem is part of holdfast.
     planning, planning_single : PlanningSettings
@@ -202,8 +191,6 @@ class Session:
         Counted size of states and answers.
     used_at : float
         Time of the last request or result.
-    closed : bool
-        Whether the session was dropped.
     """
 
     def __init__(

@@ -25,8 +25,6 @@ class StallReporter:
     ----------
     detection_timeout_s : float
         Waits shorter than the detection of a dead service are not reported.
-    effects : Effects
-        Receives the log events.
     """
 
     def __init__(self, detection_timeout_s: float, effects: Effects[RobotEffect]) -> None:

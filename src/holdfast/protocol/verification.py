@@ -78,8 +78,6 @@ class Verification:
         Of the robot; selects the questions, together with their digests.
     exempt : str or None
         A service that is not sampled: the local one, which runs the same code on the same machine.
-    effects : Effects
-        Receives what is to be computed and logged.
 
     Attributes
     ----------
