@@ -8,28 +8,38 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
 import pandas as pd
 
 from holdfast.arrays import FloatArray
 from holdfast.lab.studies import statistics
-from holdfast.lab.studies.statistics import Interval, cells_of
+from holdfast.lab.studies.statistics import cells_of
 from holdfast.lab.studies.study import CHOICE, CLAIM, Report, Results, Scale
 from holdfast.lab.studies.tables import Cell
 from holdfast.lab.studies.tasks import Task
 from holdfast.lab.studies.trial_batches import TrialSeries, trial_tasks
 from holdfast.lab.studies.trial_files import kept_trials
-from holdfast.recording.tables import wilson_interval
 
-__all__ = ["MEASURES", "JudgedStudy", "compared", "outcome_cells", "steps_and_success"]
+__all__ = [
+    "MEASURES",
+    "JudgedStudy",
+    "Trials",
+    "compared",
+    "outcome_cells",
+    "over_problems",
+    "steps_and_success",
+]
 
 _TRIALS_IN_EACH = 20
 
 MEASURES = ("steps_ratio", "success_gain")
 """What is compared: the ratio of steps (geometric mean; a failure counts as the limit), and the
 difference of success rates."""
+
+Trials: TypeAlias = tuple[FloatArray, FloatArray]
+"""The logarithm of steps and the success of each trial."""
 
 
 class JudgedStudy(ABC):
@@ -83,7 +93,7 @@ class JudgedStudy(ABC):
         return list(trial_tasks(self.series(cell, purpose, scale, number), _TRIALS_IN_EACH))
 
 
-def steps_and_success(tables: Sequence[pd.DataFrame]) -> tuple[FloatArray, FloatArray]:
+def steps_and_success(tables: Sequence[pd.DataFrame]) -> Trials:
     """Return the logarithm of steps, and success, of each trial: the mean over several tables.
 
     The tables have the same worlds; where they have different numbers of trials, the first ones
@@ -97,9 +107,7 @@ def steps_and_success(tables: Sequence[pd.DataFrame]) -> tuple[FloatArray, Float
     return np.mean(logs, axis=0), np.mean(successes, axis=0)
 
 
-def compared(
-    own: tuple[FloatArray, FloatArray], other: tuple[FloatArray, FloatArray]
-) -> dict[str, Cell]:
+def compared(own: Trials, other: Trials) -> dict[str, Cell]:
     """Return the cells of a comparison of :func:`steps_and_success`, trial by trial.
 
     Differences of rates of single trials have McNemar's p-value, all others Student's.
@@ -117,13 +125,36 @@ def compared(
     }
 
 
+def over_problems(
+    pairs: Sequence[tuple[dict[str, Cell], Sequence[tuple[Trials, Trials]]]], least_success: float
+) -> pd.DataFrame:
+    """Return how ways differ over these problems, and over all problems like them.
+
+    Parameters
+    ----------
+    pairs : sequence of (dict, sequence)
+        The names of a comparison, and in each problem the trials of one way and of the other.
+    least_success : float
+        The smallest difference of two trials' successes; that of steps is one in a hundred.
+    """
+    rows: list[dict[str, Cell]] = []
+    for part, (measure, least) in enumerate(zip(MEASURES, (0.01, least_success), strict=True)):
+        shown = {"shown": statistics.ratio_of} if measure == "steps_ratio" else {}
+        for names, trials in pairs:
+            both = [(own[part].astype(float), other[part].astype(float)) for own, other in trials]
+            cells = statistics.cells_across_problems(both, least, **shown)
+            rows.append({"measure": measure, **names, **cells})
+    table = pd.DataFrame(rows)
+    statistics.add_adjusted(table, "mean_p_value", "expected_p_value")
+    return table
+
+
 def outcome_cells(table: pd.DataFrame) -> dict[str, Cell]:
     """Return the cells of the success rate and the means of one cell's trials."""
     successes = int(table["success"].sum())
-    rate = Interval(successes / len(table), *wilson_interval(successes, len(table)))
     return {
         "trials": len(table),
-        **cells_of("success", rate),
+        **cells_of("success", statistics.rate_interval(successes, len(table))),
         **cells_of("mean_steps", statistics.mean_interval(table["steps"].to_numpy(float))),
         **cells_of("mean_reward", statistics.mean_interval(table["reward"].to_numpy(float))),
         "median_sensing_ms": float(table["median_sensing_ms"].iloc[0]),

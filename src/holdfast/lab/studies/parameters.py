@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
+from typing import TYPE_CHECKING, ClassVar, Literal, NamedTuple
 
 import msgspec
 import numpy as np
@@ -22,6 +22,7 @@ from holdfast.lab.studies.judged_study import (
     JudgedStudy,
     compared,
     outcome_cells,
+    over_problems,
     steps_and_success,
 )
 from holdfast.lab.studies.statistics import interval_in
@@ -326,32 +327,17 @@ def _together(tables: _Tables) -> pd.DataFrame:
 
 def _over_problems(tables: _Tables) -> pd.DataFrame:
     """Return how variants differ over these problems, and over all problems like them."""
-    rows: list[dict[str, Cell]] = []
-    measures: tuple[tuple[str, int, float, dict[str, Any]], ...] = (
-        ("steps_ratio", 0, 0.01, {"shown": statistics.ratio_of}),
-        ("success_gain", 1, 1.0, {}),
-    )
-    numbers = {cell: steps_and_success([table]) for cell, table in tables.items()}
-    for measure, part, least, shown in measures:
-        for variant, rival in _pairs(tables):
-            pairs = [
-                (
-                    numbers[case, variant][part].astype(float),
-                    numbers[case, rival][part].astype(float),
-                )
-                for case in _CASES
-            ]
-            rows.append(
-                {
-                    "measure": measure,
-                    **variant.names(),
-                    "reference": rival.way,
-                    **statistics.cells_across_problems(pairs, least, **shown),
-                }
+    trials = {cell: steps_and_success([table]) for cell, table in tables.items()}
+    return over_problems(
+        [
+            (
+                {**variant.names(), "reference": rival.way},
+                [(trials[case, variant], trials[case, rival]) for case in _CASES],
             )
-    table = pd.DataFrame(rows)
-    statistics.add_adjusted(table, "mean_p_value", "expected_p_value")
-    return table
+            for variant, rival in _pairs(tables)
+        ],
+        least_success=1.0,
+    )
 
 
 def _chosen_values(choosing: _Tables, tables: _Tables) -> pd.DataFrame:

@@ -30,7 +30,6 @@ from holdfast.lab.studies.study import Number, Report, Results, Scale
 from holdfast.lab.studies.tables import Cell
 from holdfast.lab.studies.tasks import Task
 from holdfast.lab.studies.trial_batches import TrialSeries, trial_tasks
-from holdfast.recording.tables import wilson_interval
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -213,8 +212,7 @@ def _compared(row: PublishedRow, emulated: pd.DataFrame, sound: pd.DataFrame) ->
 
 
 def _rate(way: str, successes: int, trials: int) -> dict[str, Cell]:
-    rate = Interval(successes / trials, *wilson_interval(successes, trials))
-    return cells_of(f"success_{way}", rate)
+    return cells_of(f"success_{way}", statistics.rate_interval(successes, trials))
 
 
 def _adjust(summary: pd.DataFrame) -> None:

@@ -28,8 +28,10 @@ from holdfast.lab.studies.cases import CASES, Case
 from holdfast.lab.studies.judged_study import (
     MEASURES,
     JudgedStudy,
+    Trials,
     compared,
     outcome_cells,
+    over_problems,
     steps_and_success,
 )
 from holdfast.lab.studies.statistics import Interval, cells_of, interval_in
@@ -37,7 +39,6 @@ from holdfast.lab.studies.study import CHOICE, CLAIM, Number, Report, Scale
 from holdfast.lab.studies.tables import Cell
 from holdfast.lab.studies.trial_batches import TrialSeries, problem_of
 from holdfast.lab.studies.trial_files import cells_of_trials, require_cells
-from holdfast.recording.tables import wilson_interval
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -139,9 +140,6 @@ _Cell = tuple[str, int, str]
 
 _Cells = Mapping[_Cell, pd.DataFrame]
 
-_Trials = tuple[FloatArray, FloatArray]
-"""The logarithm of steps and the success of each trial."""
-
 
 class Selectors(JudgedStudy):
     """The study ``selectors``."""
@@ -212,7 +210,7 @@ def _draw(name: str, table: pd.DataFrame) -> Figure:
 _PURPOSES = (CHOICE, CLAIM)
 
 
-def _over_intervals(cells: _Cells) -> dict[tuple[str, str], _Trials]:
+def _over_intervals(cells: _Cells) -> dict[tuple[str, str], Trials]:
     """Return steps and success by place and way: the mean over the intervals, trial by trial.
 
     A place is a problem, or a group of problems: their mean over the trials that all have.
@@ -300,7 +298,7 @@ def _pairs() -> list[tuple[str, str]]:
     ]
 
 
-def _relative_steps(trials: Mapping[tuple[str, str], _Trials]) -> pd.DataFrame:
+def _relative_steps(trials: Mapping[tuple[str, str], Trials]) -> pd.DataFrame:
     """Return the steps of each way relative to the baseline."""
     table = pd.DataFrame(
         {"problem": case, "way": way, **_difference("steps_ratio", own, trials[case, BASELINE])}
@@ -311,7 +309,7 @@ def _relative_steps(trials: Mapping[tuple[str, str], _Trials]) -> pd.DataFrame:
     return table
 
 
-def _rivals(trials: Mapping[tuple[str, str], _Trials], measure: str) -> pd.DataFrame:
+def _rivals(trials: Mapping[tuple[str, str], Trials], measure: str) -> pd.DataFrame:
     """Return how the first way of each pair differs from the second, everywhere."""
     table = pd.DataFrame(
         {
@@ -327,7 +325,7 @@ def _rivals(trials: Mapping[tuple[str, str], _Trials], measure: str) -> pd.DataF
     return table
 
 
-def _difference(measure: str, own: _Trials, other: _Trials) -> dict[str, Cell]:
+def _difference(measure: str, own: Trials, other: Trials) -> dict[str, Cell]:
     part = MEASURES.index(measure)
     difference, p_value = statistics.paired_difference(own[part], other[part])
     shown = statistics.ratio_of(difference) if measure == "steps_ratio" else difference
@@ -335,41 +333,29 @@ def _difference(measure: str, own: _Trials, other: _Trials) -> dict[str, Cell]:
     return {"trials": count, **cells_of(measure, shown), "p_value": p_value}
 
 
-def _over_problems(trials: Mapping[tuple[str, str], _Trials]) -> pd.DataFrame:
+def _over_problems(trials: Mapping[tuple[str, str], Trials]) -> pd.DataFrame:
     """Return how ways differ over these problems, and over all problems like them."""
-    rows: list[dict[str, Cell]] = []
-    # The smallest difference of two trials' means over the intervals; of steps, one in a hundred.
-    for part, (measure, least) in enumerate(
-        zip(MEASURES, (0.01, 1.0 / len(INTERVALS)), strict=True)
-    ):
-        shown = {"shown": statistics.ratio_of} if measure == "steps_ratio" else {}
-        rows += [
-            {
-                "measure": measure,
-                "way": way,
-                "rival": rival,
-                **statistics.cells_across_problems(
-                    [(trials[case, way][part], trials[case, rival][part]) for case in _CASES],
-                    least,
-                    **shown,
-                ),
-            }
+    return over_problems(
+        [
+            (
+                {"way": way, "rival": rival},
+                [(trials[case, way], trials[case, rival]) for case in _CASES],
+            )
             for way, rival in _pairs()
-        ]
-    table = pd.DataFrame(rows)
-    statistics.add_adjusted(table, "mean_p_value", "expected_p_value")
-    return table
+        ],
+        least_success=1.0 / len(INTERVALS),  # of means over the intervals
+    )
 
 
 def _fewest_steps(
-    choosing: Mapping[tuple[str, str], _Trials], place: str, ways: Iterable[str]
+    choosing: Mapping[tuple[str, str], Trials], place: str, ways: Iterable[str]
 ) -> str:
     """Return the way with the fewest steps on the trials for choosing."""
     return min(ways, key=lambda way: float(np.nanmean(choosing[place, way][0])))
 
 
 def _chosen_ways(
-    choosing: Mapping[tuple[str, str], _Trials], trials: Mapping[tuple[str, str], _Trials]
+    choosing: Mapping[tuple[str, str], Trials], trials: Mapping[tuple[str, str], Trials]
 ) -> pd.DataFrame:
     """Return the way that the trials for choosing choose, compared on the others.
 
@@ -398,7 +384,7 @@ def _chosen_ways(
     return table
 
 
-def _default_candidates(choosing: Mapping[tuple[str, str], _Trials], cells: _Cells) -> pd.DataFrame:
+def _default_candidates(choosing: Mapping[tuple[str, str], Trials], cells: _Cells) -> pd.DataFrame:
     """Return the comparisons that decide whether a candidate becomes the default.
 
     It does not if the baseline or the default before beats it beyond noise, in steps or success, in
@@ -498,8 +484,7 @@ def _share(trials: BoolArray) -> Interval:
     if trials.shape[0] > 1 and not whole:
         value, low, high = statistics.mean_interval(trials.mean(axis=0))
         return Interval(value, max(low, 0.0), min(high, 1.0))
-    successes, count = int(trials[0].sum()), trials.shape[1]
-    return Interval(successes / count, *wilson_interval(successes, count))
+    return statistics.rate_interval(int(trials[0].sum()), trials.shape[1])
 
 
 def _continued(table: pd.DataFrame) -> pd.DataFrame:

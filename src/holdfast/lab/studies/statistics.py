@@ -21,6 +21,7 @@ import numpy.typing as npt
 
 from holdfast.arrays import BoolArray, FloatArray
 from holdfast.errors import InvalidValueError
+from holdfast.recording.tables import wilson_interval
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -46,6 +47,7 @@ __all__ = [
     "paired_difference",
     "paired_rates",
     "random_effects",
+    "rate_interval",
     "ratio_of",
 ]
 
@@ -180,6 +182,12 @@ def paired_rates(first: BoolArray, second: BoolArray) -> tuple[Interval, float]:
     if either_alone == 0:
         return interval, 1.0
     return interval, float(stats.binomtest(first_alone, either_alone).pvalue)
+
+
+def rate_interval(successes: int, trials: int, factor: float = 1.0) -> Interval:
+    """Return a rate, times a factor, with Wilson's interval."""
+    ends = (successes / trials, *wilson_interval(successes, trials))
+    return Interval(*(factor * end for end in ends))
 
 
 def independent_difference(first: Interval, second: Interval) -> Interval:

@@ -29,7 +29,7 @@ from holdfast.config.settings import (
     SelectorSettings,
 )
 from holdfast.lab.studies.cloud_trials import CloudTrials
-from holdfast.lab.studies.statistics import Interval, cells_of, median_interval
+from holdfast.lab.studies.statistics import Interval, cells_of, median_interval, rate_interval
 from holdfast.lab.studies.study import Number, Report, Results, Scale
 from holdfast.lab.studies.tables import Cell
 from holdfast.lab.studies.tasks import Task
@@ -51,7 +51,6 @@ from holdfast.lab.studies.thesis_measurements import (
     select,
 )
 from holdfast.lab.studies.trial_batches import TrialSeries, trial_tasks
-from holdfast.recording.tables import wilson_interval
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -345,7 +344,7 @@ def _successes(trials: pd.DataFrame) -> pd.DataFrame:
                     "particles": count,
                     "trials": int(part.size),
                     "successes": found,
-                    **cells_of("success", _share(found, part.size)),
+                    **cells_of("success", rate_interval(found, part.size)),
                     "success_thesis": _success_of_thesis(count),
                 }
             )
@@ -354,12 +353,6 @@ def _successes(trials: pd.DataFrame) -> pd.DataFrame:
 
 def _success_of_thesis(particles: int) -> float:
     return THESIS_SUCCESS_ABOVE_300 if particles > 300 else THESIS_SUCCESS
-
-
-def _share(successes: int, count: int, factor: float = 1.0) -> Interval:
-    """Return a share with Wilson's interval."""
-    ends = (successes / count, *wilson_interval(successes, count))
-    return Interval(*(factor * end for end in ends))
 
 
 def _numbers(rows: pd.DataFrame, picture: pd.DataFrame) -> list[Number]:
@@ -372,7 +365,10 @@ def _numbers(rows: pd.DataFrame, picture: pd.DataFrame) -> list[Number]:
     )
     return [
         Number(
-            "disturbed runs identical to their reference runs", _share(same, runs, 100), "%", runs
+            "disturbed runs identical to their reference runs",
+            rate_interval(same, runs, 100),
+            "%",
+            runs,
         ),
         Number("kills of the cloud service", Interval(*[kills] * 3)),
         Number("sensing decisions", Interval(*[sensing] * 3)),
@@ -455,7 +451,7 @@ def _times_and_share(name: str, times: pd.Series, limit_ms: float) -> list[Numbe
     known = times.dropna().to_numpy(float)
     if not known.size:
         return []
-    below = _share(int(np.count_nonzero(known < limit_ms)), times.size, 100)
+    below = rate_interval(int(np.count_nonzero(known < limit_ms)), times.size, 100)
     return [
         Number(name, median_interval(known), "ms", known.size),
         Number(f"{name}, share below the thesis's {limit_ms:g} ms", below, "%", times.size),
@@ -484,7 +480,7 @@ def _numbers_of_loss(rows: pd.DataFrame) -> list[Number]:
             ),
             Number(
                 f"answers of the local service before the kill, {path.label}",
-                _share(local, len(asked), 100),
+                rate_interval(local, len(asked), 100),
                 "%",
                 len(asked),
             ),
