@@ -284,8 +284,6 @@ def _run(options: RunOptions) -> int:
                 notes.note(f"{service} was asked no more: {reason}")
             for text in _idle_services(configuration, summary, robot):
                 notes.note(text)
-            if (hint := _hint_about_observations(configuration, summary)) is not None:
-                notes.note(hint)
             with notes.while_it_lasts(f"drawing {FIGURE_NAME} ..."):
                 remark = draw_figure(configuration, directory, recorder, recorded)
         except KeyboardInterrupt as interruption:
@@ -374,17 +372,6 @@ def _idle_services(configuration: Configuration, summary: RunSummary, robot: Rob
         for service in configuration.offload.services
         if service not in sensing and service not in task and service not in robot.refusals
     ]
-
-
-def _hint_about_observations(configuration: Configuration, summary: RunSummary) -> str | None:
-    """Say what to do if more than one observation in a hundred is unexplained."""
-    if summary.unexplained_observations * 100 <= summary.sensing_decisions:
-        return None
-    return (
-        "the belief often lost the state: take more particles (particle_filter.num_particles, "
-        f"{configuration.planning.particle_filter.num_particles} now); if that does not help, the "
-        "problem's model does not fit the world"
-    )
 
 
 def _require_effect(options: RunOptions, configuration: Configuration, *, as_robot: bool) -> None:

@@ -292,6 +292,9 @@ def _summary_rows(summary: RunSummary) -> list[tuple[str, str]]:
                 "from every particle",
             )
         )
+        if summary.unexplained_observations * 100 > summary.sensing_decisions:
+            remedy = "take more particles (particle_filter.num_particles), or check the model"
+            rows.append(("", remedy))
     by_service = summary.sensing_decisions_by_service
     if by_service and set(by_service) != {OWN_PLANNER}:
         shares = ", ".join(f"{service} {count:,}" for service, count in by_service.items())
