@@ -12,8 +12,8 @@ from rich.console import Console
 from holdfast.errors import OutputError
 from holdfast.files import claim_directory
 from holdfast.lab.demo.command import account
+from holdfast.lab.demo.narrator import Activity, Change, DemoState, Line, Mark
 from holdfast.lab.demo.scenario import Findings, Outage
-from holdfast.lab.demo.state import Activity, Change, DemoState, Line, Mark
 from holdfast.lab.demo.timeline import ASCII, UNICODE, legend, plain_line, timeline
 from holdfast.recording.compare import Comparison, Difference
 

@@ -73,8 +73,8 @@ def main(arguments: Sequence[str]) -> int:
 
 def _run(out: Path | None, seed: int, *, quick: bool) -> Findings:
     from holdfast.files import claim_directory
+    from holdfast.lab.demo.narrator import DemoState
     from holdfast.lab.demo.scenario import Demo, Plan
-    from holdfast.lab.demo.state import DemoState
     from holdfast.lab.demo.timeline import make_show
     from holdfast.lab.testbed.driver import Testbed
 

@@ -1,18 +1,18 @@
-"""Turns what happens on the testbed into the demo's state: activities, marks and lines."""
+"""The demo's state, and what makes it of events on the testbed: activities, marks and lines."""
 
 from __future__ import annotations
 
 import time
-from typing import Literal
+from dataclasses import dataclass, field
+from typing import Literal, NamedTuple, Protocol, TypeAlias
 
-from holdfast.lab.demo.state import Activity, Change, DemoState, Line, Mark, Observer, Row
 from holdfast.lab.testbed.driver import ServiceCommand, Testbed
 from holdfast.lab.testbed.processes import Process
 from holdfast.lab.testbed.records import LogEvent
 from holdfast.protocol.status import Status
 from holdfast.robot.links import RECOVERY_SERVICE
 
-__all__ = ["Narrator"]
+__all__ = ["Activity", "Change", "DemoState", "Line", "Mark", "Narrator", "Observer", "Row"]
 
 _SENTENCES = {
     "service_appeared": "sees {who}",
@@ -28,6 +28,76 @@ _SENTENCES = {
     "unreachable": "",
     "missed_ticks": "",
 }
+
+
+Row: TypeAlias = Literal["cloud", "local", "robot"]
+Activity: TypeAlias = Literal[
+    "off", "starting", "ready", "deciding", "by_cloud", "by_local", "held"
+]
+"""Of a service: off, starting, ready, deciding. Of the robot: off, starting, which service decides
+for it, held, or ready at the end."""
+
+
+class Change(NamedTuple):
+    """From this moment on a row has another activity."""
+
+    at_s: float
+    activity: Activity
+
+
+class Mark(NamedTuple):
+    """The demo has started or killed a process."""
+
+    at_s: float
+    row: Row
+    kind: Literal["start", "kill"]
+
+
+class Line(NamedTuple):
+    """One thing that happened, in words."""
+
+    at_s: float
+    who: str
+    text: str
+
+
+@dataclass
+class DemoState:
+    """All that has happened so far; times count from the beginning of the demo.
+
+    Attributes
+    ----------
+    began_at : float
+        In seconds since the epoch.
+    expected_s : float
+        How long the demo will take, as far as can be known.
+    changes : dict of str to list of Change
+        Of each row, in order of time.
+    """
+
+    title: str = ""
+    began_at: float = field(default_factory=time.time)
+    expected_s: float = 1.0
+    changes: dict[Row, list[Change]] = field(
+        default_factory=lambda: {"cloud": [], "local": [], "robot": []}
+    )
+    marks: list[Mark] = field(default_factory=list)
+    lines: list[Line] = field(default_factory=list)
+    status: Status = Status.STANDARD
+    progress: str = ""
+
+    @property
+    def now_s(self) -> float:
+        """Seconds since the beginning."""
+        return time.time() - self.began_at
+
+
+class Observer(Protocol):
+    """Shows a demo while it runs."""
+
+    def say(self, line: Line) -> None:
+        """Show the next line; the state has it already."""
+        ...
 
 
 class Narrator:

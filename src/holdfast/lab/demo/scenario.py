@@ -16,8 +16,7 @@ import msgspec
 
 from holdfast.cli.terminal import counted
 from holdfast.files import write_atomically
-from holdfast.lab.demo.narrator import Narrator
-from holdfast.lab.demo.state import DemoState, Observer
+from holdfast.lab.demo.narrator import DemoState, Narrator, Observer
 from holdfast.lab.errors import NoProgressError
 from holdfast.lab.testbed.driver import Testbed
 from holdfast.lab.testbed.processes import free_port

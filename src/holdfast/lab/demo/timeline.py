@@ -17,7 +17,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from holdfast.lab.demo.state import Activity, DemoState, Line, Row
+from holdfast.lab.demo.narrator import Activity, DemoState, Line, Row
 from holdfast.printable import printable
 from holdfast.protocol.status import MEANINGS
 
