@@ -17,6 +17,8 @@ from tests.golden.table import pinned
 
 import holdfast
 
+pytestmark = pytest.mark.slow  # building it takes minutes
+
 _BUILD_S = 1200.0
 _NOT_IN_SOURCES = (".ci/", "docs/images/")
 _LINK_POLICY = "manylinux_2_"
@@ -141,14 +143,12 @@ def test_it_runs_on_a_bare_machine(wheel: Path, engine: Engine) -> None:
     assert lines[-1] == f'served: "digest": "{digest}"'
 
 
-@pytest.mark.slow
 def test_made_again_it_is_the_same(wheel: Path, tmp_path: Path) -> None:
     again = tmp_path / "dist"
     _make("wheel", again)
     assert (again / wheel.name).read_bytes() == wheel.read_bytes()
 
 
-@pytest.mark.slow
 def test_its_parts_are_written_down(wheel: Path) -> None:
     """Valid, and with a licence for each part: otherwise the command fails."""
     _make("sbom", wheel.parent)

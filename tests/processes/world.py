@@ -22,7 +22,7 @@ from holdfast.outcome import TaskDecision
 from holdfast.recording.journal import Journal
 from holdfast.robot.environment import SimulatedEnvironment
 
-PATIENCE_S = 60.0
+PATIENCE_S = 180.0
 """For whatever must happen; on a machine that is not busy it takes a fraction of a second."""
 
 Hook = Callable[[], object]
