@@ -30,12 +30,12 @@ from holdfast.runtime.command_line import (
     argument,
     flag,
     location,
-    log_option,
     number,
     option,
     whole_number,
 )
 from holdfast.runtime.log_lines import LogFormat
+from holdfast.runtime.logs import log_option
 from holdfast.service.options import http_address
 
 if TYPE_CHECKING:

@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any, ClassVar, NamedTuple, NoReturn, Self
 
 from holdfast.errors import OptionError
-from holdfast.runtime.log_lines import LINES
 
 __all__ = [
     "MAX_JOBS",
@@ -150,13 +149,6 @@ def option(
     return Option(
         _with_long(names), help, metavar, read, () if many else default, many, key, hidden
     )
-
-
-def log_option(
-    help: str = "Form of the ready line and of the log on standard error: text or json.",  # noqa: A002
-) -> Any:
-    """Declare the option ``--log``, whose value is a ``LogFormat``."""
-    return option(metavar="FORMAT", read=one_of(*LINES), default="text", help=help)
 
 
 def flag(*names: str, help: str, default: bool = False) -> Any:  # noqa: A002

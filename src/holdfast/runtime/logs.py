@@ -22,15 +22,23 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from queue import SimpleQueue
-from typing import Self, TextIO
+from typing import Any, Self, TextIO
 
 from holdfast.errors import OutputError
+from holdfast.runtime.command_line import one_of, option
 from holdfast.runtime.log_lines import LINES, LogFormat
 
-__all__ = ["EventLog", "LogFormat", "write_event"]
+__all__ = ["EventLog", "LogFormat", "log_option", "write_event"]
 
 _MAX_QUEUED_LINES = 10_000
 _FLUSH_TIMEOUT_S = 0.5
+
+
+def log_option(
+    help: str = "Form of the ready line and of the log on standard error: text or json.",  # noqa: A002
+) -> Any:
+    """Declare the option ``--log``, whose value is a ``LogFormat``."""
+    return option(metavar="FORMAT", read=one_of(*LINES), default="text", help=help)
 
 
 class EventLog:

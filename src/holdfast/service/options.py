@@ -13,12 +13,12 @@ from holdfast.runtime.command_line import (
     Options,
     flag,
     location,
-    log_option,
     number,
     option,
     whole_number,
 )
 from holdfast.runtime.log_lines import LogFormat
+from holdfast.runtime.logs import log_option
 
 if TYPE_CHECKING:
     from holdfast.service.health import HttpAddress

@@ -20,11 +20,11 @@ from holdfast.runtime.command_line import (
     close_match,
     flag,
     location,
-    log_option,
     option,
     whole_number,
 )
 from holdfast.runtime.log_lines import LogFormat
+from holdfast.runtime.logs import log_option
 
 if TYPE_CHECKING:
     from rich.console import Console
