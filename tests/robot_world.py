@@ -337,6 +337,7 @@ class World:
                 else:
                     self.begin(len(self.results))
             elif isinstance(effect, Halt):
+                assert effect is effects[-1], "the shell carries out nothing after it"
                 self.stopped = effect
             elif isinstance(effect, Paused):
                 self.ended = True

@@ -9,14 +9,14 @@ from holdfast.protocol.failure_detector import FailureDetector
 
 def present() -> FailureDetector:
     detector = FailureDetector(0.25)
-    assert detector.appeared("a")
+    assert detector.appeared("a", 0.0)
     return detector
 
 
 def test_absent_until_its_token_is_seen() -> None:
     detector = FailureDetector(0.25)
     assert (detector.present, detector.trusted, detector.seen) == (False, False, False)
-    detector.appeared("a")
+    detector.appeared("a", 0.0)
     assert (detector.present, detector.trusted, detector.seen) == (True, True, True)
 
 
@@ -31,8 +31,8 @@ def test_a_token_that_goes_takes_only_its_own_process() -> None:
 def test_the_same_token_again_is_no_news() -> None:
     detector = present()
     detector.suspect("slow")
-    assert (detector.appeared("a"), detector.suspicion) == (False, "slow")
-    assert (detector.appeared("b"), detector.suspicion) == (True, None)
+    assert (detector.appeared("a", 0.0), detector.suspicion) == (False, "slow")
+    assert (detector.appeared("b", 0.0), detector.suspicion) == (True, None)
 
 
 def test_silence_counts_only_while_something_is_awaited() -> None:
@@ -98,3 +98,9 @@ def test_patience_that_is_needed_is_kept() -> None:
         detector.answered()
         assert detector.deadline() == pytest.approx(10.0 * turn + 7.1)
         detector.settled()
+
+
+def test_one_that_was_never_asked_is_silent_since_it_appeared() -> None:
+    detector = FailureDetector(0.3)
+    detector.appeared("a", 86_400.0)
+    assert detector.silence_s(86_401.0) == 1.0

@@ -46,6 +46,7 @@ class TestRestartPolicy:
         launches.begin(begun_at)
         launches.failed(begun_at)
         launches.begin(begun_at)
+        launches.appeared(begun_at + 1.0)
         launches.ended(begun_at + 5.0)
         assert launches.is_due(begun_at + 5.0)  # at once, as after the first failure
 
@@ -56,6 +57,15 @@ class TestRestartPolicy:
             launches.begin(0.0)
             launches.ended(0.5)
         assert launches.next_wakeup(present=False) == pytest.approx(0.5 + 0.2)
+
+    def test_a_long_start_is_no_long_life(self) -> None:
+        launches = RestartPolicy(RecoverySettings(relaunch_delay_ms=500.0))
+        launches.want(0.0)
+        for _ in range(3):
+            launches.begin(0.0)
+            launches.appeared(4.0)
+            launches.ended(4.0)
+        assert launches.next_wakeup(present=False) == 4.0 + 1.0
 
     def test_one_that_was_not_seen_in_time_gets_more_time_the_next_time(self) -> None:
         """On a machine where a start takes longer than the limit, one comes up nevertheless."""

@@ -41,5 +41,5 @@ def test_a_busy_service_is_asked_again_soon_whatever_it_says() -> None:
     assert service.note_busy(2.0, 10.0) == 2.0
     assert service.note_busy(4_294_967.295, 10.0) == 5.0
     assert not service.usable(14.9)
-    service.detector.appeared("b1")
+    service.detector.appeared("b1", 0.0)
     assert service.usable(15.0)

@@ -93,6 +93,24 @@ def test_an_action_outside_the_limits_is_never_performed() -> None:
     assert len([e for _, e in world.trace if isinstance(e, ComputeOwnAnswer)]) == 1
 
 
+def test_a_wrong_answer_does_not_end_the_recovery() -> None:
+    world = World(verify_share=0.0)
+    lie(world, "cloud", other_actions(77.7), after=2)
+
+    def fault(performed: int) -> None:
+        if performed == 2 and not world.statuses():
+            world.kill("cloud")
+            world.bring_up("cloud", 0.012)
+
+    world.on_act = fault
+    world.start()
+    world.run()
+    world.assert_same_as_without_faults()
+    assert wrong(world) == [("cloud", "task")]
+    assert world.statuses() == ["local_recovery"]
+    assert sum(result.recoveries for result in world.results) == 1
+
+
 def test_where_two_answers_differ_the_robot_decides() -> None:
     # The first is so slow once that the second is asked as well; that one lies, and is the sooner.
     world = World(services=("first", "second"), verify_share=0.0)

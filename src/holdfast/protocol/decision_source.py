@@ -48,7 +48,7 @@ class DecisionSource:
 
     @property
     def recoveries(self) -> int:
-        """Times that the local service took over."""
+        """Times that the cloud was lost."""
         return 0
 
     @property
@@ -58,7 +58,7 @@ class DecisionSource:
 
     @property
     def is_holding(self) -> bool:
-        """Whether the robot holds still because no service is usable."""
+        """Whether the robot holds still: no service is usable, or its own planner has to decide."""
         return False
 
     @property

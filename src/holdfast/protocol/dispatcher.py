@@ -120,7 +120,8 @@ class Dispatcher(DecisionSource):
             if call.answered:
                 self._calls.abandon(call)
         self.wake(now)
-        self._try_others(now)
+        if not self.stopped:
+            self._try_others(now)
 
     def drop(self) -> None:
         """Drop the question: the trial has ended, or its answer is of no use."""
@@ -186,7 +187,7 @@ class Dispatcher(DecisionSource):
 
     @property
     def recoveries(self) -> int:
-        """Times that the local service took over."""
+        """Times that the cloud was lost."""
         return self._tracker.recoveries
 
     @property
@@ -196,7 +197,7 @@ class Dispatcher(DecisionSource):
 
     @property
     def is_holding(self) -> bool:
-        """Whether the robot holds still because no service is usable."""
+        """Whether the robot holds still: no service is usable, or its own planner has to decide."""
         return self._stalls.is_holding
 
     @property
@@ -258,13 +259,14 @@ class Dispatcher(DecisionSource):
     # -- presence --------------------------------------------------------------------------------
 
     def _appeared(self, replica: Replica | None, incarnation: str, now: float) -> None:
-        if replica is None or not replica.detector.appeared(incarnation):
+        if replica is None or not replica.detector.appeared(incarnation, now):
             return
         self._calls.abandon_all(replica)
         if incarnation != replica.last_incarnation:
             replica.forget()
             replica.last_incarnation = incarnation
         if replica is self._services.local:
+            self._launches.appeared(now)
             launched_s = self._launches.since_launch_s(now)
             if launched_s is not None:
                 self.effects.report("launched", launch_ms=1e3 * launched_s)
@@ -307,7 +309,12 @@ class Dispatcher(DecisionSource):
             and replica is self._services.local
         ):
             self._launches.succeeded()
-        elif outcome is ReplyOutcome.ANSWERED and self._tracker.is_recovering:
+        elif (
+            outcome is ReplyOutcome.ANSWERED
+            and self._tracker.is_recovering
+            and replica.reliable
+            and not question.disputed
+        ):
             reason = f"{replica.name} has answered"
             self.effects.report("status", **self._tracker.change(Cause.CLOUD_ANSWERED, reason, now))
 

@@ -1,7 +1,7 @@
 """The robot's end: events in, effects out.
 
 Events tell what happened on the wire and in the environment. A call is one request with any number
-of replies, and always ends; one that ends without the answer shows that the service is gone. An
+of replies, and always ends; a service whose call ends without any is suspected. An
 order to the environment ends in one event, which may be a failure.
 
 Effects are orders to the shell. It carries out each before it begins the next, and

@@ -58,13 +58,14 @@ class FailureDetector:
         """Whether it is present and not suspected."""
         return self.incarnation is not None and self.suspicion is None
 
-    def appeared(self, incarnation: str) -> bool:
+    def appeared(self, incarnation: str, now: float) -> bool:
         """Note the presence of a process; return whether it is new."""
         fresh = incarnation != self.incarnation
         self.incarnation = incarnation
         self.seen = True
         if fresh:
             self.suspicion = None
+            self._last_sign = now
         return fresh
 
     def vanished(self, incarnation: str) -> bool:
@@ -96,7 +97,10 @@ class FailureDetector:
         self._timeout_s = min(factor * self._timeout_s, max(limit_s, self._timeout_s))
 
     def answered(self) -> None:
-        """Note a complete answer, and shorten an extended timeout to what this answer needed."""
+        """Note a complete answer, and shorten an extended timeout.
+
+        It becomes twice the longest silence of that answer, but at least half of what it was.
+        """
         needed_s = 2.0 * self._longest_silence_s
         shorter_s = max(0.5 * self._timeout_s, needed_s, self._usual_timeout_s)
         self._timeout_s = min(self._timeout_s, shorter_s)
@@ -107,7 +111,10 @@ class FailureDetector:
         self._last_sign += seconds
 
     def silence_s(self, now: float) -> float:
-        """Return how long nothing has been received."""
+        """Return the time since the last sign of life.
+
+        Its appearance is one, and so is a request that is sent while none is awaited.
+        """
         return max(0.0, now - self._last_sign)
 
     def suspect(self, reason: str) -> None:

@@ -19,7 +19,7 @@ _HEDGING_BURST = 3.0
 """Hedges that may be made at once."""
 
 _LONG_LIFE_S = 1.0
-"""A process that lived longer did not fail at its start."""
+"""A process that lived longer after it appeared did not fail at its start."""
 
 _MOST_TIME = 8
 """Largest factor by which a later launch may take longer than the first."""
@@ -38,6 +38,7 @@ class RestartPolicy:
         self._timeout_s = 1e-3 * settings.launch_timeout_ms
         self._pause_s = 1e-3 * settings.relaunch_delay_ms
         self._launched_at: float | None = None
+        self._appeared_at: float | None = None
         self._launch_after: float | None = None
         self._failures = 0
         self._late = 0
@@ -61,8 +62,13 @@ class RestartPolicy:
         """Note a launch; return its number."""
         self._launch_after = None
         self._launched_at = now
+        self._appeared_at = None
         self.number += 1
         return self.number
+
+    def appeared(self, now: float) -> None:
+        """Note that the launched process can be asked."""
+        self._appeared_at = now
 
     def since_launch_s(self, now: float) -> float | None:
         """Return the time since the last launch; None before the first."""
@@ -92,7 +98,7 @@ class RestartPolicy:
 
     def ended(self, now: float) -> None:
         """Note the end of the process."""
-        if self._launched_at is not None and now - self._launched_at > _LONG_LIFE_S:
+        if self._appeared_at is not None and now - self._appeared_at > _LONG_LIFE_S:
             self.succeeded()
         self.failed(now)
 

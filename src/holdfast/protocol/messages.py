@@ -348,7 +348,7 @@ _WORDS = {0xCC: 1, 0xCD: 2, 0xCE: 4}
 def encode(message: Request | Reply) -> bytes:
     """Encode a message."""
     if isinstance(message, Request) and message.session_configuration is not None:
-        # Without a session configuration both forms are the same bytes.
+        # Without a session configuration the shorter form is read as the same request.
         return with_checksum(
             _ENCODER.encode(_sent(message, pack_configuration(message.session_configuration)))
         )

@@ -89,8 +89,10 @@ class AnswerPart:
 class Question:
     """A state in which to decide, and the answer as far as it has arrived.
 
-    The question itself never changes. Its answer is written by the
-    :class:`~holdfast.protocol.decision_source.DecisionSource` alone; the robot only reads it.
+    The question itself never changes. Its answer is written by
+    :class:`~holdfast.protocol.verification.Verification` where services answer, else by
+    :class:`~holdfast.protocol.decision_source.InProcessSource`. The robot only reads it; the source
+    notes in ``needed_at`` that the robot waits.
 
     Parameters
     ----------

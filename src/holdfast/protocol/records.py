@@ -75,7 +75,7 @@ class ActingRecord(msgspec.Struct, array_like=True, frozen=True, tag=2):
 
 
 class PerformedRecord(msgspec.Struct, array_like=True, frozen=True, tag=3):
-    """The task action was performed. Written together with the next record."""
+    """The task action was performed. Written before anything else is ordered."""
 
     step: int
     reward: float | None
@@ -159,7 +159,7 @@ class TrialHistory:
     sensing_ms : list of float
         Computing time of each sensing action.
     recoveries : int
-        Times that the local service took over.
+        Times that the cloud was lost.
     """
 
     def __init__(self, planner: Planner, seed: int, trial: int) -> None:

@@ -3,7 +3,8 @@
 Tasks wait in three orders: those that a known robot waits for (urgent), those of newcomers, which
 were never served, and prefetches, which are ahead of their robots. Urgent ones go first, but not
 forever: a prefetch that has waited long enough has its turn. A new identity costs nothing, so one
-client can be thousands of newcomers; together they get at most every second turn while others wait.
+client can be thousands of newcomers; together they get at most every second turn while an urgent
+task of others waits.
 
 Within an order the owners take turns, and each owner's tasks go in arrival order. So all sessions
 of one certificate together get one robot's turn; all robots without a certificate are one owner. A

@@ -56,7 +56,7 @@ class OpenRequest:
     call_number : int
         Of its call, in effects and events.
     number : int
-        In the message, repeated by each reply. It is unique in the run, across all processes of the
+        In the message, repeated by each reply. It is unique in the run over 2,048 processes of the
         robot, so a reply that arrives late in another call is recognized.
     heard : bool
         Whether any reply has come.

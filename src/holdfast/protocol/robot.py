@@ -130,7 +130,7 @@ class Robot:
 
     @property
     def is_holding(self) -> bool:
-        """Whether the robot holds still because no service is usable."""
+        """Whether the robot holds still: no service is usable, or its own planner has to decide."""
         return self._source.is_holding
 
     @property
@@ -441,7 +441,7 @@ class Robot:
             assert question is not None
         answer = question.sensing
         if answer is None or question.disputed:
-            self._source.need(now)
+            self._need(now)
             return
         if (
             question.state is not state
@@ -451,7 +451,7 @@ class Robot:
             self._effects.report("prefetch_unused", trial=self._trial, step=state.step)
             self._source.check()
             self._ask(self._planner.digest(state), now)
-            self._source.need(now)
+            self._need(now)
             return
         provenance = question.sensing_provenance
         assert provenance is not None
@@ -471,12 +471,13 @@ class Robot:
             assert question is not None
             offset = 0
         if question.task_actions is None or question.disputed:
-            self._source.need(now)
+            self._need(now)
             return
         provenance = question.task_provenance
         if offset == 0 and provenance is not None and provenance is not self._timed_provenance:
             self._timed_provenance = provenance
             self._timed("task", question, provenance, now)
+        if question.needed_at is not None:
             self._source.go_on()
         if not self._take_tick(now):
             return
@@ -485,7 +486,7 @@ class Robot:
             own, _ = self._planner.choose_task_action(state)
             if not same_actions([own], [action]):
                 self._source.dispute()
-                self._source.need(now)
+                self._need(now)
                 return
         self._write(ActingRecord(state.step, encode_floats(action)))
         history = self._current_history
@@ -501,6 +502,11 @@ class Robot:
             self._planner.settings, history.state, state_digest, observations, num_observations
         )
         self._source.ask(question, now)
+
+    def _need(self, now: float) -> None:
+        # The source may stop the run: what happened before that is written before it.
+        self._write()
+        self._source.need(now)
 
     def _take_tick(self, now: float) -> bool:
         """Return whether the next task action is due, and take its tick; else set the wakeup."""

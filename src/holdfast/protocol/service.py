@@ -482,7 +482,7 @@ class Service:
             else:
                 self._calls.send_refused(record.call, record.number, *outcome.failure)
         if not session.built:
-            # Nothing can ever come of it.
+            # There is nothing to keep: whoever asks again sends all of it.
             self._forget(session, "refused")
 
     def _succeeded(self, task: PendingTask, outcome: JobResult, now: float) -> None:

@@ -2,7 +2,7 @@
 
 A robot that *waits* has asked a service that takes its time. That is reported once per question and
 only if it lasts. A robot that *holds* has no usable service. That is reported at once, with the
-reason, and again when a service answers.
+reason, and again when a service works on the question.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class StallReporter:
 
     @property
     def is_holding(self) -> bool:
-        """Whether the robot holds still because no service is usable."""
+        """Whether the robot holds still: no service is usable, or its own planner has to decide."""
         return self._holding_since is not None
 
     def waiting_at(self, question: Question) -> float | None:

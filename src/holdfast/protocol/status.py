@@ -76,7 +76,7 @@ class StatusTracker:
     Attributes
     ----------
     recoveries : int
-        Times that the local service took over.
+        Times that the cloud was lost.
     """
 
     def __init__(self) -> None:
