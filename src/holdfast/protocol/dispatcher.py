@@ -309,14 +309,13 @@ class Dispatcher(DecisionSource):
             and replica is self._services.local
         ):
             self._launches.succeeded()
-        elif (
-            outcome is ReplyOutcome.ANSWERED
-            and self._tracker.is_recovering
-            and replica.reliable
-            and not question.disputed
-        ):
+        elif outcome is ReplyOutcome.ANSWERED and self._ends_recovery(replica, question):
             reason = f"{replica.name} has answered"
             self.effects.report("status", **self._tracker.change(Cause.CLOUD_ANSWERED, reason, now))
+
+    def _ends_recovery(self, replica: Replica, question: Question) -> bool:
+        """Return whether an answer does: one that is wrong, or may be, does not."""
+        return self._tracker.is_recovering and replica.reliable and not question.disputed
 
     def _ended(self, call: OpenRequest, now: float) -> None:
         self._calls.settle(call)
