@@ -91,7 +91,10 @@ def wheel(engine: Engine, images: Images, tmp_path_factory: pytest.TempPathFacto
 
 
 @pytest.fixture(scope="module")
-def machine(engine: Engine, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Machine]:
+def machine(
+    engine: Engine, images: Images, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Machine]:
+    del images  # it stands on their base
     directory = tmp_path_factory.mktemp("machine")
     with booted(engine, CLOUD_INIT / "user-data.yaml", directory) as machine:
         yield machine
