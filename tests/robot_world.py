@@ -400,6 +400,10 @@ class World:
     def reports(self, name: str) -> list[dict[str, object]]:
         return [e.fields for _, e in self.trace if isinstance(e, LogEvent) and e.name == name]
 
+    def report_times(self, name: str) -> list[float]:
+        """Return when an event was logged."""
+        return [at for at, e in self.trace if isinstance(e, LogEvent) and e.name == name]
+
     def statuses(self) -> list[object]:
         return [fields["to"] for fields in self.reports("status")]
 

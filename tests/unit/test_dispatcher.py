@@ -154,9 +154,7 @@ def test_a_cloud_that_appears_again_is_asked_what_the_local_service_was_asked() 
     world.start()
     world.run()
     world.assert_same_as_without_faults()
-    appeared_at = [
-        at for at, e in world.trace if isinstance(e, LogEvent) and e.name == "service_appeared"
-    ]
+    appeared_at = world.report_times("service_appeared")
     assert len(appeared_at) == 2
     asked = [sent for sent in world.sent if sent.at >= appeared_at[1]]
     assert (asked[0].service, asked[0].at) == ("cloud", appeared_at[1])
@@ -178,9 +176,7 @@ def test_a_given_up_service_sees_the_next_question_also_while_another_decides() 
     world.start()
     world.run()
     world.assert_same_as_without_faults()
-    suspected_at = next(
-        at for at, e in world.trace if isinstance(e, LogEvent) and e.name == "service_suspected"
-    )
+    suspected_at = world.report_times("service_suspected")[0]
     after = [sent for sent in world.sent if sent.at >= suspected_at]
     tries = [sent.at for sent in after if sent.service == "first"]
     assert len(tries) > 2
