@@ -66,8 +66,8 @@ class Machine(NamedTuple):
         """Return what systemd knows of a unit."""
         return self.do(f"systemctl show --value --property={name} {unit}")
 
-    def wait_for(self, unit: str, name: str, beginning: str) -> None:
-        """Wait until what systemd knows of a unit begins like this."""
+    def wait_for(self, unit: str, name: str, beginning: str) -> str:
+        """Return what systemd knows of a unit, once it begins like this."""
         found = ""
 
         def is_so() -> bool:
@@ -82,6 +82,7 @@ class Machine(NamedTuple):
         except AssertionError as error:
             log = self.do(f"journalctl --no-pager --lines=40 --unit={unit}")
             raise AssertionError(f"{error}; it is {found}\n{log}") from None
+        return found
 
     def signal(self, unit: str, name: str) -> None:
         """Send a signal to a unit's first process."""
