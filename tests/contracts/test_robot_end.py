@@ -26,9 +26,9 @@ from tests.contracts.wires import (
     connected,
     echo,
     service_process,
-    stop,
     until,
 )
+from tests.stopping import stop
 
 from holdfast.protocol.events import (
     CallEnded,
@@ -380,7 +380,7 @@ async def test_a_process_ends_quietly_whatever_its_links_do(
             assert robot.stdout is not None
             assert await loop.run_in_executor(None, robot.stdout.readline) == b"calling\n"
             if stopped:
-                stop(service)
+                stop(service.pid)
             communicate = functools.partial(robot.communicate, timeout=PATIENCE_S)
             _, errors = await loop.run_in_executor(None, communicate)
         finally:

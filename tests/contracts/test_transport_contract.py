@@ -27,8 +27,8 @@ from tests.contracts.wires import (
     saying,
     service_process,
     silent,
-    stop,
 )
+from tests.stopping import stop
 
 from holdfast.errors import InvalidValueError
 from holdfast.protocol.events import (
@@ -463,7 +463,7 @@ class TestProcesses:
             await inbox.wait_for(ServiceAppeared("cloud", "b1"))
             robot.call("cloud", 1, b"wait")
             await inbox.wait_for(ReplyReceived(1, b"begun"))
-            stop(process)
+            stop(process.pid)
             await inbox.wait_for(ServiceVanished("cloud", "b1"), CallEnded(1))
             robot.call("cloud", 2, b"echo")
             assert await inbox.of_call(2) == [CallEnded(2)]
@@ -483,7 +483,7 @@ class TestProcesses:
             async with start(f"b{k}") as process:
                 incarnation = await inbox.appeared(times=k)
                 await inbox.wait_for(ServiceAppeared("idle", "b1"))
-                stop(process)
+                stop(process.pid)
                 large, small, other, late = itertools.islice(numbers, 4)
                 robot.call("cloud", large, bytes(MAX_BYTES))  # more than buffers take
                 robot.call("cloud", small, b"echo")
@@ -508,7 +508,7 @@ class TestProcesses:
         async with start("b1") as process:
             for k in range(1, 4):
                 await inbox.appeared(times=k)
-                stop(process)
+                stop(process.pid)
                 robot.call("cloud", next(numbers), bytes(0 if wire.robot_listens else MAX_BYTES))
                 await inbox.wait(lambda _, k=k: inbox.count(ServiceVanished("cloud", "b1")) >= k)  # type: ignore[misc]
                 process.send_signal(signal.SIGCONT)

@@ -489,13 +489,6 @@ async def service_process(
         process.communicate()
 
 
-def stop(process: subprocess.Popen[bytes]) -> None:
-    """Stop all threads of a child process; returns when they have stopped."""
-    process.send_signal(signal.SIGSTOP)
-    _, status = os.waitpid(process.pid, os.WUNTRACED)
-    assert os.WIFSTOPPED(status)
-
-
 Start: TypeAlias = Callable[[str], contextlib.AbstractAsyncContextManager[subprocess.Popen[bytes]]]
 
 

@@ -22,6 +22,7 @@ from tests.ports import free_port
 from tests.processes.world import PATIENCE_S as PATIENCE_S
 from tests.processes.world import Gate, World
 from tests.processes.world import Hook as Hook
+from tests.stopping import stop
 
 from holdfast.config.loader import load
 from holdfast.lab.testbed import processes as lab
@@ -117,8 +118,8 @@ class Process(lab.Process):
 
     def stop(self) -> float:
         """Stop it with SIGSTOP; when this returns it stands still."""
-        stopped_at = super().stop()
-        os.waitid(os.P_PID, self.pid, os.WSTOPPED)
+        stopped_at = time.time()
+        stop(self.pid)
         return stopped_at
 
     def signal(self, number: signal.Signals) -> None:

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 import zenoh
 from tests.ports import free_port
+from tests.stopping import stop
 from tests.unit.test_ros_client import EXAMPLE, configuration, decisions, in_process
 
 from holdfast.config.loader import Configuration
@@ -159,7 +160,7 @@ def test_a_service_that_dies_while_it_is_asked_is_noticed_then() -> None:
 
     with service("listen", port) as process, way_to(port) as way:
         until_answered(way)
-        process.send_signal(signal.SIGSTOP)
+        stop(process.pid)
         threading.Thread(target=ask, args=(way,), daemon=True).start()
         with pytest.raises(queue.Empty):
             outcome.get(timeout=0.3)
@@ -175,7 +176,7 @@ def test_a_service_that_is_stopped_costs_its_deadline_again_and_again() -> None:
     state = ActiveSensing(particles).answer(BEGIN).state
     with service("listen", port) as process, way_to(port) as way:
         until_answered(way)
-        process.send_signal(signal.SIGSTOP)
+        stop(process.pid)
         # Half a megabyte each, much more than sockets hold: sending must not wait for it either.
         for _ in range(20):
             with pytest.raises(TransportError, match=r"no answer in 0\.1 s|has died"):

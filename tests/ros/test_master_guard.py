@@ -15,6 +15,7 @@ import pytest
 from tests.ros.conftest import PATIENCE_S
 from tests.ros.graph import Graph, count, keeps_on, replaced, settled, start_everything, topic_tool
 from tests.ros.ros1_processes import SYSTEM_PYTHON, wait_for
+from tests.stopping import stop
 
 from holdfast.errors import GuardError
 from holdfast.ros.master.settings import MasterAddress
@@ -92,7 +93,7 @@ class TestItsOwnMaster:
         server = graph.node("server", "/server", "/work", "/more_work")
         wait_for(lambda: server.lines)
         # The guard is kept from doing anything, so that there is no master for as long as we like.
-        os.kill(guard.process.pid, signal.SIGSTOP)
+        stop(guard.process.pid)
         graph.kill_master()
         setting = graph.start("rosparam", "set", "/late", "1")
         listing = graph.start("rosservice", "list")
@@ -148,7 +149,7 @@ class TestItsOwnMaster:
         wait_for(lambda: all(server.lines for server in stopped))
         before = graph.registered()
         for server in stopped:
-            os.kill(server.process.pid, signal.SIGSTOP)
+            stop(server.process.pid)
         replaced(graph, graph.kill_master())
         assert graph.registered()["services"] == before["services"]
         silent = graph.events(guard, "master_started")[1]["silent"]

@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 from tests.ros.conftest import line_of
 from tests.ros.ros1_processes import SYSTEM_PYTHON, Ros1, ros1_in, wait_for
+from tests.stopping import stop
 from tests.unit.test_ros_client import in_process
 
 from holdfast.config.loader import Configuration, load
@@ -203,7 +204,7 @@ def test_a_run_decides_as_in_process_whatever_happens_to_the_cloud(
                 cloud = around.serve(CLOUD, EXAMPLE)
                 told = "wait for the cloud"
             case 6:
-                cloud.send_signal(signal.SIGSTOP)
+                stop(cloud.pid)
             case 8:
                 cloud.send_signal(signal.SIGCONT)
                 told = "wait for the cloud"
@@ -245,7 +246,7 @@ def test_a_stopped_service_costs_no_more_than_the_deadline(
     cloud = around.serve(CLOUD, EXAMPLE)
     standing, new = Ros1Service(CLOUD, here), Ros1Service(CLOUD, here)
     standing.ask(DecisionRequest(RequestKind.INITIALIZE), 30.0)
-    cloud.send_signal(signal.SIGSTOP)
+    stop(cloud.pid)
     for service in (standing, new, standing):
         with pytest.raises(TransportError, match=r"no answer in 0\.2 s"):
             service.ask(DecisionRequest(RequestKind.INITIALIZE), 0.2)
@@ -261,7 +262,7 @@ def test_a_question_that_hangs_ends_when_its_asker_is_closed(
     cloud = around.serve(CLOUD, EXAMPLE)
     service = Ros1Service(CLOUD, here)
     service.ask(DecisionRequest(RequestKind.INITIALIZE), 30.0)
-    cloud.send_signal(signal.SIGSTOP)
+    stop(cloud.pid)
     said: list[str] = []
 
     def ask() -> None:
@@ -315,7 +316,7 @@ class TestTheMasterDies:
         service = Ros1Service(CLOUD, here)
         service.ask(DecisionRequest(RequestKind.INITIALIZE), 30.0)
         assert around.master is not None
-        around.master.send_signal(signal.SIGSTOP)
+        stop(around.master.pid)
         service._disconnect()
         assert service.ask(DecisionRequest(RequestKind.INITIALIZE), 30.0).error is ErrorCode.OK
         never_seen = Ros1Service(CLOUD, here)
