@@ -239,6 +239,14 @@ class Graph(AtMaster):
         assert isinstance(pid, int)
         return pid
 
+    def incoming(self, name: str, topic: str) -> list[tuple[int, str]]:
+        """Return a node's connections to publishers: its number for each, and whose it is."""
+        with xmlrpc.client.ServerProxy(self.ask("lookupNode", name)[2]) as node:
+            connections: Any = node.getBusInfo("/test")[2]  # type: ignore[index]
+        return sorted(
+            (each[0], each[1]) for each in connections if (each[2], each[4]) == ("i", topic)
+        )
+
     def kill_master(self) -> int:
         """Kill the master -9, and return which process it was."""
         pid = self.master_pid()
