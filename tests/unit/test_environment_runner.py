@@ -291,13 +291,6 @@ class TestFailures:
         assert bench.event() == EnvironmentFailed(2, "perform", first.text, False)
         assert len(robot.calls) == called
 
-    def test_nothing_is_performed_before_the_trial_has_begun(self, bench: Bench) -> None:
-        runner = bench.open(Robot())
-        runner.perform(0, ACTION)
-        failed = bench.failure()
-        assert "a trial in it has not begun" in failed.text
-        assert not failed.action_in_doubt
-
     def test_errors_of_holdfast_come_as_they_are(self, bench: Bench) -> None:
         runner = bench.begin(SimulatedEnvironment(PegInHole2D(), 0, 0))
         runner.perform(0, np.array([np.nan, 0.0, 0.0]))
@@ -486,11 +479,6 @@ class TestThreads:
         with pytest.raises(KeyboardInterrupt):
             runner.perform(0, ACTION)
         assert events == [EnvironmentReady(False, None)]
-
-    @pytest.mark.parametrize("timeout_ms", [0.0, -1.0, float("nan")])
-    def test_a_timeout_is_positive(self, timeout_ms: float) -> None:
-        with pytest.raises(InvalidValueError, match=r"environment\.timeout_ms"):
-            ThreadedRunner(Robot, PegInHole2D(), print, "robot", timeout_ms)
 
 
 class TestStalls:

@@ -17,7 +17,7 @@ import threading
 from collections.abc import Callable, Sequence
 from queue import SimpleQueue
 from time import monotonic
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -71,78 +71,148 @@ def make_runner(
     )
 
 
-class _CheckedEnvironment:
-    """An environment whose results are checked and become events.
+class _Call(NamedTuple):
+    """A call of the environment, and what makes its event; ``kind`` is the runner's method."""
 
-    Exceptions of the types ``passed_on`` are raised instead.
+    step: int
+    kind: str
+    function: Callable[[], EnvironmentEvent]
+
+
+class EnvironmentRunner(abc.ABC):
+    """Calls the environment of one trial, one call at a time.
+
+    Each call leads to one event: at once, or later from another thread. After a failure every
+    further call fails. After ``close`` no event comes.
+
+    Parameters
+    ----------
+    make : callable
+        Makes the environment.
+    deliver : callable
+        Takes the events; it must not block.
+    name : str
+        Of the environment, for messages.
+    resumed : bool
+        Whether the environment is asked how many task actions it has performed.
     """
+
+    _passed_on: tuple[type[BaseException], ...] = ()
+    """Exceptions that are no failures of the environment."""
 
     def __init__(
         self,
         make: Callable[[], Environment],
         problem: Problem,
+        deliver: Deliver,
         name: str,
         *,
-        resumed: bool,
-        passed_on: tuple[type[BaseException], ...] = (),
+        resumed: bool = False,
     ) -> None:
         self._make = make
+        self._deliver = deliver
         self._name = name
         self._resumed = resumed
-        self._passed_on = passed_on
         self._sizes = ObservationSizes(problem)
-        # The current method. Another thread reads it when the call takes too long.
-        self._method = name
-        # The reward of the task action that the current call has performed. Also read by another
-        # thread.
-        self._performed: tuple[float | None] | None = None
+        # The watchdog reads the next three when a call takes too long: the environment, its current
+        # method, and the reward of the task action that the current call has performed.
         self.environment: Environment | None = None
+        self._method = name
+        self._performed: tuple[float | None] | None = None
+        self._failed: EnvironmentFailed | None = None
+        self._closed = False
 
-    def begin(self, step: int) -> EnvironmentEvent:
-        try:
-            environment = self._make()
-            self.environment = environment
-            count = None
-            ask = getattr(environment, "steps_performed", None)
-            if self._resumed and callable(ask):
-                self._method = "steps_performed"
-                count = self._count(ask())
-            self._method = "is_done"
-            return EnvironmentReady(self._done(environment.is_done()), count)
-        except self._passed_on:
-            raise
-        except BaseException as error:  # noqa: BLE001 - a SystemExit would end a thread unheard
-            return self._failed(step, error)
+    def begin(self, step: int = 0) -> None:
+        """Make the environment: :class:`EnvironmentReady`. Comes first."""
+        self._call(_Call(step, "begin", self._made))
 
-    def sense(self, step: int, sensing_action: int) -> EnvironmentEvent:
+    def sense(self, step: int, sensing_action: int) -> None:
+        """Perform a sensing action: :class:`Sensed`."""
+        self._call(_Call(step, "sense", lambda: self._sensed(step, sensing_action)))
+
+    def perform(self, step: int, task_action: FloatArray) -> None:
+        """Perform a task action, and ask whether the task is done: :class:`Acted`."""
+        self._call(_Call(step, "perform", lambda: self._acted(step, task_action)))
+
+    @abc.abstractmethod
+    def close(self, timeout_s: float = 1.0) -> None:
+        """Call the environment's ``close``, if it has one, within about this time.
+
+        An environment that is still in a call after that is abandoned. May be repeated.
+        """
+
+    @abc.abstractmethod
+    def _call(self, call: _Call) -> None:
+        """Call the environment, and deliver the event."""
+
+    def _made(self) -> EnvironmentEvent:
+        environment = self.environment = self._make()
+        count = None
+        ask = getattr(environment, "steps_performed", None)
+        if self._resumed and callable(ask):
+            self._method = "steps_performed"
+            count = self._count(ask())
+        self._method = "is_done"
+        return EnvironmentReady(self._done(environment.is_done()), count)
+
+    def _sensed(self, step: int, sensing_action: int) -> EnvironmentEvent:
+        assert self.environment is not None
         self._method = "perform_sensing"
-        try:
-            shown = self._begun().perform_sensing(sensing_action)
-            return Sensed(step, self._observation(sensing_action, shown))
-        except self._passed_on:
-            raise
-        except BaseException as error:  # noqa: BLE001 - a SystemExit would end a thread unheard
-            return self._failed(step, error)
+        shown = self.environment.perform_sensing(sensing_action)
+        return Sensed(step, self._observation(sensing_action, shown))
 
-    def perform(self, step: int, task_action: FloatArray) -> EnvironmentEvent:
+    def _acted(self, step: int, task_action: FloatArray) -> EnvironmentEvent:
+        assert self.environment is not None
         self._performed = None
         self._method = "perform"
-        begun = False
+        # A copy: the robot's own record of the action must stay what it is.
+        action = np.array(task_action, dtype=np.float64)
+        reward = self._reward(self.environment.perform(action))
+        self._performed = (reward,)
+        self._method = "is_done"
+        return Acted(step, reward, self._done(self.environment.is_done()))
+
+    def _event_of(self, call: _Call) -> EnvironmentEvent:
+        """Call the environment; an exception is an event, too."""
         try:
-            environment = self._begun()
-            # A copy: the robot's own record of the action must stay what it is.
-            action = np.array(task_action, dtype=np.float64)
-            begun = True
-            reward = self._reward(environment.perform(action))
-            self._performed = (reward,)
-            self._method = "is_done"
-            return Acted(step, reward, self._done(environment.is_done()))
+            return call.function()
         except self._passed_on:
             raise
         except BaseException as error:  # noqa: BLE001 - a SystemExit would end a thread unheard
-            return self._failed(step, error, performance_begun=begun)
+            called = self._called(self._method)
+            text = account_of_user_error(error, called)
+            if text is None and isinstance(error, HoldfastError):
+                text = str(error)
+            elif text is None:
+                message = f": {error}" if str(error) else ""
+                text = f"{called} raised {type(error).__name__}{message}"
+            return self._failure(call, text)
 
-    def close(self) -> None:
+    def _failure(self, call: _Call, text: str) -> EnvironmentFailed:
+        method, performed = self._method, self._performed
+        if call.kind != "perform":
+            return EnvironmentFailed(call.step, method, text, False)
+        if performed is None:
+            counts = callable(getattr(self.environment, "steps_performed", None))
+            return EnvironmentFailed(call.step, method, text, True, counts_steps=counts)
+        # Only is_done has failed: the result of ``perform`` is known.
+        return EnvironmentFailed(call.step, method, text, False, True, *performed)
+
+    def _refused(self, call: _Call) -> bool:
+        """Return whether no call is made any more; deliver the earlier failure, if there is one."""
+        if self._closed:
+            return True
+        if self._failed is not None:
+            self._deliver(EnvironmentFailed(call.step, self._failed.what, self._failed.text, False))
+        return self._failed is not None
+
+    def _finish(self, event: EnvironmentEvent) -> None:
+        if isinstance(event, EnvironmentFailed):
+            self._failed = event
+        if not self._closed:
+            self._deliver(event)
+
+    def _close_environment(self) -> None:
         close = getattr(self.environment, "close", None)
         if callable(close):
             # The trial is over: an error here changes nothing of it.
@@ -152,46 +222,6 @@ class _CheckedEnvironment:
                 raise
             except BaseException:  # noqa: BLE001
                 return
-
-    def stalled(
-        self, step: int, timeout_ms: float, *, performance_begun: bool
-    ) -> EnvironmentFailed:
-        """Return the event of a call that takes too long."""
-        method = self._method
-        made = method == self._name
-        called = f"the constructor of {method}" if made else self._called(method)
-        text = (
-            f"{called} has not returned within {timeout_ms:g} ms, which is environment.timeout_ms"
-        )
-        return self._failure(step, method, text, performance_begun=performance_begun)
-
-    def _failure(
-        self, step: int, method: str, text: str, *, performance_begun: bool
-    ) -> EnvironmentFailed:
-        performed = self._performed
-        if not performance_begun or performed is None:
-            asked = getattr(self.environment, "steps_performed", None)
-            counts = callable(asked) or not performance_begun
-            return EnvironmentFailed(step, method, text, performance_begun, counts_steps=counts)
-        # Only is_done has failed: the result of ``perform`` is known.
-        return EnvironmentFailed(step, method, text, False, True, *performed)
-
-    def _begun(self) -> Environment:
-        if self.environment is None:
-            raise EnvironmentFailedError(f"{self._name}: a trial in it has not begun")
-        return self.environment
-
-    def _failed(
-        self, step: int, error: BaseException, *, performance_begun: bool = False
-    ) -> EnvironmentFailed:
-        called = self._called(self._method)
-        text = account_of_user_error(error, called)
-        if text is None and isinstance(error, HoldfastError):
-            text = str(error)
-        elif text is None:
-            message = f": {error}" if str(error) else ""
-            text = f"{called} raised {type(error).__name__}{message}"
-        return self._failure(step, self._method, text, performance_begun=performance_begun)
 
     def _called(self, method: str) -> str:
         return self._name if method == self._name else f"{self._name}: {method}"
@@ -243,104 +273,21 @@ def _numbers(value: object) -> npt.NDArray[Any] | None:
     return array if array.dtype.kind in "fiu" else None
 
 
-class EnvironmentRunner(abc.ABC):
-    """Calls the environment of one trial, one call at a time.
-
-    Each call leads to one event: at once, or later from another thread. After a failure every
-    further call fails. After ``close`` no event comes. ``deliver`` takes the events; it must not
-    block.
-    """
-
-    _passed_on: tuple[type[BaseException], ...] = ()
-
-    def __init__(
-        self,
-        make: Callable[[], Environment],
-        problem: Problem,
-        deliver: Deliver,
-        name: str,
-        *,
-        resumed: bool = False,
-    ) -> None:
-        self._checked = _CheckedEnvironment(
-            make, problem, name, resumed=resumed, passed_on=self._passed_on
-        )
-        self._deliver = deliver
-        self._name = name
-        self._failed: EnvironmentFailed | None = None
-        self._closed = False
-
-    def begin(self, step: int = 0) -> None:
-        """Make the environment: :class:`Begun`. Comes first."""
-        self._call(step, "begin", lambda: self._checked.begin(step))
-
-    def sense(self, step: int, sensing_action: int) -> None:
-        """Perform a sensing action: :class:`Sensed`."""
-        self._call(step, "sense", lambda: self._checked.sense(step, sensing_action))
-
-    def perform(self, step: int, task_action: FloatArray) -> None:
-        """Perform a task action, and ask whether the task is done: :class:`Acted`."""
-        self._call(step, "perform", lambda: self._checked.perform(step, task_action))
-
-    @abc.abstractmethod
-    def close(self, timeout_s: float = 1.0) -> None:
-        """Call the environment's ``close``, if it has one, within about this time.
-
-        An environment that is still in a call after that is abandoned. May be repeated.
-        """
-
-    @abc.abstractmethod
-    def _call(self, step: int, kind: str, function: Callable[[], EnvironmentEvent]) -> None:
-        """Call the environment, and deliver the event."""
-
-
 class InlineRunner(EnvironmentRunner):
     """Calls a simulated world at once, in the caller's thread; KeyboardInterrupt passes through."""
 
     _passed_on = (KeyboardInterrupt,)
-
-    @property
-    def environment(self) -> Environment | None:
-        """The environment, once the trial has begun."""
-        return self._checked.environment
 
     def close(self, timeout_s: float = 1.0) -> None:
         """Call the environment's ``close``, if it has one."""
         del timeout_s
         if not self._closed:
             self._closed = True
-            self._checked.close()
+            self._close_environment()
 
-    def _call(self, step: int, kind: str, function: Callable[[], EnvironmentEvent]) -> None:
-        del kind
-        if self._closed:
-            return
-        if self._failed is not None:
-            self._deliver(_again(self._failed, step))
-            return
-        event = function()
-        if isinstance(event, EnvironmentFailed):
-            self._failed = event
-        self._deliver(event)
-
-
-def _again(failed: EnvironmentFailed, step: int) -> EnvironmentFailed:
-    """Return the event of a call after a failure: it has not begun."""
-    return EnvironmentFailed(step, failed.what, failed.text, False)
-
-
-class _EnvironmentCall:
-    """A call for the worker thread."""
-
-    __slots__ = ("deadline", "function", "kind", "step")
-
-    def __init__(
-        self, step: int, kind: str, function: Callable[[], EnvironmentEvent], deadline: float
-    ) -> None:
-        self.step = step
-        self.kind = kind
-        self.function = function
-        self.deadline = deadline
+    def _call(self, call: _Call) -> None:
+        if not self._refused(call):
+            self._finish(self._event_of(call))
 
 
 class ThreadedRunner(EnvironmentRunner):
@@ -366,15 +313,14 @@ class ThreadedRunner(EnvironmentRunner):
         *,
         resumed: bool = False,
     ) -> None:
-        if not timeout_ms > 0.0:
-            raise InvalidValueError(f"environment.timeout_ms {timeout_ms}: must be above 0")
         super().__init__(make, problem, deliver, name, resumed=resumed)
         self._timeout_ms = timeout_ms
-        self._calls: SimpleQueue[_EnvironmentCall | None] = SimpleQueue()
+        self._calls: SimpleQueue[_Call | None] = SimpleQueue()
         # Guards the fields below, _failed and _closed. Events are delivered while it is held, so
         # that none comes after close, and no call leads to two.
         self._changed = threading.Condition()
-        self._current: _EnvironmentCall | None = None
+        self._current: _Call | None = None
+        self._deadline = 0.0
         self._watchdog_idles = False
         self._worker = threading.Thread(target=self._work, name="environment", daemon=True)
         self._watchdog = threading.Thread(
@@ -393,32 +339,28 @@ class ThreadedRunner(EnvironmentRunner):
         self._watchdog.join(timeout_s)
         self._worker.join(timeout_s)
 
-    def _call(self, step: int, kind: str, function: Callable[[], EnvironmentEvent]) -> None:
+    def _call(self, call: _Call) -> None:
         with self._changed:
-            if self._closed:
-                return
-            if self._failed is not None:
-                self._deliver(_again(self._failed, step))
+            if self._refused(call):
                 return
             if self._current is not None:
                 raise InvalidValueError(
-                    f"{self._name}: {kind} of step {step} while {self._current.kind} of step "
-                    f"{self._current.step} has not ended; one call at a time is allowed"
+                    f"{self._name}: {call.kind} of step {call.step} while {self._current.kind} of "
+                    f"step {self._current.step} has not ended; one call at a time is allowed"
                 )
-            call = _EnvironmentCall(step, kind, function, monotonic() + 1e-3 * self._timeout_ms)
-            self._current = call
+            self._current, self._deadline = call, monotonic() + 1e-3 * self._timeout_ms
             self._calls.put(call)
             if self._watchdog_idles:
                 self._changed.notify_all()
 
     def _work(self) -> None:
         while (call := self._calls.get()) is not None:
-            event = call.function()
+            event = self._event_of(call)
             with self._changed:
                 if self._current is call:
                     self._current = None
                     self._finish(event)
-        self._checked.close()
+        self._close_environment()
 
     def _watch(self) -> None:
         with self._changed:
@@ -431,22 +373,23 @@ class ThreadedRunner(EnvironmentRunner):
                     continue
                 # Most calls end long before, and the next round sees the later ones. So a call
                 # costs no switch to this thread.
-                wakes_at = call.deadline
+                wakes_at = self._deadline
                 self._changed.wait(max(0.0, wakes_at - monotonic()))
                 if self._closed or self._current is not call:
                     continue
                 now = monotonic()
                 if now - wakes_at > _SUSPENDED_S:
-                    call.deadline = now + min(now - wakes_at, 1e-3 * self._timeout_ms)
-                elif now >= call.deadline:
+                    self._deadline = now + min(now - wakes_at, 1e-3 * self._timeout_ms)
+                elif now >= self._deadline:
                     self._current = None
-                    begun = call.kind == "perform"
-                    self._finish(
-                        self._checked.stalled(call.step, self._timeout_ms, performance_begun=begun)
-                    )
+                    self._finish(self._stalled(call))
 
-    def _finish(self, event: EnvironmentEvent) -> None:
-        if isinstance(event, EnvironmentFailed):
-            self._failed = event
-        if not self._closed:
-            self._deliver(event)
+    def _stalled(self, call: _Call) -> EnvironmentFailed:
+        method = self._method
+        made = method == self._name
+        called = f"the constructor of {method}" if made else self._called(method)
+        return self._failure(
+            call,
+            f"{called} has not returned within {self._timeout_ms:g} ms, which is "
+            "environment.timeout_ms",
+        )
