@@ -22,9 +22,9 @@ def exits() -> queue.SimpleQueue[RecoveryExited]:
 
 
 @pytest.fixture
-def launcher(exits: queue.SimpleQueue[RecoveryExited]) -> Iterator[RecoveryLauncher]:
+def launcher() -> Iterator[RecoveryLauncher]:
     arguments = ["--listen", f"tcp/127.0.0.1:{free_port()}", "--until-stdin-closes"]
-    made = RecoveryLauncher(arguments, exits.put)
+    made = RecoveryLauncher(arguments)
     yield made
     made.close()
 
@@ -37,7 +37,7 @@ def pid_of(launcher: RecoveryLauncher) -> int:
 def test_a_killed_service_is_reported_with_its_number(
     launcher: RecoveryLauncher, exits: queue.SimpleQueue[RecoveryExited]
 ) -> None:
-    launcher.launch(3)
+    launcher.launch(3, exits.put)
     os.kill(pid_of(launcher), signal.SIGKILL)
     assert exits.get(timeout=PATIENCE_S) == (3, "was ended by SIGKILL")
 
@@ -45,9 +45,9 @@ def test_a_killed_service_is_reported_with_its_number(
 def test_a_service_that_is_replaced_or_closed_is_not_reported(
     launcher: RecoveryLauncher, exits: queue.SimpleQueue[RecoveryExited]
 ) -> None:
-    launcher.launch(1)
+    launcher.launch(1, exits.put)
     first = pid_of(launcher)
-    launcher.launch(2)
+    launcher.launch(2, exits.put)
     assert pid_of(launcher) != first
     with pytest.raises(ProcessLookupError):
         os.kill(first, 0)
@@ -60,8 +60,8 @@ def test_one_that_refuses_its_options_says_why_in_its_log(
     tmp_path: Path, exits: queue.SimpleQueue[RecoveryExited]
 ) -> None:
     log = tmp_path / "recovery.log"
-    launcher = RecoveryLauncher(["--no-such-option"], exits.put, log)
-    launcher.launch(1)
+    launcher = RecoveryLauncher(["--no-such-option"], log)
+    launcher.launch(1, exits.put)
     assert exits.get(timeout=PATIENCE_S) == (1, f"ended with exit code 2; see {log}")
     assert "--no-such-option" in log.read_text()
     launcher.close()
@@ -70,6 +70,6 @@ def test_one_that_refuses_its_options_says_why_in_its_log(
 def test_a_log_that_cannot_be_written_is_the_reason(
     tmp_path: Path, exits: queue.SimpleQueue[RecoveryExited]
 ) -> None:
-    launcher = RecoveryLauncher([], exits.put, tmp_path / "missing" / "recovery.log")
-    launcher.launch(7)
+    launcher = RecoveryLauncher([], tmp_path / "missing" / "recovery.log")
+    launcher.launch(7, exits.put)
     assert exits.get(timeout=PATIENCE_S) == (7, "cannot be started: No such file or directory")

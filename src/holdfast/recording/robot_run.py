@@ -108,8 +108,7 @@ def perform_trials(
         )
         if observer is not None:
             observer.process(robot)
-        launcher = None if links.launcher is None else links.launcher(robot.deliver)
-        robot.run(directory.journal.finished(), launcher)
+        robot.run(directory.journal.finished())
         return robot.missed_ticks
 
 

@@ -13,7 +13,7 @@ import re
 import socket
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from holdfast.config.loader import Configuration
 from holdfast.config.settings import OffloadSettings, PlanningSettings
@@ -21,9 +21,12 @@ from holdfast.errors import TransportError
 from holdfast.planning import Planner
 from holdfast.problems.problem import Problem
 from holdfast.robot.memo_cache import MemoCache, MemoizingPlanner
-from holdfast.robot.recovery_launcher import RecoveryExited, RecoveryLauncher
+from holdfast.robot.recovery_launcher import RecoveryLauncher
 from holdfast.runtime.events import EventSink
 from holdfast.transport.contract import RobotTransport
+
+if TYPE_CHECKING:
+    from holdfast.transport.endpoints import TlsFiles
 
 __all__ = ["RECOVERY_SERVICE", "Links", "check_services", "make_links"]
 
@@ -38,14 +41,8 @@ class Links(NamedTuple):
     ----------
     transport : RobotTransport or None
         Not started yet; None for a robot without services, which decides itself.
-    services : tuple of str
-        In order of preference.
-    recovery : str or None
-        The local service; None if there is none.
-    launcher : callable or None
-        Makes its launcher, given the callback for its end.
-    offload : OffloadSettings
-        For the dispatcher.
+    launcher : RecoveryLauncher or None
+        Of the local service; None if there is none.
     close : callable
         Releases resources, after the transport is closed.
     make_planner : callable
@@ -53,11 +50,8 @@ class Links(NamedTuple):
     """
 
     transport: RobotTransport | None
-    services: tuple[str, ...]
-    recovery: str | None
-    launcher: Callable[[Callable[[RecoveryExited], None]], RecoveryLauncher] | None
-    offload: OffloadSettings
-    close: Callable[[], None]
+    launcher: RecoveryLauncher | None = None
+    close: Callable[[], None] = lambda: None
     make_planner: Callable[[Problem, PlanningSettings], Planner] = Planner
 
 
@@ -113,48 +107,18 @@ def make_links(configuration: Configuration, log_path: Path | None, events: Even
     offload = configuration.offload
     if not offload.services:
         # The robot and its own planner come to the same states.
-        make_planner = functools.partial(MemoizingPlanner, cache=MemoCache())
-        return Links(None, (), None, None, offload, _nothing, make_planner)
-    return _streams(configuration, log_path, events)
-
-
-def _streams(configuration: Configuration, log_path: Path | None, events: EventSink) -> Links:
+        return Links(None, make_planner=functools.partial(MemoizingPlanner, cache=MemoCache()))
     # Only a robot that has services needs these.
-    from holdfast.transport.credentials import load_credentials
-    from holdfast.transport.endpoints import (
-        ServiceAddress,
-        check_credentials,
-        check_name,
-        parse_endpoint,
-    )
+    from holdfast.transport.endpoints import ServiceAddress, parse_endpoint
     from holdfast.transport.private_socket import PrivateSocket
     from holdfast.transport.robot_end import StreamRobotTransport
-
-    offload = configuration.offload
-    if offload.name is not None:
-        check_name("offload.name", offload.name)
 
     def tell_credentials(reason: str) -> None:
         events.event("credentials", reason=reason)
 
-    tls = None
-    name = offload.name or _machine_name()
-    if offload.tls is not None:
-        own = load_credentials(Path(offload.tls), "robot", warn=tell_credentials)
-        tls = own.files
-        name = offload.name or ""
-        with contextlib.suppress(TransportError):  # what another program made may have any name
-            check_name("", own.name)
-            name = name or own.name
-        if name not in ("", own.name):
-            raise TransportError(
-                f"offload.name {name!r}: the certificate in {offload.tls} is {own.name}'s; copy "
-                f"that robot's own credentials here ('holdfast keys DIR --robot {name}' makes "
-                "them), or leave the key out"
-            )
+    name, tls = _identity(offload, tell_credentials)
     for service in offload.services:
         endpoint = parse_endpoint(service)
-        check_credentials(endpoint, tls)
         if not endpoint.is_encrypted and not endpoint.is_loopback:
             events.event(
                 "insecure",
@@ -167,29 +131,21 @@ def _streams(configuration: Configuration, log_path: Path | None, events: EventS
                 ),
             )
     addresses = {service: ServiceAddress(service) for service in offload.services}
-    recovery = None
-    launcher = None
-    close: Callable[[], None] = _nothing
-    if configuration.recovery.launch != "never":
-        recovery = RECOVERY_SERVICE
-        local = PrivateSocket()
-        close = local.remove
-        addresses[recovery] = ServiceAddress(local.endpoint, listens=True, name=recovery)
-        arguments = [
-            "--name",
-            recovery,
-            "--connect",
-            local.endpoint,
-            "--lease-ms",
-            f"{offload.lease_ms:g}",
-            "--until-stdin-closes",
-            *_problem_arguments(configuration),
-        ]
-
-        def launcher(deliver: Callable[[RecoveryExited], None]) -> RecoveryLauncher:
-            return RecoveryLauncher(arguments, deliver, log_path)
-
-    try:
+    with contextlib.ExitStack() as stack:
+        launcher = None
+        if configuration.recovery.launch != "never":
+            local = PrivateSocket()
+            stack.callback(local.remove)
+            addresses[RECOVERY_SERVICE] = ServiceAddress(
+                local.endpoint, listens=True, name=RECOVERY_SERVICE
+            )
+            arguments = ["--name", RECOVERY_SERVICE, "--connect", local.endpoint]
+            arguments += ["--lease-ms", f"{offload.lease_ms:g}", "--until-stdin-closes"]
+            if ":" in configuration.problem_name:
+                arguments += ["--problem", configuration.problem_name]
+                if configuration.problem_directory is not None:
+                    arguments += ["--problem-directory", str(configuration.problem_directory)]
+            launcher = RecoveryLauncher(arguments, log_path)
         transport = StreamRobotTransport(
             addresses,
             name=name,
@@ -206,26 +162,29 @@ def _streams(configuration: Configuration, log_path: Path | None, events: EventS
             ),
             on_unusable=tell_credentials,
         )
-    except BaseException:
-        close()
-        raise
-    return Links(transport, offload.services, recovery, launcher, offload, close)
+        return Links(transport, launcher, stack.pop_all().close)
 
 
-def _problem_arguments(configuration: Configuration) -> list[str]:
-    """Return what lets the local service build a problem that is not registered."""
-    if ":" not in configuration.problem_name:
-        return []
-    arguments = ["--problem", configuration.problem_name]
-    if configuration.problem_directory is not None:
-        arguments += ["--problem-directory", str(configuration.problem_directory)]
-    return arguments
+def _identity(offload: OffloadSettings, warn: Callable[[str], None]) -> tuple[str, TlsFiles | None]:
+    """Return the robot's name for its services, and its credentials."""
+    from holdfast.transport.credentials import load_credentials
+    from holdfast.transport.endpoints import check_name
 
-
-def _machine_name() -> str:
-    """Return the name of this machine in the characters that services accept."""
-    return re.sub(r"[^A-Za-z0-9_.-]", "-", socket.gethostname()).lstrip("_.-")[:100]
-
-
-def _nothing() -> None:
-    pass
+    if offload.name is not None:
+        check_name("offload.name", offload.name)
+    if offload.tls is None:
+        # The name of this machine in the characters that services accept.
+        machine = re.sub(r"[^A-Za-z0-9_.-]", "-", socket.gethostname()).lstrip("_.-")[:100]
+        return offload.name or machine, None
+    own = load_credentials(Path(offload.tls), "robot", warn=warn)
+    name = offload.name or ""
+    with contextlib.suppress(TransportError):  # what another program made may have any name
+        check_name("", own.name)
+        name = name or own.name
+    if name not in ("", own.name):
+        raise TransportError(
+            f"offload.name {name!r}: the certificate in {offload.tls} is {own.name}'s; copy "
+            f"that robot's own credentials here ('holdfast keys DIR --robot {name}' makes "
+            "them), or leave the key out"
+        )
+    return name, own.files

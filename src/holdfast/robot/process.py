@@ -18,7 +18,7 @@ import sys
 from collections import deque
 from collections.abc import Callable, Collection, Iterator
 from time import monotonic
-from typing import Any, NamedTuple, Protocol, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 from holdfast.config.loader import Configuration
 from holdfast.config.user_code import account_of_user_error, describe_problem_error
@@ -60,13 +60,13 @@ from holdfast.robot.environment import EnvironmentMaker
 from holdfast.robot.environment_runner import EnvironmentRunner, make_runner
 from holdfast.robot.health import Condition, RobotWatch
 from holdfast.robot.in_process_planner import InProcessPlanner
-from holdfast.robot.links import Links
+from holdfast.robot.links import RECOVERY_SERVICE, Links
 from holdfast.robot.recovery_launcher import RecoveryExited
 from holdfast.robot.session_configuration import session_configuration_of
 from holdfast.robot.step_journal import StepJournal
 from holdfast.runtime.events import EventSink
 
-__all__ = ["Launcher", "RobotProcess"]
+__all__ = ["RobotProcess"]
 
 _LAST_VERIFICATION_S = 10.0
 """Longest wait for unfinished verifications once all trials are finished."""
@@ -82,18 +82,6 @@ _TURN_WITHOUT_WIRE_S = 0.02
 
 _SWITCH_INTERVAL_S = 0.0005
 """Longest time that a thread holds the interpreter while another one waits for it."""
-
-
-class Launcher(Protocol):
-    """Starts the local service."""
-
-    def launch(self, number: int) -> None:
-        """Start it, and end an earlier one."""
-        ...
-
-    def close(self) -> None:
-        """End it."""
-        ...
 
 
 class _Interrupted(NamedTuple):
@@ -165,7 +153,7 @@ class RobotProcess:
         self._listens_since = self._now
         self._timer: asyncio.TimerHandle | None = None
         self._error: BaseException | None = None
-        self._launcher: Launcher | None = None
+        self._launcher = links.launcher
         self._runner: EnvironmentRunner | None = None
         self._replayed: int | None = None
         self._starting: tuple[int, TrialHistory, bool] | None = None
@@ -183,9 +171,9 @@ class RobotProcess:
             dispatcher = InProcessSource()
         else:
             dispatcher = Dispatcher(
-                links.services,
-                links.recovery,
-                links.offload,
+                configuration.offload.services,
+                None if links.launcher is None else RECOVERY_SERVICE,
+                configuration.offload,
                 configuration.recovery,
                 journal.session(),
                 epoch,
@@ -260,7 +248,7 @@ class RobotProcess:
             with contextlib.suppress(RuntimeError):
                 self._loop.call_soon_threadsafe(self._go_on)
 
-    def run(self, finished: Collection[int], launcher: Launcher | None = None) -> None:
+    def run(self, finished: Collection[int]) -> None:
         """Run all trials that are not finished, on a new event loop.
 
         Raises
@@ -272,7 +260,6 @@ class RobotProcess:
             handler of that signal raises. Other threads than the main one use :meth:`pause`.
         """
         self._finished = set(finished)
-        self._launcher = launcher
         self._loop = loop = asyncio.new_event_loop()
         loop.set_exception_handler(self._loop_failed)
         before = sys.getswitchinterval()
@@ -308,8 +295,8 @@ class RobotProcess:
                 loop.run_until_complete(self._transport.close())
             self._in_process.close()
             self._verifier.close()
-            if launcher is not None:
-                launcher.close()
+            if self._launcher is not None:
+                self._launcher.close()
             loop.close()
         if self._interrupted is not None and self._interrupted.number is not None:
             signal.raise_signal(self._interrupted.number)
@@ -506,7 +493,8 @@ class RobotProcess:
             elif isinstance(effect, LogEvent):
                 self._events.event(effect.name, **effect.fields)
             elif isinstance(effect, Launch):
-                self._launch(effect)
+                assert self._launcher is not None
+                self._launcher.launch(effect.number, self.deliver)
             elif isinstance(effect, EndTrial):
                 self._end_trial(effect.result)
             elif isinstance(effect, Paused):
@@ -518,12 +506,6 @@ class RobotProcess:
     def _report_order(self, order: Act | Sense) -> None:
         if self._on_order is not None and (state := self._robot.state) is not None:
             self._on_order(state, order)
-
-    def _launch(self, effect: Launch) -> None:
-        if self._launcher is None:
-            self._happens(RecoveryExited(effect.number, "there is none to be launched"))
-        else:
-            self._launcher.launch(effect.number)
 
     def _end_trial(self, result: TrialResult) -> None:
         if self._runner is not None:

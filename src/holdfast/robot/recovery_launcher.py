@@ -36,25 +36,22 @@ class RecoveryExited(NamedTuple):
 class RecoveryLauncher:
     """Starts the local service, watches it, and ends it.
 
-    ``deliver`` is called from a thread when a process ends other than by :meth:`launch` or
-    :meth:`close`; the file at ``log_path`` gets what the service writes.
+    The file at ``log_path`` gets what the service writes.
     """
 
-    def __init__(
-        self,
-        arguments: Sequence[str],
-        deliver: Callable[[RecoveryExited], None],
-        log_path: Path | None = None,
-    ) -> None:
+    def __init__(self, arguments: Sequence[str], log_path: Path | None = None) -> None:
         # -P: files in the current directory must not shadow modules.
         self._command = [sys.executable, "-P", "-m", "holdfast", "serve", *arguments]
-        self._deliver = deliver
         self._log_path = log_path
         self._process: subprocess.Popen[bytes] | None = None
         self._lock = threading.Lock()
 
-    def launch(self, number: int) -> None:
-        """Start a process, and end the one before; whatever goes wrong is delivered."""
+    def launch(self, number: int, deliver: Callable[[RecoveryExited], None]) -> None:
+        """Start a process, and end the one before.
+
+        ``deliver`` is called, from a thread, if the process ends other than by :meth:`launch` or
+        :meth:`close`; at once if it cannot be started.
+        """
         self.close()
         try:
             with self._output() as output:
@@ -67,13 +64,16 @@ class RecoveryLauncher:
                     start_new_session=True,
                 )
         except OSError as error:
-            self._deliver(RecoveryExited(number, f"cannot be started: {error.strerror}"))
+            deliver(RecoveryExited(number, f"cannot be started: {error.strerror}"))
             return
         self._process = process
         if process.stdin is not None:
             _close_in_forked_children(process.stdin)
         threading.Thread(
-            target=self._watch, args=(process, number), name="holdfast-recovery", daemon=True
+            target=self._watch,
+            args=(process, number, deliver),
+            name="holdfast-recovery",
+            daemon=True,
         ).start()
 
     def close(self) -> None:
@@ -89,7 +89,12 @@ class RecoveryLauncher:
             with contextlib.suppress(OSError):
                 process.stdin.close()
 
-    def _watch(self, process: subprocess.Popen[bytes], number: int) -> None:
+    def _watch(
+        self,
+        process: subprocess.Popen[bytes],
+        number: int,
+        deliver: Callable[[RecoveryExited], None],
+    ) -> None:
         code = process.wait()
         with self._lock:
             if self._process is not process:
@@ -100,7 +105,7 @@ class RecoveryLauncher:
             reason = f"ended with exit code {code}"
             if self._log_path is not None:
                 reason += f"; see {self._log_path}"
-        self._deliver(RecoveryExited(number, reason))
+        deliver(RecoveryExited(number, reason))
 
     def _output(self) -> contextlib.AbstractContextManager[IO[bytes] | int]:
         if self._log_path is None:
