@@ -189,7 +189,8 @@ class RobotProcess:
         self._verifier = AnswerChecker(
             lambda: Planner(another_problem(), configuration.planning),
             functools.partial(describe_problem_error, configuration.problem_name),
-            self.deliver,
+            self._happens,
+            self._fail,
         )
         self._in_process = InProcessPlanner(
             lambda: links.make_planner(another_problem(), configuration.planning),
@@ -226,7 +227,7 @@ class RobotProcess:
             return Condition("starting", False, robot.trial)
         return Condition(robot.status.value, True, robot.trial)
 
-    def deliver(self, event: EnvironmentEvent | OwnAnswer | RecoveryExited) -> None:
+    def deliver(self, event: EnvironmentEvent | RecoveryExited) -> None:
         """Take an event from any thread; after the run's end it is dropped."""
         if self._loop is not None:
             with contextlib.suppress(RuntimeError):

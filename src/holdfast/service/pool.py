@@ -47,6 +47,7 @@ class ThreadPool:
         self._failed = failed
         self._queue: SimpleQueue[_Task | None] = SimpleQueue()
         self._threads: list[threading.Thread] = []
+        self._closed = False
         self.num_open = 0
 
     def submit(self, function: Callable[[], _Result], done: Callable[[_Result], None]) -> None:
@@ -60,10 +61,13 @@ class ThreadPool:
             thread.start()
         self._queue.put((loop, function, done))
 
-    def close(self) -> None:
-        """End the threads, without waiting for a computation."""
+    def close(self, timeout_s: float = 0.0) -> None:
+        """End the threads, and deliver no more; wait so long for the computations that run."""
+        self._closed = True
         for _ in self._threads:
             self._queue.put(None)
+        for each in self._threads:
+            each.join(timeout_s)
 
     def _work(self) -> None:
         while (task := self._queue.get()) is not None:
@@ -81,7 +85,8 @@ class ThreadPool:
 
     def _deliver(self, done: Callable[[Any], None], result: object) -> None:
         self.num_open -= 1
-        done(result)
+        if not self._closed:
+            done(result)
 
 
 def _nothing() -> None:
