@@ -31,7 +31,7 @@ async def serving(host: str = "127.0.0.1", port: int = 0) -> AsyncIterator[HttpA
     try:
         yield await server.start()
     finally:
-        server.close()
+        await server.close()
 
 
 async def exchange(address: HttpAddress, request: bytes) -> bytes:

@@ -70,8 +70,8 @@ class RobotWatch:
                 return Page(200 if now.is_deciding else 503, f"{now.word}\n".encode())
 
             self._watched = MonitoringServers()
-            self._watched.add("health", self._health, {"/livez": alive, "/readyz": ready})
-            self._events.event("offers", **await self._watched.start())
+            offered = {"health": (self._health, {"/livez": alive, "/readyz": ready})}
+            self._events.event("offers", **await self._watched.start(offered))
         self._manager.watch(asyncio.get_running_loop(), lambda: str(condition()))
 
     def begun(self) -> None:
@@ -89,5 +89,4 @@ class RobotWatch:
         self._manager.stopping()
         self._manager.close()
         if self._watched is not None:
-            self._watched.close()
-            await asyncio.sleep(0)  # the loop lets go of the connections
+            await self._watched.close()

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
     from holdfast.service.credentials import ServiceCredentials
     from holdfast.service.extensions import Extension, MakeExtensions
+    from holdfast.service.health import HttpAddress, Pages
     from holdfast.service.metrics import ServiceReport
     from holdfast.service.shell import ServiceShell
     from holdfast.service.supervisor import Supervised
@@ -370,9 +371,9 @@ async def _watched(
     async def ready() -> Page:
         return Page.of(why_not_ready())
 
-    watched = MonitoringServers()
+    offered: dict[str, tuple[HttpAddress, Pages]] = {}
     if options.health is not None:
-        watched.add("health", options.health, {"/livez": alive, "/readyz": ready})
+        offered["health"] = options.health, {"/livez": alive, "/readyz": ready}
     if options.metrics is not None:
         from holdfast.service.metrics import CONTENT_TYPE, Exposition
 
@@ -383,11 +384,12 @@ async def _watched(
                 200, exposition.text(await report(), is_ready=why_not_ready() is None), CONTENT_TYPE
             )
 
-        watched.add("metrics", options.metrics, {"/metrics": metrics})
+        offered["metrics"] = options.metrics, {"/metrics": metrics}
+    watched = MonitoringServers()
     try:
-        yield await watched.start()
+        yield await watched.start(offered)
     finally:
-        watched.close()
+        await watched.close()
 
 
 def _import_without_openssl() -> None:

@@ -169,9 +169,8 @@ class ServiceShell:
 
     def note(self, event: str, /, **fields: object) -> None:
         """Log an event, with a limited rate for each kind."""
-        admitted = self._rates.admit(event, event, fields, self._loop.time())
-        if admitted is not None:
-            admitted.report_to(self._events)
+        for name, told in self._rates.admit(event, event, fields, self._loop.time()):
+            self._events.event(name, **told)
         self._set_timer()
 
     def statistics(self) -> ServiceStatistics:
@@ -283,8 +282,8 @@ class ServiceShell:
         """Advance the machine's clock, and log dropped events that are due."""
         self._timer = None
         now = self._loop.time()
-        for event in self._rates.due(now):
-            event.report_to(self._events)
+        for name, told in self._rates.due(now):
+            self._events.event(name, **told)
         self._carry_out(self._service.tick(now))
 
     # -- effects ---------------------------------------------------------------------------------
