@@ -82,7 +82,7 @@ def _serve_with_several(options: ServeOptions) -> int:
     from holdfast.runtime.logs import EventLog
     from holdfast.runtime.service_manager import ServiceManager
     from holdfast.service.listening import SharedEndpoints
-    from holdfast.service.supervisor import Supervisor, supervise
+    from holdfast.service.supervisor import Supervisor
 
     manager = ServiceManager()
     workers = options.workers or max(1, len(os.sched_getaffinity(0)) // options.processes)
@@ -103,17 +103,16 @@ def _serve_with_several(options: ServeOptions) -> int:
             supervisor.process_ids,
         ) as watched:
             where = {"listen": endpoints, "processes": options.processes, **watched}
-            return await supervise(
-                supervisor,
-                events,
+            number = await supervisor.run(
                 options.ending_signals,
                 options.drain_s + 2 * _CLOSE_TIMEOUT_S,
                 lambda: _say_ready(options, where),
                 manager,
             )
+            return _exit_status(number.name)
 
     try:
-        return _exit_status(signal.Signals(asyncio.run(run())).name)
+        return asyncio.run(run())
     finally:
         shared.close()
         events.close()

@@ -37,7 +37,7 @@ from holdfast.protocol.service_jobs import (
     StartJob,
 )
 from holdfast.protocol.service_limits import ServiceStatistics
-from holdfast.runtime.events import EventRates, EventSink, NullEventLog
+from holdfast.runtime.events import EventRates, EventSink
 from holdfast.service.pool import ThreadPool
 from holdfast.transport.contract import IncomingCall, ServiceTransport
 
@@ -52,7 +52,7 @@ _LARGE_BYTES = 64 << 10
 """Requests that are larger are decoded on a thread."""
 
 _MAX_UNDECODED = 4096
-"""Large requests that wait to be decoded."""
+"""Large requests that wait to be decoded; further ones are rejected unread."""
 
 _MAX_UNDECODED_BYTES = 128 << 20
 """Of these requests: two of the largest. One request is always admitted; when other robots have
@@ -71,8 +71,6 @@ class ServiceShell:
         Not started yet.
     on_decision : callable or None
         Called with the kind, computing time and waiting time of each decision.
-    max_undecoded, max_undecoded_bytes : int
-        Bounds on large requests that wait to be decoded; further ones are rejected unread.
 
     Attributes
     ----------
@@ -85,20 +83,15 @@ class ServiceShell:
         service: Service,
         transport: ServiceTransport,
         workers: int,
-        events: EventSink | None = None,
+        events: EventSink,
         on_decision: DecisionHook | None = None,
-        *,
-        max_undecoded: int = _MAX_UNDECODED,
-        max_undecoded_bytes: int = _MAX_UNDECODED_BYTES,
     ) -> None:
         self._service = service
         self._transport = transport
         self._jobs = ThreadPool(workers, "holdfast-worker", self._broke)
         self._decoder = ThreadPool(1, "holdfast-decoder", self._broke)
-        self._events = events or NullEventLog()
+        self._events = events
         self._on_decision = on_decision
-        self._max_undecoded = max_undecoded
-        self._max_undecoded_bytes = max_undecoded_bytes
         self._calls: dict[int, IncomingCall] = {}
         self._numbers = itertools.count(1)
         self._undecoded = 0
@@ -213,7 +206,7 @@ class ServiceShell:
         size = len(payload)
         if size <= _LARGE_BYTES:
             self._decoded(call, size, _decode(payload))
-        elif self._undecoded >= self._max_undecoded or self._takes_too_much(call.robot, size):
+        elif self._undecoded >= _MAX_UNDECODED or self._takes_too_much(call.robot, size):
             self._reject_unread(call)
         else:
             self._undecoded += 1
@@ -226,8 +219,8 @@ class ServiceShell:
         """Return whether a large request exceeds the bound on bytes."""
         wanted_bytes = self._undecoded_bytes + size
         if self._undecoded_of[robot]:
-            return wanted_bytes > self._max_undecoded_bytes
-        return self._undecoded > 0 and wanted_bytes > 2 * self._max_undecoded_bytes
+            return wanted_bytes > _MAX_UNDECODED_BYTES
+        return self._undecoded > 0 and wanted_bytes > 2 * _MAX_UNDECODED_BYTES
 
     def _reject_unread(self, call: IncomingCall) -> None:
         self._unread += 1
