@@ -47,7 +47,6 @@ from holdfast.robot.probe import (
     certificate_at,
     in_thread,
     interface_of,
-    waited_for,
 )
 from holdfast.robot.reference_decisions import ReferenceDecisions, ReferenceTurn
 from holdfast.transport.contract import DEFAULT_MAX_MESSAGE_BYTES
@@ -296,7 +295,7 @@ class _Examination:
             return []
         look_up = partial(socket.getaddrinfo, host, port, type=socket.SOCK_STREAM)
         try:
-            found = await waited_for(in_thread(look_up), _NAME_S)
+            found = await asyncio.wait_for(asyncio.wrap_future(in_thread(look_up)), _NAME_S)
         except (OSError, UnicodeError) as error:
             why = getattr(error, "strerror", None) or f"no answer within {_NAME_S:g} s"
             advice = "is it spelled right, and the name server reached? /etc/hosts may name it too"
@@ -446,11 +445,12 @@ class _Examination:
     async def _problem(self, path: AddressPath) -> _Seen | None:
         if path is not next((each for each in self._paths if each.is_greeted), path):
             return None
-        if self._robot.decisions is None:
+        decisions = self._robot.decisions
+        if decisions is None:
             seen = "not asked: with CONFIG, decisions are compared"
             return _Seen(seen, state=NOT_REACHED)
         try:
-            own = await waited_for(self._robot.decisions, _DECISION_S)
+            own = await asyncio.wait_for(asyncio.wrap_future(decisions), _DECISION_S)
         except TimeoutError:
             seen = f"not asked: two decisions take longer than {_DECISION_S:g} s here"
             return _Seen(seen, state=NOT_REACHED)

@@ -16,9 +16,9 @@ import os
 import signal
 import sys
 from collections import deque
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from time import monotonic
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, Protocol, TypeAlias
 
 from holdfast.config.loader import Configuration
 from holdfast.config.user_code import account_of_user_error, describe_problem_error
@@ -51,7 +51,7 @@ from holdfast.protocol.events import (
     VerificationNoted,
     WriteRecords,
 )
-from holdfast.protocol.records import TrialHistory, replay
+from holdfast.protocol.records import Record, TrialHistory, replay
 from holdfast.protocol.robot import Robot
 from holdfast.protocol.status import Status
 from holdfast.robot.answer_check import AnswerChecker
@@ -63,10 +63,9 @@ from holdfast.robot.in_process_planner import InProcessPlanner
 from holdfast.robot.links import RECOVERY_SERVICE, Links
 from holdfast.robot.recovery_launcher import RecoveryExited
 from holdfast.robot.session_configuration import session_configuration_of
-from holdfast.robot.step_journal import StepJournal
 from holdfast.runtime.events import EventSink
 
-__all__ = ["RobotProcess"]
+__all__ = ["RobotProcess", "StepJournal"]
 
 _LAST_VERIFICATION_S = 10.0
 """Longest wait for unfinished verifications once all trials are finished."""
@@ -82,6 +81,37 @@ _TURN_WITHOUT_WIRE_S = 0.02
 
 _SWITCH_INTERVAL_S = 0.0005
 """Longest time that a thread holds the interpreter while another one waits for it."""
+
+
+class _TrialInProgress(Protocol):
+    """A trial that has not ended; complete if none of its records can be missing."""
+
+    @property
+    def trial(self) -> int: ...
+    @property
+    def records(self) -> Sequence[Record]: ...
+    @property
+    def is_complete(self) -> bool: ...
+
+
+class StepJournal(Protocol):
+    """What a robot needs of a journal: :class:`holdfast.recording.journal.Journal` has it."""
+
+    def session(self) -> bytes:
+        """Return the run's identifier, 16 bytes."""
+        ...
+
+    def raise_epoch(self) -> int:
+        """Return a number above all earlier ones, once it is on the disk."""
+        ...
+
+    def append(self, trial: int, records: Sequence[Record]) -> None:
+        """Write records of the unfinished trial; they are safe when this returns."""
+        ...
+
+    def unfinished(self) -> _TrialInProgress | None:
+        """Return the trial that has not ended, if there is one."""
+        ...
 
 
 class _Interrupted(NamedTuple):
@@ -406,14 +436,14 @@ class RobotProcess:
         self._error = self._error or error
         self._end()
 
+    def _raise_error(self) -> None:
+        if self._error is not None:
+            raise self._error
+
     def _abandon_call(self, within_s: float) -> None:
         self._fail(
             HeldError(f"{self._where()}: the environment has not ended its call in {within_s:g} s")
         )
-
-    def _raise_error(self) -> None:
-        if self._error is not None:
-            raise self._error
 
     def _end(self) -> None:
         self._ended = True
