@@ -23,16 +23,8 @@ __all__ = ["AnswerChecker"]
 class AnswerChecker:
     """Answers questions with a planner; all methods are called on the loop's thread.
 
-    Parameters
-    ----------
-    make_planner : callable
-        Called on the thread.
-    describe_error : callable
-        Returns what an error of the planner means, as a text.
-    deliver : callable
-        Takes the answers, on the loop's thread.
-    failed : callable
-        Takes an error of this code, on the loop's thread.
+    ``make_planner`` and ``describe_error``, which says what an error of the planner means, are
+    called on the other thread; ``deliver`` and ``failed`` on the loop's.
     """
 
     def __init__(

@@ -20,15 +20,10 @@ __all__ = ["Condition", "RobotWatch"]
 
 
 class Condition(NamedTuple):
-    """A robot's condition.
+    """A robot's condition: in a word, and the trial, None between two trials.
 
-    Attributes
-    ----------
-    word : str
-        The :class:`~holdfast.protocol.status.Status` while a service decides; else
-        ``starting``, ``holding still`` or ``ending``.
-    trial : int or None
-        None between two trials.
+    The word is the :class:`~holdfast.protocol.status.Status` while a service decides; else
+    ``starting``, ``holding still`` or ``ending``.
     """
 
     word: str

@@ -133,16 +133,13 @@ class RobotProcess:
     ----------
     links : Links
         Their transport is closed at the end. Without one the robot's own planner decides.
-    on_result : callable
-        Stores the result of each trial.
-    on_verified : callable
-        Gets the result of each verified answer.
+    on_result, on_timing, on_verified : callable
+        Store the result of each trial, the times of each decision, and the result of each verified
+        answer.
     rate_hz : float or None
         Task actions a second; None acts as soon as possible.
     distrusted : collection of str
         Services that answered wrongly earlier in the run.
-    watch : RobotWatch or None
-        Reports the robot's condition.
     on_order : callable
         Gets each order to the environment and the state in which it was decided, on the event loop;
         it must return at once.
@@ -266,13 +263,9 @@ class RobotProcess:
     def pause(self, within_s: float) -> None:
         """End the run in order, from any thread, before or while it runs; may be repeated.
 
-        :meth:`run` returns once the environment's call has ended and the journal is written.
-
-        Parameters
-        ----------
-        within_s : float
-            If that call takes longer, it is abandoned, and :meth:`run` raises a
-            :class:`~holdfast.errors.HeldError`. The run can be resumed in either case.
+        :meth:`run` returns once the environment's call has ended and the journal is written. If
+        that call takes longer than ``within_s``, it is abandoned, and :meth:`run` raises a
+        :class:`~holdfast.errors.HeldError`. The run can be resumed in either case.
         """
         self._happened.append((monotonic(), _Interrupted(None, within_s)))
         if self._loop is not None:
