@@ -74,12 +74,8 @@ def check_services(configuration: Configuration, source: str | None = "") -> Non
         return
     from holdfast.transport.endpoints import check_credentials, parse_endpoint
 
-    tls = None
-    if offload.tls is not None:
-        from holdfast.transport.credentials import load_credentials
-
-        # Warnings are reported when the run begins.
-        tls = load_credentials(Path(offload.tls), "robot", warn=lambda _: None).files
+    # Warnings are reported when the run begins.
+    _, tls = _identity(offload, lambda _: None)
     for index, service in enumerate(offload.services):
         try:
             endpoint = parse_endpoint(service)

@@ -26,15 +26,8 @@ class Extension(Protocol):
     def start(self, on_event: Callable[..., None]) -> Mapping[str, str]:
         """Start; return what is offered where, for the ready line.
 
-        Parameters
-        ----------
-        on_event : callable
-            Logs an event, ``on_event(name, **fields)``, from any thread.
-
-        Raises
-        ------
-        HoldfastError
-            If it cannot start; then it has released everything.
+        ``on_event(name, **fields)`` logs an event, from any thread. A start that raises a
+        HoldfastError has released everything.
         """
         ...
 

@@ -21,14 +21,8 @@ _Task: TypeAlias = tuple[asyncio.AbstractEventLoop, Callable[[], Any], Callable[
 class ThreadPool:
     """Runs functions on threads, and hands their results to an event loop.
 
-    Its methods are called on the loop's thread.
-
-    Parameters
-    ----------
-    num_threads : int
-        At most; they start when needed.
-    failed : callable
-        Called on the loop with an exception of a function.
+    Its methods are called on the loop's thread, and ``failed``, too, with an exception of a
+    function. Threads start when they are needed.
 
     Attributes
     ----------
@@ -37,10 +31,7 @@ class ThreadPool:
     """
 
     def __init__(
-        self,
-        num_threads: int,
-        name: str,
-        failed: Callable[[BaseException], None],
+        self, num_threads: int, name: str, failed: Callable[[BaseException], None]
     ) -> None:
         self._num_threads = num_threads
         self._name = name

@@ -71,11 +71,6 @@ class ServiceShell:
         Not started yet.
     on_decision : callable or None
         Called with the kind, computing time and waiting time of each decision.
-
-    Attributes
-    ----------
-    is_draining : bool
-        Whether new robots are rejected because the service is about to end.
     """
 
     def __init__(
@@ -103,6 +98,7 @@ class ServiceShell:
         self._timer: asyncio.TimerHandle | None = None
         self._idle: asyncio.Future[None] | None = None
         self._closed = False
+        # Whether new robots are rejected because the service is about to end.
         self.is_draining = False
 
     async def start(self) -> None:

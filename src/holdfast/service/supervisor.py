@@ -160,14 +160,8 @@ class _Child:
 class Supervisor:
     """Starts a service's processes, watches them, restarts those that die, and ends them.
 
-    Belongs to the event loop that runs when it is made.
-
-    Parameters
-    ----------
-    arguments : sequence of str
-        Of ``holdfast serve``, for every process.
-    listening : SharedEndpoints
-        Closed when the processes are to end.
+    Belongs to the event loop that runs when it is made. Each process is given the ``arguments`` of
+    ``holdfast serve``; ``listening`` is closed when the processes are to end.
     """
 
     def __init__(
@@ -202,19 +196,14 @@ class Supervisor:
     ) -> signal.Signals:
         """Run the processes until a signal ends them; return that signal.
 
-        Parameters
-        ----------
-        ending : iterable of signal.Signals
-            The signals that end the service. SIGHUP goes to the processes if it is not among them.
-        drain_s : float
-            Time for the processes to end in order. A second signal ends them at once.
-        ready : callable
-            Called once, when all processes serve.
+        They have ``drain_s`` to end in order; a second signal ends them at once. SIGHUP has them
+        read their credentials again unless it is one of the ``ending`` signals. ``ready`` is called
+        once, when all of them serve.
 
         Raises
         ------
         ServiceProcessError
-            If a process cannot serve.
+            If one of them cannot serve; the message says why.
         """
         loop = self._loop
         stopping: asyncio.Future[signal.Signals] = loop.create_future()
@@ -227,7 +216,11 @@ class Supervisor:
 
         def reload() -> None:
             manager.reloading()
-            self._reload()
+            for child in self._living():
+                if child.ready:
+                    child.process.send_signal(signal.SIGHUP)
+                else:
+                    child.reload = True  # it may have read the old credentials already
             if starting.done():
                 manager.ready()
 
@@ -254,13 +247,7 @@ class Supervisor:
             self._kill()
 
     async def _start_all(self) -> None:
-        """Start all processes; return when all of them serve.
-
-        Raises
-        ------
-        ServiceProcessError
-            If one has ended before; the message says why.
-        """
+        """Start all processes; return when all of them serve, raise if one has ended before."""
         for index in range(len(self._children)):
             self._start(index)
         await self._until(
@@ -273,14 +260,6 @@ class Supervisor:
         if self._failure is not None:
             raise ServiceProcessError(self._failure)
         self._has_served = True
-
-    def _reload(self) -> None:
-        """Have all processes read their credentials again."""
-        for child in self._living():
-            if child.ready:
-                child.process.send_signal(signal.SIGHUP)
-            else:
-                child.reload = True  # it may have read the old ones already
 
     def _kill(self) -> None:
         """End all processes now; may be repeated."""
