@@ -13,11 +13,11 @@ Results are checked against the environment's contract here, where the method's 
 from __future__ import annotations
 
 import abc
-import threading
+import asyncio
+import functools
 from collections.abc import Callable, Sequence
-from queue import SimpleQueue
 from time import monotonic
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -41,14 +41,16 @@ from holdfast.robot.environment import (
     ObservationSizes,
     as_done,
 )
+from holdfast.service.pool import ThreadPool
 
 __all__ = ["EnvironmentRunner", "InlineRunner", "ThreadedRunner", "make_runner"]
 
 
-Deliver = Callable[[EnvironmentEvent], None]
+Deliver: TypeAlias = Callable[[EnvironmentEvent, float], None]
+"""Takes an event and its time, in seconds; it must not block."""
 
 _SUSPENDED_S = 0.1
-"""A watchdog that wakes this much too late was in a stopped process, like what it watches."""
+"""If a timer fires this much too late, the process was stopped, and with it the environment."""
 
 
 def make_runner(
@@ -82,15 +84,14 @@ class _Call(NamedTuple):
 class EnvironmentRunner(abc.ABC):
     """Calls the environment of one trial, one call at a time.
 
-    Each call leads to one event: at once, or later from another thread. After a failure every
-    further call fails. After ``close`` no event comes.
+    Each call leads to one event: at once, or later on the event loop that runs. After a failure
+    every further call fails. After ``close`` no event comes. All methods are called on the loop's
+    thread.
 
     Parameters
     ----------
     make : callable
         Makes the environment.
-    deliver : callable
-        Takes the events; it must not block.
     name : str
         Of the environment, for messages.
     resumed : bool
@@ -114,8 +115,8 @@ class EnvironmentRunner(abc.ABC):
         self._name = name
         self._resumed = resumed
         self._sizes = ObservationSizes(problem)
-        # The watchdog reads the next three when a call takes too long: the environment, its current
-        # method, and the reward of the task action that the current call has performed.
+        # They are read when a call takes too long, too: the environment, its current method, and
+        # the reward of the task action that the current call has performed.
         self.environment: Environment | None = None
         self._method = name
         self._performed: tuple[float | None] | None = None
@@ -203,14 +204,14 @@ class EnvironmentRunner(abc.ABC):
         if self._closed:
             return True
         if self._failed is not None:
-            self._deliver(EnvironmentFailed(call.step, self._failed.what, self._failed.text, False))
+            again = EnvironmentFailed(call.step, self._failed.what, self._failed.text, False)
+            self._deliver(again, monotonic())
         return self._failed is not None
 
-    def _finish(self, event: EnvironmentEvent) -> None:
+    def _finish(self, event: EnvironmentEvent, at: float) -> None:
         if isinstance(event, EnvironmentFailed):
             self._failed = event
-        if not self._closed:
-            self._deliver(event)
+        self._deliver(event, at)
 
     def _close_environment(self) -> None:
         close = getattr(self.environment, "close", None)
@@ -287,14 +288,14 @@ class InlineRunner(EnvironmentRunner):
 
     def _call(self, call: _Call) -> None:
         if not self._refused(call):
-            self._finish(self._event_of(call))
+            self._finish(self._event_of(call), monotonic())
 
 
 class ThreadedRunner(EnvironmentRunner):
     """Calls an environment on its own thread, and gives up a call that takes too long.
 
     The environment is made, called and closed on one thread, and never called again after a call
-    was given up. Both threads are daemons: an environment that never returns does not keep the
+    was given up. The thread is a daemon: an environment that never returns does not keep the
     process alive.
 
     Parameters
@@ -315,81 +316,55 @@ class ThreadedRunner(EnvironmentRunner):
     ) -> None:
         super().__init__(make, problem, deliver, name, resumed=resumed)
         self._timeout_ms = timeout_ms
-        self._calls: SimpleQueue[_Call | None] = SimpleQueue()
-        # Guards the fields below, _failed and _closed. Events are delivered while it is held, so
-        # that none comes after close, and no call leads to two.
-        self._changed = threading.Condition()
+        self._thread = ThreadPool(1, "environment", _raise)
         self._current: _Call | None = None
-        self._deadline = 0.0
-        self._watchdog_idles = False
-        self._worker = threading.Thread(target=self._work, name="environment", daemon=True)
-        self._watchdog = threading.Thread(
-            target=self._watch, name="environment-watchdog", daemon=True
-        )
-        self._worker.start()
-        self._watchdog.start()
+        self._timer: asyncio.TimerHandle | None = None
 
     def close(self, timeout_s: float = 1.0) -> None:
         """Call the environment's ``close``, within about this time, unless it is in a call."""
-        with self._changed:
-            if not self._closed:
-                self._closed = True
-                self._calls.put(None)
-                self._changed.notify_all()
-        self._watchdog.join(timeout_s)
-        self._worker.join(timeout_s)
+        last = None if self._closed else self._close_environment
+        self._closed = True
+        if self._timer is not None:
+            self._timer.cancel()
+        self._thread.close(timeout_s, last)
 
     def _call(self, call: _Call) -> None:
-        with self._changed:
-            if self._refused(call):
-                return
-            if self._current is not None:
-                raise InvalidValueError(
-                    f"{self._name}: {call.kind} of step {call.step} while {self._current.kind} of "
-                    f"step {self._current.step} has not ended; one call at a time is allowed"
-                )
-            self._current, self._deadline = call, monotonic() + 1e-3 * self._timeout_ms
-            self._calls.put(call)
-            if self._watchdog_idles:
-                self._changed.notify_all()
+        if self._refused(call):
+            return
+        if self._current is not None:
+            raise InvalidValueError(
+                f"{self._name}: {call.kind} of step {call.step} while {self._current.kind} of "
+                f"step {self._current.step} has not ended; one call at a time is allowed"
+            )
+        self._current = call
+        self._thread.submit(
+            lambda: (self._event_of(call), monotonic()), functools.partial(self._returned, call)
+        )
+        self._watch(call, 1e-3 * self._timeout_ms)
 
-    def _work(self) -> None:
-        while (call := self._calls.get()) is not None:
-            event = self._event_of(call)
-            with self._changed:
-                if self._current is call:
-                    self._current = None
-                    self._finish(event)
-        self._close_environment()
+    def _returned(self, call: _Call, came: tuple[EnvironmentEvent, float]) -> None:
+        if self._current is call and self._timer is not None:  # else it was given up
+            self._current = None
+            self._timer.cancel()
+            self._finish(*came)
 
-    def _watch(self) -> None:
-        with self._changed:
-            while not self._closed:
-                call = self._current
-                if call is None:
-                    self._watchdog_idles = True
-                    self._changed.wait()
-                    self._watchdog_idles = False
-                    continue
-                # Most calls end long before, and the next round sees the later ones. So a call
-                # costs no switch to this thread.
-                wakes_at = self._deadline
-                self._changed.wait(max(0.0, wakes_at - monotonic()))
-                if self._closed or self._current is not call:
-                    continue
-                now = monotonic()
-                if now - wakes_at > _SUSPENDED_S:
-                    self._deadline = now + min(now - wakes_at, 1e-3 * self._timeout_ms)
-                elif now >= self._deadline:
-                    self._current = None
-                    self._finish(self._stalled(call))
+    def _watch(self, call: _Call, within_s: float) -> None:
+        self._timer = asyncio.get_running_loop().call_later(
+            within_s, self._overdue, call, monotonic() + within_s
+        )
 
-    def _stalled(self, call: _Call) -> EnvironmentFailed:
+    def _overdue(self, call: _Call, due_at: float) -> None:
+        now = monotonic()
+        if now - due_at > _SUSPENDED_S:
+            self._watch(call, min(now - due_at, 1e-3 * self._timeout_ms))
+            return
+        self._current = None
         method = self._method
         made = method == self._name
         called = f"the constructor of {method}" if made else self._called(method)
-        return self._failure(
-            call,
-            f"{called} has not returned within {self._timeout_ms:g} ms, which is "
-            "environment.timeout_ms",
-        )
+        limit = f"{self._timeout_ms:g} ms, which is environment.timeout_ms"
+        self._finish(self._failure(call, f"{called} has not returned within {limit}"), now)
+
+
+def _raise(error: BaseException) -> None:
+    raise error

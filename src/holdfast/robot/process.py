@@ -254,7 +254,7 @@ class RobotProcess:
             return Condition("starting", False, robot.trial)
         return Condition(robot.status.value, True, robot.trial)
 
-    def deliver(self, event: EnvironmentEvent | RecoveryExited) -> None:
+    def deliver(self, event: RecoveryExited) -> None:
         """Take an event from any thread; after the run's end it is dropped."""
         if self._loop is not None:
             with contextlib.suppress(RuntimeError):
@@ -579,8 +579,7 @@ class RobotProcess:
         self._runner = make_runner(
             self._maker,
             trial,
-            # A simulated world answers at once, on this thread.
-            self._happens if self._maker.simulated else self.deliver,
+            self._happens,
             resumed=history.begun,
             performed=history.actions,
         )
