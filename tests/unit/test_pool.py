@@ -60,3 +60,17 @@ async def test_no_more_threads_than_allowed() -> None:
     await done
     assert names <= {"few-0", "few-1"}
     pool.close()
+
+
+async def test_after_the_end_nothing_is_delivered_and_the_last_function_runs() -> None:
+    pool = ThreadPool(1, "test")
+    gate = threading.Event()
+    delivered: list[object] = []
+    ran: list[str] = []
+    pool.submit(lambda: gate.wait() and ran.append("first"), delivered.append)
+    pool.close(last=lambda: ran.append("last"))
+    assert ran == []
+    gate.set()
+    pool.close(30.0)
+    await asyncio.sleep(0)
+    assert (ran, delivered) == (["first", "last"], [])

@@ -316,7 +316,7 @@ class ThreadedRunner(EnvironmentRunner):
     ) -> None:
         super().__init__(make, problem, deliver, name, resumed=resumed)
         self._timeout_ms = timeout_ms
-        self._thread = ThreadPool(1, "environment", _raise)
+        self._thread = ThreadPool(1, "environment")
         self._current: _Call | None = None
         self._timer: asyncio.TimerHandle | None = None
 
@@ -364,7 +364,3 @@ class ThreadedRunner(EnvironmentRunner):
         called = f"the constructor of {method}" if made else self._called(method)
         limit = f"{self._timeout_ms:g} ms, which is environment.timeout_ms"
         self._finish(self._failure(call, f"{called} has not returned within {limit}"), now)
-
-
-def _raise(error: BaseException) -> None:
-    raise error

@@ -254,12 +254,6 @@ class RobotProcess:
             return Condition("starting", False, robot.trial)
         return Condition(robot.status.value, True, robot.trial)
 
-    def deliver(self, event: RecoveryExited) -> None:
-        """Take an event from any thread; after the run's end it is dropped."""
-        if self._loop is not None:
-            with contextlib.suppress(RuntimeError):
-                self._loop.call_soon_threadsafe(self._happens, event, monotonic())
-
     def pause(self, within_s: float) -> None:
         """End the run in order, from any thread, before or while it runs; may be repeated.
 
@@ -518,7 +512,7 @@ class RobotProcess:
                 self._events.event(effect.name, **effect.fields)
             elif isinstance(effect, Launch):
                 assert self._launcher is not None
-                self._launcher.launch(effect.number, self.deliver)
+                self._launcher.launch(effect.number, self._happens)
             elif isinstance(effect, EndTrial):
                 self._end_trial(effect.result)
             elif isinstance(effect, Paused):

@@ -11,11 +11,12 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 import weakref
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import IO, NamedTuple
+
+from holdfast.service.pool import ThreadPool
 
 __all__ = ["RecoveryExited", "RecoveryLauncher"]
 
@@ -34,7 +35,7 @@ class RecoveryExited(NamedTuple):
 
 
 class RecoveryLauncher:
-    """Starts the local service, watches it, and ends it.
+    """Starts the local service, watches it, and ends it; all on the thread of an event loop.
 
     The file at ``log_path`` gets what the service writes.
     """
@@ -44,15 +45,15 @@ class RecoveryLauncher:
         self._command = [sys.executable, "-P", "-m", "holdfast", "serve", *arguments]
         self._log_path = log_path
         self._process: subprocess.Popen[bytes] | None = None
-        self._lock = threading.Lock()
+        self._waiting = ThreadPool(1, "holdfast-recovery")
 
     def launch(self, number: int, deliver: Callable[[RecoveryExited], None]) -> None:
         """Start a process, and end the one before.
 
-        ``deliver`` is called, from a thread, if the process ends other than by :meth:`launch` or
+        ``deliver`` is called, on the loop, if the process ends other than by :meth:`launch` or
         :meth:`close`; at once if it cannot be started.
         """
-        self.close()
+        self._end()
         try:
             with self._output() as output:
                 process = subprocess.Popen(
@@ -69,17 +70,20 @@ class RecoveryLauncher:
         self._process = process
         if process.stdin is not None:
             _close_in_forked_children(process.stdin)
-        threading.Thread(
-            target=self._watch,
-            args=(process, number, deliver),
-            name="holdfast-recovery",
-            daemon=True,
-        ).start()
+
+        def ended(code: int) -> None:
+            if self._process is process:
+                deliver(RecoveryExited(number, self._account_of(code)))
+
+        self._waiting.submit(process.wait, ended)
 
     def close(self) -> None:
-        """End the process, if there is one."""
-        with self._lock:
-            process, self._process = self._process, None
+        """End the process, if there is one. May be repeated."""
+        self._waiting.close()
+        self._end()
+
+    def _end(self) -> None:
+        process, self._process = self._process, None
         if process is None:
             return
         # It holds nothing that would have to be kept, and it may be stopped or stuck.
@@ -89,23 +93,11 @@ class RecoveryLauncher:
             with contextlib.suppress(OSError):
                 process.stdin.close()
 
-    def _watch(
-        self,
-        process: subprocess.Popen[bytes],
-        number: int,
-        deliver: Callable[[RecoveryExited], None],
-    ) -> None:
-        code = process.wait()
-        with self._lock:
-            if self._process is not process:
-                return
+    def _account_of(self, code: int) -> str:
         if code < 0:
-            reason = f"was ended by {signal.Signals(-code).name}"
-        else:
-            reason = f"ended with exit code {code}"
-            if self._log_path is not None:
-                reason += f"; see {self._log_path}"
-        deliver(RecoveryExited(number, reason))
+            return f"was ended by {signal.Signals(-code).name}"
+        log = "" if self._log_path is None else f"; see {self._log_path}"
+        return f"ended with exit code {code}{log}"
 
     def _output(self) -> contextlib.AbstractContextManager[IO[bytes] | int]:
         if self._log_path is None:

@@ -22,7 +22,7 @@ class ThreadPool:
     """Runs functions on threads, and hands their results to an event loop.
 
     Its methods are called on the loop's thread, and ``failed``, too, with an exception of a
-    function. Threads start when they are needed.
+    function; without it the loop's exception handler gets that. Threads start when they are needed.
 
     Attributes
     ----------
@@ -31,11 +31,14 @@ class ThreadPool:
     """
 
     def __init__(
-        self, num_threads: int, name: str, failed: Callable[[BaseException], None]
+        self,
+        num_threads: int,
+        name: str,
+        failed: Callable[[BaseException], None] | None = None,
     ) -> None:
         self._num_threads = num_threads
         self._name = name
-        self._failed = failed
+        self._failed = failed or _raise
         self._queue: SimpleQueue[_Task | None] = SimpleQueue()
         self._threads: list[threading.Thread] = []
         self._closed = False
@@ -84,6 +87,10 @@ class ThreadPool:
         self.num_open -= 1
         if not self._closed:
             done(result)
+
+
+def _raise(error: BaseException) -> None:
+    raise error
 
 
 def _dropped(result: object) -> None:
