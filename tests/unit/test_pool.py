@@ -67,7 +67,12 @@ async def test_after_the_end_nothing_is_delivered_and_the_last_function_runs() -
     gate = threading.Event()
     delivered: list[object] = []
     ran: list[str] = []
-    pool.submit(lambda: gate.wait() and ran.append("first"), delivered.append)
+
+    def first() -> None:
+        gate.wait()
+        ran.append("first")
+
+    pool.submit(first, delivered.append)
     pool.close(last=lambda: ran.append("last"))
     assert ran == []
     gate.set()

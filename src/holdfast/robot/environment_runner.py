@@ -86,16 +86,8 @@ class EnvironmentRunner(abc.ABC):
 
     Each call leads to one event: at once, or later on the event loop that runs. After a failure
     every further call fails. After ``close`` no event comes. All methods are called on the loop's
-    thread.
-
-    Parameters
-    ----------
-    make : callable
-        Makes the environment.
-    name : str
-        Of the environment, for messages.
-    resumed : bool
-        Whether the environment is asked how many task actions it has performed.
+    thread. If the trial is ``resumed``, the environment is asked how many task actions it has
+    performed.
     """
 
     _passed_on: tuple[type[BaseException], ...] = ()
@@ -296,12 +288,7 @@ class ThreadedRunner(EnvironmentRunner):
 
     The environment is made, called and closed on one thread, and never called again after a call
     was given up. The thread is a daemon: an environment that never returns does not keep the
-    process alive.
-
-    Parameters
-    ----------
-    timeout_ms : float
-        Longest time of a call. Time in which this whole process was stopped does not count.
+    process alive. Time in which this whole process was stopped is no time of a call.
     """
 
     def __init__(

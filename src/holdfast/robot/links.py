@@ -35,39 +35,26 @@ RECOVERY_SERVICE = "cloud_active_sensing_recovery"
 
 
 class Links(NamedTuple):
-    """A robot's links to services.
-
-    Attributes
-    ----------
-    transport : RobotTransport or None
-        Not started yet; None for a robot without services, which decides itself.
-    launcher : RecoveryLauncher or None
-        Of the local service; None if there is none.
-    close : callable
-        Releases resources, after the transport is closed.
-    make_planner : callable
-        Joins the robot's problem and settings to the functions that lead from state to state.
-    """
+    """A robot's links to services."""
 
     transport: RobotTransport | None
+    """Not started yet; None for a robot without services, which decides itself."""
     launcher: RecoveryLauncher | None = None
+    """Of the local service; None if there is none."""
     close: Callable[[], None] = lambda: None
+    """Releases resources, after the transport is closed."""
     make_planner: Callable[[Problem, PlanningSettings], Planner] = Planner
+    """Joins the robot's problem and settings to the functions that lead from state to state."""
 
 
 def check_services(configuration: Configuration, source: str | None = "") -> None:
     """Check what can be checked of the services before a run: endpoints and credentials.
 
-    Parameters
-    ----------
-    source : str or None
-        What stands before the key in a message; None leaves the key out, too, of services that
-        were not given by it.
-
     Raises
     ------
     HoldfastError
-        If one of them cannot be used; the message names its key.
+        If one of them cannot be used; the message names its key, after ``source``. None leaves the
+        key out, too, of services that were not given by it.
     """
     offload = configuration.offload
     if not offload.services:
@@ -95,10 +82,8 @@ def make_links(configuration: Configuration, log_path: Path | None, events: Even
 
     Raises
     ------
-    TransportError
-        If an endpoint is malformed, or does not go with the credentials.
     HoldfastError
-        If the credentials cannot be used.
+        If an endpoint or the credentials cannot be used.
     """
     offload = configuration.offload
     if not offload.services:

@@ -261,10 +261,7 @@ class RobotProcess:
         that call takes longer than ``within_s``, it is abandoned, and :meth:`run` raises a
         :class:`~holdfast.errors.HeldError`. The run can be resumed in either case.
         """
-        self._happened.append((monotonic(), _Interrupted(None, within_s)))
-        if self._loop is not None:
-            with contextlib.suppress(RuntimeError):
-                self._loop.call_soon_threadsafe(self._go_on)
+        self._interrupt(None, within_s)
 
     def run(self, finished: Collection[int]) -> None:
         """Run all trials that are not finished, on a new event loop.
@@ -285,7 +282,7 @@ class RobotProcess:
         try:
             if self._watch is not None:
                 loop.run_until_complete(self._watch.start(self.condition))
-            with ending_signals(loop, self._signalled):
+            with ending_signals(loop, self._interrupt):
                 loop.call_soon(self._start)
                 loop.run_forever()
                 self._raise_error()
@@ -333,10 +330,12 @@ class RobotProcess:
             return f"trial {self._starting[0]} (seed {seed})"
         return f"trial {self._robot.trial} (seed {seed}), step {self._robot.step}"
 
-    def _signalled(self, number: int) -> None:
-        self._happened.append((monotonic(), _Interrupted(number)))
+    def _interrupt(self, number: int | None, within_s: float | None = None) -> None:
+        """Ask for an end in order, from any thread or a signal's handler."""
+        self._happened.append((monotonic(), _Interrupted(number, within_s)))
         if self._loop is not None:
-            self._loop.call_soon_threadsafe(self._go_on)
+            with contextlib.suppress(RuntimeError):
+                self._loop.call_soon_threadsafe(self._go_on)
 
     # -- on the loop -----------------------------------------------------------------------------
 
