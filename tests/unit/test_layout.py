@@ -22,7 +22,6 @@ WITHOUT_TESTS = {
     "robot/session_configuration": "one function; tests/unit/test_reference_decisions.py calls it",
     "ros/ros2/messages": "converts rclpy's messages, which only tests/ros has",
     "ros/ros2_connections": "needs ROS 2; tests/ros/test_ros2_environment.py",
-    "service/extensions": "types without behaviour",
 }
 """Modules of the product that no test is named after, and why."""
 

@@ -16,7 +16,7 @@ import socket
 import sys
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, NoReturn, Protocol, TypeAlias
 
 from holdfast.errors import HoldfastError, InvalidValueError
 from holdfast.printable import printable
@@ -26,13 +26,12 @@ if TYPE_CHECKING:
     import asyncio
 
     from holdfast.service.credentials import ServiceCredentials
-    from holdfast.service.extensions import Extension, MakeExtensions
     from holdfast.service.health import HttpAddress, Pages
     from holdfast.service.metrics import ServiceReport
     from holdfast.service.shell import ServiceShell
     from holdfast.service.supervisor import Supervised
 
-__all__ = ["main"]
+__all__ = ["Extension", "MakeExtensions", "main"]
 
 _SWITCH_INTERVAL_S = 0.0005
 """How long a thread may hold the interpreter while another waits for it."""
@@ -44,6 +43,39 @@ _STDIN = 0
 
 _OFFERED = ("health", "metrics", "ros2", "ros1")
 """Keys of the ready line for what else is offered, and where."""
+
+
+class Extension(Protocol):
+    """Something else that runs in a service's process, on threads of its own: a service in ROS.
+
+    This package knows none. Who starts the service passes a function that makes those for which the
+    options ask.
+    """
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether it owes answers."""
+        ...
+
+    def start(self, on_event: Callable[..., None]) -> Mapping[str, str]:
+        """Start; return what is offered where, for the ready line.
+
+        ``on_event(name, **fields)`` logs an event, from any thread. A start that raises a
+        HoldfastError has released everything.
+        """
+        ...
+
+    def take_no_more(self) -> None:
+        """Finish open requests and refuse new ones."""
+        ...
+
+    def close(self, timeout_s: float) -> None:
+        """Stop; wait at most this long for a running computation. May be repeated."""
+        ...
+
+
+MakeExtensions: TypeAlias = "Callable[[ServeOptions], Sequence[Extension]]"
+"""Makes the extensions for some options; raises a HoldfastError if they cannot be used."""
 
 
 def main(arguments: Sequence[str], make_extensions: MakeExtensions | None = None) -> int:
