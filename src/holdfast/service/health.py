@@ -15,8 +15,8 @@ import socket
 from collections.abc import Awaitable, Callable, Mapping
 from typing import Any, NamedTuple, TypeAlias
 
-from holdfast.errors import HealthError, TransportError
-from holdfast.transport.endpoints import host_and_port, parse_host, why_not_bound
+from holdfast.errors import HealthError
+from holdfast.transport.endpoints import host_and_port, why_not_bound
 
 __all__ = [
     "HttpAddress",
@@ -24,7 +24,6 @@ __all__ = [
     "MonitoringServers",
     "Page",
     "Pages",
-    "parse_http_address",
 ]
 
 _MAX_HEAD_BYTES = 8192
@@ -32,15 +31,6 @@ _MAX_CONNECTIONS = 64
 _TIMEOUT_S = 5.0
 """For a whole connection."""
 
-_REASONS = {
-    200: "OK",
-    400: "Bad Request",
-    404: "Not Found",
-    405: "Method Not Allowed",
-    431: "Request Header Fields Too Large",
-    503: "Service Unavailable",
-}
-_LOOPBACK = "127.0.0.1"
 _END_OF_HEAD = re.compile(rb"\r?\n\r?\n")
 
 
@@ -69,18 +59,6 @@ class Page(NamedTuple):
 
 Pages: TypeAlias = Mapping[str, Callable[[], Awaitable[Page]]]
 """A function for each path."""
-
-
-def parse_http_address(text: str) -> HttpAddress:
-    """Read ``HOST:PORT``, or ``PORT`` of the loopback address; raise HealthError for others."""
-    host, colon, port = text.rpartition(":")
-    try:
-        host = parse_host(host) if colon else _LOOPBACK
-    except TransportError as error:
-        raise HealthError(f"{text!r:.80}: {error}") from None
-    if not re.fullmatch("[0-9]{1,5}", port) or int(port) > 65535:
-        raise HealthError(f"{text!r:.80}: port {port!r:.80} is not a whole number from 0 to 65535")
-    return HttpAddress(host, int(port))
 
 
 class HttpServer:
@@ -148,6 +126,8 @@ class HttpServer:
             writer.transport.abort()
 
     async def _response(self, head: bytes) -> bytes:
+        from http import HTTPStatus  # no start waits for it
+
         words = head.splitlines()[0].split()
         if _END_OF_HEAD.search(head) is None:
             page = Page(431, b"a request's head has at most 8192 bytes\n")
@@ -160,7 +140,7 @@ class HttpServer:
         else:
             page = Page(404, f"there are {', '.join(sorted(self._pages))}\n".encode())
         told = (
-            f"HTTP/1.1 {page.status} {_REASONS[page.status]}\r\n"
+            f"HTTP/1.1 {page.status} {HTTPStatus(page.status).phrase}\r\n"
             f"Content-Type: {page.content_type}\r\n"
             f"Content-Length: {len(page.body)}\r\n"
             "Cache-Control: no-store\r\n"
