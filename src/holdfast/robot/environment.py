@@ -10,7 +10,6 @@ counts its task actions answers that, with a fourth method.
 from __future__ import annotations
 
 import copy
-import difflib
 import inspect
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -351,10 +350,11 @@ def _provided_parameters(
         allowed = [key for key in named if key not in _PROVIDED]
         for key in arguments:
             if key not in allowed:
-                close = difflib.get_close_matches(key, allowed, n=1)
-                suggestion = f"; did you mean {close[0]}?" if close else ""
+                from holdfast.config.validation import close_match
+
                 raise ConfigurationError(
-                    f"environment.arguments.{key} is no argument of {name}{suggestion}\n"
+                    f"environment.arguments.{key} is no argument of {name}"
+                    f"{close_match(key, allowed)}\n"
                     f"allowed: {', '.join(allowed) or 'no keys'}"
                 )
     provided = tuple(key for key in _PROVIDED if key in named)
