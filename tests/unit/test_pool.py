@@ -1,11 +1,11 @@
-"""The service's threads: results come back to the loop, and errors do, too."""
+"""Threads of both shells: results come back to the loop, and errors do, too."""
 
 from __future__ import annotations
 
 import asyncio
 import threading
 
-from holdfast.service.pool import ThreadPool
+from holdfast.runtime.pool import ThreadPool
 
 
 async def test_results_come_back_on_the_loops_thread() -> None:

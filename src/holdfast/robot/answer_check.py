@@ -15,7 +15,7 @@ from time import monotonic
 from holdfast.planning import Planner
 from holdfast.protocol.events import ComputeOwnAnswer, OwnAnswer
 from holdfast.protocol.messages import MAX_TASK_ACTIONS
-from holdfast.service.pool import ThreadPool
+from holdfast.runtime.pool import ThreadPool
 
 __all__ = ["AnswerChecker"]
 

@@ -41,7 +41,7 @@ from holdfast.robot.environment import (
     ObservationSizes,
     as_done,
 )
-from holdfast.service.pool import ThreadPool
+from holdfast.runtime.pool import ThreadPool
 
 __all__ = ["EnvironmentRunner", "InlineRunner", "ThreadedRunner", "make_runner"]
 

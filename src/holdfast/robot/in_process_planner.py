@@ -20,7 +20,7 @@ from holdfast.planning import Planner
 from holdfast.protocol.events import Plan, Planned
 from holdfast.protocol.expected_time import TypicalTime
 from holdfast.protocol.messages import MAX_TASK_ACTIONS
-from holdfast.service.pool import ThreadPool
+from holdfast.runtime.pool import ThreadPool
 
 __all__ = ["InProcessPlanner"]
 

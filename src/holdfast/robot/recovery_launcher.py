@@ -16,7 +16,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import IO, NamedTuple
 
-from holdfast.service.pool import ThreadPool
+from holdfast.runtime.pool import ThreadPool
 
 __all__ = ["RecoveryExited", "RecoveryLauncher"]
 

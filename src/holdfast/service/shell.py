@@ -38,7 +38,7 @@ from holdfast.protocol.service_jobs import (
 )
 from holdfast.protocol.service_limits import ServiceStatistics
 from holdfast.runtime.events import EventRates, EventSink
-from holdfast.service.pool import ThreadPool
+from holdfast.runtime.pool import ThreadPool
 from holdfast.transport.contract import IncomingCall, ServiceTransport
 
 __all__ = ["DecisionHook", "ServiceShell"]
