@@ -232,9 +232,8 @@ def run_robot(
             lambda _: None,
             rate_hz,
         )
-        launcher = None if links.launcher is None else links.launcher(robot.deliver)
         with contextlib.suppress(_EnoughError):
-            robot.run(run.journal.finished(), launcher)
+            robot.run(run.journal.finished())
         return robot
 
 

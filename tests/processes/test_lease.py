@@ -126,7 +126,7 @@ def test_the_local_service_is_told_the_robots_lease() -> None:
     links = make_links(load(EXAMPLE, overrides=overrides), None, NullEventLog())
     try:
         assert links.launcher is not None and links.transport is not None
-        command = links.launcher(lambda _: None)._command
+        command = links.launcher._command
         assert command[command.index("--lease-ms") + 1] == str(ROBOT_MS)
         asyncio.run(links.transport.close())
     finally:

@@ -6,6 +6,7 @@ often. It shares no code with holdfast.
 
 from __future__ import annotations
 
+import asyncio
 import importlib.util
 import json
 import os
@@ -14,9 +15,8 @@ import socket
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from queue import SimpleQueue
 from types import ModuleType
 from typing import Any
 
@@ -311,26 +311,38 @@ def test_without_its_controller_the_example_says_why_in_time() -> None:
     failed = watched.begin()
     assert isinstance(failed, EnvironmentFailed)
     assert "Connection refused" in failed.text
-    watched.runner.close()
+    watched.close()
 
 
 class Watched:
-    """A runner with the queue of its events."""
+    """A runner with the queue of its events, on an event loop of its own."""
 
     def __init__(self, maker: EnvironmentMaker, trial: int = 0, *, resumed: bool = False) -> None:
-        self.queue: SimpleQueue[EnvironmentEvent] = SimpleQueue()
-        self.runner: EnvironmentRunner = make_runner(maker, trial, self.queue.put, resumed=resumed)
+        self.loop = asyncio.new_event_loop()
+        self.queue: asyncio.Queue[EnvironmentEvent] = asyncio.Queue()
+        self.runner: EnvironmentRunner = make_runner(
+            maker, trial, lambda event, _: self.queue.put_nowait(event), resumed=resumed
+        )
 
-    def event(self) -> EnvironmentEvent:
-        return self.queue.get(timeout=PATIENCE_S)
+    def _event_of(self, call: Callable[..., None], *arguments: object) -> EnvironmentEvent:
+        async def event() -> EnvironmentEvent:
+            call(*arguments)
+            return await asyncio.wait_for(self.queue.get(), PATIENCE_S)
+
+        return self.loop.run_until_complete(event())
 
     def begin(self) -> EnvironmentEvent:
-        self.runner.begin()
-        return self.event()
+        return self._event_of(self.runner.begin)
 
     def perform(self, step: int) -> EnvironmentEvent:
-        self.runner.perform(step, np.array([-0.1, 0.0, 0.0]))
-        return self.event()
+        return self._event_of(self.runner.perform, step, np.array([-0.1, 0.0, 0.0]))
+
+    def sense(self, step: int, sensing_action: int) -> EnvironmentEvent:
+        return self._event_of(self.runner.sense, step, sensing_action)
+
+    def close(self) -> None:
+        self.runner.close()
+        self.loop.close()
 
 
 class TestFailures:
@@ -359,8 +371,8 @@ class TestFailures:
         assert isinstance(again.perform(3), Acted)
         assert [move["step"] for move in controller.moves()] == [0, 1, 2, 3]
         assert not [move for move in controller.moves() if "error" in move]
-        first.runner.close()
-        again.runner.close()
+        first.close()
+        again.close()
 
     def test_no_controller_at_all(self, controller: Controller) -> None:
         controller.port = free_port()
@@ -371,24 +383,24 @@ class TestFailures:
         assert failed.text.startswith("environment:SocketRobot raised ConnectionRefusedError")
         assert f'File "{EXAMPLE / "environment.py"}", line ' in failed.text
         assert not failed.action_in_doubt
-        watched.runner.close()
+        watched.close()
 
     def test_a_controller_in_another_trial_is_not_resumed(self, controller: Controller) -> None:
         controller.start()
         maker = load_environment(configuration_for(controller))
         first = Watched(maker, trial=0)
         assert isinstance(first.begin(), EnvironmentReady)
-        first.runner.close()
+        first.close()
         other = Watched(maker, trial=1, resumed=True)
         failed = other.begin()
         assert isinstance(failed, EnvironmentFailed)
         assert "RuntimeError: the controller is in trial 0, not in 1" in failed.text
-        other.runner.close()
+        other.close()
 
 
 ROBOT = """\
+import asyncio
 import sys
-from queue import SimpleQueue
 
 import numpy as np
 
@@ -402,15 +414,23 @@ configuration = load(file, overrides={
     "environment.arguments": {"port": int(port)},
     "environment.timeout_ms": float(timeout_ms),
 })
-events = SimpleQueue()
-runner = make_runner(load_environment(configuration), 0, events.put)
-runner.begin()
-print(events.get(), flush=True)
-for step in range(int(steps)):
-    runner.perform(step, np.array([-0.1, 0.0, 0.0]))
-    print("performing", flush=True)
-    print(events.get(), flush=True)
-runner.close()
+
+
+async def main():
+    events = asyncio.Queue()
+    runner = make_runner(
+        load_environment(configuration), 0, lambda event, _: events.put_nowait(event)
+    )
+    runner.begin()
+    print(await events.get(), flush=True)
+    for step in range(int(steps)):
+        runner.perform(step, np.array([-0.1, 0.0, 0.0]))
+        print("performing", flush=True)
+        print(await events.get(), flush=True)
+    runner.close()
+
+
+asyncio.run(main())
 """
 
 
@@ -448,7 +468,7 @@ class TestProcesses:
             assert isinstance(again.perform(step), Acted)
         assert [move["step"] for move in controller.moves()] == [0, 1, 2]
         assert not [move for move in controller.moves() if "error" in move]
-        again.runner.close()
+        again.close()
 
     def test_stopped_for_longer_than_the_timeout(self, controller: Controller) -> None:
         """A robot that was stopped itself does not blame its controller for the time."""
@@ -476,11 +496,10 @@ def test_sensing_through_the_runner(controller: Controller) -> None:
     controller.start()
     watched = Watched(load_environment(configuration_for(controller)))
     assert isinstance(watched.begin(), EnvironmentReady)
-    watched.runner.sense(0, 1)
-    sensed = watched.event()
+    sensed = watched.sense(0, 1)
     assert isinstance(sensed, Sensed)
     assert sensed.observation.shape == (1,)
-    watched.runner.close()
+    watched.close()
     operator = controller.connect()
     assert operator.ask(do="sense", coordinate=1)["value"] == sensed.observation[0]
     operator.close()

@@ -155,7 +155,7 @@ def test_controller_that_falls_silent(
     controller.start("--silent-at", "20", "--silent-s", "4")
     cloud = site.service().start()
     robot = site.run(configuration_for(controller, site, timeout_ms=1500.0), services=[cloud])
-    assert robot.wait() == 2
+    assert robot.wait() == 4
     assert "the robot holds still in trial 0, step 20" in robot.output
     assert "environment.timeout_ms" in robot.output
     assert "Go on with: " in robot.output

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import queue
+import asyncio
 import threading
 
 from holdfast.config.settings import ParticleFilterSettings, PlanningSettings
@@ -36,13 +36,23 @@ def question(number: int, state: PlanningState, *, urgent: bool = False) -> Comp
     return ComputeOwnAnswer(number, state, urgent, again=False)
 
 
-def checker() -> tuple[AnswerChecker, GatedPlanner, queue.SimpleQueue[OwnAnswer]]:
+def checker() -> tuple[AnswerChecker, GatedPlanner, asyncio.Queue[OwnAnswer | BaseException]]:
     planner = GatedPlanner()
-    answers: queue.SimpleQueue[OwnAnswer] = queue.SimpleQueue()
-    return AnswerChecker(lambda: planner, repr, answers.put), planner, answers
+    come: asyncio.Queue[OwnAnswer | BaseException] = asyncio.Queue()
+    return (
+        AnswerChecker(lambda: planner, repr, come.put_nowait, come.put_nowait),
+        planner,
+        come,
+    )
 
 
-def test_urgent_questions_come_first_and_once() -> None:
+async def next_of(come: asyncio.Queue[OwnAnswer | BaseException]) -> OwnAnswer:
+    answer = await asyncio.wait_for(come.get(), PATIENCE_S)
+    assert isinstance(answer, OwnAnswer)
+    return answer
+
+
+async def test_urgent_questions_come_first_and_once() -> None:
     checks, planner, answers = checker()
     state = planner.init(3, 0)
     checks.ask(question(0, state))
@@ -52,26 +62,28 @@ def test_urgent_questions_come_first_and_once() -> None:
     checks.ask(question(2, state, urgent=True))
     for _ in range(3):
         planner.may.release()
-    assert [answers.get(timeout=PATIENCE_S).number for _ in range(3)] == [0, 2, 1]
+    assert [(await next_of(answers)).number for _ in range(3)] == [0, 2, 1]
     checks.close(PATIENCE_S)
     assert answers.empty()
 
 
-def test_an_error_is_an_answer() -> None:
+async def test_an_error_is_an_answer() -> None:
     checks, planner, answers = checker()
     planner.fails = True
     planner.may.release()
     checks.ask(question(5, planner.init(3, 0)))
-    answer = answers.get(timeout=PATIENCE_S)
+    answer = await next_of(answers)
     assert (answer.number, answer.failure) == (5, "ZeroDivisionError('a defect')")
     checks.close(PATIENCE_S)
 
 
-def test_nothing_is_answered_after_the_end() -> None:
+async def test_nothing_is_answered_after_the_end() -> None:
     checks, planner, answers = checker()
-    checks.ask(question(0, planner.init(3, 0)))
+    for number in range(2):
+        checks.ask(question(number, planner.init(3, 0)))
     assert planner.begun.acquire(timeout=PATIENCE_S)
     checks.close(0.0)
     planner.may.release()
     checks.close(PATIENCE_S)
+    await asyncio.sleep(0)
     assert answers.empty()

@@ -16,7 +16,6 @@ from holdfast.errors import OptionError
 from holdfast.runtime.command_line import (
     Options,
     argument,
-    close_match,
     flag,
     location,
     number,
@@ -94,11 +93,6 @@ def test_bad_arguments(arguments: list[str], message: str) -> None:
     with pytest.raises(OptionError) as refused:
         Brew.parse("brew", arguments)
     assert message in str(refused.value)
-
-
-def test_a_close_match() -> None:
-    assert close_match("zzz", ["fine"]) == ""
-    assert close_match("fien", ["fine"]) == "; did you mean fine?"
 
 
 def test_events_as_json_are_wanted() -> None:

@@ -20,10 +20,8 @@ WITHOUT_TESTS = {
     "robot/health": "tests/processes/test_unattended.py asks it over HTTP",
     "ros/ros2/__main__": "one line, which tests/ros runs",
     "robot/session_configuration": "one function; tests/unit/test_reference_decisions.py calls it",
-    "robot/step_journal": "types without behaviour",
     "ros/ros2/messages": "converts rclpy's messages, which only tests/ros has",
     "ros/ros2_connections": "needs ROS 2; tests/ros/test_ros2_environment.py",
-    "service/extensions": "types without behaviour",
 }
 """Modules of the product that no test is named after, and why."""
 

@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 from holdfast.errors import OutputError
-from holdfast.runtime.events import TeeEventLog
+from holdfast.runtime.events import BoundedEventLog
 from holdfast.runtime.logs import EventLog
 
 CHANGE: dict[str, object] = {
@@ -101,7 +101,7 @@ class TestTargets:
         path = tmp_path / "events.jsonl"
         stream = io.StringIO()
         with EventLog(path, format="json", component="robot") as file_log:
-            tee = TeeEventLog(file_log, EventLog(stream, format="json", component="robot"))
+            tee = BoundedEventLog(file_log, EventLog(stream, format="json", component="robot"))
 
             def report(thread: int) -> None:
                 for number in range(200):

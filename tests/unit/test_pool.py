@@ -1,11 +1,11 @@
-"""The service's threads: results come back to the loop, and errors do, too."""
+"""Threads of both shells: results come back to the loop, and errors do, too."""
 
 from __future__ import annotations
 
 import asyncio
 import threading
 
-from holdfast.service.pool import ThreadPool
+from holdfast.runtime.pool import ThreadPool
 
 
 async def test_results_come_back_on_the_loops_thread() -> None:
@@ -60,3 +60,22 @@ async def test_no_more_threads_than_allowed() -> None:
     await done
     assert names <= {"few-0", "few-1"}
     pool.close()
+
+
+async def test_after_the_end_nothing_is_delivered_and_the_last_function_runs() -> None:
+    pool = ThreadPool(1, "test")
+    gate = threading.Event()
+    delivered: list[object] = []
+    ran: list[str] = []
+
+    def first() -> None:
+        gate.wait()
+        ran.append("first")
+
+    pool.submit(first, delivered.append)
+    pool.close(last=lambda: ran.append("last"))
+    assert ran == []
+    gate.set()
+    pool.close(30.0)
+    await asyncio.sleep(0)
+    assert (ran, delivered) == (["first", "last"], [])

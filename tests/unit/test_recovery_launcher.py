@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
-import queue
 import signal
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,16 +17,18 @@ PATIENCE_S = 60.0
 
 
 @pytest.fixture
-def exits() -> queue.SimpleQueue[RecoveryExited]:
-    return queue.SimpleQueue()
-
-
-@pytest.fixture
-def launcher(exits: queue.SimpleQueue[RecoveryExited]) -> Iterator[RecoveryLauncher]:
+def launcher() -> Iterator[RecoveryLauncher]:
     arguments = ["--listen", f"tcp/127.0.0.1:{free_port()}", "--until-stdin-closes"]
-    made = RecoveryLauncher(arguments, exits.put)
+    made = RecoveryLauncher(arguments)
     yield made
     made.close()
+
+
+class Exits(asyncio.Queue[RecoveryExited]):
+    """What a launcher has delivered."""
+
+    async def next(self) -> RecoveryExited:
+        return await asyncio.wait_for(self.get(), PATIENCE_S)
 
 
 def pid_of(launcher: RecoveryLauncher) -> int:
@@ -34,42 +36,41 @@ def pid_of(launcher: RecoveryLauncher) -> int:
     return launcher._process.pid
 
 
-def test_a_killed_service_is_reported_with_its_number(
-    launcher: RecoveryLauncher, exits: queue.SimpleQueue[RecoveryExited]
-) -> None:
-    launcher.launch(3)
+async def test_a_killed_service_is_reported_with_its_number(launcher: RecoveryLauncher) -> None:
+    exits = Exits()
+    launcher.launch(3, exits.put_nowait)
     os.kill(pid_of(launcher), signal.SIGKILL)
-    assert exits.get(timeout=PATIENCE_S) == (3, "was ended by SIGKILL")
+    assert await exits.next() == (3, "was ended by SIGKILL")
 
 
-def test_a_service_that_is_replaced_or_closed_is_not_reported(
-    launcher: RecoveryLauncher, exits: queue.SimpleQueue[RecoveryExited]
+async def test_a_service_that_is_replaced_or_closed_is_not_reported(
+    launcher: RecoveryLauncher,
 ) -> None:
-    launcher.launch(1)
+    exits = Exits()
+    launcher.launch(1, exits.put_nowait)
     first = pid_of(launcher)
-    launcher.launch(2)
+    launcher.launch(2, exits.put_nowait)
     assert pid_of(launcher) != first
     with pytest.raises(ProcessLookupError):
         os.kill(first, 0)
     launcher.close()
     launcher.close()
+    await asyncio.sleep(0)
     assert exits.empty()
 
 
-def test_one_that_refuses_its_options_says_why_in_its_log(
-    tmp_path: Path, exits: queue.SimpleQueue[RecoveryExited]
-) -> None:
+async def test_one_that_refuses_its_options_says_why_in_its_log(tmp_path: Path) -> None:
+    exits = Exits()
     log = tmp_path / "recovery.log"
-    launcher = RecoveryLauncher(["--no-such-option"], exits.put, log)
-    launcher.launch(1)
-    assert exits.get(timeout=PATIENCE_S) == (1, f"ended with exit code 2; see {log}")
+    launcher = RecoveryLauncher(["--no-such-option"], log)
+    launcher.launch(1, exits.put_nowait)
+    assert await exits.next() == (1, f"ended with exit code 2; see {log}")
     assert "--no-such-option" in log.read_text()
     launcher.close()
 
 
-def test_a_log_that_cannot_be_written_is_the_reason(
-    tmp_path: Path, exits: queue.SimpleQueue[RecoveryExited]
-) -> None:
-    launcher = RecoveryLauncher([], exits.put, tmp_path / "missing" / "recovery.log")
-    launcher.launch(7)
-    assert exits.get(timeout=PATIENCE_S) == (7, "cannot be started: No such file or directory")
+async def test_a_log_that_cannot_be_written_is_the_reason(tmp_path: Path) -> None:
+    exits = Exits()
+    launcher = RecoveryLauncher([], tmp_path / "missing" / "recovery.log")
+    launcher.launch(7, exits.put_nowait)
+    assert await exits.next() == (7, "cannot be started: No such file or directory")

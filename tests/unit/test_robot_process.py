@@ -255,30 +255,17 @@ def test_the_loop_looks_at_the_wire_before_it_handles_more_than_some_events(
     ]
 
 
-def test_events_come_from_any_thread_and_are_dropped_once_the_run_has_ended(
-    robots: Robots,
-) -> None:
-    def begin() -> None:
-        threading.Thread(target=robot.deliver, args=(RecoveryExited(1, "ended"),)).start()
-
-    robot, machine = scripted(robots, begin)
-    machine.answers = [[Paused()]]
-    robot.run(())
-    robot.deliver(RecoveryExited(2, "too late"))
-    assert machine.trace == ["handle RecoveryExited"]
-
-
 def test_what_comes_while_all_is_closed_ends_nothing_too_early(robots: Robots) -> None:
     class SlowWire(NoWire):
         is_closed = False
 
         async def close(self, timeout_s: float = 1.0) -> None:
-            robot.deliver(RecoveryExited(2, "while the wire is closed"))
+            robot._happens(RecoveryExited(2, "while the wire is closed"))
             robot._on_loop().call_soon(robot._end)
             await asyncio.sleep(0.01)
             self.is_closed = True
 
-    robot, machine = scripted(robots, lambda: robot.deliver(RecoveryExited(1, "ended")))
+    robot, machine = scripted(robots, lambda: robot._happens(RecoveryExited(1, "ended")))
     robot._transport = wire = SlowWire()
     machine.answers = [[Paused()]]
     robot.run(())

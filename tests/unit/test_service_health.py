@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import asyncio
 import contextlib
 import re
@@ -12,7 +13,8 @@ import pytest
 
 from holdfast.errors import HealthError
 from holdfast.service import health
-from holdfast.service.health import HttpAddress, HttpServer, Page, parse_http_address
+from holdfast.service.health import HttpAddress, HttpServer, Page
+from holdfast.service.options import http_address
 
 PATIENCE_S = 30.0
 
@@ -31,7 +33,7 @@ async def serving(host: str = "127.0.0.1", port: int = 0) -> AsyncIterator[HttpA
     try:
         yield await server.start()
     finally:
-        server.close()
+        await server.close()
 
 
 async def exchange(address: HttpAddress, request: bytes) -> bytes:
@@ -164,7 +166,7 @@ class TestAddresses:
         ],
     )
     def test_forms(self, text: str, host: str, port: int) -> None:
-        assert parse_http_address(text) == HttpAddress(host, port)
+        assert http_address(text) == HttpAddress(host, port)
 
     @pytest.mark.parametrize(
         "text",
@@ -174,8 +176,8 @@ class TestAddresses:
         ],
     )
     def test_what_is_none_is_named(self, text: str) -> None:
-        with pytest.raises(HealthError, match=re.escape(f"{text!r}")):
-            parse_http_address(text)
+        with pytest.raises(argparse.ArgumentTypeError, match=re.escape(f"is {text!r}: ")):
+            http_address(text)
 
     def test_an_address_of_another_machine_is_named_once(self) -> None:
         async def main() -> None:

@@ -14,6 +14,7 @@ import pytest
 from tests.ports import free_port
 
 from holdfast.errors import TransportError
+from holdfast.service import listening
 from holdfast.service.listening import SharedEndpoints
 from holdfast.transport import listener
 from holdfast.transport.endpoints import Endpoint, parse_endpoint
@@ -207,3 +208,19 @@ def test_no_local_socket_is_left_if_another_endpoint_cannot_be(tmp_path: Path) -
     with pytest.raises(TransportError, match="there is a file of that name"):
         SharedEndpoints([parse_endpoint(f"unix/{tmp_path / name}") for name in ("free", "file")])
     assert not (tmp_path / "free").exists()
+
+
+def test_a_process_has_all_of_its_sockets_or_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    with shared("tcp/127.0.0.1:0", "tcp/127.0.0.1:0") as sockets:
+        listen_at = listening._listen
+        second = sockets.endpoints[1].port
+
+        def fail(bound: socket.socket) -> socket.socket:
+            if bound.getsockname()[1] == second:
+                raise OSError("too many open files")
+            return listen_at(bound)
+
+        with monkeypatch.context() as patch, pytest.raises(OSError, match="too many"):
+            patch.setattr(listening, "_listen", fail)
+            sockets.of(0)
+        assert len(sockets.of(0)) == 2

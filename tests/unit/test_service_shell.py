@@ -137,7 +137,7 @@ class Log:
 class Joined:
     """A shell on a network."""
 
-    def __init__(self, workers: int, shell: dict[str, Any], limits: dict[str, Any]) -> None:
+    def __init__(self, workers: int, limits: dict[str, Any]) -> None:
         self.held = Held()
         known = ProblemFactory()
 
@@ -157,7 +157,6 @@ class Joined:
             workers,
             self.log,
             on_decision=lambda *times: self.timed.append(times),
-            **shell,
         )
 
     async def robot_in_work(self, key: int) -> tuple[Patient, int, Robot]:
@@ -170,10 +169,8 @@ class Joined:
 
 
 @contextlib.asynccontextmanager
-async def joined(
-    workers: int = 2, shell: dict[str, Any] | None = None, **limits: Any
-) -> AsyncIterator[Joined]:
-    both = Joined(workers, shell or {}, limits)
+async def joined(workers: int = 2, **limits: Any) -> AsyncIterator[Joined]:
+    both = Joined(workers, limits)
     await both.shell.start()
     try:
         yield both
@@ -268,13 +265,13 @@ async def test_calls_are_heard_while_all_workers_compute() -> None:
 
 
 @pytest.mark.parametrize(
-    "bounds",
-    [{"max_undecoded": 2}, {"max_undecoded_bytes": int(2.5 * len(LARGE))}],
-    ids=["calls", "bytes"],
+    ("bound", "value"),
+    [("_MAX_UNDECODED", 2), ("_MAX_UNDECODED_BYTES", int(2.5 * len(LARGE)))],
 )
 def test_large_requests_beyond_the_bound_are_turned_away_unread(
-    bounds: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+    bound: str, value: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(shell, bound, value)
     let_go = threading.Event()
 
     def decode(payload: bytes) -> Request:
@@ -285,7 +282,7 @@ def test_large_requests_beyond_the_bound_are_turned_away_unread(
     monkeypatch.setattr(shell, "decode_request", decode)
 
     async def test() -> None:
-        async with joined(shell=bounds) as both:
+        async with joined() as both:
             patient = Patient(both.network)
             kept = {patient.send(LARGE), patient.send(LARGE)}
             unread = {patient.send(LARGE) for _ in range(28)}
@@ -335,6 +332,7 @@ class LargeCall:
 def test_one_robot_takes_no_room_for_large_requests_from_another(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    monkeypatch.setattr(shell, "_MAX_UNDECODED_BYTES", 2 * len(LARGE))
     let_go = threading.Event()
 
     def decode(payload: bytes) -> Request:
@@ -344,7 +342,7 @@ def test_one_robot_takes_no_room_for_large_requests_from_another(
     monkeypatch.setattr(shell, "decode_request", decode)
 
     async def test() -> None:
-        async with joined(shell={"max_undecoded_bytes": 2 * len(LARGE)}) as both:
+        async with joined() as both:
             names = ["mallory"] * 3 + ["anna", "berta", "anna", "carla"]
             calls = [LargeCall(name) for name in names]
             for call in calls:
@@ -358,10 +356,14 @@ def test_one_robot_takes_no_room_for_large_requests_from_another(
     on_a_loop(test)()
 
 
-@on_a_loop
-async def test_one_call_is_let_in_however_large_it_is() -> None:
-    async with joined(shell={"max_undecoded_bytes": 10}) as both:
-        assert isinstance((await Patient(both.network).ask(LARGE))[0], Refused)
+def test_one_call_is_let_in_however_large_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shell, "_MAX_UNDECODED_BYTES", 10)
+
+    async def test() -> None:
+        async with joined() as both:
+            assert isinstance((await Patient(both.network).ask(LARGE))[0], Refused)
+
+    on_a_loop(test)()
 
 
 @pytest.mark.parametrize(
@@ -493,7 +495,7 @@ class Call:
 
 def scripted(*jobs: tuple[str, float, Callable[[], object]]) -> tuple[Script, ServiceShell]:
     machine = Script(*(StartJob(cast(Job, Scripted(kind, run)), s) for kind, s, run in jobs))
-    return machine, ServiceShell(machine, InProcessNetwork().service("service", "boot"), 2)
+    return machine, ServiceShell(machine, InProcessNetwork().service("service", "boot"), 2, Log())
 
 
 @on_a_loop

@@ -13,7 +13,6 @@ from typing import NamedTuple
 
 from holdfast.cli.exit_codes import EXIT_ERROR
 from holdfast.errors import OptionError
-from holdfast.runtime.command_line import close_match
 
 __all__ = ["COMMANDS", "Command", "run_application"]
 
@@ -96,6 +95,8 @@ def run_application(arguments: Sequence[str]) -> int:
 
         command = shlex.join(["holdfast", "run", *arguments])
         raise OptionError(f"{first} is no command; did you mean: {command}")
+    from holdfast.config.validation import close_match
+
     what = "option of holdfast" if first.startswith("-") else "command"
     known = [*COMMANDS, "--help", "--version"]
     hint = close_match(first, known) or f"; commands are {', '.join(COMMANDS)}"

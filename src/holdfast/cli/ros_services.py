@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from holdfast.ros.active_sensing import ActiveSensing
     from holdfast.ros.ros1_service import Ros1Server
     from holdfast.ros.ros2_service import Ros2Server
-    from holdfast.service.extensions import Extension
     from holdfast.service.options import ServeOptions
+    from holdfast.service.process import Extension
 
 __all__ = ["make_ros_services"]
 

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 from holdfast.service import process
 
 if TYPE_CHECKING:
-    from holdfast.service.extensions import Extension
     from holdfast.service.options import ServeOptions
+    from holdfast.service.process import Extension
 
 __all__ = ["main"]
 

@@ -14,7 +14,7 @@ from holdfast.recording.run_directory import EVENTS_NAME, TIMINGS_NAME, VERIFICA
 from holdfast.recording.timings import TimingTable, VerificationTable, count_verified
 from holdfast.robot.links import make_links
 from holdfast.robot.process import RobotProcess
-from holdfast.runtime.events import BoundedEventLog, TeeEventLog
+from holdfast.runtime.events import BoundedEventLog
 from holdfast.runtime.logs import EventLog
 
 if TYPE_CHECKING:
@@ -72,7 +72,7 @@ def perform_trials(
     """
     with contextlib.ExitStack() as stack:
         log = EventLog(directory.path / EVENTS_NAME, format="json", component="robot")
-        events = BoundedEventLog(TeeEventLog(log, *sinks))
+        events = BoundedEventLog(log, *sinks)
         stack.callback(events.close)
         links = make_links(configuration, directory.path / RECOVERY_LOG_NAME, events)
         stack.callback(links.close)
@@ -108,8 +108,7 @@ def perform_trials(
         )
         if observer is not None:
             observer.process(robot)
-        launcher = None if links.launcher is None else links.launcher(robot.deliver)
-        robot.run(directory.journal.finished(), launcher)
+        robot.run(directory.journal.finished())
         return robot.missed_ticks
 
 

@@ -1,4 +1,4 @@
-"""A thread that recomputes some of the services' answers with the robot's own planner.
+"""Some of the services' answers, recomputed with the robot's own planner on a thread.
 
 It has its own instance of the problem, so the robot's loop continues meanwhile. Answers that the
 robot waits for come before answers that are only verified. Thread and planner are made with the
@@ -7,7 +7,7 @@ first question: most runs of a few steps need neither, and start-up time is part
 
 from __future__ import annotations
 
-import threading
+import functools
 from collections import deque
 from collections.abc import Callable
 from time import monotonic
@@ -15,66 +15,55 @@ from time import monotonic
 from holdfast.planning import Planner
 from holdfast.protocol.events import ComputeOwnAnswer, OwnAnswer
 from holdfast.protocol.messages import MAX_TASK_ACTIONS
+from holdfast.runtime.pool import ThreadPool
 
 __all__ = ["AnswerChecker"]
 
 
 class AnswerChecker:
-    """Answers questions with a planner, on its own thread."""
+    """Answers questions with a planner; all methods are called on the loop's thread.
+
+    ``make_planner`` and ``describe_error``, which says what an error of the planner means, are
+    called on the other thread; ``deliver`` and ``failed`` on the loop's.
+    """
 
     def __init__(
         self,
         make_planner: Callable[[], Planner],
         describe_error: Callable[[BaseException], str],
         deliver: Callable[[OwnAnswer], None],
+        failed: Callable[[BaseException], None],
     ) -> None:
         self._make_planner = make_planner
         self._describe_error = describe_error
         self._deliver = deliver
+        self._thread = ThreadPool(1, "holdfast-answer-check", failed)
         self._planner: Planner | None = None
         self._waiting: deque[ComputeOwnAnswer] = deque()
-        self._changed = threading.Condition()
-        self._closed = False
-        self._thread: threading.Thread | None = None
 
     def ask(self, effect: ComputeOwnAnswer) -> None:
         """Queue a question; an urgent one goes first and replaces its earlier copy."""
-        with self._changed:
-            if effect.urgent:
-                self._waiting = deque(
-                    each for each in self._waiting if each.number != effect.number
-                )
-                self._waiting.appendleft(effect)
-            else:
-                self._waiting.append(effect)
-            self._changed.notify()
-            if self._thread is None:
-                self._thread = threading.Thread(
-                    target=self._work, name="holdfast-answer-check", daemon=True
-                )
-                self._thread.start()
+        if effect.urgent:
+            self._waiting = deque(each for each in self._waiting if each.number != effect.number)
+            self._waiting.appendleft(effect)
+        else:
+            self._waiting.append(effect)
+        self._compute_next()
 
     def close(self, timeout_s: float = 1.0) -> None:
         """Answer no more; wait at most ``timeout_s`` for a computation that runs."""
-        with self._changed:
-            self._closed = True
-            self._changed.notify()
-        if self._thread is not None:
-            self._thread.join(timeout_s)
+        self._thread.close(timeout_s)
 
-    def _work(self) -> None:
-        while True:
-            with self._changed:
-                while not self._waiting and not self._closed:
-                    self._changed.wait()
-                if self._closed:
-                    return
-                effect = self._waiting.popleft()
-            decided = self._decided(effect)
-            if not self._closed:
-                self._deliver(decided)
+    def _compute_next(self) -> None:
+        if self._waiting and not self._thread.num_open:
+            effect = self._waiting.popleft()
+            self._thread.submit(functools.partial(self._answer_of, effect), self._answered)
 
-    def _decided(self, effect: ComputeOwnAnswer) -> OwnAnswer:
+    def _answered(self, answer: OwnAnswer) -> None:
+        self._compute_next()
+        self._deliver(answer)
+
+    def _answer_of(self, effect: ComputeOwnAnswer) -> OwnAnswer:
         began = monotonic()
         try:
             if self._planner is None or effect.again:

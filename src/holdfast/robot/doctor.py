@@ -47,7 +47,6 @@ from holdfast.robot.probe import (
     certificate_at,
     in_thread,
     interface_of,
-    waited_for,
 )
 from holdfast.robot.reference_decisions import ReferenceDecisions, ReferenceTurn
 from holdfast.transport.contract import DEFAULT_MAX_MESSAGE_BYTES
@@ -113,44 +112,29 @@ _OPEN_IT: Final = "let it through the firewalls on the way, or mend the VPN"
 
 
 class LayerFinding(NamedTuple):
-    """The result of one layer, at one address or at all of them.
-
-    Attributes
-    ----------
-    state : str
-        :data:`OK`, :data:`WARNS` (it works, with a problem), :data:`FAILS` or :data:`NOT_REACHED`.
-    advice : str
-        What to do, if anything.
-    address : str
-        If the host has several; else empty.
-    """
+    """The result of one layer, at one address or at all of them."""
 
     layer: str
     state: str
+    """:data:`OK`, :data:`WARNS` (works, with a problem), :data:`FAILS` or :data:`NOT_REACHED`."""
     seen: str
     advice: str = ""
+    """What to do, if anything."""
     address: str = ""
+    """If the host has several."""
 
 
 class RobotSetup(NamedTuple):
-    """The robot whose link to a service is checked.
-
-    Attributes
-    ----------
-    name : str
-        May be empty.
-    tls : Path or None
-        Directory of its credentials.
-    offload : OffloadSettings
-        The robot's limits on time.
-    decisions : Future of OwnDecisions, or None
-        What the service's answers are compared with; None asks for none.
-    """
+    """The robot whose link to a service is checked."""
 
     name: str
+    """May be empty."""
     tls: Path | None
+    """Directory of its credentials."""
     offload: OffloadSettings
+    """The robot's limits on time."""
     decisions: Future[ReferenceDecisions] | None
+    """What the service's answers are compared with; None asks for none."""
 
 
 def check(service: str, tls: Path | None) -> Endpoint:
@@ -177,31 +161,19 @@ def check(service: str, tls: Path | None) -> Endpoint:
 async def examine(
     endpoint: Endpoint, robot: RobotSetup, tell: Callable[[LayerFinding], None]
 ) -> None:
-    """Check all layers between this robot and a service.
-
-    Parameters
-    ----------
-    tell : callable
-        Gets each finding at once.
-    """
+    """Check all layers between this robot and a service; ``tell`` gets each finding at once."""
     await _Examination(endpoint, robot, tell).run()
 
 
 class _Seen(NamedTuple):
-    """What the check of a layer at one address has found.
-
-    Attributes
-    ----------
-    state : str
-        Empty: :data:`OK`, or :data:`WARNS` if there is advice.
-    goes_on : bool
-        Whether the layers above a failed one are checked nevertheless.
-    """
+    """What the check of a layer at one address has found."""
 
     text: str
     advice: str = ""
     state: str = ""
+    """If empty: :data:`OK`, or :data:`WARNS` if there is advice."""
     goes_on: bool = False
+    """Whether the layers above a failed one are checked nevertheless."""
 
 
 _Look: TypeAlias = Callable[[AddressPath], Awaitable[_Seen | None]]
@@ -296,7 +268,7 @@ class _Examination:
             return []
         look_up = partial(socket.getaddrinfo, host, port, type=socket.SOCK_STREAM)
         try:
-            found = await waited_for(in_thread(look_up), _NAME_S)
+            found = await asyncio.wait_for(asyncio.wrap_future(in_thread(look_up)), _NAME_S)
         except (OSError, UnicodeError) as error:
             why = getattr(error, "strerror", None) or f"no answer within {_NAME_S:g} s"
             advice = "is it spelled right, and the name server reached? /etc/hosts may name it too"
@@ -446,11 +418,12 @@ class _Examination:
     async def _problem(self, path: AddressPath) -> _Seen | None:
         if path is not next((each for each in self._paths if each.is_greeted), path):
             return None
-        if self._robot.decisions is None:
+        decisions = self._robot.decisions
+        if decisions is None:
             seen = "not asked: with CONFIG, decisions are compared"
             return _Seen(seen, state=NOT_REACHED)
         try:
-            own = await waited_for(self._robot.decisions, _DECISION_S)
+            own = await asyncio.wait_for(asyncio.wrap_future(decisions), _DECISION_S)
         except TimeoutError:
             seen = f"not asked: two decisions take longer than {_DECISION_S:g} s here"
             return _Seen(seen, state=NOT_REACHED)
@@ -485,15 +458,16 @@ class _Examination:
         session_configuration: SessionConfiguration | None,
     ) -> list[Reply]:
         while True:
+            state = turn.state
             request = Request(
                 PROTOCOL_VERSION,
                 session,
                 1,
                 next(self._numbers),
-                turn.state.trial,
-                turn.state.step,
-                turn.state.sensed,
-                digest(turn.state)[:DIGEST_SIZE],
+                state.trial,
+                state.step,
+                state.sensed,
+                digest(state)[:DIGEST_SIZE],
                 turn.observations,
                 session_configuration,
             )

@@ -10,7 +10,6 @@ counts its task actions answers that, with a fourth method.
 from __future__ import annotations
 
 import copy
-import difflib
 import inspect
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -25,7 +24,7 @@ from holdfast.errors import ConfigurationError, EnvironmentFailedError, InvalidV
 from holdfast.outcome import Done
 from holdfast.problem_attributes import check_sizes, has_general_observations
 from holdfast.problems.problem import Problem, ProblemBase
-from holdfast.randomness import Purpose, stream
+from holdfast.randomness import Purpose, Stream, stream
 
 if TYPE_CHECKING:
     from holdfast.config.loader import Configuration
@@ -66,13 +65,10 @@ class Environment(Protocol):
         ...
 
     def is_done(self) -> Done:
-        """Return whether the task is done.
+        """Return True if the task has succeeded, False if it goes on, or ``"failed"``.
 
-        Returns
-        -------
-        bool or "failed"
-            True if it has succeeded, False if it goes on. ``"failed"`` ends the trial as well, but
-            in failure: the robot has crashed, say, or broken what it was to handle.
+        ``"failed"`` ends the trial as well, but in failure: the robot has crashed, say, or broken
+        what it was to handle.
         """
         ...
 
@@ -116,9 +112,7 @@ class SimulatedEnvironment:
         self.step = 0
         check_sizes(problem)
         initial = stream(seed, trial, 0, Purpose.WORLD_INITIAL_STATE)
-        drawn = problem.initial_states(initial, 1)
-        shape = (1, problem.state_size)
-        self.state: FloatArray = checked.states_of(problem, "initial_states", drawn, shape)[0]
+        self.state = _initial_state(problem, initial)
 
     @classmethod
     def after(cls, problem: Problem, seed: int, trial: int, actions: Sequence[FloatArray]) -> Self:
@@ -192,18 +186,20 @@ class ObservationSizes(dict[int, "int | None"]):
         self._problem = problem
 
     def __missing__(self, sensing_action: int) -> int | None:
-        size = self[sensing_action] = _observation_size(self._problem, sensing_action)
+        problem = self._problem
+        size = None
+        if not has_general_observations(problem):
+            state = _initial_state(problem, stream(0, 0, 0, Purpose.INITIAL_BELIEF))
+            size = checked.observation_mean(problem, state, sensing_action).shape[-1]
+        self[sensing_action] = size
         return size
 
 
-def _observation_size(problem: Problem, sensing_action: int) -> int | None:
-    if has_general_observations(problem):
-        return None
-    drawn = problem.initial_states(stream(0, 0, 0, Purpose.INITIAL_BELIEF), 1)
+def _initial_state(problem: Problem, random: Stream) -> FloatArray:
+    drawn = problem.initial_states(random, 1)
     shape = (1, problem.state_size)
-    state = checked.states_of(problem, "initial_states", drawn, shape)[0]
-    size: int = checked.observation_mean(problem, state, sensing_action).shape[-1]
-    return size
+    state: FloatArray = checked.states_of(problem, "initial_states", drawn, shape)[0]
+    return state
 
 
 class EnvironmentMaker:
@@ -225,16 +221,9 @@ class EnvironmentMaker:
     timeout_ms : float
         Longest time that one call of the environment may take.
     environment_class : type, optional
-        The user's class; None for the simulated world.
+        The user's class; None for a world that is simulated from the problem.
     arguments : mapping, optional
         Keyword arguments for the class.
-
-    Attributes
-    ----------
-    name, problem, timeout_ms
-        As passed.
-    simulated : bool
-        Whether the world is simulated from the problem.
 
     Raises
     ------
@@ -315,15 +304,13 @@ def load_environment(configuration: Configuration) -> EnvironmentMaker:
         If the class cannot be imported or does not take the arguments.
     """
     settings = configuration.environment
-    problem, seed = configuration.problem, configuration.simulator.seed
+    seed, timeout_ms = configuration.simulator.seed, settings.timeout_ms
     name = settings.object
-    if name is not None:
-        # It is used by the environment's thread, while the robot's own is by the loop's.
-        problem = type(configuration).from_plain(configuration.plain()).problem
-    else:
-        return EnvironmentMaker(
-            f"the simulated {configuration.problem_name}", problem, seed, settings.timeout_ms
-        )
+    if name is None:
+        simulated = f"the simulated {configuration.problem_name}"
+        return EnvironmentMaker(simulated, configuration.problem, seed, timeout_ms)
+    # It is used by the environment's thread, while the robot's own is by the loop's.
+    problem = type(configuration).from_plain(configuration.plain()).problem
     directory = None if settings.directory is None else Path(settings.directory)
     try:
         found = find_class(
@@ -334,10 +321,7 @@ def load_environment(configuration: Configuration) -> EnvironmentMaker:
             search_directory=directory if ":" in name else configuration.path.parent,
             error_type=ConfigurationError,
         )
-    except ConfigurationError as error:
-        raise ConfigurationError(f"{configuration.path}: {error}") from error
-    try:
-        return EnvironmentMaker(name, problem, seed, settings.timeout_ms, found, settings.arguments)
+        return EnvironmentMaker(name, problem, seed, timeout_ms, found, settings.arguments)
     except ConfigurationError as error:
         raise ConfigurationError(f"{configuration.path}: {error}") from error
 
@@ -366,10 +350,11 @@ def _provided_parameters(
         allowed = [key for key in named if key not in _PROVIDED]
         for key in arguments:
             if key not in allowed:
-                close = difflib.get_close_matches(key, allowed, n=1)
-                suggestion = f"; did you mean {close[0]}?" if close else ""
+                from holdfast.config.validation import close_match
+
                 raise ConfigurationError(
-                    f"environment.arguments.{key} is no argument of {name}{suggestion}\n"
+                    f"environment.arguments.{key} is no argument of {name}"
+                    f"{close_match(key, allowed)}\n"
                     f"allowed: {', '.join(allowed) or 'no keys'}"
                 )
     provided = tuple(key for key in _PROVIDED if key in named)

@@ -20,15 +20,10 @@ __all__ = ["Condition", "RobotWatch"]
 
 
 class Condition(NamedTuple):
-    """A robot's condition.
+    """A robot's condition: in a word, and the trial, None between two trials.
 
-    Attributes
-    ----------
-    word : str
-        The :class:`~holdfast.protocol.status.Status` while a service decides; else
-        ``starting``, ``holding still`` or ``ending``.
-    trial : int or None
-        None between two trials.
+    The word is the :class:`~holdfast.protocol.status.Status` while a service decides; else
+    ``starting``, ``holding still`` or ``ending``.
     """
 
     word: str
@@ -70,8 +65,8 @@ class RobotWatch:
                 return Page(200 if now.is_deciding else 503, f"{now.word}\n".encode())
 
             self._watched = MonitoringServers()
-            self._watched.add("health", self._health, {"/livez": alive, "/readyz": ready})
-            self._events.event("offers", **await self._watched.start())
+            offered = {"health": (self._health, {"/livez": alive, "/readyz": ready})}
+            self._events.event("offers", **await self._watched.start(offered))
         self._manager.watch(asyncio.get_running_loop(), lambda: str(condition()))
 
     def begun(self) -> None:
@@ -89,5 +84,4 @@ class RobotWatch:
         self._manager.stopping()
         self._manager.close()
         if self._watched is not None:
-            self._watched.close()
-            await asyncio.sleep(0)  # the loop lets go of the connections
+            await self._watched.close()

@@ -20,7 +20,7 @@ from holdfast.planning import Planner
 from holdfast.protocol.events import Plan, Planned
 from holdfast.protocol.expected_time import TypicalTime
 from holdfast.protocol.messages import MAX_TASK_ACTIONS
-from holdfast.service.pool import ThreadPool
+from holdfast.runtime.pool import ThreadPool
 
 __all__ = ["InProcessPlanner"]
 
@@ -31,15 +31,13 @@ _BRIEF_S = 0.001
 class InProcessPlanner:
     """Computes the parts of an answer; all methods are called on the loop's thread.
 
+    ``deliver`` and ``failed`` (for an error of the problem's code) are called there, too.
+
     Parameters
     ----------
     make_planner : callable
         Builds the planner with its own instance of the problem, because the loop's thread uses the
         robot's instance at the same time. Called on a thread, with the first question.
-    deliver : callable
-        Takes the results, on the loop's thread.
-    failed : callable
-        Takes an error of the problem's code, on the loop's thread.
     may_be_brief : bool
         Whether work that was brief before is expected to be brief again. User code may take any
         time at any call.

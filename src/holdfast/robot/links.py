@@ -13,7 +13,7 @@ import re
 import socket
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from holdfast.config.loader import Configuration
 from holdfast.config.settings import OffloadSettings, PlanningSettings
@@ -21,9 +21,12 @@ from holdfast.errors import TransportError
 from holdfast.planning import Planner
 from holdfast.problems.problem import Problem
 from holdfast.robot.memo_cache import MemoCache, MemoizingPlanner
-from holdfast.robot.recovery_launcher import RecoveryExited, RecoveryLauncher
+from holdfast.robot.recovery_launcher import RecoveryLauncher
 from holdfast.runtime.events import EventSink
 from holdfast.transport.contract import RobotTransport
+
+if TYPE_CHECKING:
+    from holdfast.transport.endpoints import TlsFiles
 
 __all__ = ["RECOVERY_SERVICE", "Links", "check_services", "make_links"]
 
@@ -32,60 +35,34 @@ RECOVERY_SERVICE = "cloud_active_sensing_recovery"
 
 
 class Links(NamedTuple):
-    """A robot's links to services.
-
-    Attributes
-    ----------
-    transport : RobotTransport or None
-        Not started yet; None for a robot without services, which decides itself.
-    services : tuple of str
-        In order of preference.
-    recovery : str or None
-        The local service; None if there is none.
-    launcher : callable or None
-        Makes its launcher, given the callback for its end.
-    offload : OffloadSettings
-        For the dispatcher.
-    close : callable
-        Releases resources, after the transport is closed.
-    make_planner : callable
-        Joins the robot's problem and settings to the functions that lead from state to state.
-    """
+    """A robot's links to services."""
 
     transport: RobotTransport | None
-    services: tuple[str, ...]
-    recovery: str | None
-    launcher: Callable[[Callable[[RecoveryExited], None]], RecoveryLauncher] | None
-    offload: OffloadSettings
-    close: Callable[[], None]
+    """Not started yet; None for a robot without services, which decides itself."""
+    launcher: RecoveryLauncher | None = None
+    """Of the local service; None if there is none."""
+    close: Callable[[], None] = lambda: None
+    """Releases resources, after the transport is closed."""
     make_planner: Callable[[Problem, PlanningSettings], Planner] = Planner
+    """Joins the robot's problem and settings to the functions that lead from state to state."""
 
 
 def check_services(configuration: Configuration, source: str | None = "") -> None:
     """Check what can be checked of the services before a run: endpoints and credentials.
 
-    Parameters
-    ----------
-    source : str or None
-        What stands before the key in a message; None leaves the key out, too, of services that
-        were not given by it.
-
     Raises
     ------
     HoldfastError
-        If one of them cannot be used; the message names its key.
+        If one of them cannot be used; the message names its key, after ``source``. None leaves the
+        key out, too, of services that were not given by it.
     """
     offload = configuration.offload
     if not offload.services:
         return
     from holdfast.transport.endpoints import check_credentials, parse_endpoint
 
-    tls = None
-    if offload.tls is not None:
-        from holdfast.transport.credentials import load_credentials
-
-        # Warnings are reported when the run begins.
-        tls = load_credentials(Path(offload.tls), "robot", warn=lambda _: None).files
+    # Warnings are reported when the run begins.
+    _, tls = _identity(offload, lambda _: None)
     for index, service in enumerate(offload.services):
         try:
             endpoint = parse_endpoint(service)
@@ -105,56 +82,24 @@ def make_links(configuration: Configuration, log_path: Path | None, events: Even
 
     Raises
     ------
-    TransportError
-        If an endpoint is malformed, or does not go with the credentials.
     HoldfastError
-        If the credentials cannot be used.
+        If an endpoint or the credentials cannot be used.
     """
     offload = configuration.offload
     if not offload.services:
         # The robot and its own planner come to the same states.
-        make_planner = functools.partial(MemoizingPlanner, cache=MemoCache())
-        return Links(None, (), None, None, offload, _nothing, make_planner)
-    return _streams(configuration, log_path, events)
-
-
-def _streams(configuration: Configuration, log_path: Path | None, events: EventSink) -> Links:
+        return Links(None, make_planner=functools.partial(MemoizingPlanner, cache=MemoCache()))
     # Only a robot that has services needs these.
-    from holdfast.transport.credentials import load_credentials
-    from holdfast.transport.endpoints import (
-        ServiceAddress,
-        check_credentials,
-        check_name,
-        parse_endpoint,
-    )
+    from holdfast.transport.endpoints import ServiceAddress, parse_endpoint
     from holdfast.transport.private_socket import PrivateSocket
     from holdfast.transport.robot_end import StreamRobotTransport
-
-    offload = configuration.offload
-    if offload.name is not None:
-        check_name("offload.name", offload.name)
 
     def tell_credentials(reason: str) -> None:
         events.event("credentials", reason=reason)
 
-    tls = None
-    name = offload.name or _machine_name()
-    if offload.tls is not None:
-        own = load_credentials(Path(offload.tls), "robot", warn=tell_credentials)
-        tls = own.files
-        name = offload.name or ""
-        with contextlib.suppress(TransportError):  # what another program made may have any name
-            check_name("", own.name)
-            name = name or own.name
-        if name not in ("", own.name):
-            raise TransportError(
-                f"offload.name {name!r}: the certificate in {offload.tls} is {own.name}'s; copy "
-                f"that robot's own credentials here ('holdfast keys DIR --robot {name}' makes "
-                "them), or leave the key out"
-            )
+    name, tls = _identity(offload, tell_credentials)
     for service in offload.services:
         endpoint = parse_endpoint(service)
-        check_credentials(endpoint, tls)
         if not endpoint.is_encrypted and not endpoint.is_loopback:
             events.event(
                 "insecure",
@@ -167,29 +112,21 @@ def _streams(configuration: Configuration, log_path: Path | None, events: EventS
                 ),
             )
     addresses = {service: ServiceAddress(service) for service in offload.services}
-    recovery = None
-    launcher = None
-    close: Callable[[], None] = _nothing
-    if configuration.recovery.launch != "never":
-        recovery = RECOVERY_SERVICE
-        local = PrivateSocket()
-        close = local.remove
-        addresses[recovery] = ServiceAddress(local.endpoint, listens=True, name=recovery)
-        arguments = [
-            "--name",
-            recovery,
-            "--connect",
-            local.endpoint,
-            "--lease-ms",
-            f"{offload.lease_ms:g}",
-            "--until-stdin-closes",
-            *_problem_arguments(configuration),
-        ]
-
-        def launcher(deliver: Callable[[RecoveryExited], None]) -> RecoveryLauncher:
-            return RecoveryLauncher(arguments, deliver, log_path)
-
-    try:
+    with contextlib.ExitStack() as stack:
+        launcher = None
+        if configuration.recovery.launch != "never":
+            local = PrivateSocket()
+            stack.callback(local.remove)
+            addresses[RECOVERY_SERVICE] = ServiceAddress(
+                local.endpoint, listens=True, name=RECOVERY_SERVICE
+            )
+            arguments = ["--name", RECOVERY_SERVICE, "--connect", local.endpoint]
+            arguments += ["--lease-ms", f"{offload.lease_ms:g}", "--until-stdin-closes"]
+            if ":" in configuration.problem_name:
+                arguments += ["--problem", configuration.problem_name]
+                if configuration.problem_directory is not None:
+                    arguments += ["--problem-directory", str(configuration.problem_directory)]
+            launcher = RecoveryLauncher(arguments, log_path)
         transport = StreamRobotTransport(
             addresses,
             name=name,
@@ -206,26 +143,29 @@ def _streams(configuration: Configuration, log_path: Path | None, events: EventS
             ),
             on_unusable=tell_credentials,
         )
-    except BaseException:
-        close()
-        raise
-    return Links(transport, offload.services, recovery, launcher, offload, close)
+        return Links(transport, launcher, stack.pop_all().close)
 
 
-def _problem_arguments(configuration: Configuration) -> list[str]:
-    """Return what lets the local service build a problem that is not registered."""
-    if ":" not in configuration.problem_name:
-        return []
-    arguments = ["--problem", configuration.problem_name]
-    if configuration.problem_directory is not None:
-        arguments += ["--problem-directory", str(configuration.problem_directory)]
-    return arguments
+def _identity(offload: OffloadSettings, warn: Callable[[str], None]) -> tuple[str, TlsFiles | None]:
+    """Return the robot's name for its services, and its credentials."""
+    from holdfast.transport.credentials import load_credentials
+    from holdfast.transport.endpoints import check_name
 
-
-def _machine_name() -> str:
-    """Return the name of this machine in the characters that services accept."""
-    return re.sub(r"[^A-Za-z0-9_.-]", "-", socket.gethostname()).lstrip("_.-")[:100]
-
-
-def _nothing() -> None:
-    pass
+    if offload.name is not None:
+        check_name("offload.name", offload.name)
+    if offload.tls is None:
+        # The name of this machine in the characters that services accept.
+        machine = re.sub(r"[^A-Za-z0-9_.-]", "-", socket.gethostname()).lstrip("_.-")[:100]
+        return offload.name or machine, None
+    own = load_credentials(Path(offload.tls), "robot", warn=warn)
+    name = offload.name or ""
+    with contextlib.suppress(TransportError):  # what another program made may have any name
+        check_name("", own.name)
+        name = name or own.name
+    if name not in ("", own.name):
+        raise TransportError(
+            f"offload.name {name!r}: the certificate in {offload.tls} is {own.name}'s; copy "
+            f"that robot's own credentials here ('holdfast keys DIR --robot {name}' makes "
+            "them), or leave the key out"
+        )
+    return name, own.files

@@ -34,7 +34,6 @@ __all__ = [
     "certificate_at",
     "in_thread",
     "interface_of",
-    "waited_for",
 ]
 
 GREETING_S: Final = 3.0
@@ -254,7 +253,7 @@ def interface_of(local: str) -> str:
 
 
 def in_thread(function: Callable[[], _T]) -> Future[_T]:
-    """Call what cannot be broken off; the process does not wait for its end."""
+    """Call what cannot be broken off; unlike asyncio's threads it does not hold the process up."""
     done: Future[_T] = Future()
     done.set_running_or_notify_cancel()
 
@@ -266,14 +265,3 @@ def in_thread(function: Callable[[], _T]) -> Future[_T]:
 
     threading.Thread(target=call, daemon=True).start()
     return done
-
-
-async def waited_for(done: Future[_T], limit_s: float) -> _T:
-    """Wait for what another thread does.
-
-    Raises
-    ------
-    TimeoutError
-    """
-    async with asyncio.timeout(limit_s):
-        return await asyncio.wrap_future(done)

@@ -16,7 +16,7 @@ import os
 import signal
 import sys
 from collections import deque
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from time import monotonic
 from typing import Any, NamedTuple, Protocol, TypeAlias
 
@@ -51,7 +51,7 @@ from holdfast.protocol.events import (
     VerificationNoted,
     WriteRecords,
 )
-from holdfast.protocol.records import TrialHistory, replay
+from holdfast.protocol.records import Record, TrialHistory, replay
 from holdfast.protocol.robot import Robot
 from holdfast.protocol.status import Status
 from holdfast.robot.answer_check import AnswerChecker
@@ -60,13 +60,12 @@ from holdfast.robot.environment import EnvironmentMaker
 from holdfast.robot.environment_runner import EnvironmentRunner, make_runner
 from holdfast.robot.health import Condition, RobotWatch
 from holdfast.robot.in_process_planner import InProcessPlanner
-from holdfast.robot.links import Links
+from holdfast.robot.links import RECOVERY_SERVICE, Links
 from holdfast.robot.recovery_launcher import RecoveryExited
 from holdfast.robot.session_configuration import session_configuration_of
-from holdfast.robot.step_journal import StepJournal
 from holdfast.runtime.events import EventSink
 
-__all__ = ["Launcher", "RobotProcess"]
+__all__ = ["RobotProcess", "StepJournal"]
 
 _LAST_VERIFICATION_S = 10.0
 """Longest wait for unfinished verifications once all trials are finished."""
@@ -84,15 +83,34 @@ _SWITCH_INTERVAL_S = 0.0005
 """Longest time that a thread holds the interpreter while another one waits for it."""
 
 
-class Launcher(Protocol):
-    """Starts the local service."""
+class _TrialInProgress(Protocol):
+    """A trial that has not ended; complete if none of its records can be missing."""
 
-    def launch(self, number: int) -> None:
-        """Start it, and end an earlier one."""
+    @property
+    def trial(self) -> int: ...
+    @property
+    def records(self) -> Sequence[Record]: ...
+    @property
+    def is_complete(self) -> bool: ...
+
+
+class StepJournal(Protocol):
+    """What a robot needs of a journal: :class:`holdfast.recording.journal.Journal` has it."""
+
+    def session(self) -> bytes:
+        """Return the run's identifier, 16 bytes."""
         ...
 
-    def close(self) -> None:
-        """End it."""
+    def raise_epoch(self) -> int:
+        """Return a number above all earlier ones, once it is on the disk."""
+        ...
+
+    def append(self, trial: int, records: Sequence[Record]) -> None:
+        """Write records of the unfinished trial; they are safe when this returns."""
+        ...
+
+    def unfinished(self) -> _TrialInProgress | None:
+        """Return the trial that has not ended, if there is one."""
         ...
 
 
@@ -115,16 +133,13 @@ class RobotProcess:
     ----------
     links : Links
         Their transport is closed at the end. Without one the robot's own planner decides.
-    on_result : callable
-        Stores the result of each trial.
-    on_verified : callable
-        Gets the result of each verified answer.
+    on_result, on_timing, on_verified : callable
+        Store the result of each trial, the times of each decision, and the result of each verified
+        answer.
     rate_hz : float or None
         Task actions a second; None acts as soon as possible.
     distrusted : collection of str
         Services that answered wrongly earlier in the run.
-    watch : RobotWatch or None
-        Reports the robot's condition.
     on_order : callable
         Gets each order to the environment and the state in which it was decided, on the event loop;
         it must return at once.
@@ -165,7 +180,7 @@ class RobotProcess:
         self._listens_since = self._now
         self._timer: asyncio.TimerHandle | None = None
         self._error: BaseException | None = None
-        self._launcher: Launcher | None = None
+        self._launcher = links.launcher
         self._runner: EnvironmentRunner | None = None
         self._replayed: int | None = None
         self._starting: tuple[int, TrialHistory, bool] | None = None
@@ -183,9 +198,9 @@ class RobotProcess:
             dispatcher = InProcessSource()
         else:
             dispatcher = Dispatcher(
-                links.services,
-                links.recovery,
-                links.offload,
+                configuration.offload.services,
+                None if links.launcher is None else RECOVERY_SERVICE,
+                configuration.offload,
                 configuration.recovery,
                 journal.session(),
                 epoch,
@@ -201,7 +216,8 @@ class RobotProcess:
         self._verifier = AnswerChecker(
             lambda: Planner(another_problem(), configuration.planning),
             functools.partial(describe_problem_error, configuration.problem_name),
-            self.deliver,
+            self._happens,
+            self._fail,
         )
         self._in_process = InProcessPlanner(
             lambda: links.make_planner(another_problem(), configuration.planning),
@@ -238,29 +254,16 @@ class RobotProcess:
             return Condition("starting", False, robot.trial)
         return Condition(robot.status.value, True, robot.trial)
 
-    def deliver(self, event: EnvironmentEvent | OwnAnswer | RecoveryExited) -> None:
-        """Take an event from any thread; after the run's end it is dropped."""
-        if self._loop is not None:
-            with contextlib.suppress(RuntimeError):
-                self._loop.call_soon_threadsafe(self._happens, event, monotonic())
-
     def pause(self, within_s: float) -> None:
         """End the run in order, from any thread, before or while it runs; may be repeated.
 
-        :meth:`run` returns once the environment's call has ended and the journal is written.
-
-        Parameters
-        ----------
-        within_s : float
-            If that call takes longer, it is abandoned, and :meth:`run` raises a
-            :class:`~holdfast.errors.HeldError`. The run can be resumed in either case.
+        :meth:`run` returns once the environment's call has ended and the journal is written. If
+        that call takes longer than ``within_s``, it is abandoned, and :meth:`run` raises a
+        :class:`~holdfast.errors.HeldError`. The run can be resumed in either case.
         """
-        self._happened.append((monotonic(), _Interrupted(None, within_s)))
-        if self._loop is not None:
-            with contextlib.suppress(RuntimeError):
-                self._loop.call_soon_threadsafe(self._go_on)
+        self._interrupt(None, within_s)
 
-    def run(self, finished: Collection[int], launcher: Launcher | None = None) -> None:
+    def run(self, finished: Collection[int]) -> None:
         """Run all trials that are not finished, on a new event loop.
 
         Raises
@@ -272,7 +275,6 @@ class RobotProcess:
             handler of that signal raises. Other threads than the main one use :meth:`pause`.
         """
         self._finished = set(finished)
-        self._launcher = launcher
         self._loop = loop = asyncio.new_event_loop()
         loop.set_exception_handler(self._loop_failed)
         before = sys.getswitchinterval()
@@ -280,7 +282,7 @@ class RobotProcess:
         try:
             if self._watch is not None:
                 loop.run_until_complete(self._watch.start(self.condition))
-            with ending_signals(loop, self._signalled):
+            with ending_signals(loop, self._interrupt):
                 loop.call_soon(self._start)
                 loop.run_forever()
                 self._raise_error()
@@ -308,8 +310,8 @@ class RobotProcess:
                 loop.run_until_complete(self._transport.close())
             self._in_process.close()
             self._verifier.close()
-            if launcher is not None:
-                launcher.close()
+            if self._launcher is not None:
+                self._launcher.close()
             loop.close()
         if self._interrupted is not None and self._interrupted.number is not None:
             signal.raise_signal(self._interrupted.number)
@@ -328,10 +330,12 @@ class RobotProcess:
             return f"trial {self._starting[0]} (seed {seed})"
         return f"trial {self._robot.trial} (seed {seed}), step {self._robot.step}"
 
-    def _signalled(self, number: int) -> None:
-        self._happened.append((monotonic(), _Interrupted(number)))
+    def _interrupt(self, number: int | None, within_s: float | None = None) -> None:
+        """Ask for an end in order, from any thread or a signal's handler."""
+        self._happened.append((monotonic(), _Interrupted(number, within_s)))
         if self._loop is not None:
-            self._loop.call_soon_threadsafe(self._go_on)
+            with contextlib.suppress(RuntimeError):
+                self._loop.call_soon_threadsafe(self._go_on)
 
     # -- on the loop -----------------------------------------------------------------------------
 
@@ -418,14 +422,14 @@ class RobotProcess:
         self._error = self._error or error
         self._end()
 
+    def _raise_error(self) -> None:
+        if self._error is not None:
+            raise self._error
+
     def _abandon_call(self, within_s: float) -> None:
         self._fail(
             HeldError(f"{self._where()}: the environment has not ended its call in {within_s:g} s")
         )
-
-    def _raise_error(self) -> None:
-        if self._error is not None:
-            raise self._error
 
     def _end(self) -> None:
         self._ended = True
@@ -506,7 +510,8 @@ class RobotProcess:
             elif isinstance(effect, LogEvent):
                 self._events.event(effect.name, **effect.fields)
             elif isinstance(effect, Launch):
-                self._launch(effect)
+                assert self._launcher is not None
+                self._launcher.launch(effect.number, self._happens)
             elif isinstance(effect, EndTrial):
                 self._end_trial(effect.result)
             elif isinstance(effect, Paused):
@@ -518,12 +523,6 @@ class RobotProcess:
     def _report_order(self, order: Act | Sense) -> None:
         if self._on_order is not None and (state := self._robot.state) is not None:
             self._on_order(state, order)
-
-    def _launch(self, effect: Launch) -> None:
-        if self._launcher is None:
-            self._happens(RecoveryExited(effect.number, "there is none to be launched"))
-        else:
-            self._launcher.launch(effect.number)
 
     def _end_trial(self, result: TrialResult) -> None:
         if self._runner is not None:
@@ -573,8 +572,7 @@ class RobotProcess:
         self._runner = make_runner(
             self._maker,
             trial,
-            # A simulated world answers at once, on this thread.
-            self._happens if self._maker.simulated else self.deliver,
+            self._happens,
             resumed=history.begun,
             performed=history.actions,
         )

@@ -11,11 +11,12 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 import weakref
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import IO, NamedTuple
+
+from holdfast.runtime.pool import ThreadPool
 
 __all__ = ["RecoveryExited", "RecoveryLauncher"]
 
@@ -34,28 +35,25 @@ class RecoveryExited(NamedTuple):
 
 
 class RecoveryLauncher:
-    """Starts the local service, watches it, and ends it.
+    """Starts the local service, watches it, and ends it; all on the thread of an event loop.
 
-    ``deliver`` is called from a thread when a process ends other than by :meth:`launch` or
-    :meth:`close`; the file at ``log_path`` gets what the service writes.
+    The file at ``log_path`` gets what the service writes.
     """
 
-    def __init__(
-        self,
-        arguments: Sequence[str],
-        deliver: Callable[[RecoveryExited], None],
-        log_path: Path | None = None,
-    ) -> None:
+    def __init__(self, arguments: Sequence[str], log_path: Path | None = None) -> None:
         # -P: files in the current directory must not shadow modules.
         self._command = [sys.executable, "-P", "-m", "holdfast", "serve", *arguments]
-        self._deliver = deliver
         self._log_path = log_path
         self._process: subprocess.Popen[bytes] | None = None
-        self._lock = threading.Lock()
+        self._waiting = ThreadPool(1, "holdfast-recovery")
 
-    def launch(self, number: int) -> None:
-        """Start a process, and end the one before; whatever goes wrong is delivered."""
-        self.close()
+    def launch(self, number: int, deliver: Callable[[RecoveryExited], None]) -> None:
+        """Start a process, and end the one before.
+
+        ``deliver`` is called, on the loop, if the process ends other than by :meth:`launch` or
+        :meth:`close`; at once if it cannot be started.
+        """
+        self._end()
         try:
             with self._output() as output:
                 process = subprocess.Popen(
@@ -67,19 +65,25 @@ class RecoveryLauncher:
                     start_new_session=True,
                 )
         except OSError as error:
-            self._deliver(RecoveryExited(number, f"cannot be started: {error.strerror}"))
+            deliver(RecoveryExited(number, f"cannot be started: {error.strerror}"))
             return
         self._process = process
         if process.stdin is not None:
             _close_in_forked_children(process.stdin)
-        threading.Thread(
-            target=self._watch, args=(process, number), name="holdfast-recovery", daemon=True
-        ).start()
+
+        def ended(code: int) -> None:
+            if self._process is process:
+                deliver(RecoveryExited(number, self._account_of(code)))
+
+        self._waiting.submit(process.wait, ended)
 
     def close(self) -> None:
-        """End the process, if there is one."""
-        with self._lock:
-            process, self._process = self._process, None
+        """End the process, if there is one. May be repeated."""
+        self._waiting.close()
+        self._end()
+
+    def _end(self) -> None:
+        process, self._process = self._process, None
         if process is None:
             return
         # It holds nothing that would have to be kept, and it may be stopped or stuck.
@@ -89,18 +93,11 @@ class RecoveryLauncher:
             with contextlib.suppress(OSError):
                 process.stdin.close()
 
-    def _watch(self, process: subprocess.Popen[bytes], number: int) -> None:
-        code = process.wait()
-        with self._lock:
-            if self._process is not process:
-                return
+    def _account_of(self, code: int) -> str:
         if code < 0:
-            reason = f"was ended by {signal.Signals(-code).name}"
-        else:
-            reason = f"ended with exit code {code}"
-            if self._log_path is not None:
-                reason += f"; see {self._log_path}"
-        self._deliver(RecoveryExited(number, reason))
+            return f"was ended by {signal.Signals(-code).name}"
+        log = "" if self._log_path is None else f"; see {self._log_path}"
+        return f"ended with exit code {code}{log}"
 
     def _output(self) -> contextlib.AbstractContextManager[IO[bytes] | int]:
         if self._log_path is None:

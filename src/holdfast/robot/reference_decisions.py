@@ -49,28 +49,15 @@ class ReferenceTurn(NamedTuple):
 
 
 class ReferenceDecisions(NamedTuple):
-    """The first decisions of a configuration's run.
-
-    Attributes
-    ----------
-    session_configuration : SessionConfiguration
-        Describes the run to a service.
-    turns : tuple
-        Two, if the first leads to a sensing action.
-    """
+    """The first decisions of a configuration's run, and what describes the run to a service."""
 
     session_configuration: SessionConfiguration
     turns: tuple[ReferenceTurn, ...]
+    """Two, if the first leads to a sensing action."""
 
     @classmethod
     def of(cls, configuration: Configuration) -> ReferenceDecisions:
-        """Decide, with a simulated world.
-
-        Raises
-        ------
-        HoldfastError
-            If the problem's code fails.
-        """
+        """Decide, with a simulated world; raise a HoldfastError if the problem's code fails."""
         try:
             problem, seed = configuration.problem, configuration.simulator.seed
             planner = Planner(problem, configuration.planning)

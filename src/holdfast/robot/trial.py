@@ -107,8 +107,6 @@ def run_trial(
         Task actions, at least 1.
     environment : Environment, optional
         By default simulated from the problem.
-    observer : TrialObserver, optional
-        Sees every step.
 
     Raises
     ------

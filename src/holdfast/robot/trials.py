@@ -126,8 +126,6 @@ def run_trials(
 
     Parameters
     ----------
-    configuration : Configuration
-        Says what a trial is and how many there are.
     jobs : int
         Largest number of processes; 1 runs all trials in this one. Changes time only.
     finished : collection of int
@@ -135,8 +133,8 @@ def run_trials(
     on_result : callable
         Called in this process with the result of each trial as soon as it is there, in any order.
     observer : TrialObserver
-        Looks on at the trials that are run in this process because no worker could help: all of
-        them if ``jobs`` is 1, else the last one at most.
+        Observes the trials that are run in this process because no worker could help: all of them
+        if ``jobs`` is 1, else the last one at most.
 
     Raises
     ------
@@ -155,11 +153,11 @@ def run_trials(
         raise InvalidValueError(f"jobs is {jobs}; it must be from 1 to {MAX_JOBS}")
     num_trials = configuration.simulator.num_trials
     finished = finished if isinstance(finished, (set, frozenset, range)) else set(finished)
-    pending = (trial for trial in range(num_trials) if trial not in finished)
+    pending: Iterator[int] = (trial for trial in range(num_trials) if trial not in finished)
     remaining = num_trials - sum(1 for trial in finished if 0 <= trial < num_trials)
 
     serial = jobs == 1 or remaining <= 1
-    elapsed_s = 0.0
+    elapsed_s = mean_s = 0.0
     for count, trial in enumerate(pending, start=1):
         started = perf_counter()
         try:
@@ -168,23 +166,18 @@ def run_trials(
             )
         except _TrialIsLongError:
             # It decides the same when a worker runs it again; only the time so far is lost.
-            _run_in_workers(
-                configuration, jobs, chain((trial,), pending), remaining, _WORKER_START_S, on_result
-            )
-            return
+            pending, mean_s = chain((trial,), pending), _WORKER_START_S
+            break
         elapsed_s += perf_counter() - started
+        mean_s = elapsed_s / count
         remaining -= 1
         on_result(result)
-        if not serial and remaining > 1:
-            saved_s = remaining * (elapsed_s / count) * (1.0 - 1.0 / min(jobs, remaining))
-            if saved_s > _WORKER_START_S:
-                _run_in_workers(
-                    configuration, jobs, pending, remaining, elapsed_s / count, on_result
-                )
-                return
-        elif remaining == 1:
-            # The last one: no worker could help.
-            serial = True
+        serial = serial or remaining == 1  # the last one: no worker could help
+        if not serial and remaining * mean_s * (1.0 - 1.0 / min(jobs, remaining)) > _WORKER_START_S:
+            break
+    else:
+        return
+    _run_in_workers(configuration, jobs, pending, remaining, mean_s, on_result)
 
 
 def _run_one(
@@ -201,12 +194,10 @@ def _run_one(
             max_steps=simulator.max_steps,
             observer=observer,
         )
-    except _TrialIsLongError:
+    except (_TrialIsLongError, KeyboardInterrupt):
         raise
     except HoldfastError as error:
         raise TrialError(f"{where}: {error}") from error
-    except KeyboardInterrupt:
-        raise
     except BaseException as error:
         account = account_of_user_error(error, configuration.problem_name)
         if account is not None:

@@ -26,7 +26,6 @@ __all__ = [
     "Options",
     "argument",
     "bad_value",
-    "close_match",
     "flag",
     "location",
     "number",
@@ -217,6 +216,8 @@ class Options:
             if not word.startswith("-"):
                 word = word.removeprefix(_AFTER_DASHES)
                 raise OptionError(f"{word!r:.80} is one argument too many")
+            from holdfast.config.validation import close_match
+
             names = [name for each in cls.table().values() for name in each.names]
             hint = close_match(word, names)
             raise OptionError(f"{word!r:.80} is no option of holdfast {command}{hint}")
@@ -346,14 +347,6 @@ def bad_value(text: str, allowed: str) -> argparse.ArgumentTypeError:
     return argparse.ArgumentTypeError(f"is {text!r:.80}; allowed are {allowed}")
 
 
-def close_match(text: str, allowed: Sequence[str]) -> str:
-    """Return "; did you mean ...?" with the closest allowed word; empty if none is close."""
-    import difflib
-
-    near = difflib.get_close_matches(text.lower(), allowed, n=1)
-    return f"; did you mean {near[0]}?" if near else ""
-
-
 def whole_number(least: int, most: int) -> Callable[[str], int]:
     """Return a reader of whole numbers from ``least`` to ``most``."""
 
@@ -383,6 +376,8 @@ def one_of(*choices: str) -> Callable[[str], str]:
 
     def read(text: str) -> str:
         if text not in choices:
+            from holdfast.config.validation import close_match
+
             listed = ", ".join(choices[:-1]) + f" and {choices[-1]}"
             raise bad_value(text, listed + close_match(text, choices))
         return text

@@ -1,8 +1,8 @@
 """Events: what happened in a process, as a name and a few fields.
 
 The code that reports an event does not know where it goes: :class:`~holdfast.runtime.logs.EventLog`
-writes it as a line, :class:`TeeEventLog` passes it to several sinks, :class:`BoundedEventLog`
-limits the rate of repeated ones.
+writes it as a line, :class:`BoundedEventLog` passes it to several sinks and limits the rate of
+repeated ones.
 
 Events of the robot: status, launch, launched, launch_failed, recovery_exited,
 retry, hedge, restore, restored, state_diverged, service_appeared, service_vanished,
@@ -27,20 +27,22 @@ import math
 import threading
 import time
 from collections.abc import Callable, Hashable, Iterable, Mapping
-from typing import NamedTuple, Protocol
+from typing import Protocol, TypeAlias
 
 __all__ = [
     "BoundedEventLog",
-    "CountedEvent",
+    "Event",
     "EventRates",
     "EventSink",
     "NullEventLog",
-    "TeeEventLog",
 ]
 
 _REPEAT_INTERVAL_S = 1.0
 _BURST = 20
 """Events of one kind that pass at once: more than correct peers cause."""
+
+Event: TypeAlias = tuple[str, Mapping[str, object]]
+"""A name and its fields; after dropped ones like it with their number."""
 
 
 class EventSink(Protocol):
@@ -63,36 +65,6 @@ class NullEventLog:
 
     def close(self) -> None:
         """Do nothing."""
-
-
-class TeeEventLog:
-    """Passes every event to several sinks, in order."""
-
-    def __init__(self, *sinks: EventSink) -> None:
-        self._sinks = sinks
-
-    def event(self, name: str, /, **fields: object) -> None:
-        """Pass an event to all sinks."""
-        for sink in self._sinks:
-            sink.event(name, **fields)
-
-    def close(self) -> None:
-        """Close all sinks."""
-        for sink in self._sinks:
-            sink.close()
-
-
-class CountedEvent(NamedTuple):
-    """An event, and the number of similar ones that were dropped before it."""
-
-    name: str
-    fields: Mapping[str, object]
-    omitted: int
-
-    def report_to(self, sink: EventSink) -> None:
-        """Pass the event on, with the number as a field unless it is 0."""
-        more = {"similar_lines_omitted": self.omitted} if self.omitted else {}
-        sink.event(self.name, **{**self.fields, **more})
 
 
 class _TokenBucket:
@@ -128,8 +100,8 @@ class EventRates:
 
     def admit(
         self, kind: Hashable, name: str, fields: Mapping[str, object], now: float
-    ) -> CountedEvent | None:
-        """Return the event if it may be reported now (``now`` in seconds); None if it is dropped.
+    ) -> list[Event]:
+        """Return the event, if it may be reported now (``now`` in seconds), or nothing.
 
         Events of one ``kind`` share a bucket.
         """
@@ -140,35 +112,39 @@ class EventRates:
         if bucket.tokens < 1.0:
             bucket.omitted += 1
             bucket.last = name, fields
-            return None
+            return []
         bucket.tokens -= 1.0
         omitted, bucket.omitted, bucket.last = bucket.omitted, 0, None
-        return CountedEvent(name, fields, omitted)
+        return [_counted(name, fields, omitted)]
 
     def next_due(self) -> float | None:
         """Return when :meth:`due` will return something; None if nothing was dropped."""
         times = [bucket.due_at for bucket in self._buckets.values() if bucket.last is not None]
         return min(times, default=None)
 
-    def due(self, now: float) -> list[CountedEvent]:
+    def due(self, now: float) -> list[Event]:
         """Return the last dropped event of each kind whose time has come; of all if infinite."""
         found = []
         for bucket in self._buckets.values():
             if bucket.last is not None and bucket.due_at <= now:
-                found.append(CountedEvent(*bucket.last, bucket.omitted - 1))
+                found.append(_counted(*bucket.last, bucket.omitted - 1))
                 bucket.tokens, bucket.updated_at = 0.0, now
                 bucket.omitted, bucket.last = 0, None
         return found
 
 
-class BoundedEventLog:
-    """Limits the rate of events about a service, so that no service can fill a robot's log.
+def _counted(name: str, fields: Mapping[str, object], omitted: int) -> Event:
+    return name, {**fields, "similar_lines_omitted": omitted} if omitted else fields
 
-    Changes of status always pass.
+
+class BoundedEventLog:
+    """Passes events to several sinks; limits the rate of those about a service.
+
+    So no service can fill a robot's log. Changes of status always pass.
     """
 
-    def __init__(self, sink: EventSink, clock: Callable[[], float] = time.monotonic) -> None:
-        self._sink = sink
+    def __init__(self, *sinks: EventSink, clock: Callable[[], float] = time.monotonic) -> None:
+        self._sinks = sinks
         self._clock = clock
         # Reentrant: a signal handler of the same thread may report an event.
         self._lock = threading.RLock()
@@ -179,18 +155,19 @@ class BoundedEventLog:
         with self._lock:
             now = self._clock()
             self._report(self._rates.due(now))
-            event: CountedEvent | None = CountedEvent(name, fields, 0)
             if "service" in fields and name != "status":
-                event = self._rates.admit((name, fields["service"]), name, fields, now)
-            if event is not None:
-                event.report_to(self._sink)
+                self._report(self._rates.admit((name, fields["service"]), name, fields, now))
+            else:
+                self._report([(name, fields)])
 
     def close(self) -> None:
-        """Report the last dropped events, and close the sink."""
+        """Report the last dropped events, and close the sinks."""
         with self._lock:
             self._report(self._rates.due(math.inf))
-            self._sink.close()
+            for sink in self._sinks:
+                sink.close()
 
-    def _report(self, events: Iterable[CountedEvent]) -> None:
-        for event in events:
-            event.report_to(self._sink)
+    def _report(self, events: Iterable[Event]) -> None:
+        for name, fields in events:
+            for sink in self._sinks:
+                sink.event(name, **fields)

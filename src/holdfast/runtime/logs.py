@@ -4,11 +4,8 @@ A log must never hurt the process that writes it. A closed terminal, a full disk
 cannot be written costs at most the line. A terminal or pipe that nobody reads must not stop the
 event loop, so a thread writes to those, from a bounded queue.
 
-The queue is ours, not ``logging.handlers.QueueHandler`` with its ``QueueListener``. Importing that
-module takes 4 to 5 ms (it brings pickle and the network handlers) at the start of a service for
-which a robot may be waiting. Its ``stop`` also waits without bound for a reader that does not read,
-``logging.shutdown`` waits for the same lock, and the bound, the count of lost lines and re-entry
-from signal handlers would be ours in any case.
+``logging.handlers`` would not do: its import takes 4 to 5 ms of a service's start, and its listener
+waits without bound for a reader that does not read.
 """
 
 from __future__ import annotations

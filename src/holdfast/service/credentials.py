@@ -27,12 +27,7 @@ _CHECK_INTERVAL_S = 1.0
 
 
 class ServiceCredentials:
-    """The credentials of this process.
-
-    Parameters
-    ----------
-    warn : callable
-        Takes warnings as text.
+    """The credentials of this process; ``warn`` takes warnings as text.
 
     Attributes
     ----------
@@ -71,10 +66,7 @@ class ServiceCredentials:
     ) -> None:
         """Read the files again; if they cannot be used, the previous ones stay in use.
 
-        Parameters
-        ----------
-        requested : bool
-            Whether an operator has requested it. Else a repeated failure is logged only once.
+        Unless an operator has requested it, a repeated failure is logged only once.
         """
         read_at = file_versions(self.files)
         warnings: list[str] = []

@@ -13,10 +13,10 @@ import errno
 import re
 import socket
 from collections.abc import Awaitable, Callable, Mapping
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
-from holdfast.errors import HealthError, TransportError
-from holdfast.transport.endpoints import host_and_port, parse_host, why_not_bound
+from holdfast.errors import HealthError
+from holdfast.transport.endpoints import host_and_port, why_not_bound
 
 __all__ = [
     "HttpAddress",
@@ -24,7 +24,6 @@ __all__ = [
     "MonitoringServers",
     "Page",
     "Pages",
-    "parse_http_address",
 ]
 
 _MAX_HEAD_BYTES = 8192
@@ -32,15 +31,7 @@ _MAX_CONNECTIONS = 64
 _TIMEOUT_S = 5.0
 """For a whole connection."""
 
-_REASONS = {
-    200: "OK",
-    400: "Bad Request",
-    404: "Not Found",
-    405: "Method Not Allowed",
-    431: "Request Header Fields Too Large",
-    503: "Service Unavailable",
-}
-_LOOPBACK = "127.0.0.1"
+_END_OF_HEAD = re.compile(rb"\r?\n\r?\n")
 
 
 class HttpAddress(NamedTuple):
@@ -70,18 +61,6 @@ Pages: TypeAlias = Mapping[str, Callable[[], Awaitable[Page]]]
 """A function for each path."""
 
 
-def parse_http_address(text: str) -> HttpAddress:
-    """Read ``HOST:PORT``, or ``PORT`` of the loopback address; raise HealthError for others."""
-    host, colon, port = text.rpartition(":")
-    try:
-        host = parse_host(host) if colon else _LOOPBACK
-    except TransportError as error:
-        raise HealthError(f"{text!r:.80}: {error}") from None
-    if not re.fullmatch("[0-9]{1,5}", port) or int(port) > 65535:
-        raise HealthError(f"{text!r:.80}: port {port!r:.80} is not a whole number from 0 to 65535")
-    return HttpAddress(host, int(port))
-
-
 class HttpServer:
     """Answers GET and HEAD at one address."""
 
@@ -89,8 +68,8 @@ class HttpServer:
         self._address = address
         self._pages = pages
         self._server: asyncio.Server | None = None
-        # The oldest first.
-        self._connections: dict[_Connection, None] = {}
+        # One for each connection, the oldest first.
+        self._tasks: dict[asyncio.Task[Any], None] = {}
 
     async def start(self) -> HttpAddress:
         """Listen, in the running loop; return the address, with the chosen port instead of 0.
@@ -100,14 +79,13 @@ class HttpServer:
         HealthError
             If it cannot listen there; the message names the address.
         """
-        loop = asyncio.get_running_loop()
         try:
             # The first address alone, so that there is one port.
             family, *_, where = socket.getaddrinfo(
                 *self._address, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
             )[0]
-            self._server = await loop.create_server(
-                lambda: _Connection(self), str(where[0]), self._address.port, family=family
+            self._server = await asyncio.start_server(
+                self._serve, str(where[0]), self._address.port, family=family, limit=_MAX_HEAD_BYTES
             )
         except OSError as error:
             if error.errno == errno.EADDRINUSE:
@@ -117,117 +95,95 @@ class HttpServer:
             raise HealthError(f"health or metrics at {self._address}: {reason}") from error
         return self._address._replace(port=self._server.sockets[0].getsockname()[1])
 
-    def close(self) -> None:
+    async def close(self) -> None:
         """Stop listening, and end all connections; may be repeated."""
         if self._server is not None:
             self._server.close()
-        for connection in list(self._connections):
-            connection.abort()
+        for task in self._tasks:
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
 
-    def begun(self, connection: _Connection) -> None:
-        """Add a connection; if there are too many, end the oldest."""
-        if len(self._connections) >= _MAX_CONNECTIONS:
-            next(iter(self._connections)).abort()
-        self._connections[connection] = None
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """Answer one request."""
+        task = asyncio.current_task()
+        assert task is not None
+        if len(self._tasks) >= _MAX_CONNECTIONS:
+            oldest = next(iter(self._tasks))
+            del self._tasks[oldest]
+            oldest.cancel()
+        self._tasks[task] = None
+        # Else the end of the connection would wait, without bound, for a reader.
+        writer.transport.set_write_buffer_limits(0)
+        try:
+            async with asyncio.timeout(_TIMEOUT_S):
+                if (head := await _head_of(reader)) is not None:
+                    writer.write(await self._response(head))
+                    await writer.drain()
+        except (OSError, TimeoutError):
+            pass
+        finally:
+            self._tasks.pop(task, None)
+            writer.transport.abort()
 
-    def ended(self, connection: _Connection) -> None:
-        """Forget a connection."""
-        self._connections.pop(connection, None)
+    async def _response(self, head: bytes) -> bytes:
+        from http import HTTPStatus  # no start waits for it
 
-    async def page(self, method: bytes, target: bytes) -> Page:
-        """Return the response to a request."""
-        if method not in (b"GET", b"HEAD"):
-            return Page(405, b"GET and HEAD are answered\n")
-        page = self._pages.get(target.partition(b"?")[0].decode("latin-1"))
-        if page is None:
-            return Page(404, f"there are {', '.join(sorted(self._pages))}\n".encode())
-        return await page()
+        words = head.splitlines()[0].split()
+        if _END_OF_HEAD.search(head) is None:
+            page = Page(431, b"a request's head has at most 8192 bytes\n")
+        elif len(words) != 3 or not words[2].startswith(b"HTTP/1."):
+            page = Page(400, b"this is no request of HTTP/1\n")
+        elif words[0] not in (b"GET", b"HEAD"):
+            page = Page(405, b"GET and HEAD are answered\n")
+        elif make := self._pages.get(words[1].partition(b"?")[0].decode("latin-1")):
+            page = await make()
+        else:
+            page = Page(404, f"there are {', '.join(sorted(self._pages))}\n".encode())
+        told = (
+            f"HTTP/1.1 {page.status} {HTTPStatus(page.status).phrase}\r\n"
+            f"Content-Type: {page.content_type}\r\n"
+            f"Content-Length: {len(page.body)}\r\n"
+            "Cache-Control: no-store\r\n"
+            "Connection: close\r\n\r\n"
+        )
+        return told.encode() + (b"" if words[:1] == [b"HEAD"] else page.body)
+
+
+async def _head_of(reader: asyncio.StreamReader) -> bytes | None:
+    """Read until a head is whole or too large; return None if the connection ends before."""
+    head = b""
+    while _END_OF_HEAD.search(head) is None and len(head) <= _MAX_HEAD_BYTES:
+        data = await reader.read(_MAX_HEAD_BYTES)
+        if not data:
+            return None
+        head += data
+    return head
 
 
 class MonitoringServers:
     """Servers at several addresses; pages of the same address share one."""
 
     def __init__(self) -> None:
-        self._addresses: dict[str, HttpAddress] = {}
-        self._pages: dict[HttpAddress, dict[str, Callable[[], Awaitable[Page]]]] = {}
         self._servers: list[HttpServer] = []
 
-    def add(self, purpose: str, address: HttpAddress, pages: Pages) -> None:
-        """Add pages at an address, before the start."""
-        self._addresses[purpose] = address
-        self._pages.setdefault(address, {}).update(pages)
-
-    async def start(self) -> dict[str, str]:
-        """Listen; return ``HOST:PORT`` for each purpose.
+    async def start(self, offered: Mapping[str, tuple[HttpAddress, Pages]]) -> dict[str, str]:
+        """Offer pages for each purpose; return ``HOST:PORT`` for each.
 
         Raises
         ------
         HealthError
             If it cannot listen at an address; the message names it.
         """
+        pages: dict[HttpAddress, dict[str, Callable[[], Awaitable[Page]]]] = {}
+        for address, own in offered.values():
+            pages.setdefault(address, {}).update(own)
         found = {}
-        for address, pages in self._pages.items():
-            server = HttpServer(address, pages)
-            found[address] = str(await server.start())
-            self._servers.append(server)
-        return {purpose: found[address] for purpose, address in self._addresses.items()}
+        for address, all_pages in pages.items():
+            self._servers.append(HttpServer(address, all_pages))
+            found[address] = str(await self._servers[-1].start())
+        return {purpose: found[address] for purpose, (address, _) in offered.items()}
 
-    def close(self) -> None:
+    async def close(self) -> None:
         """Stop all servers; may be repeated."""
         for server in self._servers:
-            server.close()
-
-
-class _Connection(asyncio.Protocol):
-    """One request and its response."""
-
-    def __init__(self, server: HttpServer) -> None:
-        self._server = server
-        self._head = bytearray()
-        self._answering: asyncio.Task[None] | None = None
-
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        assert isinstance(transport, asyncio.Transport)
-        self._transport = transport
-        self._timeout = asyncio.get_running_loop().call_later(_TIMEOUT_S, self.abort)
-        self._server.begun(self)
-
-    def data_received(self, data: bytes) -> None:
-        if self._answering is not None:
-            return
-        self._head += data
-        whole = b"\r\n\r\n" in self._head or b"\n\n" in self._head
-        if whole or len(self._head) > _MAX_HEAD_BYTES:
-            self._transport.pause_reading()
-            self._answering = asyncio.get_running_loop().create_task(self._answer(whole=whole))
-
-    def connection_lost(self, exc: Exception | None) -> None:
-        del exc
-        self._timeout.cancel()
-        self._server.ended(self)
-        if self._answering is not None:
-            self._answering.cancel()
-
-    def abort(self) -> None:
-        """End the connection now."""
-        self._server.ended(self)
-        self._transport.abort()
-
-    async def _answer(self, *, whole: bool) -> None:
-        words = bytes(self._head).splitlines()[0].split() if whole and self._head.strip() else []
-        if not whole:
-            page = Page(431, b"a request's head has at most 8192 bytes\n")
-        elif len(words) != 3 or not words[2].startswith(b"HTTP/1."):
-            page = Page(400, b"this is no request of HTTP/1\n")
-        else:
-            page = await self._server.page(words[0], words[1])
-        head = (
-            f"HTTP/1.1 {page.status} {_REASONS[page.status]}\r\n"
-            f"Content-Type: {page.content_type}\r\n"
-            f"Content-Length: {len(page.body)}\r\n"
-            "Cache-Control: no-store\r\n"
-            "Connection: close\r\n\r\n"
-        )
-        body = b"" if words[:1] == [b"HEAD"] else page.body
-        self._transport.write(head.encode() + body)
-        self._transport.close()
+            await server.close()

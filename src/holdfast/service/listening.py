@@ -61,10 +61,12 @@ class SharedEndpoints:
         """
         if index not in self._listening:
             listening = self._listening[index] = []
-            for endpoint, bound in zip(self.endpoints, self._bound, strict=True):
-                listening.append(
-                    bound if endpoint.is_local_socket else _listen(bound.family, bound)
-                )
+            try:
+                for endpoint, bound in zip(self.endpoints, self._bound, strict=True):
+                    listening.append(bound if endpoint.is_local_socket else _listen(bound))
+            except OSError:
+                self.release(index)
+                raise
         return self._listening[index]
 
     def release(self, index: int) -> None:
@@ -100,9 +102,9 @@ class SharedEndpoints:
         return endpoint._replace(port=bound.getsockname()[1])
 
 
-def _listen(family: int, bound: socket.socket) -> socket.socket:
+def _listen(bound: socket.socket) -> socket.socket:
     """Return another socket that listens where one is bound."""
-    listening = socket.socket(family)
+    listening = socket.socket(bound.family)
     try:
         listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)

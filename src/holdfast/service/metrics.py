@@ -100,20 +100,14 @@ class DecisionTimes(msgspec.Struct):
 
 
 class ServiceReport(msgspec.Struct):
-    """The counters of one process of a service, or the sum of several.
-
-    Attributes
-    ----------
-    restarts : int
-        Of processes.
-    certificate_expires_s : float or None
-        The earliest end of a certificate in use, in seconds since 1970; None without.
-    """
+    """The counters of one process of a service, or the sum of several."""
 
     statistics: ServiceStatistics = msgspec.field(default_factory=ServiceStatistics)
     times: DecisionTimes = msgspec.field(default_factory=DecisionTimes)
     restarts: int = 0
+    """Of processes."""
     certificate_expires_s: float | None = None
+    """The earliest end of a certificate in use, in seconds since 1970."""
 
     def without_gauges(self) -> ServiceReport:
         """Return the report of an ended process: its counters, without what it held."""
@@ -145,19 +139,10 @@ def summed(reports: Iterable[ServiceReport]) -> ServiceReport:
 
 
 class Exposition:
-    """Writes a report in Prometheus's text format.
+    """Writes a service's report in Prometheus's text format.
 
-    Parameters
-    ----------
-    name : str
-        Of the service.
-    processes : callable, optional
-        Returns the ids of the processes whose memory and time are summed, this process first.
-
-    Raises
-    ------
-    MetricsError
-        If ``prometheus_client`` is not installed.
+    ``processes`` returns the ids of the processes whose memory and time are summed, this process
+    first. Raises a MetricsError if ``prometheus_client`` is not installed.
     """
 
     def __init__(

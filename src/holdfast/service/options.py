@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import re
 import signal
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
-from holdfast.errors import HealthError, InvalidValueError, TransportError
+from holdfast.errors import InvalidValueError, TransportError
 from holdfast.runtime.command_line import (
     Options,
     flag,
@@ -36,13 +37,20 @@ _DEFAULT_ROUTER = "tcp/localhost:7447"
 
 
 def http_address(text: str) -> HttpAddress:
-    """Read the address at which HTTP is answered, as an option's value."""
-    from holdfast.service.health import parse_http_address
+    """Read the address at which HTTP is answered: ``HOST:PORT``, or ``PORT`` of the loopback."""
+    from holdfast.service.health import HttpAddress
+    from holdfast.transport.endpoints import parse_host
 
+    host, colon, port = text.rpartition(":")
     try:
-        return parse_http_address(text)
-    except HealthError as error:
-        raise argparse.ArgumentTypeError(f"is {error}") from error
+        host = parse_host(host) if colon else "127.0.0.1"
+    except TransportError as error:
+        raise argparse.ArgumentTypeError(f"is {text!r:.80}: {error}") from None
+    if not re.fullmatch("[0-9]{1,5}", port) or int(port) > 65535:
+        raise argparse.ArgumentTypeError(
+            f"is {text!r:.80}: port {port!r:.80} is not a whole number from 0 to 65535"
+        )
+    return HttpAddress(host, int(port))
 
 
 def _descriptors(text: str) -> tuple[int, ...]:

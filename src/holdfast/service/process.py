@@ -16,7 +16,7 @@ import socket
 import sys
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, NoReturn, Protocol, TypeAlias
 
 from holdfast.errors import HoldfastError, InvalidValueError
 from holdfast.printable import printable
@@ -26,12 +26,12 @@ if TYPE_CHECKING:
     import asyncio
 
     from holdfast.service.credentials import ServiceCredentials
-    from holdfast.service.extensions import Extension, MakeExtensions
+    from holdfast.service.health import HttpAddress, Pages
     from holdfast.service.metrics import ServiceReport
     from holdfast.service.shell import ServiceShell
     from holdfast.service.supervisor import Supervised
 
-__all__ = ["main"]
+__all__ = ["Extension", "MakeExtensions", "main"]
 
 _SWITCH_INTERVAL_S = 0.0005
 """How long a thread may hold the interpreter while another waits for it."""
@@ -43,6 +43,39 @@ _STDIN = 0
 
 _OFFERED = ("health", "metrics", "ros2", "ros1")
 """Keys of the ready line for what else is offered, and where."""
+
+
+class Extension(Protocol):
+    """Something else that runs in a service's process, on threads of its own: a service in ROS.
+
+    This package knows none. Who starts the service passes a function that makes those for which the
+    options ask.
+    """
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether it owes answers."""
+        ...
+
+    def start(self, on_event: Callable[..., None]) -> Mapping[str, str]:
+        """Start; return what is offered where, for the ready line.
+
+        ``on_event(name, **fields)`` logs an event, from any thread. A start that raises a
+        HoldfastError has released everything.
+        """
+        ...
+
+    def take_no_more(self) -> None:
+        """Finish open requests and refuse new ones."""
+        ...
+
+    def close(self, timeout_s: float) -> None:
+        """Stop; wait at most this long for a running computation. May be repeated."""
+        ...
+
+
+MakeExtensions: TypeAlias = "Callable[[ServeOptions], Sequence[Extension]]"
+"""Makes the extensions for some options; raises a HoldfastError if they cannot be used."""
 
 
 def main(arguments: Sequence[str], make_extensions: MakeExtensions | None = None) -> int:
@@ -81,7 +114,7 @@ def _serve_with_several(options: ServeOptions) -> int:
     from holdfast.runtime.logs import EventLog
     from holdfast.runtime.service_manager import ServiceManager
     from holdfast.service.listening import SharedEndpoints
-    from holdfast.service.supervisor import Supervisor, supervise
+    from holdfast.service.supervisor import Supervisor
 
     manager = ServiceManager()
     workers = options.workers or max(1, len(os.sched_getaffinity(0)) // options.processes)
@@ -102,17 +135,16 @@ def _serve_with_several(options: ServeOptions) -> int:
             supervisor.process_ids,
         ) as watched:
             where = {"listen": endpoints, "processes": options.processes, **watched}
-            return await supervise(
-                supervisor,
-                events,
+            number = await supervisor.run(
                 options.ending_signals,
                 options.drain_s + 2 * _CLOSE_TIMEOUT_S,
                 lambda: _say_ready(options, where),
                 manager,
             )
+            return _exit_status(number.name)
 
     try:
-        return _exit_status(signal.Signals(asyncio.run(run())).name)
+        return asyncio.run(run())
     finally:
         shared.close()
         events.close()
@@ -370,9 +402,9 @@ async def _watched(
     async def ready() -> Page:
         return Page.of(why_not_ready())
 
-    watched = MonitoringServers()
+    offered: dict[str, tuple[HttpAddress, Pages]] = {}
     if options.health is not None:
-        watched.add("health", options.health, {"/livez": alive, "/readyz": ready})
+        offered["health"] = options.health, {"/livez": alive, "/readyz": ready}
     if options.metrics is not None:
         from holdfast.service.metrics import CONTENT_TYPE, Exposition
 
@@ -383,11 +415,12 @@ async def _watched(
                 200, exposition.text(await report(), is_ready=why_not_ready() is None), CONTENT_TYPE
             )
 
-        watched.add("metrics", options.metrics, {"/metrics": metrics})
+        offered["metrics"] = options.metrics, {"/metrics": metrics}
+    watched = MonitoringServers()
     try:
-        yield await watched.start()
+        yield await watched.start(offered)
     finally:
-        watched.close()
+        await watched.close()
 
 
 def _import_without_openssl() -> None:

@@ -37,8 +37,8 @@ from holdfast.protocol.service_jobs import (
     StartJob,
 )
 from holdfast.protocol.service_limits import ServiceStatistics
-from holdfast.runtime.events import EventRates, EventSink, NullEventLog
-from holdfast.service.pool import ThreadPool
+from holdfast.runtime.events import EventRates, EventSink
+from holdfast.runtime.pool import ThreadPool
 from holdfast.transport.contract import IncomingCall, ServiceTransport
 
 __all__ = ["DecisionHook", "ServiceShell"]
@@ -52,7 +52,7 @@ _LARGE_BYTES = 64 << 10
 """Requests that are larger are decoded on a thread."""
 
 _MAX_UNDECODED = 4096
-"""Large requests that wait to be decoded."""
+"""Large requests that wait to be decoded; further ones are rejected unread."""
 
 _MAX_UNDECODED_BYTES = 128 << 20
 """Of these requests: two of the largest. One request is always admitted; when other robots have
@@ -71,13 +71,6 @@ class ServiceShell:
         Not started yet.
     on_decision : callable or None
         Called with the kind, computing time and waiting time of each decision.
-    max_undecoded, max_undecoded_bytes : int
-        Bounds on large requests that wait to be decoded; further ones are rejected unread.
-
-    Attributes
-    ----------
-    is_draining : bool
-        Whether new robots are rejected because the service is about to end.
     """
 
     def __init__(
@@ -85,20 +78,15 @@ class ServiceShell:
         service: Service,
         transport: ServiceTransport,
         workers: int,
-        events: EventSink | None = None,
+        events: EventSink,
         on_decision: DecisionHook | None = None,
-        *,
-        max_undecoded: int = _MAX_UNDECODED,
-        max_undecoded_bytes: int = _MAX_UNDECODED_BYTES,
     ) -> None:
         self._service = service
         self._transport = transport
         self._jobs = ThreadPool(workers, "holdfast-worker", self._broke)
         self._decoder = ThreadPool(1, "holdfast-decoder", self._broke)
-        self._events = events or NullEventLog()
+        self._events = events
         self._on_decision = on_decision
-        self._max_undecoded = max_undecoded
-        self._max_undecoded_bytes = max_undecoded_bytes
         self._calls: dict[int, IncomingCall] = {}
         self._numbers = itertools.count(1)
         self._undecoded = 0
@@ -110,6 +98,7 @@ class ServiceShell:
         self._timer: asyncio.TimerHandle | None = None
         self._idle: asyncio.Future[None] | None = None
         self._closed = False
+        # Whether new robots are rejected because the service is about to end.
         self.is_draining = False
 
     async def start(self) -> None:
@@ -169,9 +158,8 @@ class ServiceShell:
 
     def note(self, event: str, /, **fields: object) -> None:
         """Log an event, with a limited rate for each kind."""
-        admitted = self._rates.admit(event, event, fields, self._loop.time())
-        if admitted is not None:
-            admitted.report_to(self._events)
+        for name, told in self._rates.admit(event, event, fields, self._loop.time()):
+            self._events.event(name, **told)
         self._set_timer()
 
     def statistics(self) -> ServiceStatistics:
@@ -214,7 +202,7 @@ class ServiceShell:
         size = len(payload)
         if size <= _LARGE_BYTES:
             self._decoded(call, size, _decode(payload))
-        elif self._undecoded >= self._max_undecoded or self._takes_too_much(call.robot, size):
+        elif self._undecoded >= _MAX_UNDECODED or self._takes_too_much(call.robot, size):
             self._reject_unread(call)
         else:
             self._undecoded += 1
@@ -227,8 +215,8 @@ class ServiceShell:
         """Return whether a large request exceeds the bound on bytes."""
         wanted_bytes = self._undecoded_bytes + size
         if self._undecoded_of[robot]:
-            return wanted_bytes > self._max_undecoded_bytes
-        return self._undecoded > 0 and wanted_bytes > 2 * self._max_undecoded_bytes
+            return wanted_bytes > _MAX_UNDECODED_BYTES
+        return self._undecoded > 0 and wanted_bytes > 2 * _MAX_UNDECODED_BYTES
 
     def _reject_unread(self, call: IncomingCall) -> None:
         self._unread += 1
@@ -283,8 +271,8 @@ class ServiceShell:
         """Advance the machine's clock, and log dropped events that are due."""
         self._timer = None
         now = self._loop.time()
-        for event in self._rates.due(now):
-            event.report_to(self._events)
+        for name, told in self._rates.due(now):
+            self._events.event(name, **told)
         self._carry_out(self._service.tick(now))
 
     # -- effects ---------------------------------------------------------------------------------

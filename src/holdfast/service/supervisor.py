@@ -36,7 +36,7 @@ from holdfast.service.metrics import ServiceReport, summed
 if TYPE_CHECKING:
     from holdfast.service.listening import SharedEndpoints
 
-__all__ = ["Supervised", "Supervisor", "supervise"]
+__all__ = ["Supervised", "Supervisor"]
 
 _REPORT_EVERY_S = 1.0
 _FRESH_WITHIN_S = 1.0
@@ -149,11 +149,6 @@ class _Child:
         self.answered = 0
         self.failure: str | None = None
 
-    def request_report(self, number: int) -> None:
-        """Request a report."""
-        with contextlib.suppress(OSError):
-            self.control.send(number.to_bytes(8, "big"))
-
     def trouble(self, now: float) -> str | None:
         """Return what is wrong with it, if anything."""
         silent_s = now - self.heard_at
@@ -165,14 +160,8 @@ class _Child:
 class Supervisor:
     """Starts a service's processes, watches them, restarts those that die, and ends them.
 
-    Belongs to the event loop that runs when it is made.
-
-    Parameters
-    ----------
-    arguments : sequence of str
-        Of ``holdfast serve``, for every process.
-    listening : SharedEndpoints
-        Closed when the processes are to end.
+    Belongs to the event loop that runs when it is made. Each process is given the ``arguments`` of
+    ``holdfast serve``; ``listening`` is closed when the processes are to end.
     """
 
     def __init__(
@@ -198,14 +187,67 @@ class Supervisor:
         self._has_served = False
         self._restarts = 0
 
-    async def start(self) -> None:
-        """Start all processes; return when all of them serve.
+    async def run(
+        self,
+        ending: Iterable[signal.Signals],
+        drain_s: float,
+        ready: Callable[[], None],
+        manager: ServiceManager,
+    ) -> signal.Signals:
+        """Run the processes until a signal ends them; return that signal.
+
+        They have ``drain_s`` to end in order; a second signal ends them at once. SIGHUP has them
+        read their credentials again unless it is one of the ``ending`` signals. ``ready`` is called
+        once, when all of them serve.
 
         Raises
         ------
         ServiceProcessError
-            If one has ended before; the message says why.
+            If one of them cannot serve; the message says why.
         """
+        loop = self._loop
+        stopping: asyncio.Future[signal.Signals] = loop.create_future()
+
+        def stop(number: signal.Signals) -> None:
+            if stopping.done():
+                self._kill()
+            else:
+                stopping.set_result(number)
+
+        def reload() -> None:
+            manager.reloading()
+            for child in self._living():
+                if child.ready:
+                    child.process.send_signal(signal.SIGHUP)
+                else:
+                    child.reload = True  # it may have read the old credentials already
+            if starting.done():
+                manager.ready()
+
+        loop.add_signal_handler(signal.SIGHUP, reload)
+        for each in ending:
+            loop.add_signal_handler(each, stop, each)
+        starting = loop.create_task(self._start_all())
+        try:
+            awaited: set[asyncio.Future[Any]] = {starting, stopping}
+            await asyncio.wait(awaited, return_when=asyncio.FIRST_COMPLETED)
+            if starting.done():
+                starting.result()
+                ready()
+                manager.watch(loop, self._status, lambda: self.why_not_alive() is None)
+                manager.ready()
+            number = await stopping
+            self._events.event("stopping", reason=number.name)
+            manager.stopping(drain_s)
+            self._signal_all(number)
+            await self._until(lambda: not self._living(), drain_s)
+            return number
+        finally:
+            starting.cancel()
+            self._kill()
+
+    async def _start_all(self) -> None:
+        """Start all processes; return when all of them serve, raise if one has ended before."""
         for index in range(len(self._children)):
             self._start(index)
         await self._until(
@@ -219,21 +261,7 @@ class Supervisor:
             raise ServiceProcessError(self._failure)
         self._has_served = True
 
-    def reload(self) -> None:
-        """Have all processes read their credentials again."""
-        for child in self._living():
-            if child.ready:
-                child.process.send_signal(signal.SIGHUP)
-            else:
-                child.reload = True  # it may have read the old ones already
-
-    async def stop(self, number: int, timeout_s: float) -> None:
-        """Send this signal to all processes, and kill those that do not end within this time."""
-        self._signal_all(number)
-        await self._until(lambda: not self._living(), timeout_s)
-        self.kill()
-
-    def kill(self) -> None:
+    def _kill(self) -> None:
         """End all processes now; may be repeated."""
         self._signal_all(signal.SIGKILL)
         for index, dead in enumerate(self._children):
@@ -267,7 +295,7 @@ class Supervisor:
         now = monotonic()
         return next(filter(None, (child.trouble(now) for child in self._living())), None)
 
-    def status(self) -> str:
+    def _status(self) -> str:
         """Return the status in a few words, from the processes' last reports."""
         living = self._living()
         sessions = sum(each.report.statistics.sessions for each in living if each.report)
@@ -281,7 +309,8 @@ class Supervisor:
         """Return the sum of all processes' counters, those that have ended included."""
         self._requests = number = self._requests + 1
         for child in self._living():
-            child.request_report(number)
+            with contextlib.suppress(OSError):
+                child.control.send(number.to_bytes(8, "big"))
         await self._until(
             lambda: all(child.answered >= number for child in self._living() if child.ready),
             _FRESH_WITHIN_S,
@@ -396,64 +425,3 @@ class Supervisor:
             if left_s is not None and left_s <= 0.0:
                 return
             await asyncio.wait({self._change}, timeout=left_s)
-
-
-async def supervise(
-    supervisor: Supervisor,
-    events: EventSink,
-    ending: Iterable[signal.Signals],
-    drain_s: float,
-    ready: Callable[[], None],
-    manager: ServiceManager,
-) -> int:
-    """Run a service's processes until a signal ends them; return that signal.
-
-    Parameters
-    ----------
-    ending : iterable of signal.Signals
-        The signals that end the service. SIGHUP goes to the processes if it is not among them.
-    drain_s : float
-        Time for the processes to end in order. A second signal ends them at once.
-    ready : callable
-        Called once, when all processes serve.
-
-    Raises
-    ------
-    ServiceProcessError
-        If a process cannot serve.
-    """
-    loop = asyncio.get_running_loop()
-    stopping: asyncio.Future[int] = loop.create_future()
-
-    def stop(number: int) -> None:
-        if stopping.done():
-            supervisor.kill()
-        else:
-            stopping.set_result(number)
-
-    def reload() -> None:
-        manager.reloading()
-        supervisor.reload()
-        if starting.done():
-            manager.ready()
-
-    loop.add_signal_handler(signal.SIGHUP, reload)
-    for each in ending:
-        loop.add_signal_handler(each, stop, each)
-    starting = loop.create_task(supervisor.start())
-    try:
-        awaited: set[asyncio.Future[Any]] = {starting, stopping}
-        await asyncio.wait(awaited, return_when=asyncio.FIRST_COMPLETED)
-        if starting.done():
-            starting.result()
-            ready()
-            manager.watch(loop, supervisor.status, lambda: supervisor.why_not_alive() is None)
-            manager.ready()
-        number = await stopping
-        events.event("stopping", reason=signal.Signals(number).name)
-        manager.stopping(drain_s)
-        await supervisor.stop(number, drain_s)
-        return number
-    finally:
-        starting.cancel()
-        supervisor.kill()

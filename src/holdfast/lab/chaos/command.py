@@ -11,13 +11,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from holdfast.cli.exit_codes import EXIT_DIFFERENT, ended_by_signals, interrupted_by
+from holdfast.config.validation import close_match
 from holdfast.errors import HoldfastError, OptionError, RunError
 from holdfast.printable import printable
 from holdfast.runtime.command_line import (
     MAX_SEED,
     MAX_TRIALS,
     Options,
-    close_match,
     flag,
     location,
     option,

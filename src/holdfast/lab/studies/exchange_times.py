@@ -47,6 +47,7 @@ from holdfast.protocol.messages import (
     encode_floats,
 )
 from holdfast.protocol.service import Service
+from holdfast.runtime.events import NullEventLog
 from holdfast.service.shell import ServiceShell
 from holdfast.source_digest import core_version, problem_digest
 from holdfast.transport.contract import RobotTransport
@@ -256,7 +257,10 @@ async def _in_process(wanted: Exchange) -> AsyncIterator[tuple[str, RobotTranspo
     problem = problem_of(wanted.problem, {}, {})
     network = InProcessNetwork()
     shell = ServiceShell(
-        Service(lambda _: problem, workers=1), network.service(_IN_PROCESS, "0"), workers=1
+        Service(lambda _: problem, workers=1),
+        network.service(_IN_PROCESS, "0"),
+        workers=1,
+        events=NullEventLog(),
     )
     robot = network.robot([_IN_PROCESS])
     await shell.start()

@@ -15,20 +15,14 @@ from typing import Any, TypeAlias, TypeVar
 __all__ = ["ThreadPool"]
 
 _Result = TypeVar("_Result")
-_Task: TypeAlias = tuple[asyncio.AbstractEventLoop, Callable[[], Any], Callable[[Any], None]]
+_Task: TypeAlias = tuple[Callable[[], Any], Callable[[Any], None]]
 
 
 class ThreadPool:
     """Runs functions on threads, and hands their results to an event loop.
 
-    Its methods are called on the loop's thread.
-
-    Parameters
-    ----------
-    num_threads : int
-        At most; they start when needed.
-    failed : callable
-        Called on the loop with an exception of a function.
+    Its methods are called on the loop's thread, and ``failed``, too, with an exception of a
+    function; without it the loop's exception handler gets that. Threads start when they are needed.
 
     Attributes
     ----------
@@ -40,40 +34,50 @@ class ThreadPool:
         self,
         num_threads: int,
         name: str,
-        failed: Callable[[BaseException], None],
+        failed: Callable[[BaseException], None] | None = None,
     ) -> None:
         self._num_threads = num_threads
         self._name = name
-        self._failed = failed
+        self._failed = failed or _raise
         self._queue: SimpleQueue[_Task | None] = SimpleQueue()
         self._threads: list[threading.Thread] = []
+        self._closed = False
         self.num_open = 0
 
     def submit(self, function: Callable[[], _Result], done: Callable[[_Result], None]) -> None:
         """Run a function on a thread, then ``done`` with its result on the running loop."""
-        loop = asyncio.get_running_loop()
+        self._loop = asyncio.get_running_loop()
         self.num_open += 1
         if len(self._threads) < min(self.num_open, self._num_threads):
             name = f"{self._name}-{len(self._threads)}"
             thread = threading.Thread(target=self._work, name=name, daemon=True)
             self._threads.append(thread)
             thread.start()
-        self._queue.put((loop, function, done))
+        self._queue.put((function, done))
 
-    def close(self) -> None:
-        """End the threads, without waiting for a computation."""
+    def close(self, timeout_s: float = 0.0, last: Callable[[], object] | None = None) -> None:
+        """End the threads, and deliver no more; wait so long for the computations that run.
+
+        ``last`` is run after all else, unless no thread was needed. May be repeated.
+        """
+        self._closed = True
+        if last is not None:
+            self.num_open += 1
+            self._queue.put((last, _dropped))
         for _ in self._threads:
             self._queue.put(None)
+        for each in self._threads:
+            each.join(timeout_s)
 
     def _work(self) -> None:
         while (task := self._queue.get()) is not None:
-            loop, function, done = task
+            function, done = task
             try:
                 result = function()
             except BaseException as error:  # noqa: BLE001 - the loop handles it
-                function, done, result = _nothing, self._failed, error
+                done, result = self._failed, error
             try:
-                loop.call_soon_threadsafe(self._deliver, done, result)
+                self._loop.call_soon_threadsafe(self._deliver, done, result)
             except RuntimeError:
                 return  # the loop is closed
             # Release everything before waiting for the next task.
@@ -81,8 +85,13 @@ class ThreadPool:
 
     def _deliver(self, done: Callable[[Any], None], result: object) -> None:
         self.num_open -= 1
-        done(result)
+        if not self._closed:
+            done(result)
 
 
-def _nothing() -> None:
-    pass
+def _raise(error: BaseException) -> None:
+    raise error
+
+
+def _dropped(result: object) -> None:
+    """Take a result that nobody wants."""
