@@ -26,9 +26,9 @@ from holdfast.lab.simulation.schedule_draws import draw_schedule
 from holdfast.lab.simulation.world import Simulator
 from holdfast.protocol import requests, service
 from holdfast.protocol.dispatcher import Dispatcher
-from holdfast.protocol.failure_detector import FailureDetector
 from holdfast.protocol.local_service import RestartPolicy
 from holdfast.protocol.question import Question
+from holdfast.protocol.replica_set import FailureDetector
 from holdfast.protocol.robot import Robot
 from holdfast.protocol.service import Service
 from holdfast.protocol.service_jobs import Job
@@ -516,7 +516,7 @@ _defect(
     Edit(
         Dispatcher,
         "_appeared",
-        "self._tracker.is_recovering and question",
+        "self.tracker.is_recovering and question",
         "False and question",
     ),
 )
@@ -563,7 +563,7 @@ _defect(
         Dispatcher,
         "_appeared",
         "# It need not wait for the next turn",
-        "self._tracker.change(Cause.CLOUD_ANSWERED, 'seen', now)\n# It need not wait",
+        "self.tracker.change(Cause.CLOUD_ANSWERED, 'seen', now)\n# It need not wait",
     ),
 )
 _defect(
@@ -577,14 +577,14 @@ _defect(
     Edit(
         Dispatcher,
         "_replied",
-        "elif outcome is ReplyOutcome.ANSWERED and",
-        "if outcome is ReplyOutcome.ANSWERED and",
+        "elif is_answer and is_first and",
+        "if is_answer and is_first and",
     ),
 )
 _defect(
     "cloud_lost_twice",
     "The robot reports the loss of the cloud in every status.",
-    Edit(Dispatcher, "_note_lost_cloud", "and not self._tracker.is_recovering", ""),
+    Edit(Dispatcher, "_note_lost_cloud", "and not self.tracker.is_recovering", ""),
 )
 
 

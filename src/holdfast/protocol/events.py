@@ -38,6 +38,7 @@ __all__ = [
     "Paused",
     "Plan",
     "Planned",
+    "RecoveryExited",
     "ReplyReceived",
     "RobotEffect",
     "Send",
@@ -214,6 +215,19 @@ class Planned(NamedTuple):
     sensing_action: int | None = None
     computed_s: float = 0.0
     error: HoldfastError | None = None
+
+
+class RecoveryExited(NamedTuple):
+    """A local service's process ended, or could not be started.
+
+    Attributes
+    ----------
+    launch : int
+        Number of its :class:`Launch`.
+    """
+
+    launch: int
+    reason: str
 
 
 class WriteRecords(NamedTuple):

@@ -1,7 +1,7 @@
 """What a robot knows of the services: which can be asked, when again, and what each must be sent.
 
 All services answer alike, so they are replicas of one another. Known of a replica are its presence
-and silence (the failure detector), how it last answered (well, busy, refusing) and which of the
+and silence (:class:`FailureDetector`), how it last answered (well, busy, refusing) and which of the
 robot's states it holds. The last determines what a request carries: only the latest observations
 for a replica that holds the previous state, else the whole state. Nothing here sends anything.
 """
@@ -12,11 +12,10 @@ import math
 from collections.abc import Collection, Iterator, Sequence
 from typing import NamedTuple
 
-from holdfast.protocol.failure_detector import FailureDetector
 from holdfast.protocol.messages import Observed
 from holdfast.protocol.question import Question
 
-__all__ = ["CatchUp", "Replica", "ReplicaSet"]
+__all__ = ["CatchUp", "FailureDetector", "Replica", "ReplicaSet"]
 
 _LATE_IN_A_ROW = 3
 """After so many late replies in a row, the service is further away than the timeout."""
@@ -50,6 +49,134 @@ _WRONG_ANSWER = "wrong_answer"
 _FINAL_REFUSALS = frozenset({"unknown_problem", "other_code", "version", "too_large"})
 _REFUSED_BY_ALL = frozenset({"invalid", "failed"})
 """Refusals caused by the question itself; any service would refuse."""
+
+
+class FailureDetector:
+    """Is one service dead, or only slow? Evidence from what is seen of it.
+
+    Nobody can know for certain, so errors are made cheap: a suspected service is no longer
+    preferred, but any sign of life clears it, and two services that decide the same question decide
+    alike. There are four kinds of evidence:
+
+    - *presence*: the link breaks when the process dies. This finds a killed service in
+      milliseconds, but a hung one keeps its link for a while;
+    - *signs of life*: every reply is one. While a request waits or is computed, the service sends a
+      ``Progress`` reply every few tens of milliseconds, so silence means that its process hangs, is
+      stopped or is cut off. A service of which nothing is awaited may be silent for any time;
+    - *calls that end without an answer*: the process is gone;
+    - *deadlines*: a decision that takes too long is of no use even with signs of life.
+
+    Parameters
+    ----------
+    detection_timeout_s : float
+        Longest accepted silence while something is awaited.
+
+    Attributes
+    ----------
+    incarnation : str or None
+        Of the present process; None if the service is absent.
+    suspicion : str or None
+        Why the service is not trusted; None if it is.
+    seen : bool
+        Whether it was ever present.
+    """
+
+    def __init__(self, detection_timeout_s: float) -> None:
+        self._usual_timeout_s = detection_timeout_s
+        self._timeout_s = detection_timeout_s
+        self._longest_silence_s = 0.0
+        self._awaited = 0
+        self._last_sign = 0.0
+        self.incarnation: str | None = None
+        self.suspicion: str | None = None
+        self.seen = False
+
+    @property
+    def present(self) -> bool:
+        """Whether its process is there."""
+        return self.incarnation is not None
+
+    @property
+    def trusted(self) -> bool:
+        """Whether it is present and not suspected."""
+        return self.incarnation is not None and self.suspicion is None
+
+    def appeared(self, incarnation: str, now: float) -> bool:
+        """Note the presence of a process; return whether it is new."""
+        fresh = incarnation != self.incarnation
+        self.incarnation = incarnation
+        self.seen = True
+        if fresh:
+            self.suspicion = None
+            self._last_sign = now
+        return fresh
+
+    def vanished(self, incarnation: str) -> bool:
+        """Note the end of a process; return whether it was the present one."""
+        if incarnation != self.incarnation:
+            return False
+        self.incarnation = None
+        return True
+
+    def asked(self, now: float) -> None:
+        """Note that a request was sent."""
+        if self._awaited == 0:
+            self._last_sign = now
+        self._awaited += 1
+
+    def settled(self) -> None:
+        """Note that one request is no longer awaited."""
+        self._awaited = max(0, self._awaited - 1)
+
+    def heard(self, now: float) -> None:
+        """Note a sign of life."""
+        if self._awaited:
+            self._longest_silence_s = max(self._longest_silence_s, now - self._last_sign)
+        self._last_sign = now
+        self.suspicion = None
+
+    def extend_patience(self, factor: float, limit_s: float) -> None:
+        """Accept a longer silence, up to a limit."""
+        self._timeout_s = min(factor * self._timeout_s, max(limit_s, self._timeout_s))
+
+    def answered(self) -> None:
+        """Note a complete answer, and shorten an extended timeout.
+
+        It becomes twice the longest silence of that answer, but at least half of what it was.
+        """
+        needed_s = 2.0 * self._longest_silence_s
+        shorter_s = max(0.5 * self._timeout_s, needed_s, self._usual_timeout_s)
+        self._timeout_s = min(self._timeout_s, shorter_s)
+        self._longest_silence_s = 0.0
+
+    def excuse(self, seconds: float) -> None:
+        """Disregard a time in which the robot could not receive."""
+        self._last_sign += seconds
+
+    def silence_s(self, now: float) -> float:
+        """Return the time since the last sign of life.
+
+        Its appearance is one, and so is a request that is sent while none is awaited.
+        """
+        return max(0.0, now - self._last_sign)
+
+    def suspect(self, reason: str) -> None:
+        """Distrust it until it is heard or another process takes its place."""
+        self.suspicion = reason
+
+    def suspect_if_silent(self, now: float) -> bool:
+        """Suspect it if its silence is too long; return whether that is new."""
+        deadline = self.deadline()
+        if deadline is None or now < deadline:
+            return False
+        self.suspicion = f"no sign of progress for {1e3 * (now - self._last_sign):.0f} ms"
+        return True
+
+    def deadline(self) -> float | None:
+        """Return when it becomes suspected if nothing comes; None if nothing is awaited."""
+        if self._awaited == 0 or self.suspicion is not None:
+            return None
+        return self._last_sign + self._timeout_s
 
 
 class CatchUp(NamedTuple):
@@ -91,10 +218,10 @@ class Replica:
         Trial and number of observations of the latest state that it is known to hold.
     times_differed : int
         Times in a row that it reached another state than the robot.
-    task_refusals, sensing_refusals : int
-        Of each part since it last gave that part. A problem's code can fail in one part only.
+    num_refusals : int
+        Since its last whole answer: a problem's code can fail in one part only.
     complaint : str or None
-        Text of the last refusal since it last answered.
+        Text of the last of these.
     refusal, refusal_code : str or None, str
         Why it is no longer asked.
     distrusted : str or None
@@ -123,7 +250,7 @@ class Replica:
         self.opened = False
         self.acknowledged: tuple[int, int] | None = None
         self.times_differed = 0
-        self.task_refusals = self.sensing_refusals = 0
+        self.num_refusals = 0
         self.complaint: str | None = None
         self.refusal = self.distrusted
         self.refusal_code = "" if self.refusal is None else _WRONG_ANSWER
@@ -170,30 +297,30 @@ class Replica:
                 return self.late_soonest_s
         return None
 
-    def note_answer(self, question: Question, now: float, *, sensing: bool, restored: bool) -> None:
+    def note_answer(self, question: Question, now: float, *, restored: bool) -> None:
         """Record a part of an answer: it lives and holds the question's state.
 
         Parameters
         ----------
-        sensing : bool
-            Whether it is the sensing part.
         restored : bool
             Whether the request carried the state.
         """
         self.detector.heard(now)
         self.opened = True
-        if sensing:
-            self.sensing_refusals = 0
-        else:
-            self.task_refusals = 0
         self.retry_at = 0.0
-        if not self.task_refusals and not self.sensing_refusals:
+        if not self.num_refusals:
             self.backoff_s = _FIRST_RETRY_S
-            self.complaint = None
         if not restored:
             self.times_differed = 0
         holds = (question.state.trial, question.num_observations)
         self.acknowledged = max(self.acknowledged or holds, holds)
+
+    def note_whole_answer(self) -> None:
+        """Record that an answer is complete."""
+        self.detector.answered()
+        self.num_refusals = 0
+        self.complaint = None
+        self.backoff_s = _FIRST_RETRY_S
 
     def note_busy(self, retry_after_s: float, now: float) -> float:
         """Record that it is busy; return for how long it is left alone, in seconds."""
@@ -211,26 +338,16 @@ class Replica:
         if differs:
             self.times_differed += 1
 
-    def note_refusal(self, code: str, text: str, now: float, *, sensing: bool) -> bool:
-        """Record a refusal, which delays it; return whether it is no longer asked.
-
-        Parameters
-        ----------
-        sensing : bool
-            Whether it refuses the sensing part.
-        """
+    def note_refusal(self, code: str, text: str, now: float) -> bool:
+        """Record a refusal, which delays it; return whether it is no longer asked."""
         most = _MAX_REFUSALS
         if code == _OUT_OF_MEMORY:
             most = _MAX_OUT_OF_MEMORY
             self.backoff_s = max(self.backoff_s, _OUT_OF_MEMORY_RETRY_S)
         self.delay(now)
-        if sensing:
-            self.sensing_refusals += 1
-        else:
-            self.task_refusals += 1
+        self.num_refusals += 1
         self.complaint = f"{code}: {text}"
-        refusals = self.sensing_refusals if sensing else self.task_refusals
-        final = code in _FINAL_REFUSALS or refusals >= most
+        final = code in _FINAL_REFUSALS or self.num_refusals >= most
         if final:
             self.refusal = text
             self.refusal_code = code

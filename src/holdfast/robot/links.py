@@ -20,8 +20,9 @@ from holdfast.config.settings import OffloadSettings, PlanningSettings
 from holdfast.errors import TransportError
 from holdfast.planning import Planner
 from holdfast.problems.problem import Problem
+from holdfast.protocol.events import RecoveryExited
 from holdfast.robot.memo_cache import MemoCache, MemoizingPlanner
-from holdfast.robot.recovery_launcher import RecoveryExited, RecoveryLauncher
+from holdfast.robot.recovery_launcher import RecoveryLauncher
 from holdfast.runtime.events import EventSink
 from holdfast.transport.contract import RobotTransport
 

@@ -15,22 +15,11 @@ import threading
 import weakref
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import IO, NamedTuple
+from typing import IO
 
-__all__ = ["RecoveryExited", "RecoveryLauncher"]
+from holdfast.protocol.events import RecoveryExited
 
-
-class RecoveryExited(NamedTuple):
-    """A process of the local service has ended, or could not be started.
-
-    Attributes
-    ----------
-    launch : int
-        The number that it was launched by.
-    """
-
-    launch: int
-    reason: str
+__all__ = ["RecoveryLauncher"]
 
 
 class RecoveryLauncher:
