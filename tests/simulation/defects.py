@@ -32,7 +32,7 @@ from holdfast.protocol.replica_set import FailureDetector
 from holdfast.protocol.robot import Robot
 from holdfast.protocol.service import Service
 from holdfast.protocol.service_jobs import Job
-from holdfast.protocol.service_sessions import Session, SessionTable
+from holdfast.protocol.service_sessions import SessionTable
 
 __all__ = [
     "DEFECTS",
@@ -226,7 +226,12 @@ _defect(
     "new_epoch_not_noted",
     "The service drops what a robot's last process waited for, but does not note the epoch of the "
     "next one.",
-    Edit(Session, "take_over", "self.epoch = epoch", "pass"),
+    Edit(
+        Service,
+        "_take_over",
+        "session.epoch, session.number = epoch, -1",
+        "session.number = -1",
+    ),
 )
 _defect(
     "old_process_still_served",
@@ -266,9 +271,7 @@ _defect(
         Service,
         "_answer_from_cache",
         "following = answer.following",
-        "self._effects.append(EndCall(call))\n"
-        "return _Disposition.ANSWERED\n"
-        "following = answer.following",
+        "self._effects.append(EndCall(call))\nreturn True, None\nfollowing = answer.following",
     ),
 )
 _defect(
@@ -280,7 +283,7 @@ _defect(
         "if rest is not None:\n    self._calls.attach(",
         "if answer.num_actions:\n"
         "    self._effects.append(EndCall(call))\n"
-        "    return _Disposition.ANSWERED\n"
+        "    return True, None\n"
         "if rest is not None:\n"
         "    self._calls.attach(",
     ),

@@ -192,6 +192,11 @@ class Question:
             self.sensing is not None or self.sensing_step is None
         )
 
+    @property
+    def is_first(self) -> bool:
+        """Whether its trial has only begun, so that a service needs nothing to reach its state."""
+        return self.state.step == 0 and self.num_observations == 0
+
     def checkpoint(self) -> bytes:
         """Return the encoded state (computed once)."""
         if self._checkpoint is None:

@@ -10,12 +10,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterator, Sequence
-from typing import NamedTuple
 
 from holdfast.protocol.messages import Observed
 from holdfast.protocol.question import Question
 
-__all__ = ["CatchUp", "FailureDetector", "Replica", "ReplicaSet"]
+__all__ = ["FailureDetector", "Replica", "ReplicaSet"]
 
 _LATE_IN_A_ROW = 3
 """After so many late replies in a row, the service is further away than the timeout."""
@@ -179,27 +178,6 @@ class FailureDetector:
         return self._last_sign + self._timeout_s
 
 
-class CatchUp(NamedTuple):
-    """What a request must carry for a service to reach the question's state.
-
-    Attributes
-    ----------
-    needs_session_configuration : bool
-        Whether it does not know the session.
-    fresh : bool
-        Whether the trial has only begun, so nothing else is missing.
-    observations : tuple of Observed
-        From the state that it holds to the question's.
-    checkpoint : bytes or None
-        The whole state, where that is better.
-    """
-
-    needs_session_configuration: bool
-    fresh: bool
-    observations: tuple[Observed, ...]
-    checkpoint: bytes | None
-
-
 class Replica:
     """One service, as far as the robot knows it.
 
@@ -360,20 +338,28 @@ class Replica:
 
     # -- what it needs ---------------------------------------------------------------------------
 
-    def catch_up(self, question: Question, *, whole_state: bool) -> CatchUp:
-        """Return what a request must carry.
+    def catch_up(
+        self, question: Question, *, whole_state: bool
+    ) -> tuple[tuple[Observed, ...], bytes | None]:
+        """Return what a request must carry for the service to reach the question's state.
 
         Parameters
         ----------
         whole_state : bool
             Whether it needs the whole state in any case.
+
+        Returns
+        -------
+        observations : tuple of Observed
+            From the state that it holds to the question's.
+        checkpoint : bytes or None
+            The whole state, where that is better.
         """
         state = question.state
         known = self.acknowledged
         start = known[1] if known is not None and known[0] == state.trial else 0
         missing = question.num_observations - start
-        fresh = state.step == 0 and missing == 0
-        if missing > 1 or not (self.opened or fresh):
+        if missing > 1 or not (self.opened or question.is_first):
             # It knows nothing, or others have decided since. Replaying takes time that other robots
             # need, so it is sent the state, unless that is large.
             whole_state |= (
@@ -383,9 +369,8 @@ class Replica:
         if self.times_differed >= _MAX_TIMES_DIFFERED or missing > len(question.observations):
             whole_state = True
         if whole_state:
-            return CatchUp(not self.opened, fresh, (), question.checkpoint())
-        observations = question.observations[-missing:] if missing > 0 else ()
-        return CatchUp(not self.opened, fresh, observations, None)
+            return (), question.checkpoint()
+        return question.observations[-missing:] if missing > 0 else (), None
 
 
 class ReplicaSet:
@@ -438,22 +423,15 @@ class ReplicaSet:
         """Return the service of a name; None if there is none."""
         return self._by_name.get(name)
 
-    def all_to_come(self) -> bool:
-        """Return whether no cloud service was ever present, not counting those that refuse.
-
-        False if all refuse.
-        """
-        seen = [each.detector.seen for each in self.cloud if each.refusal is None]
-        return bool(seen) and not any(seen)
-
     def start(self, now: float) -> None:
         """Give the services time to come up."""
         self.startup_until = now + self._startup_timeout_s
 
     def is_starting(self, now: float) -> bool:
         """Return whether services may still be coming up."""
+        seen = [each.detector.seen for each in self.cloud if each.refusal is None]
         until = self.startup_until
-        return until is not None and now < until and self.all_to_come()
+        return until is not None and now < until and bool(seen) and not any(seen)
 
     def local_usable(self, now: float) -> bool:
         """Return whether the local service can be expected to answer now."""

@@ -220,7 +220,8 @@ class OpenRequests:
         for call in open_calls[: max(0, len(open_calls) - _MAX_CALLS + 1)]:
             self.abandon(call)
         state = question.state
-        catch_up = replica.catch_up(question, whole_state=whole_state)
+        opens = not replica.opened
+        observations, checkpoint = replica.catch_up(question, whole_state=whole_state)
         self._number += 1
         call_number = self._number
         number = self._first_request + call_number
@@ -233,9 +234,9 @@ class OpenRequests:
             state.step,
             state.sensed,
             question.digest,
-            catch_up.observations,
-            self._session_configuration if catch_up.needs_session_configuration else None,
-            catch_up.checkpoint,
+            observations,
+            self._session_configuration if opens else None,
+            checkpoint,
         )
         self._open[call_number] = OpenRequest(
             call_number,
@@ -243,12 +244,12 @@ class OpenRequests:
             replica,
             question,
             now,
-            opens=catch_up.needs_session_configuration,
-            restores=catch_up.checkpoint is not None,
+            opens=opens,
+            restores=checkpoint is not None,
         )
         replica.detector.asked(now)
         payload = encode(request)
-        if catch_up.needs_session_configuration and not catch_up.fresh:
+        if opens and not question.is_first:
             self._effects.report(
                 "restore", service=replica.name, step=state.step, bytes=len(payload)
             )

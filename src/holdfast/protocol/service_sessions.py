@@ -17,15 +17,14 @@ from __future__ import annotations
 import hashlib
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
-from functools import lru_cache
-from typing import NamedTuple, TypeAlias
+from typing import Literal, NamedTuple, TypeAlias
 
 import msgspec
 
 from holdfast.config.settings import PlanningSettings
 from holdfast.planning import PlanningState
 from holdfast.problems.registry import BUILT_IN
-from holdfast.protocol.expected_time import ExpectedTimes
+from holdfast.protocol.expected_time import ExpectedTime
 from holdfast.protocol.messages import Request, SessionConfiguration, pack_configuration
 from holdfast.protocol.service_limits import ServiceLimits
 
@@ -40,6 +39,7 @@ __all__ = [
     "SessionKey",
     "SessionTable",
     "WaitingCall",
+    "with_cores",
 ]
 
 _LEAST_EPOCHS = 4096
@@ -47,9 +47,6 @@ _LEAST_EPOCHS = 4096
 
 _TYPICAL_STEPS = 32
 """Bound on the steps of a task whose time earlier tasks predict."""
-
-_SETTINGS_KEPT = 128
-"""Bound on the settings that are shared between sessions."""
 
 Owner: TypeAlias = str | None
 """Name in the robot's verified certificate; None without one."""
@@ -130,9 +127,24 @@ class PendingTask:
         self.urgent = request is not None
         self.newcomer = session.newcomer
         self.calls: dict[int, WaitingCall] = {}
-        self.cost_s = session.expected_s(sensing=sensing)
+        self.cost_s = self._expected_s()
         self.running = False
         self.started_at = since
+
+    @property
+    def kind(self) -> Literal["task", "sensing"]:
+        """Which part of the answer it is."""
+        return "sensing" if self.sensing else "task"
+
+    @property
+    def expected_time(self) -> ExpectedTime:
+        """Learned from earlier ones of its session and kind."""
+        return self.session.sensing_time if self.sensing else self.session.task_time
+
+    def _expected_s(self) -> float:
+        """Return how long it may take, with the sensing part that follows a task part."""
+        session = self.session
+        return session.sensing_time.mean_s + (0.0 if self.sensing else session.task_time.mean_s)
 
     def is_typical(self, state: PlanningState | None) -> bool:
         """Return whether earlier times predict this task's, if it starts at ``state``.
@@ -156,14 +168,14 @@ class PendingTask:
         """Take the place of a superseded request of the same robot."""
         self.digest, self.request = request.digest, request
         self.sensing, self.size = sensing, size
-        self.cost_s = self.session.expected_s(sensing=sensing)
+        self.cost_s = self._expected_s()
 
 
 class Session:
     """What is remembered of one robot.
 
-    Its methods change its states, answers, tasks, epoch and number; :class:`SessionTable` writes
-    ``served``, ``newcomer``, ``closed``, ``used_at`` and ``num_bytes``.
+    :class:`~holdfast.protocol.service.Service` writes its states, answers, tasks, epoch and number,
+    :class:`SessionTable` the rest.
 
     Attributes
     ----------
@@ -175,8 +187,8 @@ class Session:
         Digest that identifies the problem among those kept for reuse.
     built_in : bool
         Whether the problem is part of holdfast.
-    planning, planning_single : PlanningSettings
-        With the threads for a decision alone, and with one thread.
+    planning : PlanningSettings
+        With the threads that a decision has when it is computed alone.
     served : bool
         Whether the robot got an answer.
     newcomer : bool
@@ -199,7 +211,8 @@ class Session:
         request: Request,
         configuration: SessionConfiguration,
         max_threads: int,
-        times: ExpectedTimes,
+        task_time: ExpectedTime,
+        sensing_time: ExpectedTime,
     ) -> None:
         self.key = key
         self.epoch = request.epoch
@@ -220,8 +233,7 @@ class Session:
         self.built_in = configuration.problem in BUILT_IN
         # The number of threads changes no result, so the service may choose it.
         most = min(configuration.planning.active_sensing.num_cores, max_threads)
-        self.planning = _with_cores(configuration.planning, most)
-        self.planning_single = _with_cores(configuration.planning, 1)
+        self.planning = with_cores(configuration.planning, most)
         self.seed = configuration.seed
         self.served = False
         self.newcomer = True
@@ -230,7 +242,8 @@ class Session:
         self.ahead_digest = b""
         self.answers: OrderedDict[bytes, CachedAnswer] = OrderedDict()
         self.pending: dict[bytes, PendingTask] = {}
-        self.times = times
+        self.task_time = task_time
+        self.sensing_time = sensing_time
         self.num_bytes = 0
         self.used_at = 0.0
         self.closed = False
@@ -240,36 +253,10 @@ class Session:
         """Name in its certificate, or None."""
         return self.key[0]
 
-    def expected_s(self, *, sensing: bool) -> float:
-        """Return how long a task may take, including the sensing part that follows a task part."""
-        times = self.times
-        return times.sensing_s if sensing else times.task_s + times.sensing_s
-
-    def take_over(self, epoch: int) -> None:
-        """Begin the epoch of the robot's next process, whose requests are numbered anew."""
-        self.epoch = epoch
-        self.number = -1
-
-    def accept(self, number: int) -> bool:
-        """Note a request's number; return whether no newer request came before."""
-        newest = number >= self.number
-        if newest:
-            self.number = number
-        return newest
-
-    def add_task(self, task: PendingTask) -> None:
-        """Note a task to be computed."""
-        self.pending[task.digest] = task
-
     def remove_task(self, task: PendingTask) -> None:
         """Remove a task, unless another has taken its place."""
         if self.pending.get(task.digest) is task:
             del self.pending[task.digest]
-
-    def hold(self, state: PlanningState, ahead: PlanningState | None, ahead_digest: bytes) -> None:
-        """Keep the state last asked about, and the one ahead of it."""
-        self.acknowledged = state
-        self.ahead, self.ahead_digest = ahead, ahead_digest
 
     def drop_states(self) -> None:
         """Drop the states and the answers."""
@@ -283,10 +270,6 @@ class Session:
         answers.move_to_end(digest)
         while len(answers) > most:
             answers.popitem(last=False)
-
-    def forget_answer(self, digest: bytes) -> None:
-        """Drop a cached part of an answer."""
-        del self.answers[digest]
 
     def state_before(self, request: Request) -> PlanningState | None:
         """Return the nearest state before the request's; None if there is none."""
@@ -562,9 +545,8 @@ def _digest_of(data: object) -> bytes:
     return hashlib.blake2b(msgspec.msgpack.encode(data), digest_size=16).digest()
 
 
-@lru_cache(maxsize=_SETTINGS_KEPT)
-def _with_cores(planning: PlanningSettings, num_cores: int) -> PlanningSettings:
-    """Return the settings with another number of threads; equal ones share a copy."""
+def with_cores(planning: PlanningSettings, num_cores: int) -> PlanningSettings:
+    """Return the settings with another number of threads."""
     sensing = msgspec.structs.replace(planning.active_sensing, num_cores=num_cores)
     return msgspec.structs.replace(planning, active_sensing=sensing)
 
