@@ -214,7 +214,11 @@ def check_limits(bench: Bench, limits: dict[str, Any]) -> None:
     kept = list(sessions._sessions.values())
     assert statistics.sessions == len(kept) <= limits["max_sessions"]
     epochs = list(sessions._epochs)
-    assert len(epochs) == sessions._epochs._count <= max(4 * limits["max_sessions"], 4096)
+    assert (
+        len(epochs)
+        == sum(sessions._epochs._num_of.values())
+        <= max(4 * limits["max_sessions"], 4096)
+    )
     assert not set(epochs) & set(sessions._sessions)
     # Owners.
     owners = {session.owner for session in kept}

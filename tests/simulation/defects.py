@@ -196,7 +196,7 @@ class _DrawingJob(Job):
     def __init__(self, *arguments: Any) -> None:
         super().__init__(*arguments)
         self.position = 0
-        named = self._request or self._state
+        named = self._request or self.state
         assert named is not None
         if self.kind == "sensing":
             _, positions = self.drawn.setdefault(id(self._configuration), (self._configuration, {}))
@@ -251,9 +251,9 @@ _defect(
     Edit(
         Job,
         "_computed",
-        "choose_sensing_action(self._state)",
+        "choose_sensing_action(self.state)",
         "choose_sensing_action(\n"
-        "    self._state._replace(step=self.position * (planning.sensing_interval + 1)))",
+        "    self.state._replace(step=self.position * (planning.sensing_interval + 1)))",
     ),
     Edit(
         Job,

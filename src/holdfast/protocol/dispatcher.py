@@ -235,10 +235,9 @@ class Dispatcher(DecisionSource):
             replica.forget()
             replica.last_incarnation = incarnation
         if replica is self._services.local:
-            self._launches.appeared(now)
-            launched_s = self._launches.since_launch_s(now)
-            if launched_s is not None:
-                self.effects.report("launched", launch_ms=1e3 * launched_s)
+            launch_s = self._launches.appeared(now)
+            if launch_s is not None:
+                self.effects.report("launched", launch_ms=1e3 * launch_s)
             return
         self.effects.report("service_appeared", service=replica.name)
         question = self.question

@@ -101,15 +101,7 @@ Numbers = Annotated[bytes, msgspec.Meta(max_length=8 * MAX_ACTION_SIZE * MAX_TAS
 
 
 class Observed(msgspec.Struct, array_like=True, frozen=True, forbid_unknown_fields=True):
-    """An observation that is part of the robot's belief.
-
-    Attributes
-    ----------
-    step : int
-        It belongs to the state of that step, before its task action.
-    observation : bytes
-        Little-endian float64.
-    """
+    """An observation (little-endian float64) of the state of a step, before its task action."""
 
     step: Word
     sensing_action: Word
@@ -125,14 +117,11 @@ class SessionConfiguration(msgspec.Struct, array_like=True, frozen=True):
 
     Attributes
     ----------
-    problem : str
-        Registered name.
     model, state_space_planner : dict
         The problem's two sections of the configuration.
-    core_version : str
-        Of the robot's holdfast (:func:`holdfast.source_digest.core_version`).
-    problem_digest : str
-        Of the problem's code beyond that (:func:`holdfast.source_digest.problem_digest`).
+    core_version, problem_digest : str
+        Of the robot's holdfast, and of the problem's code beyond that
+        (:mod:`holdfast.source_digest`).
     """
 
     problem: Name
@@ -169,20 +158,14 @@ class Request(_Named, array_like=True, frozen=True):
 
     Attributes
     ----------
-    version : int
-        :data:`PROTOCOL_VERSION`.
     session : bytes
-        16 random bytes, drawn once per run.
+        Random, drawn once per run.
     epoch : int
         Raised by each restart of the robot; a service refuses a lower one than it has seen.
     number : int
         Increases within an epoch, and is unique among epochs. Every reply repeats it.
-    trial, step : int
-        Of the state.
-    sensed : bool
-        Whether the step's observation is part of the state.
-    digest : bytes
-        Of the state.
+    trial, step, sensed, digest
+        Of the state; ``sensed`` says whether the step's observation is part of it.
     observations : tuple of Observed
         Of this trial, in order, since the state that this service acknowledged last; all of them if
         it acknowledged none.
@@ -218,16 +201,7 @@ class _SentRequest(_Named, array_like=True, frozen=True, forbid_unknown_fields=T
 class TaskAnswer(msgspec.Struct, array_like=True, frozen=True, tag=1):
     """The task actions from the state on, up to the next sensing step.
 
-    Attributes
-    ----------
-    number : int
-        Of the request.
-    count : int
-        Task actions, for the request's step and those that follow.
-    actions : bytes
-        Executed actions in order, little-endian float64.
-    computed_us : int
-        Computing time.
+    ``actions`` are the executed ones, ``count`` in number, in order, as little-endian float64.
     """
 
     number: Word
@@ -241,15 +215,11 @@ class SensingAnswer(msgspec.Struct, array_like=True, frozen=True, tag=2):
 
     Attributes
     ----------
-    number : int
-        Of the request.
     step : int
         The sensing step: the request's own if its state must still sense, else that after the task
         actions.
     digest : bytes
         Of the state in which it was chosen; the robot follows it only in exactly that state.
-    computed_us : int
-        Computing time.
     """
 
     number: Word
@@ -260,15 +230,7 @@ class SensingAnswer(msgspec.Struct, array_like=True, frozen=True, tag=2):
 
 
 class Progress(msgspec.Struct, array_like=True, frozen=True, tag=3):
-    """A sign of life: the request is in work.
-
-    Attributes
-    ----------
-    number : int
-        Of the request.
-    waiting : bool
-        Whether it still waits for a worker.
-    """
+    """A sign of life: the request is in work, or still waits for a worker."""
 
     number: Word
     waiting: bool
@@ -279,8 +241,6 @@ class NeedState(msgspec.Struct, array_like=True, frozen=True, tag=4):
 
     Attributes
     ----------
-    number : int
-        Of the request.
     differs : bool
         Whether the service holds a state of the trial that does not lead to the robot's; then only
         the checkpoint helps.
@@ -296,10 +256,7 @@ class NeedState(msgspec.Struct, array_like=True, frozen=True, tag=4):
 class Busy(msgspec.Struct, array_like=True, frozen=True, tag=5):
     """The service has too much work: ask another, or again later.
 
-    Attributes
-    ----------
-    number : int
-        Of the request; 0 if it was turned away unread.
+    ``number`` is 0 if the request was turned away unread.
     """
 
     number: Word
@@ -312,15 +269,13 @@ class Refused(msgspec.Struct, array_like=True, frozen=True, tag=6):
     Attributes
     ----------
     number : int
-        Of the request; 0 if it could not be read.
+        0 if the request could not be read.
     code : str
         ``damaged`` (in transit: it may be sent again), ``malformed``, ``too_large``, ``version``,
         ``stale_epoch``, ``unknown_problem``, ``other_code`` (the service's holdfast or problem
         is not the robot's), ``invalid`` (settings or state out of bounds),
         ``out_of_memory`` (it may be asked again) or ``failed`` (the problem's own functions failed
         in this state).
-    text : str
-        An explanation.
     """
 
     number: Word

@@ -71,10 +71,8 @@ class AnswerPart:
 
     Attributes
     ----------
-    task_actions : list of array or None
-        Task actions; None for a sensing part.
-    sensing : SensingAnswer or None
-        None for a task part.
+    task_actions, sensing
+        One of them is None.
     outside_limits : bool
         Whether the problem's ``execute`` would change the task actions.
     judged : bool
@@ -116,17 +114,10 @@ class Question:
     :class:`~holdfast.protocol.verification.Verification` where services answer, else by
     :class:`InProcessSource`; the robot writes ``needed_at`` and ``num_ordered``.
 
-    Parameters
-    ----------
-    digest : bytes
-        Of the state.
-    observations : tuple of Observed
-        The latest observations of this trial.
-    num_observations : int
-        Of this trial, including those not kept.
-
     Attributes
     ----------
+    observations, num_observations
+        The latest of this trial, and how many there were.
     task_count : int
         Task actions in the answer.
     sensing_step : int or None
@@ -135,10 +126,8 @@ class Question:
         Since when the robot waits for the answer; None if it does not.
     num_ordered : int
         Task actions of the answer that are performed or ordered.
-    task_actions : sequence of array or None
-        Task actions to follow; None until they arrive.
-    sensing : SensingAnswer or None
-        Sensing action to follow; None until it arrives.
+    task_actions, sensing
+        What the robot follows; None until it arrives.
     parts : list of AnswerPart
         All distinct parts that services gave.
     check_decided : bool

@@ -19,11 +19,7 @@ from __future__ import annotations
 from holdfast.arrays import FloatArray
 from holdfast.belief import VALIDATION_GATE_SQUARED
 from holdfast.config.settings import SimulatorSettings
-from holdfast.errors import (
-    HeldError,
-    HoldfastError,
-    UnknownPerformanceError,
-)
+from holdfast.errors import HeldError, HoldfastError, UnknownPerformanceError
 from holdfast.outcome import Done
 from holdfast.planning import ObservationInfo, Planner, PlanningState
 from holdfast.protocol.events import (
@@ -45,10 +41,7 @@ from holdfast.protocol.events import (
     TransportEvent,
     WriteRecords,
 )
-from holdfast.protocol.messages import (
-    DIGEST_SIZE,
-    encode_floats,
-)
+from holdfast.protocol.messages import DIGEST_SIZE, encode_floats
 from holdfast.protocol.question import DecisionSource, Provenance, Question, same_actions
 from holdfast.protocol.records import (
     DIVERGENCE_RUN,
@@ -476,7 +469,7 @@ class Robot:
                 return
         self._write(ActingRecord(state.step, encode_floats(action)))
         history = self._current_history
-        history.acting(action)
+        history.pending = action
         question.num_ordered = offset + 1
         self._awaits_environment = True
         self._effects.append(Act(state.step, action))
@@ -552,7 +545,7 @@ class Robot:
         times = self._source.tracker.recoveries - self._recoveries_counted
         if times:
             self._recoveries_counted = self._source.tracker.recoveries
-            history.recovered(times)
+            history.recoveries += times
             self._unwritten.append(LocalTookOverRecord(times))
 
     def _timed(self, kind: str, question: Question, provenance: Provenance, now: float) -> None:

@@ -140,12 +140,7 @@ class Job:
         self._seed = seed
         self._limits = limits
         self._request = request
-        self._state = state
-
-    @property
-    def state(self) -> PlanningState | None:
-        """Where it starts."""
-        return self._state
+        self.state = state
 
     @property
     def identity(self) -> tuple[object, ...]:
@@ -176,7 +171,7 @@ class Job:
             _check_work(problem, self._planning, self._limits)
             return self._computed(problem)
         except _LacksStateError as lack:
-            differs = lack.differs or self._state is not None
+            differs = lack.differs or self.state is not None
             return JobResult(
                 lacks_state=True, differs=differs, diverged=lack.diverged, problem=problem
             )
@@ -197,8 +192,8 @@ class Job:
         planning, request = self._planning, self._request
         planner = Planner(problem, planning)
         if request is None:
-            assert self._state is not None
-            index, _ = planner.choose_sensing_action(self._state)
+            assert self.state is not None
+            index, _ = planner.choose_sensing_action(self.state)
             return JobResult(problem=problem, sensing_action=index)
         state = self._reached(planner, request)
         restored = request.checkpoint is not None
@@ -220,7 +215,7 @@ class Job:
         """Return the requested state."""
         if request.checkpoint is not None:
             return self._restored(planner, request, request.checkpoint)
-        state = self._state
+        state = self.state
         if state is None:
             state = planner.init(self._seed, request.trial)
         most = state.step + self._limits.max_steps

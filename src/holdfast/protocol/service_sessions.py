@@ -15,7 +15,7 @@ calls. A part is identified by the digest of its state, so equal questions share
 from __future__ import annotations
 
 import hashlib
-from collections import OrderedDict
+from collections import Counter, OrderedDict
 from collections.abc import Callable, Iterator
 from typing import Literal, NamedTuple, TypeAlias
 
@@ -299,38 +299,31 @@ class ForgottenEpochs:
 
     def __init__(self, most: int) -> None:
         self._most = most
-        self._count = 0
-        # Owners in the order in which they were noted last.
-        self._of: OrderedDict[Owner, OrderedDict[bytes, int]] = OrderedDict()
+        self._epochs: OrderedDict[SessionKey, int] = OrderedDict()
+        self._num_of: Counter[Owner] = Counter()
 
     def __iter__(self) -> Iterator[SessionKey]:
-        return ((owner, session) for owner, epochs in self._of.items() for session in epochs)
+        return iter(self._epochs)
 
     def get(self, key: SessionKey) -> int:
         """Return a session's epoch; 0 if unknown."""
-        owner, session = key
-        epochs = self._of.get(owner)
-        return 0 if epochs is None else epochs.get(session, 0)
+        return self._epochs.get(key, 0)
 
     def note(self, key: SessionKey, epoch: int) -> None:
         """Keep an epoch."""
-        owner, session = key
         self.forget(key)
-        self._of.setdefault(owner, OrderedDict())[session] = epoch
-        self._of.move_to_end(owner)
-        self._count += 1
-        if self._count > self._most:
-            largest = max(self._of, key=lambda each: len(self._of[each]))
-            self.forget((largest, next(iter(self._of[largest]))))
+        self._epochs[key] = epoch
+        self._num_of[key[0]] += 1
+        if len(self._epochs) > self._most:
+            largest = max(self._num_of, key=lambda owner: self._num_of[owner])
+            self.forget(next(each for each in self._epochs if each[0] == largest))
 
     def forget(self, key: SessionKey) -> None:
         """Drop the epoch of a session that is held again."""
-        owner, session = key
-        epochs = self._of.get(owner)
-        if epochs is not None and epochs.pop(session, None) is not None:
-            self._count -= 1
-            if not epochs:
-                del self._of[owner]
+        if self._epochs.pop(key, None) is not None:
+            self._num_of[key[0]] -= 1
+            if not self._num_of[key[0]]:
+                del self._num_of[key[0]]
 
 
 class _Holding:
@@ -434,7 +427,8 @@ class SessionTable:
         return not self._sessions or not (
             self._is_full_for(session.owner)
             or self._is_full
-            or self._lacks_room_for_configuration(session)
+            or self.configuration_bytes + len(session.configuration)
+            > self._limits.max_configuration_bytes
         )
 
     def evictable_for(self, session: Session) -> Session | None:
@@ -448,12 +442,10 @@ class SessionTable:
             owner = session.owner
             return self._first_unused(lambda each: each.owner == owner)
         only_unserved = 2 * self._total.unserved >= self._limits.max_sessions
-        if self._is_full:
-            return self._unused_of_most(
-                lambda holding: holding.sessions, only_unserved=only_unserved
-            )
+        is_full = self._is_full
         return self._unused_of_most(
-            lambda holding: holding.configuration_bytes, only_unserved=only_unserved
+            lambda holding: holding.sessions if is_full else holding.configuration_bytes,
+            only_unserved=only_unserved,
         )
 
     def _is_full_for(self, owner: Owner) -> bool:
@@ -465,12 +457,6 @@ class SessionTable:
     @property
     def _is_full(self) -> bool:
         return len(self._sessions) >= self._limits.max_sessions
-
-    def _lacks_room_for_configuration(self, session: Session) -> bool:
-        return (
-            self.configuration_bytes + len(session.configuration)
-            > self._limits.max_configuration_bytes
-        )
 
     def _unused_of_most(
         self, amount: Callable[[_Holding], int], *, only_unserved: bool

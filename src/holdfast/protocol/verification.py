@@ -167,16 +167,13 @@ class Verification:
                     reason=f"{why}; the robot's own planner decides",
                 )
             self.dispute(question, part.service)
-        self._answered(question, part.service)
-
-    def _answered(self, question: Question, service: str) -> None:
         if question.own is not None:
             if self._judge(question):
                 _use(question, question.own)
-        elif service in self._suspects:
-            self.dispute(question, service)
-        elif service != self._exempt and self._is_drawn(question):
-            self.check(question, service)
+        elif part.service in self._suspects:
+            self.dispute(question, part.service)
+        elif part.service != self._exempt and self._is_drawn(question):
+            self.check(question, part.service)
 
     def check(self, question: Question, service: str) -> None:
         """Have the own planner answer a question when it has time.
