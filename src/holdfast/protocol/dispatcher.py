@@ -133,7 +133,7 @@ class Dispatcher(DecisionSource):
                 self._calls.abandon(call)
         self.wake(now)
         if not self.stopped:
-            self._try_others(now)
+            self._try_others(question, now)
 
     def drop(self) -> None:
         """Drop the question: the trial has ended, or its answer is of no use."""
@@ -354,25 +354,21 @@ class Dispatcher(DecisionSource):
         self._enforce_decision_timeout(now)
         self._tend_recovery(now)
         question = self.question
-        if question is None:
-            self._note_lost_cloud(now)
-            return
-        if question.disputed:
+        if question is not None and question.disputed:
             self._wait_for_own_planner(question, now)
             return
-        if question.complete:
-            self._end_hold(now)
-            self._note_lost_cloud(now)
-            return
-        if self._is_being_asked(question, now):
-            self._hedge(question, now)
-            if question.needed_at is not None:
-                # The service that has the question may be silent for long while the robot waits.
-                self._try_others(now)
-            self._report_wait(question, now)
-            self._note_lost_cloud(now)
-        else:
-            self._ask_or_hold(question, now)
+        if question is not None:
+            if question.complete:
+                self._end_hold(now)
+            elif self._is_being_asked(question, now):
+                self._hedge(question, now)
+                if question.needed_at is not None:
+                    # The service that has the question may be silent for long meanwhile.
+                    self._try_others(question, now)
+                self._report_wait(question, now)
+            else:
+                self._ask_or_hold(question, now)
+        self._note_lost_cloud(now)
 
     def _wait_for_own_planner(self, question: Question, now: float) -> None:
         self._hold(question, "the robot's own planner decides", now)
@@ -461,11 +457,8 @@ class Dispatcher(DecisionSource):
             return
         self._hold(question, services.why_nobody(), now)
 
-    def _try_others(self, now: float) -> None:
+    def _try_others(self, question: Question, now: float) -> None:
         """Probe suspected services with this question too: an answer brings them back."""
-        question = self.question
-        if question is None:
-            return
         needed_at = question.needed_at
         is_late = needed_at is not None and now >= needed_at + self._timeout_s
         for replica in self._services.cloud:

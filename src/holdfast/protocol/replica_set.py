@@ -37,9 +37,6 @@ _MAX_REPLAYED_STEPS = 1024
 _LARGE_CHECKPOINT = 1 << 20
 """From this size in bytes on, a service replays the trial instead of being sent the state."""
 
-_MAX_TIMES_DIFFERED = 2
-"""A service that has reached another state so often in a row is sent the state each time."""
-
 _LOCAL_PATIENCE = 4.0
 """Factor on the local service's timeout: replacing it costs more than waiting."""
 
@@ -184,7 +181,7 @@ class Replica:
     Parameters
     ----------
     late_after_s : float
-        The first reply to a request is late after this time.
+        The first reply to a request is late after this time; ``late_s`` are those late in a row.
 
     Attributes
     ----------
@@ -194,8 +191,8 @@ class Replica:
         Whether it knows the session.
     acknowledged : tuple of int or None
         Trial and number of observations of the latest state that it is known to hold.
-    times_differed : int
-        Times in a row that it reached another state than the robot.
+    diverges : bool
+        Whether it has come to another state than the robot from the same observations.
     num_refusals : int
         Since its last whole answer: a problem's code can fail in one part only.
     complaint : str or None
@@ -218,8 +215,7 @@ class Replica:
         self.last_incarnation: str | None = None
         self.late_after_s = late_after_s
         self.late_at = -math.inf
-        self.late_soonest_s = math.inf
-        self.late_times = 0
+        self.late_s: list[float] = []
         self.distrusted: str | None = None
         self.forget()
 
@@ -227,7 +223,7 @@ class Replica:
         """Reset what was known of the previous process."""
         self.opened = False
         self.acknowledged: tuple[int, int] | None = None
-        self.times_differed = 0
+        self.diverges = False
         self.num_refusals = 0
         self.complaint: str | None = None
         self.refusal = self.distrusted
@@ -261,35 +257,26 @@ class Replica:
             The shortest of these times in seconds, once, when several in a row were late.
         """
         after_s = now - sent_at
-        if self.late_times >= _LATE_IN_A_ROW:
+        if len(self.late_s) == _LATE_IN_A_ROW:
             return None
         if after_s <= self.late_after_s:
-            self.late_times, self.late_soonest_s = 0, math.inf
+            self.late_s.clear()
         elif sent_at >= self.late_at:
             # Calls that were sent meanwhile have waited for the same thing, such as a process that
             # stood still.
             self.late_at = now
-            self.late_times += 1
-            self.late_soonest_s = min(self.late_soonest_s, after_s)
-            if self.late_times == _LATE_IN_A_ROW:
-                return self.late_soonest_s
+            self.late_s.append(after_s)
+            if len(self.late_s) == _LATE_IN_A_ROW:
+                return min(self.late_s)
         return None
 
-    def note_answer(self, question: Question, now: float, *, restored: bool) -> None:
-        """Record a part of an answer: it lives and holds the question's state.
-
-        Parameters
-        ----------
-        restored : bool
-            Whether the request carried the state.
-        """
+    def note_answer(self, question: Question, now: float) -> None:
+        """Record a part of an answer: it lives and holds the question's state."""
         self.detector.heard(now)
         self.opened = True
         self.retry_at = 0.0
         if not self.num_refusals:
             self.backoff_s = _FIRST_RETRY_S
-        if not restored:
-            self.times_differed = 0
         holds = (question.state.trial, question.num_observations)
         self.acknowledged = max(self.acknowledged or holds, holds)
 
@@ -309,12 +296,10 @@ class Replica:
         self.num_busy += 1
         return after_s
 
-    def note_lost_state(self, *, differs: bool) -> None:
+    def note_lost_state(self) -> None:
         """Record that it lacks the robot's state."""
         self.opened = False
         self.acknowledged = None
-        if differs:
-            self.times_differed += 1
 
     def note_refusal(self, code: str, text: str, now: float) -> bool:
         """Record a refusal, which delays it; return whether it is no longer asked."""
@@ -366,7 +351,7 @@ class Replica:
                 8 * state.belief.states.size <= _LARGE_CHECKPOINT
                 or state.step > _MAX_REPLAYED_STEPS
             )
-        if self.times_differed >= _MAX_TIMES_DIFFERED or missing > len(question.observations):
+        if self.diverges or missing > len(question.observations):
             whole_state = True
         if whole_state:
             return (), question.checkpoint()

@@ -353,7 +353,7 @@ class OpenRequests:
             call.has_sensing_part = True
         else:
             call.has_task_part = True
-        replica.note_answer(question, now, restored=call.restores)
+        replica.note_answer(question, now)
         for earlier in self.to(replica):
             if earlier.call_number < call.call_number:
                 # Whatever became of it, nothing is awaited of it any more.
@@ -369,8 +369,9 @@ class OpenRequests:
 
     def _take_need_state(self, call: OpenRequest, reply: NeedState, now: float) -> None:
         replica = call.replica
-        replica.note_lost_state(differs=reply.differs)
+        replica.note_lost_state()
         if reply.diverged:
+            replica.diverges = True
             self._effects.report(
                 "state_diverged",
                 service=replica.name,
@@ -395,7 +396,7 @@ class OpenRequests:
             replica.delay(now)
             self._effects.report("damaged_request", service=replica.name, reason=reply.text)
             return
-        replica.note_lost_state(differs=False)
+        replica.note_lost_state()
         self._note_refusal(replica, reply.code, reply.text, now)
 
     def _note_refusal(self, replica: Replica, code: str, text: str, now: float) -> None:

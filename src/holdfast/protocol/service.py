@@ -489,7 +489,7 @@ class Service:
 
     def _succeeded(self, task: PendingTask, outcome: JobResult, now: float) -> None:
         session, statistics = task.session, self._statistics
-        self._sessions.mark_served(session)
+        session.served, session.newcomer = True, False
         most = self._limits.answers_per_session
         computed_s = now - task.started_at
         computed_us = min(MAX_WORD, max(0, round(1e6 * computed_s)))

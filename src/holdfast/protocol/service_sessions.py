@@ -175,7 +175,7 @@ class Session:
     """What is remembered of one robot.
 
     :class:`~holdfast.protocol.service.Service` writes its states, answers, tasks, epoch and number,
-    :class:`SessionTable` the rest.
+    and whether the robot was served; :class:`SessionTable` the rest.
 
     Attributes
     ----------
@@ -326,41 +326,25 @@ class ForgottenEpochs:
                 del self._num_of[key[0]]
 
 
-class _Holding:
-    """What all sessions take, or all of one owner."""
-
-    def __init__(self) -> None:
-        self.sessions = 0
-        self.unserved = 0
-        self.state_bytes = 0
-        self.configuration_bytes = 0
-
-    def count(self, session: Session, sign: int) -> None:
-        """Add a session without states, or subtract it."""
-        self.sessions += sign
-        self.unserved += 0 if session.served else sign
-        self.configuration_bytes += sign * len(session.configuration)
-
-
 class SessionTable:
-    """All sessions, least recently used first."""
+    """All sessions, least recently used first.
+
+    Attributes
+    ----------
+    state_bytes : int
+        Of all states and answers, as counted by :meth:`update_size`.
+    """
 
     def __init__(self, limits: ServiceLimits) -> None:
         self._limits = limits
         self._sessions: OrderedDict[SessionKey, Session] = OrderedDict()
-        self._holdings: dict[Owner, _Holding] = {}
         self._epochs = ForgottenEpochs(max(4 * limits.max_sessions, _LEAST_EPOCHS))
-        self._total = _Holding()
-
-    @property
-    def state_bytes(self) -> int:
-        """Bytes of all states and answers, as counted by :meth:`update_size`."""
-        return self._total.state_bytes
+        self.state_bytes = 0
 
     @property
     def configuration_bytes(self) -> int:
         """Bytes of all packed session configurations."""
-        return self._total.configuration_bytes
+        return sum(len(each.configuration) for each in self._sessions.values())
 
     def __len__(self) -> int:
         return len(self._sessions)
@@ -380,24 +364,14 @@ class SessionTable:
         A new identity costs nothing without a certificate. With one, each owner may have one
         session that was never served and still ranks with the known robots.
         """
-        holding = self._holdings.get(owner)
-        return owner is None or (holding is not None and holding.unserved > 0)
-
-    def mark_served(self, session: Session) -> None:
-        """Note that a robot got an answer."""
-        if not session.served:
-            for holding in self._holdings_with(session):
-                holding.unserved -= 1
-        session.served = True
-        session.newcomer = False
+        return owner is None or any(
+            each.owner == owner and not each.served for each in self._sessions.values()
+        )
 
     def add(self, session: Session) -> None:
         """Add a session."""
         session.newcomer = self.is_newcomer(session.owner)
         self._sessions[session.key] = session
-        self._holdings.setdefault(session.owner, _Holding())
-        for holding in self._holdings_with(session):
-            holding.count(session, 1)
         self._epochs.forget(session.key)
 
     def use(self, session: Session, now: float) -> None:
@@ -410,10 +384,6 @@ class SessionTable:
         session.closed = True
         del self._sessions[session.key]
         self._count_state(session, 0)
-        for holding in self._holdings_with(session):
-            holding.count(session, -1)
-        if not self._holdings[session.owner].sessions:
-            del self._holdings[session.owner]
         self.note_epoch(session.key, session.epoch)
 
     def note_epoch(self, key: SessionKey, epoch: int) -> None:
@@ -441,42 +411,41 @@ class SessionTable:
         if self._is_full_for(session.owner):
             owner = session.owner
             return self._first_unused(lambda each: each.owner == owner)
-        only_unserved = 2 * self._total.unserved >= self._limits.max_sessions
+        unserved = sum(not each.served for each in self._sessions.values())
         is_full = self._is_full
         return self._unused_of_most(
-            lambda holding: holding.sessions if is_full else holding.configuration_bytes,
-            only_unserved=only_unserved,
+            lambda each: 1 if is_full else len(each.configuration),
+            only_unserved=2 * unserved >= self._limits.max_sessions,
         )
 
     def _is_full_for(self, owner: Owner) -> bool:
-        most, holding = self._limits.max_sessions_per_robot, self._holdings.get(owner)
-        if owner is None or most is None or holding is None:
+        most = self._limits.max_sessions_per_robot
+        if owner is None or most is None:
             return False
-        return holding.sessions >= most
+        return sum(each.owner == owner for each in self._sessions.values()) >= most
 
     @property
     def _is_full(self) -> bool:
         return len(self._sessions) >= self._limits.max_sessions
 
     def _unused_of_most(
-        self, amount: Callable[[_Holding], int], *, only_unserved: bool
+        self, amount: Callable[[Session], int], *, only_unserved: bool
     ) -> Session | None:
         """Return the least recently used session without tasks, of the owners that hold the most.
 
         These hold at least half of the largest holding: among near equals the same one is not
         dropped each time. If all of these have tasks, it is one of the others.
         """
-        holdings = self._holdings
-        if len(holdings) > 1:
-            least = max(map(amount, holdings.values())) / 2
+        found = None
+        if len({each.owner for each in self._sessions.values()}) > 1:
+            held: Counter[Owner] = Counter()
+            for each in self._sessions.values():
+                held[each.owner] += amount(each)
+            least = max(held.values()) / 2
             found = self._first_unused(
-                lambda each: (
-                    amount(holdings[each.owner]) >= least and not (only_unserved and each.served)
-                )
+                lambda each: held[each.owner] >= least and not (only_unserved and each.served)
             )
-            if found is not None:
-                return found
-        return self._first_unused(lambda each: not (only_unserved and each.served))
+        return found or self._first_unused(lambda each: not (only_unserved and each.served))
 
     def _first_unused(self, fits: Callable[[Session], bool]) -> Session | None:
         return next(
@@ -510,7 +479,7 @@ class SessionTable:
 
     def largest_evictable(self) -> Session | None:
         """Return the session without tasks to be dropped for its memory; None if there is none."""
-        return self._unused_of_most(lambda holding: holding.state_bytes, only_unserved=False)
+        return self._unused_of_most(lambda each: each.num_bytes, only_unserved=False)
 
     def drop_states(self, session: Session) -> None:
         """Drop a session's states and answers; the robot will send its state each time."""
@@ -518,12 +487,8 @@ class SessionTable:
         self._count_state(session, 0)
 
     def _count_state(self, session: Session, num_bytes: int) -> None:
-        for holding in self._holdings_with(session):
-            holding.state_bytes += num_bytes - session.num_bytes
+        self.state_bytes += num_bytes - session.num_bytes
         session.num_bytes = num_bytes
-
-    def _holdings_with(self, session: Session) -> tuple[_Holding, _Holding]:
-        return self._total, self._holdings[session.owner]
 
 
 def _digest_of(data: object) -> bytes:
