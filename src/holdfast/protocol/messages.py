@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import hashlib
 import zlib
-from typing import Annotated, Any, TypeAlias
+from typing import Annotated, TypeAlias
 
 import msgspec
 import numpy as np
@@ -97,6 +97,8 @@ Word = Annotated[int, msgspec.Meta(ge=0, le=MAX_WORD)]
 Name = Annotated[str, msgspec.Meta(min_length=1, max_length=200)]
 Session = Annotated[bytes, msgspec.Meta(min_length=16, max_length=16)]
 Digest = Annotated[bytes, msgspec.Meta(min_length=DIGEST_SIZE, max_length=DIGEST_SIZE)]
+# Longer than allowed, so that the refusal can name the size.
+PackedConfiguration = Annotated[bytes, msgspec.Meta(max_length=16 * MAX_CONFIGURATION_BYTES)]
 Numbers = Annotated[bytes, msgspec.Meta(max_length=8 * MAX_ACTION_SIZE * MAX_TASK_ACTIONS)]
 
 
@@ -133,25 +135,7 @@ class SessionConfiguration(msgspec.Struct, array_like=True, frozen=True):
     problem_digest: Annotated[str, msgspec.Meta(max_length=200)] = ""
 
 
-class _Named(msgspec.Struct, array_like=True, frozen=True):
-    """What a request names; the first fields of both of its forms."""
-
-    version: int
-    session: Session
-    epoch: Word
-    number: Word
-    trial: Word
-    step: Word
-    sensed: bool
-    digest: Digest
-    observations: Annotated[tuple[Observed, ...], msgspec.Meta(max_length=MAX_OBSERVATIONS)] = ()
-
-    def named(self) -> dict[str, Any]:
-        """Return these fields by name."""
-        return {name: getattr(self, name) for name in _Named.__struct_fields__}
-
-
-class Request(_Named, array_like=True, frozen=True):
+class Request(msgspec.Struct, array_like=True, frozen=True):
     """A robot's question: what to do from this state until it has sensed again.
 
     Encode it with :func:`encode` only: on the wire the session configuration has another form.
@@ -176,25 +160,30 @@ class Request(_Named, array_like=True, frozen=True):
         decoded one is a view of the message.
     """
 
+    version: int
+    session: Session
+    epoch: Word
+    number: Word
+    trial: Word
+    step: Word
+    sensed: bool
+    digest: Digest
+    observations: Annotated[tuple[Observed, ...], msgspec.Meta(max_length=MAX_OBSERVATIONS)] = ()
     session_configuration: SessionConfiguration | None = None
     checkpoint: bytes | memoryview | None = None
 
 
-class _SentRequest(_Named, array_like=True, frozen=True, forbid_unknown_fields=True):
-    """A request on the wire.
+class _SentRequest(Request, array_like=True, frozen=True, forbid_unknown_fields=True):
+    """A request on the wire, with the settings' digest as the robot understands them.
 
     Its session configuration is bytes inside the message, so each field's length precedes the field
     and is checked before any of it is decoded: bytes that are no request are refused at once,
     whatever their size.
     """
 
-    # Larger than allowed, so that the refusal can name the size.
-    session_configuration: (
-        Annotated[bytes, msgspec.Meta(max_length=16 * MAX_CONFIGURATION_BYTES)] | None
-    ) = None
+    session_configuration: PackedConfiguration | None = None  # type: ignore[assignment]
     # Not copied: that would hold up all other threads, 40 ms for 60 MB.
     checkpoint: memoryview | None = None
-    # Digest of the settings, as the robot understands them.
     settings: Digest | None = None
 
 
@@ -305,9 +294,11 @@ def encode(message: Request | Reply) -> bytes:
     """Encode a message."""
     if isinstance(message, Request) and message.session_configuration is not None:
         # Without a session configuration the shorter form is read as the same request.
-        return with_checksum(
-            _ENCODER.encode(_sent(message, pack_configuration(message.session_configuration)))
-        )
+        packed = pack_configuration(message.session_configuration)
+        # What a service will make of them, not what they were before: an int where a float belongs.
+        settings = settings_digest(unpack_configuration(packed))
+        fields = msgspec.structs.asdict(message) | {"session_configuration": packed}
+        message = _SentRequest(**fields, settings=settings)
     return with_checksum(_ENCODER.encode(message))
 
 
@@ -380,9 +371,9 @@ def decode_request(payload: bytes) -> Request:
         raise MessageError("malformed", f"{len(payload)} bytes are no request: {error}") from error
     if sent.checkpoint is not None and sent.observations:
         raise MessageError("malformed", "a request has a checkpoint and observations as well")
-    return Request(
-        **sent.named(), session_configuration=session_configuration, checkpoint=sent.checkpoint
-    )
+    fields = msgspec.structs.asdict(sent) | {"session_configuration": session_configuration}
+    del fields["settings"]
+    return Request(**fields)
 
 
 def decode_reply(payload: bytes) -> Reply:
@@ -419,16 +410,6 @@ def decode_floats(data: bytes, size: int) -> FloatArray:
     if not numerics.all_finite(numbers):
         raise MessageError("malformed", f"{numbers} are not all finite")
     return numbers
-
-
-def _sent(request: Request, session_configuration: bytes) -> _SentRequest:
-    return _SentRequest(
-        **request.named(),
-        session_configuration=session_configuration,
-        checkpoint=None if request.checkpoint is None else memoryview(request.checkpoint),
-        # What a service will make of them, not what they were before: an int where a float belongs.
-        settings=settings_digest(unpack_configuration(session_configuration)),
-    )
 
 
 def _session_configuration_of(data: bytes, settings: bytes | None) -> SessionConfiguration:
