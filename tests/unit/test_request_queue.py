@@ -27,7 +27,6 @@ class TestRequestQueue:
             (None, request.session),
             request,
             robot.session_configuration,
-            1,
             ExpectedTime(4.0, 0.001),
             ExpectedTime(4.0, 0.001),
         )

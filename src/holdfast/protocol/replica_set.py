@@ -70,11 +70,9 @@ class FailureDetector:
     Attributes
     ----------
     incarnation : str or None
-        Of the present process; None if the service is absent.
+        Of the present process; None if the service is absent. ``seen`` says if it ever was present.
     suspicion : str or None
         Why the service is not trusted; None if it is.
-    seen : bool
-        Whether it was ever present.
     """
 
     def __init__(self, detection_timeout_s: float) -> None:
@@ -201,10 +199,8 @@ class Replica:
         Why it is no longer asked.
     distrusted : str or None
         Why it is no longer asked, not even after a restart.
-    retry_at : float
-        It is not asked before.
-    backoff_s : float
-        The next delay.
+    retry_at, backoff_s : float
+        It is not asked before that time, and then delayed by so much.
     """
 
     def __init__(

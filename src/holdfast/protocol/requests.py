@@ -57,12 +57,10 @@ class OpenRequest:
     number : int
         In the message, repeated by each reply. It is unique in the run over 2,048 processes of the
         robot, so a reply that arrives late in another call is recognized.
-    heard : bool
-        Whether any reply has come.
     opens, restores : bool
         Whether it carries the session configuration, and the state.
-    has_task_part, has_sensing_part : bool
-        Whether that part of the answer has come.
+    heard, has_task_part, has_sensing_part : bool
+        Whether any reply has come, and that part of the answer.
     """
 
     def __init__(

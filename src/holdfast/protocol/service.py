@@ -283,7 +283,6 @@ class Service:
             key,
             request,
             configuration,
-            limits.max_threads,
             ExpectedTime(_INERTIA_OF_ONE, self._task_time.mean_s),
             ExpectedTime(_INERTIA_OF_ONE, self._sensing_time.mean_s),
         )

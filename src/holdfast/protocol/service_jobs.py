@@ -60,21 +60,15 @@ class JobResult(NamedTuple):
     failure : tuple of str or None
         Code and text of the refusal; None if it succeeded or lacks the state.
     lacks_state : bool
-        The requested state does not follow from what the service holds.
-    differs : bool
-        The service held a state of this trial that leads elsewhere.
-    diverged : bool
-        The requested step was reached with another digest.
+        The requested state does not follow from what the service holds. ``differs``: it held a
+        state of this trial that leads elsewhere. ``diverged``: the requested step was reached with
+        another digest.
     problem : Problem or None
         To be reused, as far as it could be built.
     state : PlanningState or None
-        The requested state, verified.
-    restored : bool
-        It came from a checkpoint.
-    ahead : PlanningState or None
-        The state that they lead to.
-    ahead_digest : bytes
-        As it is sent.
+        The requested state, verified; ``restored`` if it came from a checkpoint.
+    ahead, ahead_digest
+        The state to which the ``num_actions`` actions lead, and its digest as it is sent.
     sensing_action : int
         The chosen one; -1 if none was to be chosen.
     """

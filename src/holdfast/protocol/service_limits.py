@@ -43,8 +43,6 @@ class ServiceLimits(msgspec.Struct, frozen=True, kw_only=True):
         Size of one decision: particles x observation samples x sensing actions x horizon.
     max_steps : int
         Steps by which a state is rolled forward for one request.
-    max_threads : int
-        Threads of one decision, whatever the robot's settings say; one while several are computed.
     max_problems : int
         Problems kept for reuse.
     answers_per_session : int
@@ -66,7 +64,6 @@ class ServiceLimits(msgspec.Struct, frozen=True, kw_only=True):
     max_particles: int = 1_000_000
     max_work: int = 10**9
     max_steps: int = 16 * MAX_OBSERVATIONS
-    max_threads: int = 64
     max_problems: int = 32
     answers_per_session: int = 8
 

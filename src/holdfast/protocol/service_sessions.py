@@ -45,6 +45,9 @@ __all__ = [
 _LEAST_EPOCHS = 4096
 """Epochs of forgotten sessions are remembered at least for so many."""
 
+_MAX_THREADS = 64
+"""Bound on the threads of one decision, whatever the robot's settings say."""
+
 _TYPICAL_STEPS = 32
 """Bound on the steps of a task whose time earlier tasks predict."""
 
@@ -74,7 +77,7 @@ class CachedAnswer(NamedTuple):
 
 
 class WaitingCall:
-    """A call that waits for a task."""
+    """A call (one request of a robot) that waits for a task, and when it got its last reply."""
 
     def __init__(self, call: int, number: int, task: PendingTask, last_sign_at: float) -> None:
         self.call = call
@@ -93,12 +96,8 @@ class PendingTask:
     ----------
     digest : bytes
         Of the part's state.
-    sensing : bool
-        Whether it is a sensing part.
-    request : Request or None
-        Names the state; None if it is computed before the robot asks.
-    state : PlanningState or None
-        The state, where no request names it.
+    request, state
+        The request names the state; without one (the robot has not asked yet) it is ``state``.
     size : int
         Bytes of the request.
     since : float
@@ -185,20 +184,17 @@ class Session:
         Packed session configuration.
     problem_key : bytes
         Digest that identifies the problem among those kept for reuse.
-    built_in : bool
-        Whether the problem is part of holdfast.
+    built, built_in : bool
+        Whether the problem was built before, and whether it is part of holdfast.
     planning : PlanningSettings
         With the threads that a decision has when it is computed alone.
-    served : bool
-        Whether the robot got an answer.
-    newcomer : bool
-        Whether it ranks with unknown robots.
+    served, newcomer : bool
+        Whether the robot got an answer, and whether it ranks with unknown robots.
     acknowledged, ahead : PlanningState or None
         The state last asked about, and that at the next sensing step.
-    answers : dict
-        Cached parts of answers by the digest of their state, oldest first.
-    pending : dict
-        Tasks that wait or run, by the digest of their state.
+    answers, pending : dict
+        Cached parts of answers, oldest first, and tasks that wait or run, by the digest of their
+        state.
     num_bytes : int
         Counted size of states and answers.
     used_at : float
@@ -210,7 +206,6 @@ class Session:
         key: SessionKey,
         request: Request,
         configuration: SessionConfiguration,
-        max_threads: int,
         task_time: ExpectedTime,
         sensing_time: ExpectedTime,
     ) -> None:
@@ -221,18 +216,19 @@ class Session:
         # again and again while nobody else has the interpreter.
         self.configuration = pack_configuration(configuration)
         # With its code's digests: a robot with other code must be refused.
-        named = (
-            configuration.problem,
-            configuration.core_version,
-            configuration.problem_digest,
-        )
         self.problem_key = _digest_of(
-            (named, configuration.model, configuration.state_space_planner)
+            (
+                configuration.problem,
+                configuration.core_version,
+                configuration.problem_digest,
+                configuration.model,
+                configuration.state_space_planner,
+            )
         )
         self.built = False
         self.built_in = configuration.problem in BUILT_IN
         # The number of threads changes no result, so the service may choose it.
-        most = min(configuration.planning.active_sensing.num_cores, max_threads)
+        most = min(configuration.planning.active_sensing.num_cores, _MAX_THREADS)
         self.planning = with_cores(configuration.planning, most)
         self.seed = configuration.seed
         self.served = False
@@ -257,11 +253,6 @@ class Session:
         """Remove a task, unless another has taken its place."""
         if self.pending.get(task.digest) is task:
             del self.pending[task.digest]
-
-    def drop_states(self) -> None:
-        """Drop the states and the answers."""
-        self.acknowledged = self.ahead = None
-        self.answers.clear()
 
     def remember(self, digest: bytes, answer: CachedAnswer, most: int) -> None:
         """Cache a part of an answer, and drop the oldest beyond ``most``."""
@@ -483,7 +474,8 @@ class SessionTable:
 
     def drop_states(self, session: Session) -> None:
         """Drop a session's states and answers; the robot will send its state each time."""
-        session.drop_states()
+        session.acknowledged = session.ahead = None
+        session.answers.clear()
         self._count_state(session, 0)
 
     def _count_state(self, session: Session, num_bytes: int) -> None:
