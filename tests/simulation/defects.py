@@ -21,6 +21,7 @@ from contextlib import ExitStack, contextmanager
 from typing import Any, NamedTuple, TypeAlias
 from unittest import mock
 
+from holdfast.lab.simulation import service_node
 from holdfast.lab.simulation.schedule import RunSettings, SimulationSchedule
 from holdfast.lab.simulation.schedule_draws import draw_schedule
 from holdfast.lab.simulation.world import Simulator
@@ -310,7 +311,7 @@ _defect(
     "restored_unverified",
     "A checkpoint is restored without looking at the digest, nor at the checksum of its request.",
     Edit(
-        service,
+        service_node,
         "decode_request",
         "_checked_content(payload)",
         "memoryview(payload)[:-CHECKSUM_SIZE]",
@@ -367,7 +368,7 @@ _defect(
     "request_checksum_ignored",
     "The service leaves it to TCP to find damaged requests.",
     Edit(
-        service,
+        service_node,
         "decode_request",
         "_checked_content(payload)",
         "memoryview(payload)[:-CHECKSUM_SIZE]",
@@ -572,7 +573,7 @@ _defect(
 _defect(
     "session_of_anybody",
     "A service identifies a session by its bytes alone, and does not compare the certificate.",
-    Edit(Service, "receive_request", "(owner, request.session)", "(None, request.session)"),
+    Edit(Service, "receive", "(owner, request.session)", "(None, request.session)"),
 )
 _defect(
     "any_answer_ends_recovery",

@@ -26,9 +26,9 @@ def test_what_has_become_longer_is_known_to_be_after_a_while() -> None:
 
 
 def test_the_mean_follows_and_one_outlier_moves_it_little() -> None:
-    time = ExpectedTime(inertia=4.0, mean_s=0.001)
+    time = ExpectedTime(0.001)
     time.learn(60.0)
-    assert time.mean_s == pytest.approx(0.001 + 0.013 / 4.0)
-    for _ in range(40):
+    assert time.mean_s == pytest.approx(0.001 + 0.013 / 8.0)
+    for _ in range(80):
         time.learn(0.002)
     assert time.mean_s == pytest.approx(0.002, rel=1e-2)

@@ -27,8 +27,8 @@ class TestRequestQueue:
             (None, request.session),
             request,
             robot.session_configuration,
-            ExpectedTime(4.0, 0.001),
-            ExpectedTime(4.0, 0.001),
+            ExpectedTime(0.001),
+            ExpectedTime(0.001),
         )
 
     def task(self, session: Session, name: bytes, since: float, *, prefetched: bool) -> PendingTask:

@@ -25,7 +25,7 @@ class Replies:
         robot = Robot()
         request = robot.request()
         key = None, request.session
-        times = ExpectedTime(4.0, 0.001), ExpectedTime(4.0, 0.001)
+        times = ExpectedTime(0.001), ExpectedTime(0.001)
         session = Session(key, request, robot.session_configuration, *times)
         self.task = PendingTask(
             session, b"d" * 16, sensing=True, request=request, state=None, size=9, since=0.0

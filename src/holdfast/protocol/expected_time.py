@@ -6,17 +6,13 @@ import math
 
 __all__ = ["ExpectedTime"]
 
-_INERTIA = 16.0
-"""A longer time raises the typical time by one such part of the difference."""
+_MEAN_INERTIA = 8.0
+_TYPICAL_INERTIA = 16.0
+"""A time moves the mean by one such part of its distance, and a longer one the typical time."""
 
 
 class ExpectedTime:
     """Two estimates of how long one kind of computation takes.
-
-    Parameters
-    ----------
-    inertia : float
-        A sample moves the mean by its distance divided by this.
 
     Attributes
     ----------
@@ -28,8 +24,7 @@ class ExpectedTime:
         would send brief work to threads, which makes it busier.
     """
 
-    def __init__(self, inertia: float = _INERTIA, mean_s: float = 0.0) -> None:
-        self._inertia = inertia
+    def __init__(self, mean_s: float = 0.0) -> None:
         self.mean_s = mean_s
         self.typical_s = math.inf
 
@@ -38,7 +33,7 @@ class ExpectedTime:
         # One outlier (a stopped process) moves the mean little, so that robots are not turned away
         # for it.
         bounded_s = min(computed_s, 4.0 * self.mean_s + 0.01)
-        self.mean_s += (bounded_s - self.mean_s) / self._inertia
+        self.mean_s += (bounded_s - self.mean_s) / _MEAN_INERTIA
         if computed_s > self.typical_s:
-            computed_s = self.typical_s + (computed_s - self.typical_s) / _INERTIA
+            computed_s = self.typical_s + (computed_s - self.typical_s) / _TYPICAL_INERTIA
         self.typical_s = computed_s

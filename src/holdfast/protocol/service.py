@@ -38,7 +38,6 @@ from holdfast.protocol.messages import (
     MAX_WORD,
     Request,
     SessionConfiguration,
-    decode_request,
     pack_configuration,
 )
 from holdfast.protocol.request_queue import RequestQueue
@@ -68,10 +67,6 @@ __all__ = ["Service"]
 
 _NO_ROOM_RETRY_MS = 100.0
 """Shortest retry time for a robot that finds no free session."""
-
-_INERTIA_OF_ONE = 4.0
-_INERTIA_OF_ALL = 8.0
-"""The expectation for all robots moves more slowly than that for one."""
 
 
 class Service:
@@ -106,8 +101,9 @@ class Service:
         self._problems = ProblemPool(self._limits.max_problems)
         self._queue = RequestQueue(workers, self._limits)
         self._calls = WaitingCalls(self._limits, self._statistics, self._effects)
-        self._task_time = ExpectedTime(_INERTIA_OF_ALL, mean_s=1e-3)
-        self._sensing_time = ExpectedTime(_INERTIA_OF_ALL, mean_s=1e-3)
+        # Of all robots; each session has its own, which begin here.
+        self._task_time = ExpectedTime(1e-3)
+        self._sensing_time = ExpectedTime(1e-3)
 
     @property
     def statistics(self) -> ServiceStatistics:
@@ -123,28 +119,6 @@ class Service:
     # -- what happens ----------------------------------------------------------------------------
 
     def receive(
-        self, call: int, payload: bytes, now: float, owner: Owner = None
-    ) -> list[ServiceEffect]:
-        """Handle a request.
-
-        Parameters
-        ----------
-        call : int
-            Unique number of the call, used in effects.
-        now : float
-            Seconds of any monotonic clock.
-        owner : str or None, optional
-            Name in the robot's verified certificate; None without one. The request reaches only
-            sessions of this owner.
-        """
-        request: Request | MessageError
-        try:
-            request = decode_request(payload)
-        except MessageError as error:
-            request = error.without_traceback()
-        return self.receive_request(call, request, len(payload), now, owner)
-
-    def receive_request(
         self,
         call: int,
         request: Request | MessageError,
@@ -152,16 +126,21 @@ class Service:
         now: float,
         owner: Owner = None,
     ) -> list[ServiceEffect]:
-        """Handle a request that is already decoded, so that callers can decode outside their lock.
+        """Handle a request, which callers decode outside their lock.
 
         Parameters
         ----------
+        call : int
+            Unique number of the call, used in effects.
         request : Request or MessageError
             What :func:`~holdfast.protocol.messages.decode_request` returned or raised.
         size : int
             Bytes of the message.
-        call, now, owner
-            As for :meth:`receive`.
+        now : float
+            Seconds of any monotonic clock.
+        owner : str or None, optional
+            Name in the robot's verified certificate; None without one. The request reaches only
+            sessions of this owner.
         """
         if isinstance(request, MessageError):
             self._calls.send_refused(call, 0, request.code, str(request))
@@ -283,8 +262,8 @@ class Service:
             key,
             request,
             configuration,
-            ExpectedTime(_INERTIA_OF_ONE, self._task_time.mean_s),
-            ExpectedTime(_INERTIA_OF_ONE, self._sensing_time.mean_s),
+            ExpectedTime(self._task_time.mean_s),
+            ExpectedTime(self._sensing_time.mean_s),
         )
         session.used_at = now
         while not self._sessions.has_room_for(session):

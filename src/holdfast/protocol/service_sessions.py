@@ -89,8 +89,8 @@ class WaitingCall:
 class PendingTask:
     """A part of an answer to be computed, and the calls that wait for it.
 
-    Service and session create and drop tasks; :class:`RequestQueue` writes ``urgent``, ``running``
-    and ``started_at``, :class:`WaitingCalls` writes ``calls``.
+    The service creates and drops tasks; :class:`RequestQueue` writes ``urgent``, ``running`` and
+    ``started_at``, :class:`WaitingCalls` writes ``calls``.
 
     Parameters
     ----------

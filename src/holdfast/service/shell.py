@@ -250,7 +250,7 @@ class ServiceShell:
         number = next(self._numbers)
         self._calls[number] = call
         now = self._loop.time()
-        self._carry_out(self._service.receive_request(number, request, size, now, call.robot))
+        self._carry_out(self._service.receive(number, request, size, now, call.robot))
 
     def _run_brief_job(self) -> None:
         job = self._brief_jobs.popleft()
