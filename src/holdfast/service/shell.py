@@ -335,4 +335,5 @@ def _decode(payload: bytes) -> Request | MessageError:
     try:
         return decode_request(payload)
     except MessageError as error:
+        # Kept in this frame, it would hold itself and the message until garbage collection.
         return error
