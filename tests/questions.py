@@ -5,17 +5,27 @@ from __future__ import annotations
 from typing import Any
 
 from holdfast.config.loader import Configuration
+from holdfast.errors import MessageError
 from holdfast.planning import Planner, PlanningState, digest
 from holdfast.protocol.messages import (
     DIGEST_SIZE,
     PROTOCOL_VERSION,
     Observed,
     Request,
+    decode_request,
     encode_floats,
 )
 from holdfast.robot.environment import SimulatedEnvironment
 
-__all__ = ["questions_of", "request_of"]
+__all__ = ["questions_of", "received", "request_of"]
+
+
+def received(payload: bytes) -> tuple[Request | MessageError, int]:
+    """Return the request of a message, or what is wrong with it, and the size of the message."""
+    try:
+        return decode_request(payload), len(payload)
+    except MessageError as error:
+        return error, len(payload)
 
 
 def request_of(

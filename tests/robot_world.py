@@ -33,6 +33,7 @@ from holdfast.protocol.events import (
     LogEvent,
     OwnAnswer,
     Paused,
+    RecoveryExited,
     ReplyReceived,
     RobotEffect,
     Send,
@@ -365,7 +366,9 @@ class World:
         else:
             self.after(
                 0.01,
-                lambda: self.robot.recovery_exited(effect.number, "no such program", self.now),
+                lambda: self.robot.handle(
+                    RecoveryExited(effect.number, "no such program"), self.now
+                ),
             )
 
     def send(self, effect: Send) -> None:

@@ -139,14 +139,6 @@ class MessageError(HoldfastError):
         super().__init__(text)
         self.code = code
 
-    def without_traceback(self) -> MessageError:
-        """Return the same error without its traceback.
-
-        Keep this copy beyond the handler: the traceback holds the handler's frame, and with it the
-        message and the error itself, until garbage collection.
-        """
-        return MessageError(self.code, str(self))
-
 
 class RecordError(HoldfastError):
     """A record of the journal does not decode, or does not follow from those before it."""

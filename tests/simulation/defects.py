@@ -21,18 +21,19 @@ from contextlib import ExitStack, contextmanager
 from typing import Any, NamedTuple, TypeAlias
 from unittest import mock
 
+from holdfast.lab.simulation import service_node
 from holdfast.lab.simulation.schedule import RunSettings, SimulationSchedule
 from holdfast.lab.simulation.schedule_draws import draw_schedule
 from holdfast.lab.simulation.world import Simulator
 from holdfast.protocol import requests, service
 from holdfast.protocol.dispatcher import Dispatcher
-from holdfast.protocol.failure_detector import FailureDetector
 from holdfast.protocol.local_service import RestartPolicy
 from holdfast.protocol.question import Question
+from holdfast.protocol.replica_set import FailureDetector
 from holdfast.protocol.robot import Robot
 from holdfast.protocol.service import Service
 from holdfast.protocol.service_jobs import Job
-from holdfast.protocol.service_sessions import Session, SessionTable
+from holdfast.protocol.service_sessions import SessionTable
 
 __all__ = [
     "DEFECTS",
@@ -196,7 +197,7 @@ class _DrawingJob(Job):
     def __init__(self, *arguments: Any) -> None:
         super().__init__(*arguments)
         self.position = 0
-        named = self._request or self._state
+        named = self._request or self.state
         assert named is not None
         if self.kind == "sensing":
             _, positions = self.drawn.setdefault(id(self._configuration), (self._configuration, {}))
@@ -226,7 +227,12 @@ _defect(
     "new_epoch_not_noted",
     "The service drops what a robot's last process waited for, but does not note the epoch of the "
     "next one.",
-    Edit(Session, "take_over", "self.epoch = epoch", "pass"),
+    Edit(
+        Service,
+        "_take_over",
+        "session.epoch, session.number = epoch, -1",
+        "session.number = -1",
+    ),
 )
 _defect(
     "old_process_still_served",
@@ -246,9 +252,9 @@ _defect(
     Edit(
         Job,
         "_computed",
-        "choose_sensing_action(self._state)",
+        "choose_sensing_action(self.state)",
         "choose_sensing_action(\n"
-        "    self._state._replace(step=self.position * (planning.sensing_interval + 1)))",
+        "    self.state._replace(step=self.position * (planning.sensing_interval + 1)))",
     ),
     Edit(
         Job,
@@ -266,9 +272,7 @@ _defect(
         Service,
         "_answer_from_cache",
         "following = answer.following",
-        "self._effects.append(EndCall(call))\n"
-        "return _Disposition.ANSWERED\n"
-        "following = answer.following",
+        "self._effects.append(EndCall(call))\nreturn True, None\nfollowing = answer.following",
     ),
 )
 _defect(
@@ -280,7 +284,7 @@ _defect(
         "if rest is not None:\n    self._calls.attach(",
         "if answer.num_actions:\n"
         "    self._effects.append(EndCall(call))\n"
-        "    return _Disposition.ANSWERED\n"
+        "    return True, None\n"
         "if rest is not None:\n"
         "    self._calls.attach(",
     ),
@@ -307,7 +311,7 @@ _defect(
     "restored_unverified",
     "A checkpoint is restored without looking at the digest, nor at the checksum of its request.",
     Edit(
-        service,
+        service_node,
         "decode_request",
         "_checked_content(payload)",
         "memoryview(payload)[:-CHECKSUM_SIZE]",
@@ -364,7 +368,7 @@ _defect(
     "request_checksum_ignored",
     "The service leaves it to TCP to find damaged requests.",
     Edit(
-        service,
+        service_node,
         "decode_request",
         "_checked_content(payload)",
         "memoryview(payload)[:-CHECKSUM_SIZE]",
@@ -516,7 +520,7 @@ _defect(
     Edit(
         Dispatcher,
         "_appeared",
-        "self._tracker.is_recovering and question",
+        "self.tracker.is_recovering and question",
         "False and question",
     ),
 )
@@ -563,13 +567,13 @@ _defect(
         Dispatcher,
         "_appeared",
         "# It need not wait for the next turn",
-        "self._tracker.change(Cause.CLOUD_ANSWERED, 'seen', now)\n# It need not wait",
+        "self.tracker.change(Cause.CLOUD_ANSWERED, 'seen', now)\n# It need not wait",
     ),
 )
 _defect(
     "session_of_anybody",
     "A service identifies a session by its bytes alone, and does not compare the certificate.",
-    Edit(Service, "receive_request", "(owner, request.session)", "(None, request.session)"),
+    Edit(Service, "receive", "(owner, request.session)", "(None, request.session)"),
 )
 _defect(
     "any_answer_ends_recovery",
@@ -577,14 +581,14 @@ _defect(
     Edit(
         Dispatcher,
         "_replied",
-        "elif outcome is ReplyOutcome.ANSWERED and",
-        "if outcome is ReplyOutcome.ANSWERED and",
+        "elif is_answer and is_first and",
+        "if is_answer and is_first and",
     ),
 )
 _defect(
     "cloud_lost_twice",
     "The robot reports the loss of the cloud in every status.",
-    Edit(Dispatcher, "_note_lost_cloud", "and not self._tracker.is_recovering", ""),
+    Edit(Dispatcher, "_note_lost_cloud", "and not self.tracker.is_recovering", ""),
 )
 
 

@@ -17,6 +17,7 @@ from holdfast.errors import ServiceRefusedError
 from holdfast.protocol.events import (
     Launch,
     LogEvent,
+    RecoveryExited,
     RobotEffect,
     ServiceAppeared,
     ServiceVanished,
@@ -239,7 +240,8 @@ def test_the_exit_of_a_local_service_is_logged_although_its_link_still_stands() 
         if performed == 10 and not world.results:
             (launch,) = [e for _, e in world.trace if isinstance(e, Launch)]
             world.after(
-                0.0, lambda: world.robot.recovery_exited(launch.number, "signal 9", world.now)
+                0.0,
+                lambda: world.robot.handle(RecoveryExited(launch.number, "signal 9"), world.now),
             )
 
     world.on_act = fault
@@ -526,3 +528,14 @@ def test_a_robot_that_waits_for_a_silent_local_service_asks_the_cloud_again() ->
     world.assert_same_as_without_faults()
     timeout_ms = world.offload.detection_timeout_ms
     assert world.longest_wait_ms() < 2 * timeout_ms + 300.0
+
+
+def test_a_long_wait_is_told_although_the_service_shows_life() -> None:
+    world = World()
+    answer_third_slowly(world.services["cloud"], num_signs=20)
+    world.start()
+    world.run()
+    world.assert_same_as_without_faults()
+    (told,) = world.reports("waiting")
+    assert told["service"] == "cloud"
+    assert float(str(told["waited_ms"])) >= 1000.0

@@ -4,30 +4,31 @@ from __future__ import annotations
 
 import pytest
 
-from holdfast.protocol.expected_time import ExpectedTimes, TypicalTime
+from holdfast.protocol.expected_time import ExpectedTime
 
 
-class TestTypicalTime:
-    def test_one_that_others_made_longer_counts_little_and_a_shorter_one_at_once(self) -> None:
-        typical = TypicalTime()
-        assert typical.seconds == float("inf")
-        for computed_s in (0.004, 0.0003, 0.005):
-            typical.learn(computed_s)
-        assert 0.0003 < typical.seconds < 0.001
-        typical.learn(0.0002)
-        assert typical.seconds == 0.0002
+def test_one_that_others_made_longer_counts_little_and_a_shorter_one_at_once() -> None:
+    time = ExpectedTime()
+    assert time.typical_s == float("inf")
+    for computed_s in (0.004, 0.0003, 0.005):
+        time.learn(computed_s)
+    assert 0.0003 < time.typical_s < 0.001
+    time.learn(0.0002)
+    assert time.typical_s == 0.0002
 
-    def test_what_has_become_longer_is_known_to_be_after_a_while(self) -> None:
-        typical = TypicalTime()
-        typical.learn(0.0003)
-        for _ in range(20):
-            typical.learn(0.004)
-        assert typical.seconds > 0.002
 
-    @pytest.mark.parametrize("sensing", [True, False])
-    def test_the_two_parts_of_an_answer_are_apart(self, *, sensing: bool) -> None:
-        times = ExpectedTimes(4.0, 1e-3, 1e-3)
-        times.learn(0.0003, sensing=sensing)
-        typical = (times.typical_task, times.typical_sensing)
-        assert {each.seconds for each in typical} == {0.0003, float("inf")}
-        assert (times.typical_sensing.seconds == 0.0003) is sensing
+def test_what_has_become_longer_is_known_to_be_after_a_while() -> None:
+    time = ExpectedTime()
+    time.learn(0.0003)
+    for _ in range(20):
+        time.learn(0.004)
+    assert time.typical_s > 0.002
+
+
+def test_the_mean_follows_and_one_outlier_moves_it_little() -> None:
+    time = ExpectedTime(0.001)
+    time.learn(60.0)
+    assert time.mean_s == pytest.approx(0.001 + 0.013 / 8.0)
+    for _ in range(80):
+        time.learn(0.002)
+    assert time.mean_s == pytest.approx(0.002, rel=1e-2)

@@ -11,10 +11,8 @@ from tests.recordings import robot_configuration
 from holdfast.config.loader import Configuration
 from holdfast.errors import ProblemError
 from holdfast.planning import Planner
-from holdfast.protocol.decision_source import InProcessSource
 from holdfast.protocol.events import Halt, Plan, Planned
-from holdfast.protocol.question import Question
-from holdfast.protocol.verification import OWN_PLANNER
+from holdfast.protocol.question import OWN_PLANNER, InProcessSource, Question
 from holdfast.robot import in_process_planner
 from holdfast.robot.in_process_planner import InProcessPlanner
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+from tests.questions import received
 from tests.robot_world import LOCAL, PROBLEM, SmallService, World
 
 from holdfast.protocol.messages import Reply, SessionConfiguration, decode_reply
@@ -27,7 +28,7 @@ class WholeService(SmallService):
 
     def answer(self, payload: bytes) -> list[Reply]:
         self.calls += 1
-        effects = self.machine.receive(self.calls, payload, 0.0)
+        effects = self.machine.receive(self.calls, *received(payload), 0.0)
         replies = []
         while effects:
             effect = effects.pop(0)

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests.questions import request_of
+from tests.questions import received, request_of
 
 from holdfast.config.settings import (
     ActiveSensingSettings,
@@ -133,7 +133,7 @@ class Bench:
         call = len(self.replies)
         self.replies[call] = []
         payload = message if isinstance(message, bytes) else encode(message)
-        self.apply(self.service.receive(call, payload, self.now, owner))
+        self.apply(self.service.receive(call, *received(payload), self.now, owner))
         return call
 
     def run(self, index: int = 0) -> None:
@@ -1172,13 +1172,12 @@ class TestCapacity:
         robot.sense()
         request = robot.request()
         bench.replies[0] = []
-        size = len(encode(request))
-        bench.apply(bench.service.receive_request(0, request, size, bench.now))
+        bench.apply(bench.service.receive(0, request, len(encode(request)), bench.now))
         bench.run_all()
         assert content(bench.replies[0]) == robot.right_answer()
         bench.replies[1] = []
         error = MessageError("malformed", "no request")
-        bench.apply(bench.service.receive_request(1, error, 9, bench.now))
+        bench.apply(bench.service.receive(1, error, 9, bench.now))
         assert refused(bench.replies[1]) == Refused(0, "malformed", "no request")
 
     def test_bytes_of_states(self) -> None:
@@ -1399,7 +1398,7 @@ class TestAnyOrder:
 def runs_of(service: Service, call: int, request: Request, now: float) -> list[float]:
     """Have a request answered; return how long each of its jobs was expected to take."""
     expected = []
-    effects = service.receive(call, encode(request), now)
+    effects = service.receive(call, request, len(encode(request)), now)
     while runs := [effect for effect in effects if isinstance(effect, StartJob)]:
         (run,) = runs
         expected.append(run.expected_s)

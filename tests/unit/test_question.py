@@ -1,6 +1,8 @@
-"""A question's size, and which replies can answer it."""
+"""A question's size, which replies can answer it, and what both sources of decisions offer."""
 
 from __future__ import annotations
+
+import inspect
 
 import numpy as np
 import pytest
@@ -9,8 +11,15 @@ from holdfast.config.settings import PlanningSettings
 from holdfast.errors import MessageError
 from holdfast.planning import Planner, decode_checkpoint
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
+from holdfast.protocol.dispatcher import Dispatcher
 from holdfast.protocol.messages import MAX_TASK_ACTIONS, SensingAnswer, TaskAnswer, encode_floats
-from holdfast.protocol.question import AnswerPart, Question, same_actions
+from holdfast.protocol.question import (
+    AnswerPart,
+    DecisionSource,
+    InProcessSource,
+    Question,
+    same_actions,
+)
 
 
 def question(step: int = 0, *, sensed: bool = False, interval: int = 2) -> Question:
@@ -82,3 +91,17 @@ def test_its_checkpoint_is_the_state() -> None:
     state = decode_checkpoint(asked.checkpoint())
     assert (state.seed, state.trial, state.step) == (1, 0, 0)
     assert asked.checkpoint() is asked.checkpoint()
+
+
+METHODS = [
+    name
+    for name, member in vars(DecisionSource).items()
+    if inspect.isfunction(member) and not name.startswith("_")
+]
+
+
+@pytest.mark.parametrize("source", [Dispatcher, InProcessSource])
+@pytest.mark.parametrize("name", METHODS)
+def test_methods_take_the_same_parameters(source: type, name: str) -> None:
+    asked = inspect.signature(getattr(DecisionSource, name)).parameters
+    assert list(inspect.signature(getattr(source, name)).parameters) == list(asked)

@@ -11,7 +11,8 @@ from pathlib import Path
 import pytest
 from tests.ports import free_port
 
-from holdfast.robot.recovery_launcher import RecoveryExited, RecoveryLauncher
+from holdfast.protocol.events import RecoveryExited
+from holdfast.robot.recovery_launcher import RecoveryLauncher
 
 PATIENCE_S = 60.0
 

@@ -10,7 +10,7 @@ from tests.recordings import configuration_of, record_trial
 
 from holdfast.outcome import Decisions
 from holdfast.protocol.events import Timing
-from holdfast.protocol.verification import OWN_PLANNER
+from holdfast.protocol.question import OWN_PLANNER
 from holdfast.recording.repetition import Deviation, Repetition, repeat, wrong_service
 from holdfast.recording.timings import TimingTable
 

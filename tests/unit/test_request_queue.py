@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from tests.unit.test_protocol_service import Robot, make_problem
 
-from holdfast.protocol.expected_time import ExpectedTimes
+from holdfast.protocol.expected_time import ExpectedTime
 from holdfast.protocol.messages import Request, pack_configuration
 from holdfast.protocol.request_queue import RequestQueue
 from holdfast.protocol.service_jobs import Job
@@ -27,8 +27,8 @@ class TestRequestQueue:
             (None, request.session),
             request,
             robot.session_configuration,
-            1,
-            ExpectedTimes(4.0, 0.001, 0.001),
+            ExpectedTime(0.001),
+            ExpectedTime(0.001),
         )
 
     def task(self, session: Session, name: bytes, since: float, *, prefetched: bool) -> PendingTask:

@@ -19,7 +19,6 @@ from holdfast.config.loader import Configuration
 from holdfast.errors import HeldError, ProblemError, TrialError
 from holdfast.outcome import SensingDecision, TrialResult
 from holdfast.planning import Planner, PlanningState
-from holdfast.protocol.decision_source import InProcessSource
 from holdfast.protocol.events import (
     Act,
     Acted,
@@ -27,11 +26,13 @@ from holdfast.protocol.events import (
     Paused,
     Plan,
     Planned,
+    RecoveryExited,
     RobotEffect,
     Sense,
     Timing,
     TransportEvent,
 )
+from holdfast.protocol.question import InProcessSource
 from holdfast.protocol.records import PausedRecord
 from holdfast.protocol.status import Status
 from holdfast.recording.run_directory import RunDirectory
@@ -40,7 +41,6 @@ from holdfast.robot import process as robot_process
 from holdfast.robot.environment import EnvironmentMaker, load_environment
 from holdfast.robot.links import Links, make_links
 from holdfast.robot.process import RobotProcess
-from holdfast.robot.recovery_launcher import RecoveryExited
 from holdfast.robot.trial import run_trial
 from holdfast.runtime.events import NullEventLog
 
@@ -143,9 +143,6 @@ class Machine:
     def handle(self, event: object, now: float) -> list[RobotEffect]:
         self.trace.append(f"handle {type(event).__name__}")
         return self.answers.pop(0) if self.answers else []
-
-    def recovery_exited(self, launch: int, reason: str, now: float) -> list[RobotEffect]:
-        return self.handle(RecoveryExited(launch, reason), now)
 
     def wake(self, now: float) -> list[RobotEffect]:
         assert now >= self.wakeups.pop(0)

@@ -6,7 +6,7 @@ import pytest
 from tests.unit.test_protocol_service import Robot
 
 from holdfast.protocol.events import Effects
-from holdfast.protocol.expected_time import ExpectedTimes
+from holdfast.protocol.expected_time import ExpectedTime
 from holdfast.protocol.messages import Busy, Progress, Refused, Reply, decode_reply
 from holdfast.protocol.service_calls import WaitingCalls
 from holdfast.protocol.service_jobs import EndCall, SendReply, ServiceEffect
@@ -24,9 +24,9 @@ class Replies:
         self.calls = WaitingCalls(limits, self.statistics, self.effects)
         robot = Robot()
         request = robot.request()
-        times = ExpectedTimes(4.0, 0.001, 0.001)
         key = None, request.session
-        session = Session(key, request, robot.session_configuration, 1, times)
+        times = ExpectedTime(0.001), ExpectedTime(0.001)
+        session = Session(key, request, robot.session_configuration, *times)
         self.task = PendingTask(
             session, b"d" * 16, sensing=True, request=request, state=None, size=9, since=0.0
         )

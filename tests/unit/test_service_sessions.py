@@ -8,6 +8,7 @@ import msgspec
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tests.questions import received
 from tests.unit.test_protocol_service import Bench, Robot, content, only, refused
 
 from holdfast.problems.problem import Problem
@@ -364,7 +365,7 @@ class _Split:
     def send(self, owner: str | None, number: int, payload: bytes) -> None:
         call = len(self._calls)
         self._calls[call] = owner, number
-        self._apply(owner, self.service.receive(call, payload, 0.0, owner))
+        self._apply(owner, self.service.receive(call, *received(payload), 0.0, owner))
 
     def run(self, owner: str | None) -> None:
         if self.jobs[owner]:

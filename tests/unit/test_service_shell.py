@@ -453,7 +453,7 @@ class Script(Service):
         self.trace: list[str] = []
         self.times: list[float] = []
 
-    def receive_request(self, call: int, *arguments: Any) -> list[ServiceEffect]:
+    def receive(self, call: int, *arguments: Any) -> list[ServiceEffect]:
         self.trace.append(f"call {call} of {arguments[-1]}")
         runs, self.runs = self.runs, []
         return [SendReply(call, b"first"), *runs]
@@ -615,7 +615,7 @@ async def test_a_machine_with_a_defect_ends_the_service_and_robots_see_it(
 ) -> None:
     async with joined() as both:
         patient = Patient(both.network)
-        monkeypatch.setattr(Service, "receive_request", broken)
+        monkeypatch.setattr(Service, "receive", broken)
         call = patient.send(b"rubbish")
         with pytest.raises(ServiceBrokenError, match="a defect"):
             await both.shell.wait()

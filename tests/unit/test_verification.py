@@ -186,7 +186,7 @@ def test_the_share_is_kept_and_no_service_can_tell_which() -> None:
             for effect in effects[before:]:
                 if isinstance(effect, ComputeOwnAnswer):
                     own = OwnAnswer(effect.number, (), 0, question.digest)
-                    verification.decided(own, None, 0)
+                    verification.decided(own, None)
     # Binomial: four standard deviations of 2,000 draws at 1/4 are 78 (false alarms: 6e-5 each).
     assert all(abs(sum(each) - 500) <= 78 for each in drawn.values())
     both = sum(a and b for a, b in zip(drawn[b"one"], drawn[b"other"], strict=True))

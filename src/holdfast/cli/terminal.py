@@ -253,7 +253,7 @@ def _verified_text(summary: RunSummary) -> str:
 
 def _summary_rows(summary: RunSummary) -> list[tuple[str, str]]:
     from holdfast.belief import VALIDATION_GATE_SQUARED
-    from holdfast.protocol.verification import OWN_PLANNER
+    from holdfast.protocol.question import OWN_PLANNER
 
     rows = []
     if summary.success_rate is not None and summary.success_rate_interval_95 is not None:

@@ -16,32 +16,37 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 
 from holdfast.config.settings import OffloadSettings, RecoverySettings
-from holdfast.errors import HoldfastError, OwnDecisionError, ServiceRefusedError, StaleEpochError
+from holdfast.errors import OwnDecisionError, ServiceRefusedError, StaleEpochError
 from holdfast.problems.problem import Problem
-from holdfast.protocol.decision_source import DecisionSource
 from holdfast.protocol.events import (
     CallEnded,
-    Halt,
     Launch,
     OwnAnswer,
     Planned,
+    RecoveryExited,
     ReplyReceived,
     ServiceAppeared,
     ServiceVanished,
     TransportEvent,
 )
 from holdfast.protocol.local_service import HedgingBudget, RestartPolicy
-from holdfast.protocol.messages import SessionConfiguration
-from holdfast.protocol.question import Question
+from holdfast.protocol.messages import (
+    NeedState,
+    Progress,
+    SensingAnswer,
+    SessionConfiguration,
+    TaskAnswer,
+)
+from holdfast.protocol.question import DecisionSource, Question
 from holdfast.protocol.replica_set import Replica, ReplicaSet
-from holdfast.protocol.requests import OpenRequest, OpenRequests, ReplyHandler, ReplyOutcome
-from holdfast.protocol.stall_reporter import StallReporter
-from holdfast.protocol.status import Cause, Status, StatusTracker
+from holdfast.protocol.requests import OpenRequest, OpenRequests
+from holdfast.protocol.status import Cause
 from holdfast.protocol.verification import Verification
 
-__all__ = [
-    "Dispatcher",
-]
+__all__ = ["Dispatcher"]
+
+_LONGEST_SILENT_WAIT_S = 1.0
+"""A longer wait is reported, unless a dead service takes longer to detect."""
 
 
 class Dispatcher(DecisionSource):
@@ -78,6 +83,7 @@ class Dispatcher(DecisionSource):
         timeout_s = 1e-3 * offload.detection_timeout_ms
         wanted = recovery_settings.launch != "never"
         self._timeout_s = timeout_s
+        self._patience_s = max(_LONGEST_SILENT_WAIT_S, timeout_s)
         self._limit_s = 1e-3 * offload.decision_timeout_ms
         self._launch_at_start = recovery_settings.launch == "at_start"
         self._services = ReplicaSet(
@@ -87,16 +93,22 @@ class Dispatcher(DecisionSource):
             1e-3 * offload.startup_timeout_ms,
             distrusted,
         )
-        self._calls = OpenRequests(session, epoch, session_configuration, timeout_s, self.effects)
         self._verification = Verification(
             offload.verify_share, secret, local_service_name, problem, self.effects
         )
-        self._replies = ReplyHandler(self._calls, problem, self._verification, self.effects)
+        self._calls = OpenRequests(
+            session,
+            epoch,
+            session_configuration,
+            timeout_s,
+            problem,
+            self._verification,
+            self.effects,
+        )
         self._launches = RestartPolicy(recovery_settings)
         self._hedging = HedgingBudget(offload)
-        self._stalls = StallReporter(timeout_s, self.effects)
+        self._reported_wait: Question | None = None
         self._woke_at = float("-inf")
-        self._tracker = StatusTracker()
 
     # -- what the robot's loop asks for ----------------------------------------------------------
 
@@ -121,7 +133,7 @@ class Dispatcher(DecisionSource):
                 self._calls.abandon(call)
         self.wake(now)
         if not self.stopped:
-            self._try_others(now)
+            self._try_others(question, now)
 
     def drop(self) -> None:
         """Drop the question: the trial has ended, or its answer is of no use."""
@@ -129,18 +141,14 @@ class Dispatcher(DecisionSource):
         for call in self._calls:
             if call.answered or call.replica is self._services.local:
                 self._calls.abandon(call)
-        self._stalls.forget()
-
-    def need(self, now: float) -> None:
-        """Note that the robot waits for the rest of the answer."""
-        if self.question is not None and self.question.needed_at is None:
-            self.question.wait(now)
-            self.wake(now)
+        self.holding_since = None
 
     # -- what happens ----------------------------------------------------------------------------
 
-    def handle(self, event: TransportEvent | Planned, now: float) -> None:
-        """Handle an event of the transport."""
+    def handle(
+        self, event: TransportEvent | OwnAnswer | Planned | RecoveryExited, now: float
+    ) -> None:
+        """Handle an event of the transport, the own planner or the local service's process."""
         if isinstance(event, ReplyReceived):
             call = self._calls.get(event.call)
             if call is not None:
@@ -153,42 +161,21 @@ class Dispatcher(DecisionSource):
             self._appeared(self._services.get(event.service), event.incarnation, now)
         elif isinstance(event, ServiceVanished):
             self._vanished(self._services.get(event.service), event.incarnation, now)
+        elif isinstance(event, OwnAnswer):
+            self._decided(event)
+        elif isinstance(event, RecoveryExited):
+            self._local_exited(event, now)
         self.wake(now)
 
-    def decided(self, event: OwnAnswer, performed: int, now: float) -> None:
-        """Take the answer of the robot's own planner."""
-        try:
-            usable = self._verification.decided(event, self.question, performed)
-        except OwnDecisionError as error:
-            self._stop(error)
+    def recompute(self, *, before_acting: bool) -> None:
+        """Have the own planner answer the question too."""
+        question = self.question
+        if question is None or not question.parts:
             return
-        if not usable:
-            # What was done cannot be undone; from where it led, a new question is asked.
-            self.drop()
-        self._drop_wrong_services()
-        self.wake(now)
-
-    def check(self) -> None:
-        """Have the own planner recompute the answer, because it did not fit the robot's state."""
-        question = self.question
-        if question is not None and question.parts:
-            self._verification.check(question, question.parts[0].service)
-
-    def dispute(self) -> None:
-        """Have the own planner answer before the robot acts."""
-        question = self.question
-        if question is not None and question.parts:
+        if before_acting:
             self._verification.dispute(question, question.parts[0].service)
-
-    @property
-    def status(self) -> Status:
-        """Which service decides."""
-        return self._tracker.status
-
-    @property
-    def recoveries(self) -> int:
-        """Times that the cloud was lost."""
-        return self._tracker.recoveries
+        else:
+            self._verification.check(question, question.parts[0].service)
 
     @property
     def limits_are_reliable(self) -> bool:
@@ -196,28 +183,9 @@ class Dispatcher(DecisionSource):
         return self._verification.limits_are_reliable
 
     @property
-    def is_holding(self) -> bool:
-        """Whether the robot holds still: no service is usable, or its own planner has to decide."""
-        return self._stalls.is_holding
-
-    @property
     def num_unverified(self) -> int:
         """Questions that the own planner still has to answer."""
         return len(self._verification)
-
-    def recovery_exited(self, launch: int, reason: str, now: float) -> None:
-        """Handle the end of a local service's process, or its failure to start."""
-        local, launches = self._services.local, self._launches
-        if local is None:
-            return
-        self.effects.report("recovery_exited", reason=reason)
-        if launch != launches.number or launches.pending:
-            return  # It was seen to be gone before; only the reason is new.
-        if local.detector.incarnation is not None:
-            self._vanished(local, local.detector.incarnation, now)
-        else:
-            launches.failed(now)
-        self.wake(now)
 
     def next_wakeup(self) -> float | None:
         """Return when :meth:`wake` is due if nothing happens before; None if never."""
@@ -242,7 +210,8 @@ class Dispatcher(DecisionSource):
             elif question.needed_at is not None:
                 due += [self._calls.probe_at(replica, question) for replica in services.cloud]
                 due.append(question.needed_at + self._timeout_s)
-            due.append(self._stalls.waiting_at(question))
+            if question.needed_at is not None and question is not self._reported_wait:
+                due.append(question.needed_at + self._patience_s)
             due.append(self._hedge_at(question))
         local = services.local
         if local is not None:
@@ -266,14 +235,13 @@ class Dispatcher(DecisionSource):
             replica.forget()
             replica.last_incarnation = incarnation
         if replica is self._services.local:
-            self._launches.appeared(now)
-            launched_s = self._launches.since_launch_s(now)
-            if launched_s is not None:
-                self.effects.report("launched", launch_ms=1e3 * launched_s)
+            launch_s = self._launches.appeared(now)
+            if launch_s is not None:
+                self.effects.report("launched", launch_ms=1e3 * launch_s)
             return
         self.effects.report("service_appeared", service=replica.name)
         question = self.question
-        if self._tracker.is_recovering and question is not None and replica.refusal is None:
+        if self.tracker.is_recovering and question is not None and replica.refusal is None:
             # It need not wait for the next turn: with an answer to this one it holds the state.
             self._calls.send(replica, question, now, is_retry=False)
 
@@ -285,37 +253,45 @@ class Dispatcher(DecisionSource):
         if replica is self._services.local:
             self._launches.ended(now)
 
+    def _local_exited(self, event: RecoveryExited, now: float) -> None:
+        local, launches = self._services.local, self._launches
+        if local is None:
+            return
+        self.effects.report("recovery_exited", reason=event.reason)
+        if event.launch != launches.number or launches.pending:
+            return  # It was seen to be gone before; only the reason is new.
+        if local.detector.incarnation is not None:
+            self._vanished(local, local.detector.incarnation, now)
+        else:
+            launches.failed(now)
+
+    # -- answers ---------------------------------------------------------------------------------
+
     def _replied(self, call: OpenRequest, payload: bytes, now: float) -> None:
-        replica, question = call.replica, call.question
+        replica, question, is_first = call.replica, call.question, not call.answered
         try:
-            outcome = self._replies.take(call, payload, now)
+            reply = self._calls.take(call, payload, now)
         except StaleEpochError as error:
-            self._stop(error)
+            self.stop(error)
             return
         self._drop_wrong_services()
+        is_answer = isinstance(reply, TaskAnswer | SensingAnswer)
         if question is self.question:
-            if outcome.shows_work and not question.disputed:
-                self._stalls.let_go(now)
-            elif outcome in (ReplyOutcome.LACKS_OBSERVATIONS, ReplyOutcome.LACKS_STATE):
-                self._calls.send(
-                    replica,
-                    question,
-                    now,
-                    whole_state=outcome is ReplyOutcome.LACKS_STATE,
-                    is_retry=False,
-                )
-        if (
-            outcome in (ReplyOutcome.ANSWERED, ReplyOutcome.ANSWERED_MORE)
-            and replica is self._services.local
-        ):
+            if (is_answer or isinstance(reply, Progress)) and not question.disputed:
+                self._end_hold(now)
+            elif isinstance(reply, NeedState) and not call.has_everything:
+                # Told everything but the state, it came to another one: only the state will do.
+                whole_state = reply.differs or call.opens
+                self._calls.send(replica, question, now, whole_state=whole_state, is_retry=False)
+        if is_answer and replica is self._services.local:
             self._launches.succeeded()
-        elif outcome is ReplyOutcome.ANSWERED and self._ends_recovery(replica, question):
+        elif is_answer and is_first and self._ends_recovery(replica, question):
             reason = f"{replica.name} has answered"
-            self.effects.report("status", **self._tracker.change(Cause.CLOUD_ANSWERED, reason, now))
+            self.effects.report("status", **self.tracker.change(Cause.CLOUD_ANSWERED, reason, now))
 
     def _ends_recovery(self, replica: Replica, question: Question) -> bool:
         """Return whether an answer does: one that is wrong, or may be, does not."""
-        return self._tracker.is_recovering and replica.reliable and not question.disputed
+        return self.tracker.is_recovering and replica.reliable and not question.disputed
 
     def _ended(self, call: OpenRequest, now: float) -> None:
         self._calls.settle(call)
@@ -329,6 +305,18 @@ class Dispatcher(DecisionSource):
         if replica.detector.suspicion is None:
             replica.detector.suspect("a call ended without the answer")
             self._report_suspected(replica)
+
+    def _decided(self, event: OwnAnswer) -> None:
+        """Take the answer of the robot's own planner."""
+        try:
+            usable = self._verification.decided(event, self.question)
+        except OwnDecisionError as error:
+            self.stop(error)
+            return
+        if not usable:
+            # What was done cannot be undone; from where it led, a new question is asked.
+            self.drop()
+        self._drop_wrong_services()
 
     def _drop_wrong_services(self) -> None:
         """Stop using services whose answers differ from the own planner's."""
@@ -366,34 +354,28 @@ class Dispatcher(DecisionSource):
         self._enforce_decision_timeout(now)
         self._tend_recovery(now)
         question = self.question
-        if question is None:
-            self._note_lost_cloud(now)
-            return
-        if question.disputed:
+        if question is not None and question.disputed:
             self._wait_for_own_planner(question, now)
             return
-        if question.complete:
-            self._stalls.let_go(now)
-            self._note_lost_cloud(now)
-            return
-        if self._is_being_asked(question, now):
-            self._hedge(question, now)
-            if question.needed_at is not None:
-                # The service that has the question may be silent for long while the robot waits.
-                self._try_others(now)
-            if self._stalls.waits_long(question, now):
-                asked = {call.replica.name for call in self._calls.about(question)}
-                self._stalls.tell_waiting(question, asked, now)
-            self._note_lost_cloud(now)
-        else:
-            self._ask_or_hold(question, now)
+        if question is not None:
+            if question.complete:
+                self._end_hold(now)
+            elif self._is_being_asked(question, now):
+                self._hedge(question, now)
+                if question.needed_at is not None:
+                    # The service that has the question may be silent for long meanwhile.
+                    self._try_others(question, now)
+                self._report_wait(question, now)
+            else:
+                self._ask_or_hold(question, now)
+        self._note_lost_cloud(now)
 
     def _wait_for_own_planner(self, question: Question, now: float) -> None:
-        self._stalls.hold(question, "the robot's own planner decides", now)
+        self._hold(question, "the robot's own planner decides", now)
         needed_at = question.needed_at
         if needed_at is not None and now >= needed_at + self._limit_s:
             state = question.state
-            self._stop(
+            self.stop(
                 OwnDecisionError(
                     f"trial {state.trial}, step {state.step}: services answer differently, or "
                     "outside the problem's limits, and the robot's own planner has not decided "
@@ -425,7 +407,7 @@ class Dispatcher(DecisionSource):
     def _is_being_asked(self, question: Question, now: float) -> bool:
         """Return whether a usable service has the question."""
         calls = self._calls.about(question)
-        if self._tracker.is_recovering and self._services.local_usable(now):
+        if self.tracker.is_recovering and self._services.local_usable(now):
             # The cloud is only tried: it may say for long that it is at work.
             return any(call.replica is self._services.local for call in calls)
         return any(call.replica.detector.trusted for call in calls)
@@ -433,7 +415,7 @@ class Dispatcher(DecisionSource):
     def _ask_or_hold(self, question: Question, now: float) -> None:
         """Send the question to the best usable service; without one, start the recovery or hold."""
         services = self._services
-        if not self._tracker.is_recovering:
+        if not self.tracker.is_recovering:
             for replica in services.cloud:
                 if replica.usable(now) and not self._calls.is_asked(replica, question):
                     self._calls.send(replica, question, now)
@@ -448,7 +430,7 @@ class Dispatcher(DecisionSource):
         if services.local is None:
             self._hold_and_retry(question, now)
             return
-        if not self._tracker.is_recovering:
+        if not self.tracker.is_recovering:
             self._lose_cloud(now)
             self._tend_recovery(now)
         if self._services.local_usable(now):
@@ -471,19 +453,16 @@ class Dispatcher(DecisionSource):
                 if replica.detector.trusted:
                     return
         if services.hopeless():
-            self._stop(ServiceRefusedError(f"no service will decide: {services.why_nobody()}"))
+            self.stop(ServiceRefusedError(f"no service will decide: {services.why_nobody()}"))
             return
-        self._stalls.hold(question, services.why_nobody(), now)
+        self._hold(question, services.why_nobody(), now)
 
-    def _try_others(self, now: float) -> None:
+    def _try_others(self, question: Question, now: float) -> None:
         """Probe suspected services with this question too: an answer brings them back."""
-        question = self.question
-        if question is None:
-            return
         needed_at = question.needed_at
         is_late = needed_at is not None and now >= needed_at + self._timeout_s
         for replica in self._services.cloud:
-            if replica.usable(now) and not self._tracker.is_recovering:
+            if replica.usable(now) and not self.tracker.is_recovering:
                 if is_late and not self._calls.is_asked(replica, question):
                     # It has come back while one that is less preferred takes its time.
                     self._calls.send(replica, question, now, is_retry=False)
@@ -498,7 +477,7 @@ class Dispatcher(DecisionSource):
         """Start the recovery if the cloud was lost while nothing was asked of it."""
         if (
             self._services.local is not None
-            and not self._tracker.is_recovering
+            and not self.tracker.is_recovering
             and not self._services.is_starting(now)
             and not self._services.any_reliable()
         ):
@@ -508,8 +487,37 @@ class Dispatcher(DecisionSource):
     def _lose_cloud(self, now: float) -> None:
         reason, silence_s = self._services.why_lost(), self._services.silence_s(now)
         self.effects.report(
-            "status", **self._tracker.change(Cause.CLOUD_LOST, reason, now, silence_s)
+            "status", **self.tracker.change(Cause.CLOUD_LOST, reason, now, silence_s)
         )
+
+    # -- standing still --------------------------------------------------------------------------
+
+    def _report_wait(self, question: Question, now: float) -> None:
+        """Report, once per question, that a service takes its time while the robot waits."""
+        needed_at = question.needed_at
+        if needed_at is None or question is self._reported_wait:
+            return
+        if now >= needed_at + self._patience_s:
+            self._reported_wait = question
+            asked = {call.replica.name for call in self._calls.about(question)}
+            self.effects.report(
+                "waiting",
+                service=", ".join(sorted(asked)),
+                step=question.state.step,
+                waited_ms=1e3 * (now - needed_at),
+            )
+
+    def _hold(self, question: Question, reason: str, now: float) -> None:
+        """Report that no service is usable, if the robot needs the answer."""
+        if question.needed_at is not None and self.holding_since is None:
+            self.holding_since = now
+            self.effects.report("holding", step=question.state.step, reason=reason)
+
+    def _end_hold(self, now: float) -> None:
+        """Report that a service works on the question, if the robot holds still."""
+        if self.holding_since is not None:
+            self.effects.report("resumed", held_ms=1e3 * (now - self.holding_since))
+            self.holding_since = None
 
     # -- the local service -----------------------------------------------------------------------
 
@@ -518,7 +526,7 @@ class Dispatcher(DecisionSource):
         local, launches = self._services.local, self._launches
         if local is None:
             return
-        if self._tracker.is_recovering:
+        if self.tracker.is_recovering:
             launches.want(now)
         waited_s = launches.overdue_launch_age_s(now, present=local.detector.present)
         if waited_s is not None:
@@ -560,8 +568,3 @@ class Dispatcher(DecisionSource):
         self.effects.report(
             "service_suspected", service=replica.name, reason=replica.detector.suspicion
         )
-
-    def _stop(self, error: HoldfastError) -> None:
-        if not self.stopped:
-            self.stopped = True
-            self.effects.append(Halt(error))

@@ -38,6 +38,7 @@ __all__ = [
     "Paused",
     "Plan",
     "Planned",
+    "RecoveryExited",
     "ReplyReceived",
     "RobotEffect",
     "Send",
@@ -53,13 +54,7 @@ __all__ = [
 
 
 class ServiceAppeared(NamedTuple):
-    """A service can be asked.
-
-    Attributes
-    ----------
-    incarnation : str
-        Of the service's process: another value is another process, with another memory.
-    """
+    """A service can be asked; another ``incarnation`` is another process, with another memory."""
 
     service: str
     incarnation: str
@@ -93,8 +88,6 @@ class EnvironmentReady(NamedTuple):
 
     Attributes
     ----------
-    done : bool or "failed"
-        Whether the task is done already, or has failed.
     steps_performed : int or None
         Task actions performed in this trial, counted by the environment; None if it does not count.
     """
@@ -104,28 +97,14 @@ class EnvironmentReady(NamedTuple):
 
 
 class Sensed(NamedTuple):
-    """A sensing action was performed.
-
-    Attributes
-    ----------
-    observation : array of shape (observation_size,)
-        Finite, read-only.
-    """
+    """A sensing action was performed; the observation is finite and read-only."""
 
     step: int
     observation: FloatArray
 
 
 class Acted(NamedTuple):
-    """A task action was performed.
-
-    Attributes
-    ----------
-    reward : float or None
-        Finite; None if the environment gives none.
-    done : bool or "failed"
-        Whether the task is done, or has failed.
-    """
+    """A task action was performed; the reward is finite, or None if the environment gives none."""
 
     step: int
     reward: float | None
@@ -139,14 +118,10 @@ class EnvironmentFailed(NamedTuple):
     ----------
     what : str
         The method, or the environment's name if it could not be made.
-    text : str
-        What happened, and where in the environment's code.
     action_in_doubt : bool
         Whether the step's task action was begun without an :class:`Acted`.
     performed : bool
-        Whether the step's task action was performed and something after it failed.
-    reward : float or None
-        Of that task action.
+        Whether the step's task action was performed, with ``reward``, and what came after failed.
     counts_steps : bool
         Whether the environment counts its steps, so that it can be asked later.
     """
@@ -164,12 +139,10 @@ EnvironmentEvent: TypeAlias = EnvironmentReady | Sensed | Acted | EnvironmentFai
 
 
 class OwnAnswer(NamedTuple):
-    """The robot's own planner has answered a question to verify services, or failed.
+    """The result of a :class:`ComputeOwnAnswer`.
 
     Attributes
     ----------
-    number : int
-        Of its :class:`ComputeOwnAnswer`.
     actions : tuple of array
         Task actions up to the next sensing step.
     sensing_action : int or None
@@ -177,7 +150,7 @@ class OwnAnswer(NamedTuple):
     ahead_digest : bytes
         Of the state in which the sensing action was chosen.
     failure : str or None
-        Why there is no answer; None if there is one.
+        Why there is no answer.
     """
 
     number: int
@@ -189,18 +162,14 @@ class OwnAnswer(NamedTuple):
 
 
 class Planned(NamedTuple):
-    """The planner of a robot without services has computed a part of an answer.
+    """The result of a :class:`Plan`.
 
     Attributes
     ----------
-    number : int
-        Of its :class:`Plan`.
     ahead : PlanningState
         To which the task actions lead, or in which the sensing action was chosen.
-    actions : sequence of array
-        Task actions up to the next sensing step.
     ahead_digest : bytes
-        Of the state in which the sensing action was chosen.
+        Of that state, for a sensing part.
     sensing_action : int or None
         None for a task part.
     error : HoldfastError or None
@@ -214,6 +183,13 @@ class Planned(NamedTuple):
     sensing_action: int | None = None
     computed_s: float = 0.0
     error: HoldfastError | None = None
+
+
+class RecoveryExited(NamedTuple):
+    """The process of the :class:`Launch` with this number ended, or could not be started."""
+
+    launch: int
+    reason: str
 
 
 class WriteRecords(NamedTuple):
@@ -252,12 +228,10 @@ class Act(NamedTuple):
 
 
 class ComputeOwnAnswer(NamedTuple):
-    """Have the robot's own planner answer a question in the background.
+    """Have the robot's own planner answer a question, to verify what services have answered.
 
     Attributes
     ----------
-    number : int
-        Repeated by the :class:`OwnAnswer`.
     urgent : bool
         Whether the robot waits for it; it then goes first. It may repeat an earlier number.
     again : bool
@@ -287,14 +261,10 @@ class Plan(NamedTuple):
 
 
 class VerificationNoted(NamedTuple):
-    """A part of an answer was compared with the own planner's; for the tables only.
+    """A part of a service's answer was compared with the own planner's; for the tables only.
 
     Attributes
     ----------
-    trial, step : int
-        Of the question.
-    service : str
-        That gave the answer.
     kind : {"question", "task", "sensing"}
     verdict : {"asked", "left_out", "same", "different", "not_deterministic", "failed"}
         Of a question: whether it will be recomputed, or too many wait. Of a part: the comparison;
@@ -309,25 +279,13 @@ class VerificationNoted(NamedTuple):
 
 
 class Launch(NamedTuple):
-    """Start the local service, and end its previous process if there is one.
-
-    Attributes
-    ----------
-    number : int
-        Of the launch; reported with the end of its process.
-    """
+    """Start the local service, and end its previous process if there is one."""
 
     number: int
 
 
 class LogEvent(NamedTuple):
-    """One line of the log of a robot or a service.
-
-    Attributes
-    ----------
-    fields : dict
-        Plain data; durations end in ``_ms``.
-    """
+    """One line of the log of a robot or a service: plain data; durations end in ``_ms``."""
 
     name: str
     fields: dict[str, object]
@@ -338,8 +296,7 @@ class Timing(NamedTuple):
 
     Attributes
     ----------
-    kind : str
-        ``sensing`` or ``task``.
+    kind : {"task", "sensing"}
     service : str
         Whose answer is used.
     waited_ms : float

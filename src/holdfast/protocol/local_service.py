@@ -66,12 +66,9 @@ class RestartPolicy:
         self.number += 1
         return self.number
 
-    def appeared(self, now: float) -> None:
-        """Note that the launched process can be asked."""
+    def appeared(self, now: float) -> float | None:
+        """Note that its process can be asked; return the time since the launch, if any."""
         self._appeared_at = now
-
-    def since_launch_s(self, now: float) -> float | None:
-        """Return the time since the last launch; None before the first."""
         return None if self._launched_at is None else now - self._launched_at
 
     def overdue_launch_age_s(self, now: float, *, present: bool) -> float | None:

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import hashlib
 import zlib
-from typing import Annotated, Any, TypeAlias
+from typing import Annotated, TypeAlias
 
 import msgspec
 import numpy as np
@@ -97,19 +97,13 @@ Word = Annotated[int, msgspec.Meta(ge=0, le=MAX_WORD)]
 Name = Annotated[str, msgspec.Meta(min_length=1, max_length=200)]
 Session = Annotated[bytes, msgspec.Meta(min_length=16, max_length=16)]
 Digest = Annotated[bytes, msgspec.Meta(min_length=DIGEST_SIZE, max_length=DIGEST_SIZE)]
+# Longer than allowed, so that the refusal can name the size.
+PackedConfiguration = Annotated[bytes, msgspec.Meta(max_length=16 * MAX_CONFIGURATION_BYTES)]
 Numbers = Annotated[bytes, msgspec.Meta(max_length=8 * MAX_ACTION_SIZE * MAX_TASK_ACTIONS)]
 
 
 class Observed(msgspec.Struct, array_like=True, frozen=True, forbid_unknown_fields=True):
-    """An observation that is part of the robot's belief.
-
-    Attributes
-    ----------
-    step : int
-        It belongs to the state of that step, before its task action.
-    observation : bytes
-        Little-endian float64.
-    """
+    """An observation (little-endian float64) of the state of a step, before its task action."""
 
     step: Word
     sensing_action: Word
@@ -125,14 +119,11 @@ class SessionConfiguration(msgspec.Struct, array_like=True, frozen=True):
 
     Attributes
     ----------
-    problem : str
-        Registered name.
     model, state_space_planner : dict
         The problem's two sections of the configuration.
-    core_version : str
-        Of the robot's holdfast (:func:`holdfast.source_digest.core_version`).
-    problem_digest : str
-        Of the problem's code beyond that (:func:`holdfast.source_digest.problem_digest`).
+    core_version, problem_digest : str
+        Of the robot's holdfast, and of the problem's code beyond that
+        (:mod:`holdfast.source_digest`).
     """
 
     problem: Name
@@ -144,45 +135,21 @@ class SessionConfiguration(msgspec.Struct, array_like=True, frozen=True):
     problem_digest: Annotated[str, msgspec.Meta(max_length=200)] = ""
 
 
-class _Named(msgspec.Struct, array_like=True, frozen=True):
-    """What a request names; the first fields of both of its forms."""
-
-    version: int
-    session: Session
-    epoch: Word
-    number: Word
-    trial: Word
-    step: Word
-    sensed: bool
-    digest: Digest
-    observations: Annotated[tuple[Observed, ...], msgspec.Meta(max_length=MAX_OBSERVATIONS)] = ()
-
-    def named(self) -> dict[str, Any]:
-        """Return these fields by name."""
-        return {name: getattr(self, name) for name in _Named.__struct_fields__}
-
-
-class Request(_Named, array_like=True, frozen=True):
+class Request(msgspec.Struct, array_like=True, frozen=True):
     """A robot's question: what to do from this state until it has sensed again.
 
     Encode it with :func:`encode` only: on the wire the session configuration has another form.
 
     Attributes
     ----------
-    version : int
-        :data:`PROTOCOL_VERSION`.
     session : bytes
-        16 random bytes, drawn once per run.
+        Random, drawn once per run.
     epoch : int
         Raised by each restart of the robot; a service refuses a lower one than it has seen.
     number : int
         Increases within an epoch, and is unique among epochs. Every reply repeats it.
-    trial, step : int
-        Of the state.
-    sensed : bool
-        Whether the step's observation is part of the state.
-    digest : bytes
-        Of the state.
+    trial, step, sensed, digest
+        Of the state; ``sensed`` says whether the step's observation is part of it.
     observations : tuple of Observed
         Of this trial, in order, since the state that this service acknowledged last; all of them if
         it acknowledged none.
@@ -193,41 +160,43 @@ class Request(_Named, array_like=True, frozen=True):
         decoded one is a view of the message.
     """
 
+    version: int
+    session: Session
+    epoch: Word
+    number: Word
+    trial: Word
+    step: Word
+    sensed: bool
+    digest: Digest
+    observations: Annotated[tuple[Observed, ...], msgspec.Meta(max_length=MAX_OBSERVATIONS)] = ()
     session_configuration: SessionConfiguration | None = None
     checkpoint: bytes | memoryview | None = None
 
 
-class _SentRequest(_Named, array_like=True, frozen=True, forbid_unknown_fields=True):
-    """A request on the wire.
+class _SentRequest(Request, array_like=True, frozen=True, forbid_unknown_fields=True):
+    """A request on the wire, with the settings' digest as the robot understands them.
 
     Its session configuration is bytes inside the message, so each field's length precedes the field
     and is checked before any of it is decoded: bytes that are no request are refused at once,
     whatever their size.
     """
 
-    # Larger than allowed, so that the refusal can name the size.
-    session_configuration: (
-        Annotated[bytes, msgspec.Meta(max_length=16 * MAX_CONFIGURATION_BYTES)] | None
-    ) = None
+    session_configuration: PackedConfiguration | None = None  # type: ignore[assignment]
     # Not copied: that would hold up all other threads, 40 ms for 60 MB.
     checkpoint: memoryview | None = None
-    # Digest of the settings, as the robot understands them.
     settings: Digest | None = None
+
+
+class _Versioned(msgspec.Struct, array_like=True):
+    """A request of any version, whatever its other fields are."""
+
+    version: Word
 
 
 class TaskAnswer(msgspec.Struct, array_like=True, frozen=True, tag=1):
     """The task actions from the state on, up to the next sensing step.
 
-    Attributes
-    ----------
-    number : int
-        Of the request.
-    count : int
-        Task actions, for the request's step and those that follow.
-    actions : bytes
-        Executed actions in order, little-endian float64.
-    computed_us : int
-        Computing time.
+    ``actions`` are the executed ones, ``count`` in number, in order, as little-endian float64.
     """
 
     number: Word
@@ -241,15 +210,11 @@ class SensingAnswer(msgspec.Struct, array_like=True, frozen=True, tag=2):
 
     Attributes
     ----------
-    number : int
-        Of the request.
     step : int
         The sensing step: the request's own if its state must still sense, else that after the task
         actions.
     digest : bytes
         Of the state in which it was chosen; the robot follows it only in exactly that state.
-    computed_us : int
-        Computing time.
     """
 
     number: Word
@@ -260,15 +225,7 @@ class SensingAnswer(msgspec.Struct, array_like=True, frozen=True, tag=2):
 
 
 class Progress(msgspec.Struct, array_like=True, frozen=True, tag=3):
-    """A sign of life: the request is in work.
-
-    Attributes
-    ----------
-    number : int
-        Of the request.
-    waiting : bool
-        Whether it still waits for a worker.
-    """
+    """A sign of life: the request is in work, or still waits for a worker."""
 
     number: Word
     waiting: bool
@@ -279,8 +236,6 @@ class NeedState(msgspec.Struct, array_like=True, frozen=True, tag=4):
 
     Attributes
     ----------
-    number : int
-        Of the request.
     differs : bool
         Whether the service holds a state of the trial that does not lead to the robot's; then only
         the checkpoint helps.
@@ -296,10 +251,7 @@ class NeedState(msgspec.Struct, array_like=True, frozen=True, tag=4):
 class Busy(msgspec.Struct, array_like=True, frozen=True, tag=5):
     """The service has too much work: ask another, or again later.
 
-    Attributes
-    ----------
-    number : int
-        Of the request; 0 if it was turned away unread.
+    ``number`` is 0 if the request was turned away unread.
     """
 
     number: Word
@@ -312,15 +264,13 @@ class Refused(msgspec.Struct, array_like=True, frozen=True, tag=6):
     Attributes
     ----------
     number : int
-        Of the request; 0 if it could not be read.
+        0 if the request could not be read.
     code : str
         ``damaged`` (in transit: it may be sent again), ``malformed``, ``too_large``, ``version``,
         ``stale_epoch``, ``unknown_problem``, ``other_code`` (the service's holdfast or problem
         is not the robot's), ``invalid`` (settings or state out of bounds),
         ``out_of_memory`` (it may be asked again) or ``failed`` (the problem's own functions failed
         in this state).
-    text : str
-        An explanation.
     """
 
     number: Word
@@ -331,6 +281,7 @@ class Refused(msgspec.Struct, array_like=True, frozen=True, tag=6):
 Reply: TypeAlias = TaskAnswer | SensingAnswer | Progress | NeedState | Busy | Refused
 
 _ENCODER = msgspec.msgpack.Encoder()
+_VERSION_DECODER = msgspec.msgpack.Decoder(_Versioned)
 _REQUEST_DECODER = msgspec.msgpack.Decoder(_SentRequest)
 _CONFIGURATION_DECODER = msgspec.msgpack.Decoder(SessionConfiguration)
 _REPLY_DECODER: msgspec.msgpack.Decoder[Reply] = msgspec.msgpack.Decoder(Reply)
@@ -338,20 +289,16 @@ _REPLY_DECODER: msgspec.msgpack.Decoder[Reply] = msgspec.msgpack.Decoder(Reply)
 _CONTAINERS = (dict, list, tuple)
 """Values of a configuration that contain others."""
 
-_ARRAY_HEADERS = {0xDC: 3, 0xDD: 5}
-"""Sizes in bytes of the longer array headers of MessagePack, by their first byte."""
-
-_WORDS = {0xCC: 1, 0xCD: 2, 0xCE: 4}
-"""Sizes in bytes of the longer unsigned integers of MessagePack, by their first byte."""
-
 
 def encode(message: Request | Reply) -> bytes:
     """Encode a message."""
     if isinstance(message, Request) and message.session_configuration is not None:
         # Without a session configuration the shorter form is read as the same request.
-        return with_checksum(
-            _ENCODER.encode(_sent(message, pack_configuration(message.session_configuration)))
-        )
+        packed = pack_configuration(message.session_configuration)
+        # What a service will make of them, not what they were before: an int where a float belongs.
+        settings = settings_digest(unpack_configuration(packed))
+        fields = msgspec.structs.asdict(message) | {"session_configuration": packed}
+        message = _SentRequest(**fields, settings=settings)
     return with_checksum(_ENCODER.encode(message))
 
 
@@ -407,11 +354,13 @@ def decode_request(payload: bytes) -> Request:
         settings mean something else here than on the robot.
     """
     content = _checked_content(payload)
-    # Other versions may have other fields.
-    version = _version_of(content)
-    if version is not None and version != PROTOCOL_VERSION:
-        raise _other_version(version)
     try:
+        version = _VERSION_DECODER.decode(content).version
+        if version != PROTOCOL_VERSION:
+            raise MessageError(
+                "version",
+                f"protocol version {version}: this holdfast speaks version {PROTOCOL_VERSION}",
+            )
         sent = _REQUEST_DECODER.decode(content)
         session_configuration = (
             None
@@ -420,13 +369,11 @@ def decode_request(payload: bytes) -> Request:
         )
     except (msgspec.DecodeError, RecursionError, UnicodeDecodeError) as error:
         raise MessageError("malformed", f"{len(payload)} bytes are no request: {error}") from error
-    if sent.version != PROTOCOL_VERSION:
-        raise _other_version(sent.version)
     if sent.checkpoint is not None and sent.observations:
         raise MessageError("malformed", "a request has a checkpoint and observations as well")
-    return Request(
-        **sent.named(), session_configuration=session_configuration, checkpoint=sent.checkpoint
-    )
+    fields = msgspec.structs.asdict(sent) | {"session_configuration": session_configuration}
+    del fields["settings"]
+    return Request(**fields)
 
 
 def decode_reply(payload: bytes) -> Reply:
@@ -463,31 +410,6 @@ def decode_floats(data: bytes, size: int) -> FloatArray:
     if not numerics.all_finite(numbers):
         raise MessageError("malformed", f"{numbers} are not all finite")
     return numbers
-
-
-def _sent(request: Request, session_configuration: bytes) -> _SentRequest:
-    return _SentRequest(
-        **request.named(),
-        session_configuration=session_configuration,
-        checkpoint=None if request.checkpoint is None else memoryview(request.checkpoint),
-        # What a service will make of them, not what they were before: an int where a float belongs.
-        settings=settings_digest(unpack_configuration(session_configuration)),
-    )
-
-
-def _version_of(content: memoryview) -> int | None:
-    """Return the version of what looks like a request of ours, from its first bytes alone."""
-    first = content[0]
-    start = 1 if first & 0xF0 == 0x90 else _ARRAY_HEADERS.get(first)
-    if start is None or len(content) <= start:
-        return None
-    word = content[start]
-    if word < 0x80:
-        return word
-    size = _WORDS.get(word)
-    if size is None or len(content) <= start + size:
-        return None
-    return int.from_bytes(content[start + 1 : start + 1 + size], "big")
 
 
 def _session_configuration_of(data: bytes, settings: bytes | None) -> SessionConfiguration:
@@ -538,9 +460,3 @@ def _count_values(session_configuration: SessionConfiguration) -> int:
         parts = (*container, *container.values()) if isinstance(container, dict) else container
         containers += [part for part in parts if isinstance(part, _CONTAINERS)]
     return count
-
-
-def _other_version(version: int) -> MessageError:
-    return MessageError(
-        "version", f"protocol version {version}: this holdfast speaks version {PROTOCOL_VERSION}"
-    )

@@ -1,9 +1,11 @@
-"""The question that a robot asks, and the parts of its answer that have arrived.
+"""The question that a robot asks, its answer as far as it has arrived, and what answers it.
 
 The question is a state: what to do from there until the robot has sensed again? The answer has up
 to two parts, the task actions on the way and the sensing action at its end. Each part may come from
 another service, or from several. The robot follows the first; a later one can only agree, or show
 that a service is wrong (:mod:`holdfast.protocol.verification`).
+
+What answers is a :class:`DecisionSource`: services, or the robot's own planner.
 """
 
 from __future__ import annotations
@@ -13,9 +15,18 @@ from typing import NamedTuple
 
 from holdfast.arrays import FloatArray
 from holdfast.config.settings import PlanningSettings
-from holdfast.errors import MessageError
+from holdfast.errors import HoldfastError, MessageError
 from holdfast.planning import PlanningState, encode_checkpoint, needs_sensing
-from holdfast.protocol.events import OwnAnswer
+from holdfast.protocol.events import (
+    Effects,
+    Halt,
+    OwnAnswer,
+    Plan,
+    Planned,
+    RecoveryExited,
+    RobotEffect,
+    TransportEvent,
+)
 from holdfast.protocol.messages import (
     DIGEST_SIZE,
     MAX_TASK_ACTIONS,
@@ -24,8 +35,20 @@ from holdfast.protocol.messages import (
     TaskAnswer,
     decode_floats,
 )
+from holdfast.protocol.status import StatusTracker
 
-__all__ = ["AnswerPart", "Provenance", "Question", "same_actions"]
+__all__ = [
+    "OWN_PLANNER",
+    "AnswerPart",
+    "DecisionSource",
+    "InProcessSource",
+    "Provenance",
+    "Question",
+    "same_actions",
+]
+
+OWN_PLANNER = "in_process"
+"""Name of the planner in the robot's own process, where services have names."""
 
 
 class Provenance(NamedTuple):
@@ -48,10 +71,8 @@ class AnswerPart:
 
     Attributes
     ----------
-    task_actions : list of array or None
-        Task actions; None for a sensing part.
-    sensing : SensingAnswer or None
-        None for a task part.
+    task_actions, sensing
+        One of them is None.
     outside_limits : bool
         Whether the problem's ``execute`` would change the task actions.
     judged : bool
@@ -91,30 +112,22 @@ class Question:
 
     The question itself never changes. Its answer is written by
     :class:`~holdfast.protocol.verification.Verification` where services answer, else by
-    :class:`~holdfast.protocol.decision_source.InProcessSource`. The robot only reads it; the source
-    notes in ``needed_at`` that the robot waits.
-
-    Parameters
-    ----------
-    digest : bytes
-        Of the state.
-    observations : tuple of Observed
-        The latest observations of this trial.
-    num_observations : int
-        Of this trial, including those not kept.
+    :class:`InProcessSource`; the robot writes ``needed_at`` and ``num_ordered``.
 
     Attributes
     ----------
+    observations, num_observations
+        The latest of this trial, and how many there were.
     task_count : int
         Task actions in the answer.
     sensing_step : int or None
         Step of the answer's sensing action; None if it is too far away.
     needed_at : float or None
         Since when the robot waits for the answer; None if it does not.
-    task_actions : sequence of array or None
-        Task actions to follow; None until they arrive.
-    sensing : SensingAnswer or None
-        Sensing action to follow; None until it arrives.
+    num_ordered : int
+        Task actions of the answer that are performed or ordered.
+    task_actions, sensing
+        What the robot follows; None until it arrives.
     parts : list of AnswerPart
         All distinct parts that services gave.
     check_decided : bool
@@ -140,6 +153,7 @@ class Question:
         self.observations = observations
         self.num_observations = num_observations
         self.needed_at: float | None = None
+        self.num_ordered = 0
         self.task_actions: Sequence[FloatArray] | None = None
         self.sensing: SensingAnswer | None = None
         self.task_provenance: Provenance | None = None
@@ -167,14 +181,10 @@ class Question:
             self.sensing is not None or self.sensing_step is None
         )
 
-    def wait(self, now: float) -> None:
-        """Note that the robot waits for the rest of the answer, if it does not already."""
-        if self.needed_at is None:
-            self.needed_at = now
-
-    def stop_waiting(self) -> None:
-        """Note that the robot no longer waits."""
-        self.needed_at = None
+    @property
+    def is_first(self) -> bool:
+        """Whether its trial has only begun, so that a service needs nothing to reach its state."""
+        return self.state.step == 0 and self.num_observations == 0
 
     def checkpoint(self) -> bytes:
         """Return the encoded state (computed once)."""
@@ -222,3 +232,129 @@ class Question:
         if reply.sensing_action >= num_sensing_actions:
             raise MessageError("malformed", f"there is no sensing action {reply.sensing_action}")
         return AnswerPart(service, None, reply)
+
+
+class DecisionSource:
+    """What answers a robot's questions.
+
+    :class:`~holdfast.protocol.dispatcher.Dispatcher` asks services; :class:`InProcessSource` asks
+    only the robot's own planner. What only services need does nothing here: there is no service to
+    be lost, timed or verified.
+
+    Attributes
+    ----------
+    effects : Effects
+        To be carried out in order; the robot appends its own.
+    question : Question or None
+        The current question, answered or not.
+    tracker : StatusTracker
+        Which service decides.
+    holding_since : float or None
+        Since when the robot holds still because no service is usable, or its own planner has to
+        decide.
+    stopped : bool
+        Whether the robot must not continue.
+    """
+
+    def __init__(self) -> None:
+        self.effects: Effects[RobotEffect] = Effects()
+        self.question: Question | None = None
+        self.tracker = StatusTracker()
+        self.holding_since: float | None = None
+        self.stopped = False
+
+    @property
+    def limits_are_reliable(self) -> bool:
+        """Whether an action that the problem's ``execute`` would change must be wrong."""
+        return True
+
+    @property
+    def num_unverified(self) -> int:
+        """Questions that the own planner still has to recompute."""
+        return 0
+
+    def start(self, now: float) -> None:
+        """Begin the run."""
+
+    def ask(self, question: Question, now: float) -> None:
+        """Replace the question."""
+        raise NotImplementedError
+
+    def drop(self) -> None:
+        """Drop the question: the trial has ended, or its answer is of no use."""
+        self.question = None
+
+    def recompute(self, *, before_acting: bool) -> None:
+        """Have the own planner answer the question too.
+
+        Parameters
+        ----------
+        before_acting : bool
+            Whether the robot waits for it; else it is only compared.
+        """
+
+    def handle(
+        self, event: TransportEvent | OwnAnswer | Planned | RecoveryExited, now: float
+    ) -> None:
+        """Handle an event of the transport, of a planner or of the local service's process."""
+        raise NotImplementedError
+
+    def wake(self, now: float) -> None:
+        """Do what is due now."""
+
+    def next_wakeup(self) -> float | None:
+        """Return when :meth:`wake` is due if nothing happens before; None if never."""
+        return None
+
+    def event_loop_stalled(self, seconds: float) -> None:
+        """Note that for so long the robot's process could not receive."""
+
+    def stop(self, error: HoldfastError) -> None:
+        """Hold still for good."""
+        if not self.stopped:
+            self.stopped = True
+            self.effects.append(Halt(error))
+
+
+class InProcessSource(DecisionSource):
+    """Decisions without services.
+
+    Its only effects are :class:`Plan` and :class:`Halt`; the shell computes each :class:`Plan` and
+    passes the result back to :meth:`handle`.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._number = 0
+        self._asked_at = 0.0
+
+    def ask(self, question: Question, now: float) -> None:
+        """Ask a new question; the one before is forgotten."""
+        self.question = question
+        self._number += 1
+        self._asked_at = now
+        self.effects.append(Plan(self._number, question.state, question.task_count == 0))
+
+    def handle(
+        self, event: TransportEvent | OwnAnswer | Planned | RecoveryExited, now: float
+    ) -> None:
+        """Take a part of the answer; results of earlier questions are ignored."""
+        question = self.question
+        if not isinstance(event, Planned) or event.number != self._number or question is None:
+            return
+        if event.error is not None:
+            self.stop(event.error)
+            return
+        source = Provenance(OWN_PLANNER, now - self._asked_at, event.computed_s)
+        if event.sensing_action is None:
+            question.task_actions = event.actions
+            question.task_provenance = source
+            if question.sensing_step is not None:
+                self.effects.append(Plan(self._number, event.ahead, sensing=True))
+        else:
+            assert question.sensing_step is not None
+            digest = event.ahead_digest[:DIGEST_SIZE]
+            question.sensing = SensingAnswer(
+                0, question.sensing_step, event.sensing_action, digest, 0
+            )
+            question.sensing_provenance = source

@@ -13,18 +13,10 @@ from typing import TypeAlias
 import msgspec
 
 from holdfast.arrays import FloatArray
-from holdfast.errors import (
-    InvalidValueError,
-    MessageError,
-    RecordError,
-)
+from holdfast.errors import InvalidValueError, MessageError, RecordError
 from holdfast.outcome import DecisionLog, Done, RewardAccount, TrialResult
 from holdfast.planning import Planner, PlanningState
-from holdfast.protocol.messages import (
-    MAX_OBSERVATIONS,
-    Observed,
-    decode_floats,
-)
+from holdfast.protocol.messages import MAX_OBSERVATIONS, Observed, decode_floats
 
 __all__ = [
     "DIVERGENCE_RUN",
@@ -42,12 +34,10 @@ __all__ = [
 
 
 class ObservedRecord(msgspec.Struct, array_like=True, frozen=True, tag=1):
-    """An observation, written before it is used.
+    """An observation (little-endian float64), written before it is used.
 
     Attributes
     ----------
-    observation : bytes
-        Little-endian float64.
     digest : bytes
         32 bytes, of the state that it led to; checked by :func:`replay`.
     sensing_ms : float
@@ -62,13 +52,7 @@ class ObservedRecord(msgspec.Struct, array_like=True, frozen=True, tag=1):
 
 
 class ActingRecord(msgspec.Struct, array_like=True, frozen=True, tag=2):
-    """A task action, written before it is performed.
-
-    Attributes
-    ----------
-    action : bytes
-        The executed action, little-endian float64.
-    """
+    """A task action (as executed, little-endian float64), written before it is performed."""
 
     step: int
     action: bytes
@@ -86,13 +70,7 @@ class PausedRecord(msgspec.Struct, array_like=True, frozen=True, tag=4):
 
 
 class LocalTookOverRecord(msgspec.Struct, array_like=True, frozen=True, tag=5):
-    """The local service took over; for the tables only.
-
-    Attributes
-    ----------
-    times : int
-        Since the last such record.
-    """
+    """The local service took over so often since the last such record; for the tables only."""
 
     times: int
 
@@ -138,14 +116,8 @@ class TrialHistory:
         After everything that is known to be performed.
     observations : tuple of Observed
         The latest, as many as fit into a request.
-    num_observations : int
-        Of this trial.
-    log : DecisionLog
-        All decisions.
     actions : list of array
         Replayed task actions in order.
-    rewards : RewardAccount
-        Of the trial so far.
     pending : array or None
         A task action in the journal that is not known to be performed.
     paused : bool
@@ -156,8 +128,6 @@ class TrialHistory:
         Length of the current run of these.
     num_divergences : int
         Times that such a run reached :data:`DIVERGENCE_RUN`.
-    sensing_ms : list of float
-        Computing time of each sensing action.
     recoveries : int
         Times that the cloud was lost.
     """
@@ -181,14 +151,6 @@ class TrialHistory:
     def begun(self) -> bool:
         """Whether anything has happened."""
         return self.num_observations > 0 or self.state.step > 0 or self.pending is not None
-
-    def acting(self, action: FloatArray) -> None:
-        """Fold in that a task action is in the journal and will be performed."""
-        self.pending = action
-
-    def recovered(self, times: int) -> None:
-        """Fold in that the local service took over."""
-        self.recoveries += times
 
     def observed(self, record: ObservedRecord, after: PlanningState, *, explained: bool) -> None:
         """Fold in an observation that led to the state ``after``."""
@@ -256,7 +218,7 @@ def _replay_record(planner: Planner, history: TrialHistory, record: Record) -> N
     if isinstance(record, PausedRecord):
         return
     if isinstance(record, LocalTookOverRecord):
-        history.recovered(record.times)
+        history.recoveries += record.times
         return
     state = history.state
     if not isinstance(record, PerformedRecord) and history.pending is not None:
@@ -268,7 +230,7 @@ def _replay_record(planner: Planner, history: TrialHistory, record: Record) -> N
     elif isinstance(record, ActingRecord):
         if planner.needs_sensing(state):
             raise RecordError("is a task action where an observation is due")
-        history.acting(decode_floats(record.action, planner.problem.action_size))
+        history.pending = decode_floats(record.action, planner.problem.action_size)
     elif history.pending is None:
         raise RecordError("is of a performance of which no action was written down")
     else:

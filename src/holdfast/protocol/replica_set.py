@@ -1,7 +1,7 @@
 """What a robot knows of the services: which can be asked, when again, and what each must be sent.
 
 All services answer alike, so they are replicas of one another. Known of a replica are its presence
-and silence (the failure detector), how it last answered (well, busy, refusing) and which of the
+and silence (:class:`FailureDetector`), how it last answered (well, busy, refusing) and which of the
 robot's states it holds. The last determines what a request carries: only the latest observations
 for a replica that holds the previous state, else the whole state. Nothing here sends anything.
 """
@@ -10,13 +10,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterator, Sequence
-from typing import NamedTuple
 
-from holdfast.protocol.failure_detector import FailureDetector
 from holdfast.protocol.messages import Observed
 from holdfast.protocol.question import Question
 
-__all__ = ["CatchUp", "Replica", "ReplicaSet"]
+__all__ = ["FailureDetector", "Replica", "ReplicaSet"]
 
 _LATE_IN_A_ROW = 3
 """After so many late replies in a row, the service is further away than the timeout."""
@@ -39,9 +37,6 @@ _MAX_REPLAYED_STEPS = 1024
 _LARGE_CHECKPOINT = 1 << 20
 """From this size in bytes on, a service replays the trial instead of being sent the state."""
 
-_MAX_TIMES_DIFFERED = 2
-"""A service that has reached another state so often in a row is sent the state each time."""
-
 _LOCAL_PATIENCE = 4.0
 """Factor on the local service's timeout: replacing it costs more than waiting."""
 
@@ -52,25 +47,130 @@ _REFUSED_BY_ALL = frozenset({"invalid", "failed"})
 """Refusals caused by the question itself; any service would refuse."""
 
 
-class CatchUp(NamedTuple):
-    """What a request must carry for a service to reach the question's state.
+class FailureDetector:
+    """Is one service dead, or only slow? Evidence from what is seen of it.
+
+    Nobody can know for certain, so errors are made cheap: a suspected service is no longer
+    preferred, but any sign of life clears it, and two services that decide the same question decide
+    alike. There are four kinds of evidence:
+
+    - *presence*: the link breaks when the process dies. This finds a killed service in
+      milliseconds, but a hung one keeps its link for a while;
+    - *signs of life*: every reply is one. While a request waits or is computed, the service sends a
+      ``Progress`` reply every few tens of milliseconds, so silence means that its process hangs, is
+      stopped or is cut off. A service of which nothing is awaited may be silent for any time;
+    - *calls that end without an answer*: the process is gone;
+    - *deadlines*: a decision that takes too long is of no use even with signs of life.
+
+    Parameters
+    ----------
+    detection_timeout_s : float
+        Longest accepted silence while something is awaited.
 
     Attributes
     ----------
-    needs_session_configuration : bool
-        Whether it does not know the session.
-    fresh : bool
-        Whether the trial has only begun, so nothing else is missing.
-    observations : tuple of Observed
-        From the state that it holds to the question's.
-    checkpoint : bytes or None
-        The whole state, where that is better.
+    incarnation : str or None
+        Of the present process; None if the service is absent. ``seen`` says if it ever was present.
+    suspicion : str or None
+        Why the service is not trusted; None if it is.
     """
 
-    needs_session_configuration: bool
-    fresh: bool
-    observations: tuple[Observed, ...]
-    checkpoint: bytes | None
+    def __init__(self, detection_timeout_s: float) -> None:
+        self._usual_timeout_s = detection_timeout_s
+        self._timeout_s = detection_timeout_s
+        self._longest_silence_s = 0.0
+        self._awaited = 0
+        self._last_sign = 0.0
+        self.incarnation: str | None = None
+        self.suspicion: str | None = None
+        self.seen = False
+
+    @property
+    def present(self) -> bool:
+        """Whether its process is there."""
+        return self.incarnation is not None
+
+    @property
+    def trusted(self) -> bool:
+        """Whether it is present and not suspected."""
+        return self.incarnation is not None and self.suspicion is None
+
+    def appeared(self, incarnation: str, now: float) -> bool:
+        """Note the presence of a process; return whether it is new."""
+        fresh = incarnation != self.incarnation
+        self.incarnation = incarnation
+        self.seen = True
+        if fresh:
+            self.suspicion = None
+            self._last_sign = now
+        return fresh
+
+    def vanished(self, incarnation: str) -> bool:
+        """Note the end of a process; return whether it was the present one."""
+        if incarnation != self.incarnation:
+            return False
+        self.incarnation = None
+        return True
+
+    def asked(self, now: float) -> None:
+        """Note that a request was sent."""
+        if self._awaited == 0:
+            self._last_sign = now
+        self._awaited += 1
+
+    def settled(self) -> None:
+        """Note that one request is no longer awaited."""
+        self._awaited = max(0, self._awaited - 1)
+
+    def heard(self, now: float) -> None:
+        """Note a sign of life."""
+        if self._awaited:
+            self._longest_silence_s = max(self._longest_silence_s, now - self._last_sign)
+        self._last_sign = now
+        self.suspicion = None
+
+    def extend_patience(self, factor: float, limit_s: float) -> None:
+        """Accept a longer silence, up to a limit."""
+        self._timeout_s = min(factor * self._timeout_s, max(limit_s, self._timeout_s))
+
+    def answered(self) -> None:
+        """Note a complete answer, and shorten an extended timeout.
+
+        It becomes twice the longest silence of that answer, but at least half of what it was.
+        """
+        needed_s = 2.0 * self._longest_silence_s
+        shorter_s = max(0.5 * self._timeout_s, needed_s, self._usual_timeout_s)
+        self._timeout_s = min(self._timeout_s, shorter_s)
+        self._longest_silence_s = 0.0
+
+    def excuse(self, seconds: float) -> None:
+        """Disregard a time in which the robot could not receive."""
+        self._last_sign += seconds
+
+    def silence_s(self, now: float) -> float:
+        """Return the time since the last sign of life.
+
+        Its appearance is one, and so is a request that is sent while none is awaited.
+        """
+        return max(0.0, now - self._last_sign)
+
+    def suspect(self, reason: str) -> None:
+        """Distrust it until it is heard or another process takes its place."""
+        self.suspicion = reason
+
+    def suspect_if_silent(self, now: float) -> bool:
+        """Suspect it if its silence is too long; return whether that is new."""
+        deadline = self.deadline()
+        if deadline is None or now < deadline:
+            return False
+        self.suspicion = f"no sign of progress for {1e3 * (now - self._last_sign):.0f} ms"
+        return True
+
+    def deadline(self) -> float | None:
+        """Return when it becomes suspected if nothing comes; None if nothing is awaited."""
+        if self._awaited == 0 or self.suspicion is not None:
+            return None
+        return self._last_sign + self._timeout_s
 
 
 class Replica:
@@ -79,7 +179,7 @@ class Replica:
     Parameters
     ----------
     late_after_s : float
-        The first reply to a request is late after this time.
+        The first reply to a request is late after this time; ``late_s`` are those late in a row.
 
     Attributes
     ----------
@@ -89,20 +189,18 @@ class Replica:
         Whether it knows the session.
     acknowledged : tuple of int or None
         Trial and number of observations of the latest state that it is known to hold.
-    times_differed : int
-        Times in a row that it reached another state than the robot.
-    task_refusals, sensing_refusals : int
-        Of each part since it last gave that part. A problem's code can fail in one part only.
+    diverges : bool
+        Whether it has come to another state than the robot from the same observations.
+    num_refusals : int
+        Since its last whole answer: a problem's code can fail in one part only.
     complaint : str or None
-        Text of the last refusal since it last answered.
+        Text of the last of these.
     refusal, refusal_code : str or None, str
         Why it is no longer asked.
     distrusted : str or None
         Why it is no longer asked, not even after a restart.
-    retry_at : float
-        It is not asked before.
-    backoff_s : float
-        The next delay.
+    retry_at, backoff_s : float
+        It is not asked before that time, and then delayed by so much.
     """
 
     def __init__(
@@ -113,8 +211,7 @@ class Replica:
         self.last_incarnation: str | None = None
         self.late_after_s = late_after_s
         self.late_at = -math.inf
-        self.late_soonest_s = math.inf
-        self.late_times = 0
+        self.late_s: list[float] = []
         self.distrusted: str | None = None
         self.forget()
 
@@ -122,8 +219,8 @@ class Replica:
         """Reset what was known of the previous process."""
         self.opened = False
         self.acknowledged: tuple[int, int] | None = None
-        self.times_differed = 0
-        self.task_refusals = self.sensing_refusals = 0
+        self.diverges = False
+        self.num_refusals = 0
         self.complaint: str | None = None
         self.refusal = self.distrusted
         self.refusal_code = "" if self.refusal is None else _WRONG_ANSWER
@@ -156,44 +253,35 @@ class Replica:
             The shortest of these times in seconds, once, when several in a row were late.
         """
         after_s = now - sent_at
-        if self.late_times >= _LATE_IN_A_ROW:
+        if len(self.late_s) == _LATE_IN_A_ROW:
             return None
         if after_s <= self.late_after_s:
-            self.late_times, self.late_soonest_s = 0, math.inf
+            self.late_s.clear()
         elif sent_at >= self.late_at:
             # Calls that were sent meanwhile have waited for the same thing, such as a process that
             # stood still.
             self.late_at = now
-            self.late_times += 1
-            self.late_soonest_s = min(self.late_soonest_s, after_s)
-            if self.late_times == _LATE_IN_A_ROW:
-                return self.late_soonest_s
+            self.late_s.append(after_s)
+            if len(self.late_s) == _LATE_IN_A_ROW:
+                return min(self.late_s)
         return None
 
-    def note_answer(self, question: Question, now: float, *, sensing: bool, restored: bool) -> None:
-        """Record a part of an answer: it lives and holds the question's state.
-
-        Parameters
-        ----------
-        sensing : bool
-            Whether it is the sensing part.
-        restored : bool
-            Whether the request carried the state.
-        """
+    def note_answer(self, question: Question, now: float) -> None:
+        """Record a part of an answer: it lives and holds the question's state."""
         self.detector.heard(now)
         self.opened = True
-        if sensing:
-            self.sensing_refusals = 0
-        else:
-            self.task_refusals = 0
         self.retry_at = 0.0
-        if not self.task_refusals and not self.sensing_refusals:
+        if not self.num_refusals:
             self.backoff_s = _FIRST_RETRY_S
-            self.complaint = None
-        if not restored:
-            self.times_differed = 0
         holds = (question.state.trial, question.num_observations)
         self.acknowledged = max(self.acknowledged or holds, holds)
+
+    def note_whole_answer(self) -> None:
+        """Record that an answer is complete."""
+        self.detector.answered()
+        self.num_refusals = 0
+        self.complaint = None
+        self.backoff_s = _FIRST_RETRY_S
 
     def note_busy(self, retry_after_s: float, now: float) -> float:
         """Record that it is busy; return for how long it is left alone, in seconds."""
@@ -204,33 +292,21 @@ class Replica:
         self.num_busy += 1
         return after_s
 
-    def note_lost_state(self, *, differs: bool) -> None:
+    def note_lost_state(self) -> None:
         """Record that it lacks the robot's state."""
         self.opened = False
         self.acknowledged = None
-        if differs:
-            self.times_differed += 1
 
-    def note_refusal(self, code: str, text: str, now: float, *, sensing: bool) -> bool:
-        """Record a refusal, which delays it; return whether it is no longer asked.
-
-        Parameters
-        ----------
-        sensing : bool
-            Whether it refuses the sensing part.
-        """
+    def note_refusal(self, code: str, text: str, now: float) -> bool:
+        """Record a refusal, which delays it; return whether it is no longer asked."""
         most = _MAX_REFUSALS
         if code == _OUT_OF_MEMORY:
             most = _MAX_OUT_OF_MEMORY
             self.backoff_s = max(self.backoff_s, _OUT_OF_MEMORY_RETRY_S)
         self.delay(now)
-        if sensing:
-            self.sensing_refusals += 1
-        else:
-            self.task_refusals += 1
+        self.num_refusals += 1
         self.complaint = f"{code}: {text}"
-        refusals = self.sensing_refusals if sensing else self.task_refusals
-        final = code in _FINAL_REFUSALS or refusals >= most
+        final = code in _FINAL_REFUSALS or self.num_refusals >= most
         if final:
             self.refusal = text
             self.refusal_code = code
@@ -243,32 +319,39 @@ class Replica:
 
     # -- what it needs ---------------------------------------------------------------------------
 
-    def catch_up(self, question: Question, *, whole_state: bool) -> CatchUp:
-        """Return what a request must carry.
+    def catch_up(
+        self, question: Question, *, whole_state: bool
+    ) -> tuple[tuple[Observed, ...], bytes | None]:
+        """Return what a request must carry for the service to reach the question's state.
 
         Parameters
         ----------
         whole_state : bool
             Whether it needs the whole state in any case.
+
+        Returns
+        -------
+        observations : tuple of Observed
+            From the state that it holds to the question's.
+        checkpoint : bytes or None
+            The whole state, where that is better.
         """
         state = question.state
         known = self.acknowledged
         start = known[1] if known is not None and known[0] == state.trial else 0
         missing = question.num_observations - start
-        fresh = state.step == 0 and missing == 0
-        if missing > 1 or not (self.opened or fresh):
+        if missing > 1 or not (self.opened or question.is_first):
             # It knows nothing, or others have decided since. Replaying takes time that other robots
             # need, so it is sent the state, unless that is large.
             whole_state |= (
                 8 * state.belief.states.size <= _LARGE_CHECKPOINT
                 or state.step > _MAX_REPLAYED_STEPS
             )
-        if self.times_differed >= _MAX_TIMES_DIFFERED or missing > len(question.observations):
+        if self.diverges or missing > len(question.observations):
             whole_state = True
         if whole_state:
-            return CatchUp(not self.opened, fresh, (), question.checkpoint())
-        observations = question.observations[-missing:] if missing > 0 else ()
-        return CatchUp(not self.opened, fresh, observations, None)
+            return (), question.checkpoint()
+        return question.observations[-missing:] if missing > 0 else (), None
 
 
 class ReplicaSet:
@@ -321,22 +404,15 @@ class ReplicaSet:
         """Return the service of a name; None if there is none."""
         return self._by_name.get(name)
 
-    def all_to_come(self) -> bool:
-        """Return whether no cloud service was ever present, not counting those that refuse.
-
-        False if all refuse.
-        """
-        seen = [each.detector.seen for each in self.cloud if each.refusal is None]
-        return bool(seen) and not any(seen)
-
     def start(self, now: float) -> None:
         """Give the services time to come up."""
         self.startup_until = now + self._startup_timeout_s
 
     def is_starting(self, now: float) -> bool:
         """Return whether services may still be coming up."""
+        seen = [each.detector.seen for each in self.cloud if each.refusal is None]
         until = self.startup_until
-        return until is not None and now < until and self.all_to_come()
+        return until is not None and now < until and bool(seen) and not any(seen)
 
     def local_usable(self, now: float) -> bool:
         """Return whether the local service can be expected to answer now."""

@@ -5,14 +5,13 @@ late answer still shows that it lives. A request is open until its answer is com
 ended or the robot abandons it; while it is open, its service owes a sign of life.
 
 Every reply shows that its service lives. Most say more: it holds the robot's state, has lost it, is
-busy, or refuses. The handler records that in the request, the question and the replica, after
-checking all of the reply against the question: it may be corrupted, or the service wrong. Which
-service is asked next is decided by the dispatcher, from the :class:`ReplyOutcome`.
+busy, or refuses. All of a reply is checked against the question, since it may be corrupted or the
+service wrong, and recorded in the request, the question and the replica. Which service is asked
+next is decided by the dispatcher.
 """
 
 from __future__ import annotations
 
-import enum
 from collections.abc import Iterator
 
 from holdfast.errors import MessageError, StaleEpochError
@@ -36,7 +35,7 @@ from holdfast.protocol.question import Provenance, Question
 from holdfast.protocol.replica_set import Replica
 from holdfast.protocol.verification import Verification
 
-__all__ = ["OpenRequest", "OpenRequests", "ReplyHandler", "ReplyOutcome"]
+__all__ = ["OpenRequest", "OpenRequests"]
 
 
 _MAX_CALLS = 4
@@ -58,12 +57,10 @@ class OpenRequest:
     number : int
         In the message, repeated by each reply. It is unique in the run over 2,048 processes of the
         robot, so a reply that arrives late in another call is recognized.
-    heard : bool
-        Whether any reply has come.
     opens, restores : bool
         Whether it carries the session configuration, and the state.
-    has_task_part, has_sensing_part : bool
-        Whether that part of the answer has come.
+    heard, has_task_part, has_sensing_part : bool
+        Whether any reply has come, and that part of the answer.
     """
 
     def __init__(
@@ -94,19 +91,23 @@ class OpenRequest:
         return self.has_task_part or self.has_sensing_part
 
     @property
-    def lacks_sensing(self) -> bool:
-        """Whether the sensing part is the next to come."""
-        return self.has_task_part or self.question.task_count == 0
-
-    @property
     def finished(self) -> bool:
         """Whether the whole answer has come."""
         question = self.question
-        return self.lacks_sensing and (self.has_sensing_part or question.sensing_step is None)
+        return (self.has_task_part or question.task_count == 0) and (
+            self.has_sensing_part or question.sensing_step is None
+        )
+
+    @property
+    def has_everything(self) -> bool:
+        """Whether it carries all that a service can lack."""
+        return self.opens and self.restores
 
 
 class OpenRequests:
-    """The requests in flight, in the order in which they were sent.
+    """Sends requests, records what their replies say, and keeps those in flight.
+
+    They are kept in the order in which they were sent.
 
     Parameters
     ----------
@@ -120,9 +121,14 @@ class OpenRequests:
         epoch: int,
         session_configuration: SessionConfiguration,
         timeout_s: float,
+        problem: Problem,
+        verification: Verification,
         effects: Effects[RobotEffect],
     ) -> None:
         self._timeout_s = timeout_s
+        self._action_size = problem.action_size
+        self._num_sensing_actions = len(problem.sensing_actions)
+        self._verification = verification
         self._session = session
         self._epoch = epoch
         self._session_configuration = session_configuration
@@ -212,7 +218,8 @@ class OpenRequests:
         for call in open_calls[: max(0, len(open_calls) - _MAX_CALLS + 1)]:
             self.abandon(call)
         state = question.state
-        catch_up = replica.catch_up(question, whole_state=whole_state)
+        opens = not replica.opened
+        observations, checkpoint = replica.catch_up(question, whole_state=whole_state)
         self._number += 1
         call_number = self._number
         number = self._first_request + call_number
@@ -225,9 +232,9 @@ class OpenRequests:
             state.step,
             state.sensed,
             question.digest,
-            catch_up.observations,
-            self._session_configuration if catch_up.needs_session_configuration else None,
-            catch_up.checkpoint,
+            observations,
+            self._session_configuration if opens else None,
+            checkpoint,
         )
         self._open[call_number] = OpenRequest(
             call_number,
@@ -235,12 +242,12 @@ class OpenRequests:
             replica,
             question,
             now,
-            opens=catch_up.needs_session_configuration,
-            restores=catch_up.checkpoint is not None,
+            opens=opens,
+            restores=checkpoint is not None,
         )
         replica.detector.asked(now)
         payload = encode(request)
-        if catch_up.needs_session_configuration and not catch_up.fresh:
+        if opens and not question.is_first:
             self._effects.report(
                 "restore", service=replica.name, step=state.step, bytes=len(payload)
             )
@@ -257,52 +264,15 @@ class OpenRequests:
             )
         self._effects.append(Send(replica.name, call_number, payload))
 
+    # -- replies -----------------------------------------------------------------------------------
 
-class ReplyOutcome(enum.Enum):
-    """What a reply means for its question."""
+    def take(self, call: OpenRequest, payload: bytes, now: float) -> Reply | None:
+        """Record what a reply to an open request says.
 
-    NOTHING = enum.auto()
-    """This request brings no answer: the service is busy, refuses, or its reply is invalid."""
-
-    AT_WORK = enum.auto()
-    """The service works on the answer."""
-
-    ANSWERED = enum.auto()
-    """The first part of the answer has come."""
-
-    ANSWERED_MORE = enum.auto()
-    """The second part has come."""
-
-    LACKS_OBSERVATIONS = enum.auto()
-    """The service needs the observations that it has missed."""
-
-    LACKS_STATE = enum.auto()
-    """The service needs the whole state."""
-
-    @property
-    def shows_work(self) -> bool:
-        """Whether the service works, or has worked, on the question."""
-        return self in (ReplyOutcome.AT_WORK, ReplyOutcome.ANSWERED, ReplyOutcome.ANSWERED_MORE)
-
-
-class ReplyHandler:
-    """Records what replies say."""
-
-    def __init__(
-        self,
-        calls: OpenRequests,
-        problem: Problem,
-        verification: Verification,
-        effects: Effects[RobotEffect],
-    ) -> None:
-        self._calls = calls
-        self._verification = verification
-        self._action_size = problem.action_size
-        self._num_sensing_actions = len(problem.sensing_actions)
-        self._effects = effects
-
-    def take(self, call: OpenRequest, payload: bytes, now: float) -> ReplyOutcome:
-        """Handle a reply to an open request.
+        Returns
+        -------
+        Reply or None
+            The reply; None if it is invalid.
 
         Raises
         ------
@@ -316,24 +286,28 @@ class ReplyHandler:
             self._note_lateness(call, now)
             if isinstance(reply, TaskAnswer | SensingAnswer):
                 self._take_answer(call, reply, now)
-                return self._was_answered(call, reply, now)
+                return reply
         except MessageError as error:
             # Spoilt on its way, or by a service that errs: the answer is asked for again.
             self._effects.report("malformed_reply", service=replica.name, reason=str(error))
-            self._calls.abandon(call)
+            self.abandon(call)
             replica.delay(now)
-            return ReplyOutcome.NOTHING
+            return None
         replica.detector.heard(now)
         if isinstance(reply, Progress):
-            return ReplyOutcome.AT_WORK
-        self._calls.abandon(call)
+            return reply
+        self.abandon(call)
         if isinstance(reply, NeedState):
-            return self._need_state(call, reply, now)
-        if isinstance(reply, Busy):
-            self._was_busy(replica, reply, now)
+            self._take_need_state(call, reply, now)
+        elif isinstance(reply, Busy):
+            after_s = replica.note_busy(1e-3 * reply.retry_after_ms, now)
+            # However often: the writer of the log limits repetitions.
+            self._effects.report(
+                "busy", service=replica.name, retry_after_ms=1e3 * after_s, times=replica.num_busy
+            )
         else:
-            self._was_refused(call, reply, now)
-        return ReplyOutcome.NOTHING
+            self._take_refusal(call, reply, now)
+        return reply
 
     def _note_lateness(self, call: OpenRequest, now: float) -> None:
         """Report a service whose first replies always take longer than the timeout.
@@ -355,50 +329,47 @@ class ReplyHandler:
                 "turn; if it is that far away, raise the setting above the way there and back",
             )
 
-    # -- answers ---------------------------------------------------------------------------------
-
     def _take_answer(
         self, call: OpenRequest, reply: TaskAnswer | SensingAnswer, now: float
     ) -> None:
-        question, name = call.question, call.replica.name
-        if isinstance(reply, TaskAnswer):
-            part = question.read_tasks(reply, self._action_size, name)
-        else:
-            part = question.read_sensing(reply, self._num_sensing_actions, name)
-        provenance = Provenance(name, now - call.sent_at, 1e-6 * reply.computed_us)
-        self._verification.take(question, part, provenance)
+        """Take a part of the answer.
 
-    def _was_answered(
-        self, call: OpenRequest, reply: TaskAnswer | SensingAnswer, now: float
-    ) -> ReplyOutcome:
+        Raises
+        ------
+        MessageError
+            If it cannot answer the question.
+        """
         replica, question = call.replica, call.question
         first = not call.answered
-        if isinstance(reply, TaskAnswer):
-            call.has_task_part = True
+        if isinstance(reply, SensingAnswer):
+            part = question.read_sensing(reply, self._num_sensing_actions, replica.name)
         else:
+            part = question.read_tasks(reply, self._action_size, replica.name)
+        provenance = Provenance(replica.name, now - call.sent_at, 1e-6 * reply.computed_us)
+        self._verification.take(question, part, provenance)
+        if isinstance(reply, SensingAnswer):
             call.has_sensing_part = True
-        sensing = isinstance(reply, SensingAnswer)
-        replica.note_answer(question, now, sensing=sensing, restored=call.restores)
-        for earlier in self._calls.to(replica):
+        else:
+            call.has_task_part = True
+        replica.note_answer(question, now)
+        for earlier in self.to(replica):
             if earlier.call_number < call.call_number:
                 # Whatever became of it, nothing is awaited of it any more.
-                self._calls.abandon(earlier)
+                self.abandon(earlier)
         if first and call.opens and (call.restores or question.state.step > 0):
             restore_ms = 1e3 * (now - call.sent_at)
             self._effects.report(
                 "restored", service=replica.name, step=question.state.step, restore_ms=restore_ms
             )
         if call.finished:
-            replica.detector.answered()
-            self._calls.settle(call)
-        return ReplyOutcome.ANSWERED if first else ReplyOutcome.ANSWERED_MORE
+            replica.note_whole_answer()
+            self.settle(call)
 
-    # -- anything else ---------------------------------------------------------------------------
-
-    def _need_state(self, call: OpenRequest, reply: NeedState, now: float) -> ReplyOutcome:
+    def _take_need_state(self, call: OpenRequest, reply: NeedState, now: float) -> None:
         replica = call.replica
-        replica.note_lost_state(differs=reply.differs)
+        replica.note_lost_state()
         if reply.diverged:
+            replica.diverges = True
             self._effects.report(
                 "state_diverged",
                 service=replica.name,
@@ -407,25 +378,12 @@ class ReplyHandler:
                 reason="the service came to another state than the robot from the same "
                 "observations, so it is handed the robot's",
             )
-        if call.opens and call.restores:
-            # It was handed everything and asks for it again.
-            self._refusal(call, "need_state", "asks again for a state that it was sent", now)
-            return ReplyOutcome.NOTHING
-        # Told everything but the state, it came to another one: only the state will do.
-        return (
-            ReplyOutcome.LACKS_STATE
-            if reply.differs or call.opens
-            else ReplyOutcome.LACKS_OBSERVATIONS
-        )
+        if call.has_everything:
+            self._note_refusal(
+                replica, "need_state", "asks again for a state that it was sent", now
+            )
 
-    def _was_busy(self, replica: Replica, reply: Busy, now: float) -> None:
-        after_s = replica.note_busy(1e-3 * reply.retry_after_ms, now)
-        # However often: the writer of the log limits repetitions.
-        self._effects.report(
-            "busy", service=replica.name, retry_after_ms=1e3 * after_s, times=replica.num_busy
-        )
-
-    def _was_refused(self, call: OpenRequest, reply: Refused, now: float) -> None:
+    def _take_refusal(self, call: OpenRequest, reply: Refused, now: float) -> None:
         replica = call.replica
         if reply.code == "stale_epoch":
             raise StaleEpochError(
@@ -436,12 +394,11 @@ class ReplyHandler:
             replica.delay(now)
             self._effects.report("damaged_request", service=replica.name, reason=reply.text)
             return
-        replica.note_lost_state(differs=False)
-        self._refusal(call, reply.code, reply.text, now)
+        replica.note_lost_state()
+        self._note_refusal(replica, reply.code, reply.text, now)
 
-    def _refusal(self, call: OpenRequest, code: str, text: str, now: float) -> None:
-        replica = call.replica
-        final = replica.note_refusal(code, text, now, sensing=call.lacks_sensing)
+    def _note_refusal(self, replica: Replica, code: str, text: str, now: float) -> None:
+        final = replica.note_refusal(code, text, now)
         self._effects.report("refused", service=replica.name, code=code, reason=text, final=final)
 
 

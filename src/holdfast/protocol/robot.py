@@ -19,14 +19,9 @@ from __future__ import annotations
 from holdfast.arrays import FloatArray
 from holdfast.belief import VALIDATION_GATE_SQUARED
 from holdfast.config.settings import SimulatorSettings
-from holdfast.errors import (
-    HeldError,
-    HoldfastError,
-    UnknownPerformanceError,
-)
+from holdfast.errors import HeldError, HoldfastError, UnknownPerformanceError
 from holdfast.outcome import Done
 from holdfast.planning import ObservationInfo, Planner, PlanningState
-from holdfast.protocol.decision_source import DecisionSource
 from holdfast.protocol.events import (
     Act,
     Acted,
@@ -38,6 +33,7 @@ from holdfast.protocol.events import (
     OwnAnswer,
     Paused,
     Planned,
+    RecoveryExited,
     RobotEffect,
     Sense,
     Sensed,
@@ -45,11 +41,8 @@ from holdfast.protocol.events import (
     TransportEvent,
     WriteRecords,
 )
-from holdfast.protocol.messages import (
-    DIGEST_SIZE,
-    encode_floats,
-)
-from holdfast.protocol.question import Provenance, Question, same_actions
+from holdfast.protocol.messages import DIGEST_SIZE, encode_floats
+from holdfast.protocol.question import DecisionSource, Provenance, Question, same_actions
 from holdfast.protocol.records import (
     DIVERGENCE_RUN,
     ActingRecord,
@@ -126,12 +119,12 @@ class Robot:
     @property
     def status(self) -> Status:
         """Which service decides."""
-        return self._source.status
+        return self._source.tracker.status
 
     @property
     def is_holding(self) -> bool:
         """Whether the robot holds still: no service is usable, or its own planner has to decide."""
-        return self._source.is_holding
+        return self._source.holding_since is not None
 
     @property
     def num_unverified(self) -> int:
@@ -246,12 +239,12 @@ class Robot:
     # -- what happens ----------------------------------------------------------------------------
 
     def handle(
-        self, event: TransportEvent | EnvironmentEvent | OwnAnswer | Planned, now: float
+        self,
+        event: TransportEvent | EnvironmentEvent | OwnAnswer | Planned | RecoveryExited,
+        now: float,
     ) -> list[RobotEffect]:
-        """Handle an event of the transport, the environment or a planner."""
-        if isinstance(event, OwnAnswer):
-            self._source.decided(event, self._num_ordered(), now)
-        elif isinstance(event, _FROM_ENVIRONMENT):
+        """Handle an event."""
+        if isinstance(event, _FROM_ENVIRONMENT):
             # Between trials, or after a stop, whatever comes late is of no use.
             if self._history is not None and self._awaits_environment and not self._stopped:
                 self._awaits_environment = False
@@ -271,19 +264,6 @@ class Robot:
                     self._failed(event)
         elif not isinstance(event, EnvironmentReady):
             self._source.handle(event, now)
-        self._go_on(now)
-        return self._take()
-
-    def _num_ordered(self) -> int:
-        """Return how many task actions of the current answer are performed or ordered."""
-        question, history = self._source.question, self._history
-        if question is None or history is None:
-            return 0
-        return history.state.step - question.state.step + (history.pending is not None)
-
-    def recovery_exited(self, launch: int, reason: str, now: float) -> list[RobotEffect]:
-        """Handle the end of a local service's process, or its failure to start."""
-        self._source.recovery_exited(launch, reason, now)
         self._go_on(now)
         return self._take()
 
@@ -449,7 +429,7 @@ class Robot:
         ):
             # Chosen for another state than this: the service's belief has drifted from ours.
             self._effects.report("prefetch_unused", trial=self._trial, step=state.step)
-            self._source.check()
+            self._source.recompute(before_acting=False)
             self._ask(self._planner.digest(state), now)
             self._need(now)
             return
@@ -477,20 +457,20 @@ class Robot:
         if offset == 0 and provenance is not None and provenance is not self._timed_provenance:
             self._timed_provenance = provenance
             self._timed("task", question, provenance, now)
-        if question.needed_at is not None:
-            self._source.go_on()
+        question.needed_at = None
         if not self._take_tick(now):
             return
         action = question.task_actions[offset]
         if not self._source.limits_are_reliable and question.own is None:
             own, _ = self._planner.choose_task_action(state)
             if not same_actions([own], [action]):
-                self._source.dispute()
+                self._source.recompute(before_acting=True)
                 self._need(now)
                 return
         self._write(ActingRecord(state.step, encode_floats(action)))
         history = self._current_history
-        history.acting(action)
+        history.pending = action
+        question.num_ordered = offset + 1
         self._awaits_environment = True
         self._effects.append(Act(state.step, action))
 
@@ -504,9 +484,13 @@ class Robot:
         self._source.ask(question, now)
 
     def _need(self, now: float) -> None:
-        # The source may stop the run: what happened before that is written before it.
-        self._write()
-        self._source.need(now)
+        """Wait for the rest of the answer."""
+        question = self._source.question
+        if question is not None and question.needed_at is None:
+            # The source may stop the run: what happened before that is written before it.
+            self._write()
+            question.needed_at = now
+            self._source.wake(now)
 
     def _take_tick(self, now: float) -> bool:
         """Return whether the next task action is due, and take its tick; else set the wakeup."""
@@ -558,10 +542,10 @@ class Robot:
     def _count_recoveries(self) -> None:
         """Count and record recoveries. Those between two trials belong to the second."""
         history = self._current_history
-        times = self._source.recoveries - self._recoveries_counted
+        times = self._source.tracker.recoveries - self._recoveries_counted
         if times:
-            self._recoveries_counted = self._source.recoveries
-            history.recovered(times)
+            self._recoveries_counted = self._source.tracker.recoveries
+            history.recoveries += times
             self._unwritten.append(LocalTookOverRecord(times))
 
     def _timed(self, kind: str, question: Question, provenance: Provenance, now: float) -> None:
@@ -574,7 +558,7 @@ class Robot:
                 step if step is not None else question.state.step,
                 kind,
                 provenance.service,
-                self._source.status.value,
+                self._source.tracker.status.value,
                 1e3 * waited_s,
                 1e3 * provenance.round_trip_s,
                 1e3 * provenance.computed_s,

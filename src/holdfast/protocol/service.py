@@ -24,7 +24,6 @@ computation in :mod:`~holdfast.protocol.service_jobs`.
 
 from __future__ import annotations
 
-import enum
 import math
 from collections.abc import Callable
 
@@ -34,12 +33,11 @@ from holdfast.errors import InvalidValueError, MessageError
 from holdfast.planning import needs_sensing
 from holdfast.problems.problem import Problem
 from holdfast.protocol.events import Effects
-from holdfast.protocol.expected_time import ExpectedTimes
+from holdfast.protocol.expected_time import ExpectedTime
 from holdfast.protocol.messages import (
     MAX_WORD,
     Request,
     SessionConfiguration,
-    decode_request,
     pack_configuration,
 )
 from holdfast.protocol.request_queue import RequestQueue
@@ -62,29 +60,13 @@ from holdfast.protocol.service_sessions import (
     Session,
     SessionKey,
     SessionTable,
+    with_cores,
 )
 
 __all__ = ["Service"]
 
 _NO_ROOM_RETRY_MS = 100.0
 """Shortest retry time for a robot that finds no free session."""
-
-_INERTIA_OF_ONE = 4.0
-_INERTIA_OF_ALL = 8.0
-"""The expectation for all robots moves more slowly than that for one."""
-
-
-class _Disposition(enum.Enum):
-    """How a request was handled that does not wait for a task."""
-
-    UNKNOWN = enum.auto()
-    """The cache has no answer."""
-
-    ANSWERED = enum.auto()
-    """All of the answer came from the cache."""
-
-    REJECTED = enum.auto()
-    """The request was refused, or turned away as busy."""
 
 
 class Service:
@@ -119,7 +101,9 @@ class Service:
         self._problems = ProblemPool(self._limits.max_problems)
         self._queue = RequestQueue(workers, self._limits)
         self._calls = WaitingCalls(self._limits, self._statistics, self._effects)
-        self._times = ExpectedTimes(_INERTIA_OF_ALL, task_s=1e-3, sensing_s=1e-3)
+        # Of all robots; each session has its own, which begin here.
+        self._task_time = ExpectedTime(1e-3)
+        self._sensing_time = ExpectedTime(1e-3)
 
     @property
     def statistics(self) -> ServiceStatistics:
@@ -135,28 +119,6 @@ class Service:
     # -- what happens ----------------------------------------------------------------------------
 
     def receive(
-        self, call: int, payload: bytes, now: float, owner: Owner = None
-    ) -> list[ServiceEffect]:
-        """Handle a request.
-
-        Parameters
-        ----------
-        call : int
-            Unique number of the call, used in effects.
-        now : float
-            Seconds of any monotonic clock.
-        owner : str or None, optional
-            Name in the robot's verified certificate; None without one. The request reaches only
-            sessions of this owner.
-        """
-        request: Request | MessageError
-        try:
-            request = decode_request(payload)
-        except MessageError as error:
-            request = error.without_traceback()
-        return self.receive_request(call, request, len(payload), now, owner)
-
-    def receive_request(
         self,
         call: int,
         request: Request | MessageError,
@@ -164,16 +126,21 @@ class Service:
         now: float,
         owner: Owner = None,
     ) -> list[ServiceEffect]:
-        """Handle a request that is already decoded, so that callers can decode outside their lock.
+        """Handle a request, which callers decode outside their lock.
 
         Parameters
         ----------
+        call : int
+            Unique number of the call, used in effects.
         request : Request or MessageError
             What :func:`~holdfast.protocol.messages.decode_request` returned or raised.
         size : int
             Bytes of the message.
-        call, now, owner
-            As for :meth:`receive`.
+        now : float
+            Seconds of any monotonic clock.
+        owner : str or None, optional
+            Name in the robot's verified certificate; None without one. The request reaches only
+            sessions of this owner.
         """
         if isinstance(request, MessageError):
             self._calls.send_refused(call, 0, request.code, str(request))
@@ -202,8 +169,8 @@ class Service:
             else:
                 if typical:
                     computed_s = now - task.started_at
-                    self._times.learn(computed_s, sensing=task.sensing)
-                    session.times.learn(computed_s, sensing=task.sensing)
+                    (self._sensing_time if task.sensing else self._task_time).learn(computed_s)
+                    task.expected_time.learn(computed_s)
                 self._succeeded(task, outcome, now)
             self._queue.release_held(session)
         self._dispatch(now)
@@ -253,20 +220,20 @@ class Service:
                 return
         else:
             self._sessions.use(session, now)
-        newest = session.accept(request.number)
-        task = self._answer_from_cache(session, call, request, now, newest=newest)
+        newest = request.number >= session.number
+        known, task = self._answer_from_cache(session, call, request, now, newest=newest)
         if not newest:
-            if task is _Disposition.UNKNOWN:
+            if not known:
                 # A later request of this robot came before: this one is superseded.
                 self._statistics.superseded += 1
                 self._effects.append(EndCall(call))
             return
-        if task is _Disposition.UNKNOWN:
+        session.number = request.number
+        if not known:
             task = self._enqueue(session, call, request, size, now)
-        if isinstance(task, PendingTask):
-            self._supersede(session, task)
-        elif task is _Disposition.ANSWERED:
-            self._supersede(session, None)
+            if task is None:
+                return
+        self._supersede(session, task)
 
     def _open_session(
         self,
@@ -291,8 +258,13 @@ class Service:
             self._sessions.note_epoch(key, request.epoch)
             self._reject_busy(call, request.number, key, now, newcomer=newcomer)
             return None
-        times = ExpectedTimes(_INERTIA_OF_ONE, self._times.task_s, self._times.sensing_s)
-        session = Session(key, request, configuration, limits.max_threads, times)
+        session = Session(
+            key,
+            request,
+            configuration,
+            ExpectedTime(self._task_time.mean_s),
+            ExpectedTime(self._sensing_time.mean_s),
+        )
         session.used_at = now
         while not self._sessions.has_room_for(session):
             unused = self._sessions.evictable_for(session)
@@ -315,24 +287,33 @@ class Service:
         """Continue a session with the robot's next process; nothing waits for the previous one."""
         self._note("session_taken_over", session, epoch=epoch, previous_epoch=session.epoch)
         self._statistics.sessions_taken_over += 1
-        session.take_over(epoch)
+        # The next process numbers its requests anew.
+        session.epoch, session.number = epoch, -1
         self._sessions.use(session, now)
         self._supersede(session, None)
 
     def _answer_from_cache(
         self, session: Session, call: int, request: Request, now: float, *, newest: bool
-    ) -> PendingTask | _Disposition:
-        """Answer as far as the cache goes; return the task that the rest waits for."""
+    ) -> tuple[bool, PendingTask | None]:
+        """Answer as far as the cache goes.
+
+        Returns
+        -------
+        known : bool
+            Whether it has the answer, or will have it.
+        task : PendingTask or None
+            For which the call waits.
+        """
         task = session.pending.get(request.digest)
         if task is not None:
             if task.request is None and not task.running:
                 self._queue.promote(task)
             self._statistics.attached += 1
             self._calls.attach(task, call, request.number, now)
-            return task
+            return True, task
         answer = session.answers.get(request.digest)
         if answer is None:
-            return _Disposition.UNKNOWN
+            return False, None
         asked = (request.trial, request.step, request.sensed)
         if (answer.trial, answer.step, answer.sensed) != asked:
             text = (
@@ -340,32 +321,32 @@ class Service:
                 f"of this digest has {answer.trial}, {answer.step}, {answer.sensed}"
             )
             self._calls.send_refused(call, request.number, "invalid", text)
-            return _Disposition.REJECTED
+            return True, None
         following = answer.following
         rest = None if following is None else session.pending.get(following)
         if following is not None and rest is None and following not in session.answers:
             if not newest or session.ahead is None or session.ahead_digest != following:
-                session.forget_answer(request.digest)
-                return _Disposition.UNKNOWN
+                del session.answers[request.digest]
+                return False, None
             rest = self._prefetch(session, now)
         self._statistics.cache_hits += 1
         if answer.num_actions:
             self._calls.send_task(call, request.number, answer)
         if rest is not None:
             self._calls.attach(rest, call, request.number, now)
-            return rest
+            return True, rest
         sensing = answer if following is None else session.answers[following]
         if sensing.sensing_action >= 0:
             digest = request.digest if following is None else following
             self._calls.send_sensing(call, request.number, digest, sensing)
         else:
             self._effects.append(EndCall(call))
-        return _Disposition.ANSWERED
+        return True, None
 
     def _enqueue(
         self, session: Session, call: int, request: Request, size: int, now: float
-    ) -> PendingTask | _Disposition:
-        """Queue a task for a request, or turn it away."""
+    ) -> PendingTask | None:
+        """Queue a task for a request; None if it was turned away."""
         if request.session_configuration is not None:
             # The session has it; one copy for each request that waits would count nowhere.
             request = msgspec.structs.replace(request, session_configuration=None)
@@ -382,7 +363,7 @@ class Service:
         newcomer = session.newcomer
         if waiting is None and self._queue.is_overloaded(now, session.owner, newcomer=newcomer):
             self._reject_busy(call, request.number, session.key, now, newcomer=newcomer)
-            return _Disposition.REJECTED
+            return None
         if waiting is not None:
             # It keeps the turn of the request that it replaces, and adds nothing to the backlog.
             self._calls.end(waiting)
@@ -401,7 +382,7 @@ class Service:
                 since=now,
             )
             self._queue.enqueue(task)
-        session.add_task(task)
+        session.pending[task.digest] = task
         self._calls.attach(task, call, request.number, now)
         return task
 
@@ -423,7 +404,7 @@ class Service:
         task = PendingTask(
             session, digest, sensing=True, request=None, state=state, size=0, since=now
         )
-        session.add_task(task)
+        session.pending[digest] = task
         self._queue.enqueue(task)
         return task
 
@@ -446,12 +427,12 @@ class Service:
         alone = self._queue.num_running == 0 and self._queue.num_waiting == 0
         problem = self._problems.acquire(session.problem_key)
         job = Job(
-            "sensing" if task.sensing else "task",
+            task.kind,
             problem,
             self._make_problem,
             self._describe_error,
             session.configuration,
-            session.planning if alone else session.planning_single,
+            session.planning if alone else with_cores(session.planning, 1),
             session.seed,
             self._limits,
             request,
@@ -460,8 +441,7 @@ class Service:
         self._queue.handed_out(task, job, now)
         expected_s = math.inf
         if problem is not None and task.is_typical(state):
-            times = session.times
-            expected_s = (times.typical_sensing if task.sensing else times.typical_task).seconds
+            expected_s = task.expected_time.typical_s
         self._effects.append(StartJob(job, expected_s))
 
     # -- outcomes --------------------------------------------------------------------------------
@@ -487,12 +467,13 @@ class Service:
 
     def _succeeded(self, task: PendingTask, outcome: JobResult, now: float) -> None:
         session, statistics = task.session, self._statistics
-        self._sessions.mark_served(session)
+        session.served, session.newcomer = True, False
         most = self._limits.answers_per_session
         computed_s = now - task.started_at
         computed_us = min(MAX_WORD, max(0, round(1e6 * computed_s)))
         if outcome.state is not None:
-            session.hold(outcome.state, outcome.ahead, outcome.ahead_digest)
+            session.acknowledged = outcome.state
+            session.ahead, session.ahead_digest = outcome.ahead, outcome.ahead_digest
         if outcome.restored:
             statistics.restores += 1
             assert outcome.state is not None
@@ -500,15 +481,14 @@ class Service:
         state = task.state if outcome.state is None else outcome.state
         assert state is not None
         where = (state.trial, state.step, state.sensed, computed_us)
+        self._effects.append(Computed(task.kind, computed_s, task.started_at - task.since))
         if task.sensing:
             statistics.sensing_parts += 1
-            self._effects.append(Computed("sensing", computed_s, task.started_at - task.since))
             answer = CachedAnswer(*where, sensing_action=outcome.sensing_action)
             session.remember(task.digest, answer, most)
             self._send_sensing(task, task.digest, answer)
         else:
             statistics.task_parts += 1
-            self._effects.append(Computed("task", computed_s, task.started_at - task.since))
             ahead = outcome.ahead
             assert ahead is not None
             following = outcome.ahead_digest if needs_sensing(session.planning, ahead) else None

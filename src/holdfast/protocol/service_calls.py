@@ -19,6 +19,7 @@ from holdfast.protocol.messages import (
     NeedState,
     Progress,
     Refused,
+    Reply,
     SensingAnswer,
     TaskAnswer,
     encode,
@@ -77,11 +78,11 @@ class WaitingCalls:
 
     def detach(self, task: PendingTask) -> list[WaitingCall]:
         """Remove and return the calls of a task; the caller ends them."""
-        detach = list(task.calls.values())
+        detached = list(task.calls.values())
         task.calls.clear()
-        for record in detach:
+        for record in detached:
             del self._calls[record.call]
-        return detach
+        return detached
 
     def end(self, task: PendingTask) -> None:
         """End the calls of a task."""
@@ -130,20 +131,17 @@ class WaitingCalls:
 
     def send_sensing(self, call: int, number: int, digest: bytes, answer: CachedAnswer) -> None:
         """Send a sensing part, and end the call."""
-        payload = encode(
-            SensingAnswer(number, answer.step, answer.sensing_action, digest, answer.computed_us)
+        self._end_with(
+            call,
+            SensingAnswer(number, answer.step, answer.sensing_action, digest, answer.computed_us),
         )
-        self._effects += (SendReply(call, payload), EndCall(call))
 
     def send_need_state(
         self, call: int, number: int, *, differs: bool, diverged: bool = False
     ) -> None:
         """Ask for the state, and end the call."""
         self._statistics.state_requests += 1
-        self._effects += (
-            SendReply(call, encode(NeedState(number, differs, diverged))),
-            EndCall(call),
-        )
+        self._end_with(call, NeedState(number, differs, diverged))
 
     def send_busy(self, call: int, number: int, key: bytes, wait_ms: float, waiting: int) -> None:
         """Turn a request away, and end the call.
@@ -162,10 +160,7 @@ class WaitingCalls:
         share = int.from_bytes(hashlib.blake2b(key, digest_size=2).digest(), "big") / 2**16
         spread = 1.0 + _RETRY_SPREAD * share
         retry_after_ms = min(MAX_WORD, math.ceil(wait_ms * spread))
-        self._effects += (
-            SendReply(call, encode(Busy(number, retry_after_ms))),
-            EndCall(call),
-        )
+        self._end_with(call, Busy(number, retry_after_ms))
         self._effects.report("busy", waiting=waiting, retry_after_ms=retry_after_ms)
 
     def send_refused(self, call: int, number: int, code: str, text: str) -> None:
@@ -176,11 +171,11 @@ class WaitingCalls:
         text = text.encode("utf-8", "replace").decode()
         if len(text) > MAX_TEXT:
             text = f"{text[: MAX_TEXT - 3]}..."
-        self._effects += (
-            SendReply(call, encode(Refused(number, code, text))),
-            EndCall(call),
-        )
+        self._end_with(call, Refused(number, code, text))
         self._effects.report("refused", code=code, reason=text)
+
+    def _end_with(self, call: int, reply: Reply) -> None:
+        self._effects += (SendReply(call, encode(reply)), EndCall(call))
 
 
 def _task_answer(number: int, answer: CachedAnswer) -> bytes:

@@ -60,21 +60,15 @@ class JobResult(NamedTuple):
     failure : tuple of str or None
         Code and text of the refusal; None if it succeeded or lacks the state.
     lacks_state : bool
-        The requested state does not follow from what the service holds.
-    differs : bool
-        The service held a state of this trial that leads elsewhere.
-    diverged : bool
-        The requested step was reached with another digest.
+        The requested state does not follow from what the service holds. ``differs``: it held a
+        state of this trial that leads elsewhere. ``diverged``: the requested step was reached with
+        another digest.
     problem : Problem or None
         To be reused, as far as it could be built.
     state : PlanningState or None
-        The requested state, verified.
-    restored : bool
-        It came from a checkpoint.
-    ahead : PlanningState or None
-        The state that they lead to.
-    ahead_digest : bytes
-        As it is sent.
+        The requested state, verified; ``restored`` if it came from a checkpoint.
+    ahead, ahead_digest
+        The state to which the ``num_actions`` actions lead, and its digest as it is sent.
     sensing_action : int
         The chosen one; -1 if none was to be chosen.
     """
@@ -140,12 +134,7 @@ class Job:
         self._seed = seed
         self._limits = limits
         self._request = request
-        self._state = state
-
-    @property
-    def state(self) -> PlanningState | None:
-        """Where it starts."""
-        return self._state
+        self.state = state
 
     @property
     def identity(self) -> tuple[object, ...]:
@@ -176,7 +165,7 @@ class Job:
             _check_work(problem, self._planning, self._limits)
             return self._computed(problem)
         except _LacksStateError as lack:
-            differs = lack.differs or self._state is not None
+            differs = lack.differs or self.state is not None
             return JobResult(
                 lacks_state=True, differs=differs, diverged=lack.diverged, problem=problem
             )
@@ -197,8 +186,8 @@ class Job:
         planning, request = self._planning, self._request
         planner = Planner(problem, planning)
         if request is None:
-            assert self._state is not None
-            index, _ = planner.choose_sensing_action(self._state)
+            assert self.state is not None
+            index, _ = planner.choose_sensing_action(self.state)
             return JobResult(problem=problem, sensing_action=index)
         state = self._reached(planner, request)
         restored = request.checkpoint is not None
@@ -220,7 +209,7 @@ class Job:
         """Return the requested state."""
         if request.checkpoint is not None:
             return self._restored(planner, request, request.checkpoint)
-        state = self._state
+        state = self.state
         if state is None:
             state = planner.init(self._seed, request.trial)
         most = state.step + self._limits.max_steps

@@ -19,17 +19,15 @@ class ServiceLimits(msgspec.Struct, frozen=True, kw_only=True):
         newcomers one never served, if such sessions are half of all.
     max_sessions_per_robot : int or None
         Sessions of one certificate; a further one replaces its least recently used. None: no limit.
-    max_state_bytes : int
-        Bytes of all states held.
-    max_configuration_bytes : int
-        Bytes of all session configurations held, packed.
+    max_state_bytes, max_configuration_bytes : int
+        Of all states held, and of all session configurations, packed.
     max_idle_s : float
         A session unused for this long is dropped.
     max_waiting : int
         Tasks that wait for a worker. Newcomers have half of it at most. (A service always queues as
         many tasks of each kind as it has workers.)
     max_waiting_per_robot : int
-        Tasks of one certificate that wait.
+        The same of one certificate.
     max_waiting_bytes : int
         Bytes of all waiting requests. Newcomers together, and each certificate, have half at most.
     max_wait_ms : float
@@ -41,14 +39,10 @@ class ServiceLimits(msgspec.Struct, frozen=True, kw_only=True):
         From one progress reply to the next; twice that where many calls wait.
     prefetch_patience_ms : float
         Time for which a prefetch lets urgent tasks go first.
-    max_particles : int
-        Particles of one robot.
     max_work : int
         Size of one decision: particles x observation samples x sensing actions x horizon.
     max_steps : int
         Steps by which a state is rolled forward for one request.
-    max_threads : int
-        Threads of one decision, whatever the robot's settings say; one while several are computed.
     max_problems : int
         Problems kept for reuse.
     answers_per_session : int
@@ -70,7 +64,6 @@ class ServiceLimits(msgspec.Struct, frozen=True, kw_only=True):
     max_particles: int = 1_000_000
     max_work: int = 10**9
     max_steps: int = 16 * MAX_OBSERVATIONS
-    max_threads: int = 64
     max_problems: int = 32
     answers_per_session: int = 8
 
@@ -80,22 +73,16 @@ class ServiceStatistics(msgspec.Struct):
 
     Attributes
     ----------
-    task_parts, sensing_parts : int
-        Parts of answers computed.
     cache_hits : int
         Requests answered, fully or in part, from the cache.
     attached : int
         Requests that joined a pending task.
     superseded : int
         Requests dropped for a newer one of the same robot.
-    restores : int
-        States restored from a checkpoint.
-    state_requests : int
-        Requests answered with the need for the state.
-    states_diverged : int
-        States that came out differently than on the robot.
-    busy : int
-        Requests turned away for lack of capacity.
+    restores, states_diverged : int
+        States that came from a checkpoint, or came out differently than on the robot.
+    state_requests, busy : int
+        Requests answered with the need for the state, or turned away for lack of capacity.
     refusals : dict of str to int
         By code.
     sessions, state_bytes, waiting, running, calls : int

@@ -15,17 +15,16 @@ calls. A part is identified by the digest of its state, so equal questions share
 from __future__ import annotations
 
 import hashlib
-from collections import OrderedDict
+from collections import Counter, OrderedDict
 from collections.abc import Callable, Iterator
-from functools import lru_cache
-from typing import NamedTuple, TypeAlias
+from typing import Literal, NamedTuple, TypeAlias
 
 import msgspec
 
 from holdfast.config.settings import PlanningSettings
 from holdfast.planning import PlanningState
 from holdfast.problems.registry import BUILT_IN
-from holdfast.protocol.expected_time import ExpectedTimes
+from holdfast.protocol.expected_time import ExpectedTime
 from holdfast.protocol.messages import Request, SessionConfiguration, pack_configuration
 from holdfast.protocol.service_limits import ServiceLimits
 
@@ -40,16 +39,17 @@ __all__ = [
     "SessionKey",
     "SessionTable",
     "WaitingCall",
+    "with_cores",
 ]
 
 _LEAST_EPOCHS = 4096
 """Epochs of forgotten sessions are remembered at least for so many."""
 
+_MAX_THREADS = 64
+"""Bound on the threads of one decision, whatever the robot's settings say."""
+
 _TYPICAL_STEPS = 32
 """Bound on the steps of a task whose time earlier tasks predict."""
-
-_SETTINGS_KEPT = 128
-"""Bound on the settings that are shared between sessions."""
 
 Owner: TypeAlias = str | None
 """Name in the robot's verified certificate; None without one."""
@@ -77,7 +77,7 @@ class CachedAnswer(NamedTuple):
 
 
 class WaitingCall:
-    """A call that waits for a task."""
+    """A call (one request of a robot) that waits for a task, and when it got its last reply."""
 
     def __init__(self, call: int, number: int, task: PendingTask, last_sign_at: float) -> None:
         self.call = call
@@ -89,19 +89,15 @@ class WaitingCall:
 class PendingTask:
     """A part of an answer to be computed, and the calls that wait for it.
 
-    Service and session create and drop tasks; :class:`RequestQueue` writes ``urgent``, ``running``
-    and ``started_at``, :class:`WaitingCalls` writes ``calls``.
+    The service creates and drops tasks; :class:`RequestQueue` writes ``urgent``, ``running`` and
+    ``started_at``, :class:`WaitingCalls` writes ``calls``.
 
     Parameters
     ----------
     digest : bytes
         Of the part's state.
-    sensing : bool
-        Whether it is a sensing part.
-    request : Request or None
-        Names the state; None if it is computed before the robot asks.
-    state : PlanningState or None
-        The state, where no request names it.
+    request, state
+        The request names the state; without one (the robot has not asked yet) it is ``state``.
     size : int
         Bytes of the request.
     since : float
@@ -130,9 +126,24 @@ class PendingTask:
         self.urgent = request is not None
         self.newcomer = session.newcomer
         self.calls: dict[int, WaitingCall] = {}
-        self.cost_s = session.expected_s(sensing=sensing)
+        self.cost_s = self._expected_s()
         self.running = False
         self.started_at = since
+
+    @property
+    def kind(self) -> Literal["task", "sensing"]:
+        """Which part of the answer it is."""
+        return "sensing" if self.sensing else "task"
+
+    @property
+    def expected_time(self) -> ExpectedTime:
+        """Learned from earlier ones of its session and kind."""
+        return self.session.sensing_time if self.sensing else self.session.task_time
+
+    def _expected_s(self) -> float:
+        """Return how long it may take, with the sensing part that follows a task part."""
+        session = self.session
+        return session.sensing_time.mean_s + (0.0 if self.sensing else session.task_time.mean_s)
 
     def is_typical(self, state: PlanningState | None) -> bool:
         """Return whether earlier times predict this task's, if it starts at ``state``.
@@ -156,14 +167,14 @@ class PendingTask:
         """Take the place of a superseded request of the same robot."""
         self.digest, self.request = request.digest, request
         self.sensing, self.size = sensing, size
-        self.cost_s = self.session.expected_s(sensing=sensing)
+        self.cost_s = self._expected_s()
 
 
 class Session:
     """What is remembered of one robot.
 
-    Its methods change its states, answers, tasks, epoch and number; :class:`SessionTable` writes
-    ``served``, ``newcomer``, ``closed``, ``used_at`` and ``num_bytes``.
+    :class:`~holdfast.protocol.service.Service` writes its states, answers, tasks, epoch and number,
+    and whether the robot was served; :class:`SessionTable` the rest.
 
     Attributes
     ----------
@@ -173,20 +184,17 @@ class Session:
         Packed session configuration.
     problem_key : bytes
         Digest that identifies the problem among those kept for reuse.
-    built_in : bool
-        Whether the problem is part of holdfast.
-    planning, planning_single : PlanningSettings
-        With the threads for a decision alone, and with one thread.
-    served : bool
-        Whether the robot got an answer.
-    newcomer : bool
-        Whether it ranks with unknown robots.
+    built, built_in : bool
+        Whether the problem was built before, and whether it is part of holdfast.
+    planning : PlanningSettings
+        With the threads that a decision has when it is computed alone.
+    served, newcomer : bool
+        Whether the robot got an answer, and whether it ranks with unknown robots.
     acknowledged, ahead : PlanningState or None
         The state last asked about, and that at the next sensing step.
-    answers : dict
-        Cached parts of answers by the digest of their state, oldest first.
-    pending : dict
-        Tasks that wait or run, by the digest of their state.
+    answers, pending : dict
+        Cached parts of answers, oldest first, and tasks that wait or run, by the digest of their
+        state.
     num_bytes : int
         Counted size of states and answers.
     used_at : float
@@ -198,8 +206,8 @@ class Session:
         key: SessionKey,
         request: Request,
         configuration: SessionConfiguration,
-        max_threads: int,
-        times: ExpectedTimes,
+        task_time: ExpectedTime,
+        sensing_time: ExpectedTime,
     ) -> None:
         self.key = key
         self.epoch = request.epoch
@@ -208,20 +216,20 @@ class Session:
         # again and again while nobody else has the interpreter.
         self.configuration = pack_configuration(configuration)
         # With its code's digests: a robot with other code must be refused.
-        named = (
-            configuration.problem,
-            configuration.core_version,
-            configuration.problem_digest,
-        )
         self.problem_key = _digest_of(
-            (named, configuration.model, configuration.state_space_planner)
+            (
+                configuration.problem,
+                configuration.core_version,
+                configuration.problem_digest,
+                configuration.model,
+                configuration.state_space_planner,
+            )
         )
         self.built = False
         self.built_in = configuration.problem in BUILT_IN
         # The number of threads changes no result, so the service may choose it.
-        most = min(configuration.planning.active_sensing.num_cores, max_threads)
-        self.planning = _with_cores(configuration.planning, most)
-        self.planning_single = _with_cores(configuration.planning, 1)
+        most = min(configuration.planning.active_sensing.num_cores, _MAX_THREADS)
+        self.planning = with_cores(configuration.planning, most)
         self.seed = configuration.seed
         self.served = False
         self.newcomer = True
@@ -230,7 +238,8 @@ class Session:
         self.ahead_digest = b""
         self.answers: OrderedDict[bytes, CachedAnswer] = OrderedDict()
         self.pending: dict[bytes, PendingTask] = {}
-        self.times = times
+        self.task_time = task_time
+        self.sensing_time = sensing_time
         self.num_bytes = 0
         self.used_at = 0.0
         self.closed = False
@@ -240,41 +249,10 @@ class Session:
         """Name in its certificate, or None."""
         return self.key[0]
 
-    def expected_s(self, *, sensing: bool) -> float:
-        """Return how long a task may take, including the sensing part that follows a task part."""
-        times = self.times
-        return times.sensing_s if sensing else times.task_s + times.sensing_s
-
-    def take_over(self, epoch: int) -> None:
-        """Begin the epoch of the robot's next process, whose requests are numbered anew."""
-        self.epoch = epoch
-        self.number = -1
-
-    def accept(self, number: int) -> bool:
-        """Note a request's number; return whether no newer request came before."""
-        newest = number >= self.number
-        if newest:
-            self.number = number
-        return newest
-
-    def add_task(self, task: PendingTask) -> None:
-        """Note a task to be computed."""
-        self.pending[task.digest] = task
-
     def remove_task(self, task: PendingTask) -> None:
         """Remove a task, unless another has taken its place."""
         if self.pending.get(task.digest) is task:
             del self.pending[task.digest]
-
-    def hold(self, state: PlanningState, ahead: PlanningState | None, ahead_digest: bytes) -> None:
-        """Keep the state last asked about, and the one ahead of it."""
-        self.acknowledged = state
-        self.ahead, self.ahead_digest = ahead, ahead_digest
-
-    def drop_states(self) -> None:
-        """Drop the states and the answers."""
-        self.acknowledged = self.ahead = None
-        self.answers.clear()
 
     def remember(self, digest: bytes, answer: CachedAnswer, most: int) -> None:
         """Cache a part of an answer, and drop the oldest beyond ``most``."""
@@ -283,10 +261,6 @@ class Session:
         answers.move_to_end(digest)
         while len(answers) > most:
             answers.popitem(last=False)
-
-    def forget_answer(self, digest: bytes) -> None:
-        """Drop a cached part of an answer."""
-        del self.answers[digest]
 
     def state_before(self, request: Request) -> PlanningState | None:
         """Return the nearest state before the request's; None if there is none."""
@@ -316,75 +290,52 @@ class ForgottenEpochs:
 
     def __init__(self, most: int) -> None:
         self._most = most
-        self._count = 0
-        # Owners in the order in which they were noted last.
-        self._of: OrderedDict[Owner, OrderedDict[bytes, int]] = OrderedDict()
+        self._epochs: OrderedDict[SessionKey, int] = OrderedDict()
+        self._num_of: Counter[Owner] = Counter()
 
     def __iter__(self) -> Iterator[SessionKey]:
-        return ((owner, session) for owner, epochs in self._of.items() for session in epochs)
+        return iter(self._epochs)
 
     def get(self, key: SessionKey) -> int:
         """Return a session's epoch; 0 if unknown."""
-        owner, session = key
-        epochs = self._of.get(owner)
-        return 0 if epochs is None else epochs.get(session, 0)
+        return self._epochs.get(key, 0)
 
     def note(self, key: SessionKey, epoch: int) -> None:
         """Keep an epoch."""
-        owner, session = key
         self.forget(key)
-        self._of.setdefault(owner, OrderedDict())[session] = epoch
-        self._of.move_to_end(owner)
-        self._count += 1
-        if self._count > self._most:
-            largest = max(self._of, key=lambda each: len(self._of[each]))
-            self.forget((largest, next(iter(self._of[largest]))))
+        self._epochs[key] = epoch
+        self._num_of[key[0]] += 1
+        if len(self._epochs) > self._most:
+            largest = max(self._num_of, key=lambda owner: self._num_of[owner])
+            self.forget(next(each for each in self._epochs if each[0] == largest))
 
     def forget(self, key: SessionKey) -> None:
         """Drop the epoch of a session that is held again."""
-        owner, session = key
-        epochs = self._of.get(owner)
-        if epochs is not None and epochs.pop(session, None) is not None:
-            self._count -= 1
-            if not epochs:
-                del self._of[owner]
-
-
-class _Holding:
-    """What all sessions take, or all of one owner."""
-
-    def __init__(self) -> None:
-        self.sessions = 0
-        self.unserved = 0
-        self.state_bytes = 0
-        self.configuration_bytes = 0
-
-    def count(self, session: Session, sign: int) -> None:
-        """Add a session without states, or subtract it."""
-        self.sessions += sign
-        self.unserved += 0 if session.served else sign
-        self.configuration_bytes += sign * len(session.configuration)
+        if self._epochs.pop(key, None) is not None:
+            self._num_of[key[0]] -= 1
+            if not self._num_of[key[0]]:
+                del self._num_of[key[0]]
 
 
 class SessionTable:
-    """All sessions, least recently used first."""
+    """All sessions, least recently used first.
+
+    Attributes
+    ----------
+    state_bytes : int
+        Of all states and answers, as counted by :meth:`update_size`.
+    """
 
     def __init__(self, limits: ServiceLimits) -> None:
         self._limits = limits
         self._sessions: OrderedDict[SessionKey, Session] = OrderedDict()
-        self._holdings: dict[Owner, _Holding] = {}
         self._epochs = ForgottenEpochs(max(4 * limits.max_sessions, _LEAST_EPOCHS))
-        self._total = _Holding()
-
-    @property
-    def state_bytes(self) -> int:
-        """Bytes of all states and answers, as counted by :meth:`update_size`."""
-        return self._total.state_bytes
+        self.state_bytes = 0
 
     @property
     def configuration_bytes(self) -> int:
         """Bytes of all packed session configurations."""
-        return self._total.configuration_bytes
+        return sum(len(each.configuration) for each in self._sessions.values())
 
     def __len__(self) -> int:
         return len(self._sessions)
@@ -404,24 +355,14 @@ class SessionTable:
         A new identity costs nothing without a certificate. With one, each owner may have one
         session that was never served and still ranks with the known robots.
         """
-        holding = self._holdings.get(owner)
-        return owner is None or (holding is not None and holding.unserved > 0)
-
-    def mark_served(self, session: Session) -> None:
-        """Note that a robot got an answer."""
-        if not session.served:
-            for holding in self._holdings_with(session):
-                holding.unserved -= 1
-        session.served = True
-        session.newcomer = False
+        return owner is None or any(
+            each.owner == owner and not each.served for each in self._sessions.values()
+        )
 
     def add(self, session: Session) -> None:
         """Add a session."""
         session.newcomer = self.is_newcomer(session.owner)
         self._sessions[session.key] = session
-        self._holdings.setdefault(session.owner, _Holding())
-        for holding in self._holdings_with(session):
-            holding.count(session, 1)
         self._epochs.forget(session.key)
 
     def use(self, session: Session, now: float) -> None:
@@ -434,10 +375,6 @@ class SessionTable:
         session.closed = True
         del self._sessions[session.key]
         self._count_state(session, 0)
-        for holding in self._holdings_with(session):
-            holding.count(session, -1)
-        if not self._holdings[session.owner].sessions:
-            del self._holdings[session.owner]
         self.note_epoch(session.key, session.epoch)
 
     def note_epoch(self, key: SessionKey, epoch: int) -> None:
@@ -451,7 +388,8 @@ class SessionTable:
         return not self._sessions or not (
             self._is_full_for(session.owner)
             or self._is_full
-            or self._lacks_room_for_configuration(session)
+            or self.configuration_bytes + len(session.configuration)
+            > self._limits.max_configuration_bytes
         )
 
     def evictable_for(self, session: Session) -> Session | None:
@@ -464,50 +402,41 @@ class SessionTable:
         if self._is_full_for(session.owner):
             owner = session.owner
             return self._first_unused(lambda each: each.owner == owner)
-        only_unserved = 2 * self._total.unserved >= self._limits.max_sessions
-        if self._is_full:
-            return self._unused_of_most(
-                lambda holding: holding.sessions, only_unserved=only_unserved
-            )
+        unserved = sum(not each.served for each in self._sessions.values())
+        is_full = self._is_full
         return self._unused_of_most(
-            lambda holding: holding.configuration_bytes, only_unserved=only_unserved
+            lambda each: 1 if is_full else len(each.configuration),
+            only_unserved=2 * unserved >= self._limits.max_sessions,
         )
 
     def _is_full_for(self, owner: Owner) -> bool:
-        most, holding = self._limits.max_sessions_per_robot, self._holdings.get(owner)
-        if owner is None or most is None or holding is None:
+        most = self._limits.max_sessions_per_robot
+        if owner is None or most is None:
             return False
-        return holding.sessions >= most
+        return sum(each.owner == owner for each in self._sessions.values()) >= most
 
     @property
     def _is_full(self) -> bool:
         return len(self._sessions) >= self._limits.max_sessions
 
-    def _lacks_room_for_configuration(self, session: Session) -> bool:
-        return (
-            self.configuration_bytes + len(session.configuration)
-            > self._limits.max_configuration_bytes
-        )
-
     def _unused_of_most(
-        self, amount: Callable[[_Holding], int], *, only_unserved: bool
+        self, amount: Callable[[Session], int], *, only_unserved: bool
     ) -> Session | None:
         """Return the least recently used session without tasks, of the owners that hold the most.
 
         These hold at least half of the largest holding: among near equals the same one is not
         dropped each time. If all of these have tasks, it is one of the others.
         """
-        holdings = self._holdings
-        if len(holdings) > 1:
-            least = max(map(amount, holdings.values())) / 2
+        found = None
+        if len({each.owner for each in self._sessions.values()}) > 1:
+            held: Counter[Owner] = Counter()
+            for each in self._sessions.values():
+                held[each.owner] += amount(each)
+            least = max(held.values()) / 2
             found = self._first_unused(
-                lambda each: (
-                    amount(holdings[each.owner]) >= least and not (only_unserved and each.served)
-                )
+                lambda each: held[each.owner] >= least and not (only_unserved and each.served)
             )
-            if found is not None:
-                return found
-        return self._first_unused(lambda each: not (only_unserved and each.served))
+        return found or self._first_unused(lambda each: not (only_unserved and each.served))
 
     def _first_unused(self, fits: Callable[[Session], bool]) -> Session | None:
         return next(
@@ -541,20 +470,17 @@ class SessionTable:
 
     def largest_evictable(self) -> Session | None:
         """Return the session without tasks to be dropped for its memory; None if there is none."""
-        return self._unused_of_most(lambda holding: holding.state_bytes, only_unserved=False)
+        return self._unused_of_most(lambda each: each.num_bytes, only_unserved=False)
 
     def drop_states(self, session: Session) -> None:
         """Drop a session's states and answers; the robot will send its state each time."""
-        session.drop_states()
+        session.acknowledged = session.ahead = None
+        session.answers.clear()
         self._count_state(session, 0)
 
     def _count_state(self, session: Session, num_bytes: int) -> None:
-        for holding in self._holdings_with(session):
-            holding.state_bytes += num_bytes - session.num_bytes
+        self.state_bytes += num_bytes - session.num_bytes
         session.num_bytes = num_bytes
-
-    def _holdings_with(self, session: Session) -> tuple[_Holding, _Holding]:
-        return self._total, self._holdings[session.owner]
 
 
 def _digest_of(data: object) -> bytes:
@@ -562,9 +488,8 @@ def _digest_of(data: object) -> bytes:
     return hashlib.blake2b(msgspec.msgpack.encode(data), digest_size=16).digest()
 
 
-@lru_cache(maxsize=_SETTINGS_KEPT)
-def _with_cores(planning: PlanningSettings, num_cores: int) -> PlanningSettings:
-    """Return the settings with another number of threads; equal ones share a copy."""
+def with_cores(planning: PlanningSettings, num_cores: int) -> PlanningSettings:
+    """Return the settings with another number of threads."""
     sensing = msgspec.structs.replace(planning.active_sensing, num_cores=num_cores)
     return msgspec.structs.replace(planning, active_sensing=sensing)
 

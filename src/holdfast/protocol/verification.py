@@ -35,13 +35,16 @@ from holdfast.protocol.events import (
     VerificationNoted,
 )
 from holdfast.protocol.messages import DIGEST_SIZE, SensingAnswer
-from holdfast.protocol.question import AnswerPart, Provenance, Question, same_actions
+from holdfast.protocol.question import (
+    OWN_PLANNER,
+    AnswerPart,
+    Provenance,
+    Question,
+    same_actions,
+)
 
-__all__ = ["OWN_PLANNER", "Verification", "WrongAnswer"]
+__all__ = ["Verification", "WrongAnswer"]
 
-
-OWN_PLANNER = "in_process"
-"""Name of the planner in the robot's own process, where services have names."""
 
 _MAX_PARTS = 64
 """Bound on the parts of one question's answer that are kept to be compared."""
@@ -164,16 +167,13 @@ class Verification:
                     reason=f"{why}; the robot's own planner decides",
                 )
             self.dispute(question, part.service)
-        self._answered(question, part.service)
-
-    def _answered(self, question: Question, service: str) -> None:
         if question.own is not None:
             if self._judge(question):
                 _use(question, question.own)
-        elif service in self._suspects:
-            self.dispute(question, service)
-        elif service != self._exempt and self._is_drawn(question):
-            self.check(question, service)
+        elif part.service in self._suspects:
+            self.dispute(question, part.service)
+        elif part.service != self._exempt and self._is_drawn(question):
+            self.check(question, part.service)
 
     def check(self, question: Question, service: str) -> None:
         """Have the own planner answer a question when it has time.
@@ -223,15 +223,13 @@ class Verification:
 
     # -- the robot's own decisions ---------------------------------------------------------------
 
-    def decided(self, event: OwnAnswer, current: Question | None, performed: int) -> bool:
+    def decided(self, event: OwnAnswer, current: Question | None) -> bool:
         """Take the own planner's answer.
 
         Parameters
         ----------
         current : Question or None
             The robot's current question; this answer may belong to an earlier one.
-        performed : int
-            Task actions of the current question that are performed or ordered.
 
         Returns
         -------
@@ -256,7 +254,7 @@ class Verification:
             if question is not current or not (differs or question.disputed):
                 return True
             question.disputed = False
-            task_actions = question.task_actions or []
+            task_actions, performed = question.task_actions or [], question.num_ordered
             if not same_actions(task_actions[:performed], event.actions[:performed]):
                 return False
             _use(question, event)

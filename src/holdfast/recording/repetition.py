@@ -16,7 +16,7 @@ from holdfast.config.loader import Configuration
 from holdfast.errors import DecidedOtherwiseError
 from holdfast.outcome import Decisions, SensingDecision, TrialResult
 from holdfast.planning import Planner
-from holdfast.protocol.verification import OWN_PLANNER
+from holdfast.protocol.question import OWN_PLANNER
 from holdfast.recording.recorded_environment import RecordedEnvironment
 from holdfast.recording.timings import deciders
 from holdfast.robot.trial import NULL_OBSERVER, TrialObserver, run_trial

@@ -18,7 +18,7 @@ from time import perf_counter
 from holdfast.errors import HoldfastError
 from holdfast.planning import Planner
 from holdfast.protocol.events import Plan, Planned
-from holdfast.protocol.expected_time import TypicalTime
+from holdfast.protocol.expected_time import ExpectedTime
 from holdfast.protocol.messages import MAX_TASK_ACTIONS
 from holdfast.runtime.pool import ThreadPool
 
@@ -58,13 +58,13 @@ class InProcessPlanner:
         self._planner: Planner | None = None
         self._waiting: Plan | None = None
         # By whether it is a sensing action.
-        self._usual = {False: TypicalTime(), True: TypicalTime()}
+        self._usual = {False: ExpectedTime(), True: ExpectedTime()}
 
     def ask(self, plan: Plan) -> None:
         """Compute a part of an answer; an earlier request that has not begun is forgotten."""
         self._waiting = None
         # One thread at a time uses the planner's problem.
-        if self._usual[plan.sensing].seconds <= _BRIEF_S and not self._threads.num_open:
+        if self._usual[plan.sensing].typical_s <= _BRIEF_S and not self._threads.num_open:
             self._waiting = plan
         else:
             self._threads.submit(functools.partial(self._computed, plan), self._finished)

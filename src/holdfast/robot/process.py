@@ -26,7 +26,6 @@ from holdfast.errors import HeldError, HoldfastError, TrialError
 from holdfast.outcome import TrialResult
 from holdfast.planning import Planner, PlanningState
 from holdfast.problems.problem import Problem
-from holdfast.protocol.decision_source import DecisionSource, InProcessSource
 from holdfast.protocol.dispatcher import Dispatcher
 from holdfast.protocol.events import (
     Abandon,
@@ -43,6 +42,7 @@ from holdfast.protocol.events import (
     Paused,
     Plan,
     Planned,
+    RecoveryExited,
     RobotEffect,
     Send,
     Sense,
@@ -51,6 +51,7 @@ from holdfast.protocol.events import (
     VerificationNoted,
     WriteRecords,
 )
+from holdfast.protocol.question import DecisionSource, InProcessSource
 from holdfast.protocol.records import Record, TrialHistory, replay
 from holdfast.protocol.robot import Robot
 from holdfast.protocol.status import Status
@@ -61,7 +62,6 @@ from holdfast.robot.environment_runner import EnvironmentRunner, make_runner
 from holdfast.robot.health import Condition, RobotWatch
 from holdfast.robot.in_process_planner import InProcessPlanner
 from holdfast.robot.links import RECOVERY_SERVICE, Links
-from holdfast.robot.recovery_launcher import RecoveryExited
 from holdfast.robot.session_configuration import session_configuration_of
 from holdfast.runtime.events import EventSink
 
@@ -464,8 +464,6 @@ class RobotProcess:
             if self._watch is not None:
                 self._watch.ending()
             self._carry_out(robot.pause(now))
-        elif isinstance(event, RecoveryExited):
-            self._carry_out(robot.recovery_exited(event.launch, event.reason, now))
         elif self._starting is not None and isinstance(event, EnvironmentReady | EnvironmentFailed):
             trial, history, tail_is_certain = self._starting
             self._starting = None

@@ -14,24 +14,12 @@ import sys
 import weakref
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import IO, NamedTuple
+from typing import IO
 
+from holdfast.protocol.events import RecoveryExited
 from holdfast.runtime.pool import ThreadPool
 
-__all__ = ["RecoveryExited", "RecoveryLauncher"]
-
-
-class RecoveryExited(NamedTuple):
-    """A process of the local service has ended, or could not be started.
-
-    Attributes
-    ----------
-    launch : int
-        The number that it was launched by.
-    """
-
-    launch: int
-    reason: str
+__all__ = ["RecoveryLauncher"]
 
 
 class RecoveryLauncher:

@@ -238,7 +238,7 @@ class ServiceShell:
         number = next(self._numbers)
         self._calls[number] = call
         now = self._loop.time()
-        self._carry_out(self._service.receive_request(number, request, size, now, call.robot))
+        self._carry_out(self._service.receive(number, request, size, now, call.robot))
 
     def _run_brief_job(self) -> None:
         job = self._brief_jobs.popleft()
@@ -323,4 +323,5 @@ def _decode(payload: bytes) -> Request | MessageError:
     try:
         return decode_request(payload)
     except MessageError as error:
+        # Kept in this frame, it would hold itself and the message until garbage collection.
         return error

@@ -41,6 +41,7 @@ from holdfast.protocol.events import (
     LogEvent,
     OwnAnswer,
     Paused,
+    RecoveryExited,
     ReplyReceived,
     RobotEffect,
     Send,
@@ -256,7 +257,7 @@ class RobotNode:
 
     def recovery_exited(self, process: int, launch: int, reason: str) -> None:
         """Tell the process that started it that a local service has ended."""
-        self._happens(process, self._local_ended, launch, reason)
+        self._happens(process, self._heard, RecoveryExited(launch, reason))
 
     def _happens(self, process: int, do: Callable[..., None], *arguments: Any) -> None:
         if process != self.process or self._robot is None:
@@ -290,15 +291,11 @@ class RobotNode:
         if self._robot is not None and not self._is_stalled:
             self._set_alarm()
 
-    def _heard(self, event: TransportEvent | EnvironmentEvent | OwnAnswer) -> None:
+    def _heard(self, event: TransportEvent | EnvironmentEvent | OwnAnswer | RecoveryExited) -> None:
         assert self._robot is not None
         if isinstance(event, ReplyReceived):
             self._statuses.heard(self._asked[event.call], event.payload)
         self._carry_out(self._robot.handle(event, self._now()))
-
-    def _local_ended(self, launch: int, reason: str) -> None:
-        assert self._robot is not None
-        self._carry_out(self._robot.recovery_exited(launch, reason, self._now()))
 
     def _pause(self) -> None:
         assert self._robot is not None

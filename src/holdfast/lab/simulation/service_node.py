@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
+from holdfast.errors import MessageError
 from holdfast.lab.simulation.event_queue import Clock, EventQueue
 from holdfast.lab.simulation.memo_cache import JobCache
 from holdfast.lab.simulation.schedule import RunSettings
 from holdfast.problems.problem import Problem
+from holdfast.protocol.messages import Request, decode_request
 from holdfast.protocol.service import Service
 from holdfast.protocol.service_jobs import (
     EndCall,
@@ -116,7 +118,13 @@ class ServiceNode:
             self._deferred.append((self.receive, (incarnation, call, payload, owner)))
             return
         assert self.machine is not None
-        self._carry_out(self.machine.receive(call, payload, self._clock.now(), owner))
+        request: Request | MessageError
+        try:
+            request = decode_request(payload)
+        except MessageError as error:
+            request = error
+        now = self._clock.now()
+        self._carry_out(self.machine.receive(call, request, len(payload), now, owner))
 
     def _carry_out(self, effects: list[ServiceEffect]) -> None:
         machine = self.machine
