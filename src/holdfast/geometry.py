@@ -37,13 +37,13 @@ MAX_NOISE_ATTEMPTS = 1000
 class _World:
     """Base of the worlds: the checks and the calls into the kernel."""
 
-    _DIMENSION: int
-    _SPACE_DIMENSION: int
+    dimension: int
+    space_dimension: int
     _kernel: Any  # one of the kernel's three worlds, which have the same methods
     obstacles: FloatArray
 
     def _check_obstacles(self, obstacles: npt.ArrayLike) -> FloatArray:
-        size = 2 * self._SPACE_DIMENSION
+        size = 2 * self.space_dimension
         limits = np.array(obstacles, dtype=np.float64, order="C")
         if limits.size == 0:
             limits = limits.reshape(0, size)
@@ -51,7 +51,7 @@ class _World:
             raise InvalidValueError(f"obstacles: shape {limits.shape}, must be (m, {size})")
         if not np.isfinite(limits).all():
             raise InvalidValueError(f"obstacles: a limit is not finite; use {FAR:g} for far away")
-        half = self._SPACE_DIMENSION
+        half = self.space_dimension
         empty = (limits[:, :half] >= limits[:, half:]).any(axis=1)
         if empty.any():
             index = int(np.argmax(empty))
@@ -77,7 +77,7 @@ class _World:
         InvalidValueError
             If the last axis is not d long, or a state is not finite.
         """
-        dimension = self._DIMENSION
+        dimension = self.dimension
         states = np.ascontiguousarray(states, dtype=np.float64)
         if states.shape[-1] != dimension:
             raise InvalidValueError(f"states: shape {states.shape}, must be (..., {dimension})")
@@ -124,7 +124,7 @@ class _World:
         InvalidValueError
             If shapes do not fit, or a value is not finite or out of bounds.
         """
-        dimension = self._DIMENSION
+        dimension = self.dimension
         states = np.ascontiguousarray(states, dtype=np.float64)
         actions = np.ascontiguousarray(actions, dtype=np.float64)
         if states.shape[-1] != dimension or actions.shape[-1] != dimension:
@@ -189,7 +189,7 @@ class _World:
         InvalidValueError
             If the last axis is not d long, or a state is not finite.
         """
-        dimension = self._DIMENSION
+        dimension = self.dimension
         states = np.ascontiguousarray(states, dtype=np.float64)
         if states.ndim != 2 or states.shape[1] != dimension:
             raise InvalidValueError(f"states: shape {states.shape}, must be (n, {dimension})")
@@ -242,7 +242,7 @@ class _World:
         InvalidValueError
             If shapes do not fit, or a value is not finite or out of bounds.
         """
-        dimension = self._DIMENSION
+        dimension = self.dimension
         states = np.ascontiguousarray(states, dtype=np.float64)
         actions = np.ascontiguousarray(actions, dtype=np.float64)
         beliefs = len(streams)
@@ -291,7 +291,7 @@ class _World:
         InvalidValueError
             If shapes do not fit, or a value is not finite or out of bounds.
         """
-        dimension = self._DIMENSION
+        dimension = self.dimension
         if count < 0:
             raise InvalidValueError(f"count: {count}, must be at least 0")
         for name, values in (("mean", mean), ("standard_deviation", standard_deviation)):
@@ -329,8 +329,8 @@ class DiscWorld(_World):
         If a value is not finite or out of bounds.
     """
 
-    _DIMENSION = 2
-    _SPACE_DIMENSION = 2
+    dimension = 2
+    space_dimension = 2
 
     def __init__(self, radius: float, obstacles: npt.ArrayLike) -> None:
         self.radius = _check_length("radius", radius)
@@ -354,8 +354,8 @@ class RectangleWorld(_World):
         If a value is not finite or out of bounds.
     """
 
-    _DIMENSION = 3
-    _SPACE_DIMENSION = 2
+    dimension = 3
+    space_dimension = 2
 
     def __init__(self, width: float, height: float, obstacles: npt.ArrayLike) -> None:
         self.width = _check_length("width", width)
@@ -382,8 +382,8 @@ class BoxWorld(_World):
         If a value is not finite or out of bounds.
     """
 
-    _DIMENSION = 6
-    _SPACE_DIMENSION = 3
+    dimension = 6
+    space_dimension = 3
 
     def __init__(self, size: tuple[float, float, float], obstacles: npt.ArrayLike) -> None:
         x, y, z = (_check_length(f"size[{i}]", length) for i, length in enumerate(size))
