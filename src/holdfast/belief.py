@@ -205,17 +205,13 @@ def update(
             f"observation {in_brief(observed)}: every coordinate must be finite"
         )
     if not has_general_observations(problem):
-        mean = checked.observation_mean(problem, belief.states, sensing_action)
-        variance = checked.observation_variance(problem, belief.states, sensing_action, mean)
+        mean, variance = checked.prediction(problem, belief.states, sensing_action)
         if mean.shape[-1] != observed.shape[0]:
             raise InvalidValueError(
                 f"observation of {observed.shape[0]} coordinates: sensing action {sensing_action} "
                 f"gives {mean.shape[-1]}"
             )
-        # A comparison with NaN is false.
-        usable = (variance > 0.0).all() and numerics.all_finite(variance)
-        if not usable or not numerics.all_finite(mean):
-            raise checked.unusable_prediction(problem, sensing_action, mean, variance)
+        checked.require_usable(problem, sensing_action, mean, variance)
         log_likelihood, squared_distance = _gaussian_log_likelihood(
             observed, mean, variance, belief.weights
         )

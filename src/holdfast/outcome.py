@@ -17,7 +17,7 @@ import numpy as np
 
 from holdfast.arrays import FloatArray
 from holdfast.errors import InvalidValueError
-from holdfast.problem_attributes import first_reward, sensing_costs
+from holdfast.problem_attributes import sensing_costs
 
 __all__ = [
     "TRIAL_COLUMNS",
@@ -144,7 +144,8 @@ class RewardAccount:
 
     def __init__(self, problem: Any) -> None:
         self._costs = sensing_costs(problem)
-        self.total = first_reward(problem)
+        has_costs = getattr(problem, "sensing_costs", None) is not None
+        self.total: float | None = 0.0 if has_costs else None
 
     def sensed(self, sensing_action: int) -> None:
         """Subtract the cost of a sensing action."""

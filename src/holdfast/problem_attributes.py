@@ -22,7 +22,6 @@ from holdfast.errors import InvalidValueError, ProblemError
 __all__ = [
     "check_problem",
     "check_sizes",
-    "first_reward",
     "has_general_observations",
     "has_own",
     "name_of",
@@ -250,11 +249,6 @@ def sensing_costs(problem: Any) -> FloatArray:
             f"numbers from 0 to {MAX_SENSING_COST:g}, one for each sensing action"
         )
     return costs.astype(np.float64)
-
-
-def first_reward(problem: Any) -> float | None:
-    """Return a trial's reward before its first step: 0.0 if sensing has prices, else None."""
-    return None if getattr(problem, "sensing_costs", None) is None else 0.0
 
 
 def has_general_observations(problem: object) -> bool:

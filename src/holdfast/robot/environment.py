@@ -145,12 +145,11 @@ class SimulatedEnvironment:
         noise = stream(self._seed, self._trial, self.step, Purpose.WORLD_OBSERVATION)
         if hasattr(problem, "sample_observation"):
             return checked.sample_observation(problem, self.state, sensing_action, noise)
-        mean = checked.observation_mean(problem, self.state, sensing_action)
-        variance = checked.observation_variance(problem, self.state, sensing_action, mean)
+        mean, variance = checked.prediction(problem, self.state, sensing_action)
         with np.errstate(invalid="ignore"):
             shown: FloatArray = mean + np.sqrt(variance) * noise.normal(mean.shape)
         if not np.isfinite(shown).all():
-            raise checked.unusable_prediction(problem, sensing_action, mean, variance)
+            checked.require_usable(problem, sensing_action, mean, variance)
         return shown
 
     def perform(self, task_action: FloatArray) -> float | None:
@@ -202,8 +201,8 @@ def _observation_size(problem: Problem, sensing_action: int) -> int | None:
     drawn = problem.initial_states(stream(0, 0, 0, Purpose.INITIAL_BELIEF), 1)
     shape = (1, problem.state_size)
     state = checked.states_of(problem, "initial_states", drawn, shape)[0]
-    size: int = checked.observation_mean(problem, state, sensing_action).shape[-1]
-    return size
+    mean, _ = checked.prediction(problem, state, sensing_action)
+    return int(mean.shape[-1])
 
 
 class EnvironmentMaker:
