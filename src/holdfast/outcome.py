@@ -136,10 +136,7 @@ class DecisionLog:
 class RewardAccount:
     """A trial's rewards less the costs of its sensing actions.
 
-    Attributes
-    ----------
-    total : float or None
-        None as long as there is neither a reward nor a problem with sensing costs.
+    ``total`` is None as long as there is neither a reward nor a problem with sensing costs.
     """
 
     def __init__(self, problem: Any) -> None:

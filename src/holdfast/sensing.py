@@ -85,22 +85,10 @@ def choose_sensing_action(
     hypotheses: Stream,
     selection: Stream,
 ) -> tuple[int, SensingInfo]:
-    """Choose a sensing action for a belief.
+    """Choose a sensing action for a belief: an index, the lowest of equally good ones.
 
-    Parameters
-    ----------
-    stage : int
-        Stage of the task.
-    hypotheses : Stream
-        Random numbers of the hypothetical observations.
-    selection : Stream
-        Random number of the method ``random``.
-
-    Returns
-    -------
-    index : int
-        Index into ``problem.sensing_actions``. The lowest one of equally good ones.
-    info : SensingInfo
+    The stream ``hypotheses`` has the random numbers of the hypothetical observations, ``selection``
+    the one of the method ``random``.
 
     Raises
     ------
