@@ -41,7 +41,7 @@ from holdfast.expected_return import expected_returns
 from holdfast.policy_path import path_points
 from holdfast.problem_attributes import has_general_observations, resolution_of
 from holdfast.problems.problem import Problem
-from holdfast.randomness import Stream
+from holdfast.randomness import Stream, Words
 
 __all__ = ["SensingInfo", "choose_sensing_action"]
 
@@ -265,6 +265,11 @@ class _GaussianHypotheses(NamedTuple):
     samples: int
     stream: Stream
 
+    @property
+    def _arguments(self) -> tuple[FloatArray, list[int], FloatArray, FloatArray, int, Words]:
+        """What the kernel's functions take of it."""
+        return (*self[:5], self.stream.words)
+
     def entropies(
         self,
         points: FloatArray,
@@ -274,8 +279,7 @@ class _GaussianHypotheses(NamedTuple):
     ) -> tuple[FloatArray, FloatArray, int, int]:
         """Return the mean entropies (J,), the single ones (J, M), likelihoods and visits."""
         return _kernel.hypothetical_entropies(
-            *self[:5],
-            self.stream.words,
+            *self._arguments,
             points,
             *estimator.parameters,
             threads,
@@ -285,7 +289,7 @@ class _GaussianHypotheses(NamedTuple):
 
     def weights(self, drop_negligible: bool) -> FloatArray:
         """Return the posteriors' weights, shape (J, M, N)."""
-        weights = _kernel.hypothetical_weights(*self[:5], self.stream.words, drop_negligible)
+        weights = _kernel.hypothetical_weights(*self._arguments, drop_negligible)
         return weights.reshape(len(self.sizes), self.samples, -1)
 
 
