@@ -20,15 +20,13 @@ import numpy.typing as npt
 
 from holdfast import _kernel, numerics
 from holdfast.arrays import FloatArray, in_brief
+from holdfast.config.settings import MAX_PRIOR_NEIGHBORS_POINTS
 from holdfast.errors import InvalidValueError
 
 __all__ = ["GaussianMixture", "NearestNeighbor", "PriorNeighbors", "entropy"]
 
 
 MAX_DIMENSION = 64
-MAX_PRIOR_NEIGHBORS_POINTS = 4096
-"""Bound on the points of :class:`PriorNeighbors`: where all lie within the resolution of each
-other, their neighbourhoods then take 64 MB."""
 
 LARGEST = 1e150
 """Bound on coordinates, and on the resolution and its inverse: their squares must be numbers."""

@@ -177,13 +177,9 @@ class Planner:
                     f"{what} {number!r:.80}: allowed are whole numbers from 0 to {2**bits - 1}"
                 )
         problem = self.problem
-        count = self.settings.particle_filter.num_particles
-        if not 1 <= count <= MAX_PARTICLES:
-            raise InvalidValueError(
-                f"particle_filter.num_particles {count}: allowed are 1 to {MAX_PARTICLES}"
-            )
         check_problem(problem)
         check_settings(self.settings)
+        count = self.settings.particle_filter.num_particles
         drawn = problem.initial_states(stream(seed, trial, 0, Purpose.INITIAL_BELIEF), count)
         states = checked.states_of(problem, "initial_states", drawn, (count, problem.state_size))
         return PlanningState(seed, trial, 0, 0, False, Belief(states, uniform_weights(count)))

@@ -26,7 +26,6 @@ from holdfast.config.settings import NEIGHBOR_ESTIMATORS, PlanningSettings, esti
 from holdfast.errors import InvalidValueError, ProblemError
 from holdfast.estimators import (
     LARGEST,
-    MAX_PRIOR_NEIGHBORS_POINTS,
     TOTAL_VARIANCE,
     GaussianMixture,
     KernelEstimator,
@@ -203,18 +202,8 @@ def _estimator(
     kind = estimator_of(selector, points.shape[0])
     if kind in NEIGHBOR_ESTIMATORS:
         neighbors = settings.active_sensing.num_nearest_neighbors
-        if neighbors >= points.shape[0]:
-            raise InvalidValueError(
-                f"active_sensing.num_nearest_neighbors {neighbors}: must be below the number of "
-                f"particles, {points.shape[0]}"
-            )
         if kind == "nearest_neighbor":
             return kernel_estimator(NearestNeighbor(neighbors, resolution), dimension)
-        if points.shape[0] > MAX_PRIOR_NEIGHBORS_POINTS:
-            raise InvalidValueError(
-                f"particle_filter.num_particles {points.shape[0]}: selector.estimator "
-                f"prior_neighbors allows {MAX_PRIOR_NEIGHBORS_POINTS}"
-            )
         return kernel_estimator(PriorNeighbors(belief.weights, neighbors, resolution), dimension)
     upper = kind == "gaussian_mixture_upper"
     own = np.full(dimension, resolution * resolution)
