@@ -96,11 +96,8 @@ def expected_returns(
 ) -> Returns:
     """Return the expected return after each sensing action.
 
-    Raises
-    ------
-    ProblemError
-        If a function of the problem returns something out of its contract, or a hypothetical
-        observation has no likelihood under any particle.
+    ProblemError says if a function of the problem breaks its contract, or a hypothetical
+    observation has no likelihood under any particle.
     """
     costs = sensing_costs(problem)
     count = costs.shape[0]

@@ -134,27 +134,12 @@ class _World:
         tolerance: float,
         threads: int,
     ) -> tuple[FloatArray, IntArray]:
-        """Follow a policy of the kernel without noise, from each state independently.
+        """Follow a policy of the kernel without noise, from each of n states independently.
 
-        The result equals, bit for bit, repeated calls of the problem's policy, limits, motion
-        without noise and next stage; this is much faster.
-
-        Parameters
-        ----------
-        policy : PegPolicy2D, PegPolicy3D or ViaPointPolicy
-            A policy of the kernel for this kind of world.
-        states : array of shape (n, d)
-        stage : int
-            Initial stage of all states.
-        offsets : sequence of int
-            Numbers of steps, in ascending order.
-        tolerance : float
-            Fraction of an action to which contact is located; 0 for motion without obstacles.
-
-        Returns
-        -------
-        states_at : array of shape (len(offsets), n, d)
-        stages_at : array of int of shape (len(offsets), n)
+        All begin in one stage. The result, the states (K, n, d) and stages (K, n) after K numbers
+        of steps (``offsets``, ascending), equals, bit for bit, repeated calls of the problem's
+        policy, limits, motion without noise and next stage; this is much faster. A tolerance of 0
+        is motion without obstacles.
         """
         states = self._rows("states", states)
         if states.ndim != 2:

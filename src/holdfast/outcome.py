@@ -165,21 +165,16 @@ class TrialResult(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes
     ----------
-    trial : int
-        Number of the trial, from 0.
-    seed : int
-        Seed of the run; the trial's random streams follow from it and from ``trial``.
-    success : bool
-        Whether the goal was reached.
-    failed : bool
-        Whether the task ended in failure. If neither, the trial ran out of steps.
-    steps : int
-        Task actions performed.
+    trial, seed : int
+        Number of the trial, from 0, and seed of the run: the random streams follow from both.
+    success, failed : bool
+        Whether the goal was reached, and whether the task ended in failure. If neither, the trial
+        ran out of steps.
+    steps, sensing_decisions : int
+        Task actions performed, and sensing actions chosen.
     reward : float or None
         Sum of the rewards of the steps. A step without one adds nothing; None if there were steps
         and none of them had one, unless sensing has prices, which are rewards.
-    sensing_decisions : int
-        Sensing actions chosen.
     mean_sensing_ms : float
         Mean wall time of choosing a sensing action, 0 if none was chosen.
     recoveries : int

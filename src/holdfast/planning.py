@@ -98,14 +98,8 @@ class TaskInfo(NamedTuple):
 class Decision(NamedTuple):
     """All decisions of a state that no further observation can change.
 
-    Attributes
-    ----------
-    actions : tuple of arrays of shape (action_size,)
-        Task actions up to the next sensing step; none if the state has to sense first.
-    sensing_action : int or None
-        Of that sensing step; None if it is too far away.
-    ahead : PlanningState
-        The state in which it was chosen.
+    The task actions up to the next sensing step, none if the state has to sense first; the sensing
+    action of that step, None if it is too far away; and the state ``ahead`` in which it was chosen.
     """
 
     actions: tuple[FloatArray, ...]
@@ -121,19 +115,8 @@ def needs_sensing(settings: PlanningSettings, state: PlanningState) -> bool:
 class Planner:
     """Makes all decisions for one problem, as pure functions of a state.
 
-    Parameters
-    ----------
-    settings : PlanningSettings, optional
-        Default: ``PlanningSettings()``.
-    particles : int, optional
-        Number of particles, in place of the settings'.
-    method : str, optional
-        How sensing actions are chosen (``"random"``, say), in place of the settings'.
-
-    Raises
-    ------
-    InvalidValueError
-        If the problem is a name, or what is given in place of a setting is out of bounds.
+    A number of particles and a method of choosing sensing actions (``"random"``, say) take the
+    place of the settings'; one that is out of bounds raises InvalidValueError.
     """
 
     def __init__(
@@ -187,10 +170,7 @@ class Planner:
     def check(self, state: PlanningState) -> None:
         """Check that a state from elsewhere belongs to this problem and these settings.
 
-        Raises
-        ------
-        InvalidValueError
-            If its number of particles, their size or its stage does not fit.
+        InvalidValueError says if its number of particles, their size or its stage does not fit.
         """
         problem = self.problem
         check_problem(problem)

@@ -61,14 +61,13 @@ class PegInHole3D(PegProblem):
     peg upright, and once the norm of the angles is below asin(tolerance / half the peg's height)
     it also lowers it.
 
-    The earlier work left no numbers for this problem, and the first ones tried (motion variances
-    0.01 and 0.0025, sensing variance 0.001, turning only within the tolerance of the axis and
-    standing still there) made it all but unsolvable: less than one trial in ten ended within 700
-    steps. The noise moved the peg faster than one coordinate at a time can be observed, such
-    precise observations left a few particles of hundreds in six dimensions, and an action that
-    looks at the angles only within the tolerance gives no reason to observe them before. With the
-    defaults here, 200 particles and a sensing interval of 4, about 95 % of the trials end within
-    700 steps, with an interval of 8 about 90 %; 100 particles are too few.
+    The earlier work left no numbers for this problem. Motion variances of 0.01 and 0.0025, a
+    sensing variance of 0.001 and turning only within the tolerance of the axis make it all but
+    unsolvable: the noise moves the peg faster than one coordinate at a time can be observed, such
+    precise observations leave a few particles of hundreds in six dimensions, and there is no reason
+    to observe the angles before they count. With the defaults here, 200 particles and a sensing
+    interval of 4, about 95 % of the trials end within 700 steps, with an interval of 8 about 90 %;
+    100 particles are too few.
 
     The resolution of each coordinate is what the motion noise blurs in a step, 0.071 m and
     0.032 rad: metres and radians are not added as if they were the same.

@@ -75,14 +75,9 @@ def rectangle(width: float, height: float) -> list[tuple[float, float]]:
 
 
 def validated(section: str, settings: StructT) -> StructT:
-    """Return settings whose fields have the declared types and bounds.
+    """Return settings whose fields have the declared types and bounds, or raise InvalidValueError.
 
     msgspec checks what it decodes, not what a constructor is given.
-
-    Raises
-    ------
-    InvalidValueError
-        If a field has the wrong type or is out of bounds; the message names ``section``.
     """
     try:
         return msgspec.convert(msgspec.to_builtins(settings), type(settings))
@@ -93,19 +88,12 @@ def validated(section: str, settings: StructT) -> StructT:
 class RigidBodyProblem(ProblemBase):
     """A body that stops at contact; the state is its pose, the task action a change of pose.
 
-    Parameters
-    ----------
-    model : msgspec.Struct
-        Validated; has at least ``init_mean``, ``init_cov``, ``motion_cov`` and ``collision_tol``.
-    state_space_planner : msgspec.Struct
-        Validated.
-    world : DiscWorld, RectangleWorld or BoxWorld
-        The body and its obstacles.
+    It is built of validated settings, of the types ``Model`` and ``StateSpacePlanner``. Every model
+    has ``init_mean``, ``init_cov``, ``motion_cov`` and ``collision_tol``. The world is the body and
+    its obstacles.
 
     Attributes
     ----------
-    Model, StateSpacePlanner : type
-        Of the problem's settings: it is built of one of each.
     resolution : float
         What the motion noise blurs in a step: the geometric mean of its standard deviations. The
         pegs in the plane and the capsule robot have the same deviation in every coordinate unless
