@@ -382,63 +382,41 @@ def _later_entropies(
     Each hypothetical belief takes the action of its own estimate and is moved by it. The motion
     noise is the same for every sensing action, as the observation noise is.
     """
-    actions, samples, count = weights.shape
-    rows = weights.reshape(-1, count)
-    motion = hypotheses.substream(_HORIZON_MOTION)
-    motions = [motion.substream(i) for i in range(samples)] * actions
-    size = max(1, _LARGEST_BLOCK // states_now.size)
-    blocks = [slice(first, first + size) for first in range(0, len(motions), size)]
-    later = [
-        _later_of_some(
-            problem, settings, states_now, rows[block], stage, motions[block], estimator, points_of
-        )
-        for block in blocks
-    ]
-    return np.concatenate(later).reshape(actions, samples)
-
-
-def _later_of_some(
-    problem: Problem,
-    settings: PlanningSettings,
-    states_now: FloatArray,
-    weights: FloatArray,
-    stage: int,
-    motions: Sequence[Stream],
-    estimator: KernelEstimator,
-    points_of: Callable[[FloatArray, int], FloatArray],
-) -> FloatArray:
-    """Return the later entropies of some beliefs, which are followed at the same time."""
     sensing = settings.active_sensing
-    count, threads = len(motions), sensing.num_cores
-    weights = np.ascontiguousarray(weights)
-    states = np.broadcast_to(states_now, (count, *states_now.shape))
-    stages = [stage] * count
-    later = np.zeros(count)
-    factor = 1.0
-    for step in range(1, sensing.horizon):
-        actions = np.empty((count, problem.action_size))
-        for row in range(count):
-            # One by one, as in planning: the policy of a user who does not keep to exact
-            # operations may have other bits for many estimates at once.
-            belief = Belief(states[row], weights[row])
-            estimated = estimate(belief, settings.particle_filter.estimate)
-            stages[row] = checked.next_stage(problem, estimated, stages[row])
-            commanded = checked.policy(problem, estimated, stages[row])
-            actions[row] = checked.executed_action(problem, commanded)
-        streams = [motion.substream(step) for motion in motions]
-        states = checked.move_each(problem, states, actions, streams, threads)
-        factor *= sensing.discount
-        points = _points_by_stage(points_of, states, stages)
-        flat_states = states.reshape(-1, states.shape[-1])
-        _require_bounded(problem, points, flat_states, "the predicted state")
-        later += factor * _kernel.entropies_of_each(
-            scaled(points, estimator).reshape(count, -1, points.shape[1]),
-            weights,
-            *estimator.parameters,
-            threads,
-            estimator.prior,
-        )
-    return later
+    motion = hypotheses.substream(_HORIZON_MOTION)
+    motions = [motion.substream(i) for i in range(weights.shape[1])] * weights.shape[0]
+    rows = weights.reshape(len(motions), -1)
+    later = np.zeros(len(motions))
+    size = max(1, _LARGEST_BLOCK // states_now.size)
+    for first in range(0, len(motions), size):
+        block = slice(first, first + size)
+        own = np.ascontiguousarray(rows[block])
+        states = np.broadcast_to(states_now, (len(own), *states_now.shape))
+        stages = [stage] * len(own)
+        factor = 1.0
+        for step in range(1, sensing.horizon):
+            actions = np.empty((len(own), problem.action_size))
+            for row, each in enumerate(own):
+                # One by one, as in planning: the policy of a user who does not keep to exact
+                # operations may have other bits for many estimates at once.
+                estimated = estimate(Belief(states[row], each), settings.particle_filter.estimate)
+                stages[row] = checked.next_stage(problem, estimated, stages[row])
+                commanded = checked.policy(problem, estimated, stages[row])
+                actions[row] = checked.executed_action(problem, commanded)
+            streams = [own_motion.substream(step) for own_motion in motions[block]]
+            states = checked.move_each(problem, states, actions, streams, sensing.num_cores)
+            factor *= sensing.discount
+            points = _points_by_stage(points_of, states, stages)
+            flat_states = states.reshape(-1, states.shape[-1])
+            _require_bounded(problem, points, flat_states, "the predicted state")
+            later[block] += factor * _kernel.entropies_of_each(
+                scaled(points, estimator).reshape(len(own), -1, points.shape[1]),
+                own,
+                *estimator.parameters,
+                sensing.num_cores,
+                estimator.prior,
+            )
+    return later.reshape(weights.shape[:2])
 
 
 def _points_by_stage(

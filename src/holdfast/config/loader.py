@@ -8,7 +8,8 @@ or environment is looked for beside the file and in the current directory, or in
 and :meth:`Configuration.to_yaml` writes every value in use.
 
 The bounds stand with the settings (:mod:`holdfast.config.settings`) and with each problem (its
-``Model`` and ``StateSpacePlanner``). Checks that involve two keys are here.
+``Model`` and ``StateSpacePlanner``). Checks that involve two keys are here, those of planning with
+its settings.
 """
 
 from __future__ import annotations
