@@ -49,11 +49,11 @@ def prediction(
     The mean has the shape ``(..., observation_size)``, and the variance that or
     ``(observation_size,)``. Whether they are finite is left to :func:`require_usable`.
     """
-    what = f" of sensing action {sensing_action}"
     mean: FloatArray = problem.observation_mean(states, sensing_action)
     leading = states.shape[:-1]
     if not _is_float_array(mean) or mean.ndim != states.ndim or mean.shape[:-1] != leading:
-        raise _misfit(problem, f"observation_mean{what}", mean, (*leading, "observation_size"))
+        what = f"observation_mean of sensing action {sensing_action}"
+        raise _misfit(problem, what, mean, (*leading, "observation_size"))
     if not 1 <= mean.shape[-1] <= MAX_OBSERVATION_SIZE:
         raise ProblemError(
             f"observation_mean of {name_of(problem)} has {mean.shape[-1]} coordinates: allowed are "
@@ -63,7 +63,8 @@ def prediction(
     one = mean.shape[-1:]
     if not isinstance(variance, np.ndarray) or variance.shape not in (one, mean.shape):
         need = one if mean.ndim == 1 else f"{one} or {mean.shape}"
-        raise _misfit(problem, f"observation_variance{what}", variance, need)
+        what = f"observation_variance of sensing action {sensing_action}"
+        raise _misfit(problem, what, variance, need)
     return mean, variance
 
 

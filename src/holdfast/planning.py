@@ -245,8 +245,9 @@ class Planner:
         if resampled:
             offset = stream(state.seed, state.trial, state.step, Purpose.RESAMPLING)
             belief = resample(belief, offset)
-        info = found._replace(resampled=resampled)
-        return state._replace(sensed=True, belief=belief), info
+        return state._replace(sensed=True, belief=belief), ObservationInfo(
+            found.effective_sample_size, found.explained, resampled, found.mahalanobis_distance
+        )
 
     def choose_task_action(self, state: PlanningState) -> tuple[FloatArray, TaskInfo]:
         """Choose the next task action: the policy's for the estimate, within the limits of a step.

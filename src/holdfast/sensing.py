@@ -237,27 +237,12 @@ def _require_bounded(problem: Problem, points: FloatArray, states: FloatArray, w
 class _GaussianHypotheses(NamedTuple):
     """Hypothetical observations of J sensing actions, M each, which the kernel draws.
 
-    Attributes
-    ----------
-    sizes : list of int
-        Coordinates of an observation of each sensing action, D in all.
-    predicted : array of shape (D, N)
-        Their means in each particle's state.
-    variance : array of shape (D, N) or (D, 1)
-        One column where no sensing action's variance depends on the state.
+    ``arguments`` are what its functions take: the particles' weights, N; the sizes of the
+    observations, D in all; their means in each particle's state, (D, N); their variances, (D, N),
+    or (D, 1) where none depends on the state; M; and the words of the stream.
     """
 
-    prior: FloatArray
-    sizes: list[int]
-    predicted: FloatArray
-    variance: FloatArray
-    samples: int
-    stream: Stream
-
-    @property
-    def _arguments(self) -> tuple[FloatArray, list[int], FloatArray, FloatArray, int, Words]:
-        """What the kernel's functions take of it."""
-        return (*self[:5], self.stream.words)
+    arguments: tuple[FloatArray, list[int], FloatArray, FloatArray, int, Words]
 
     def entropies(
         self,
@@ -268,7 +253,7 @@ class _GaussianHypotheses(NamedTuple):
     ) -> tuple[FloatArray, FloatArray, int, int]:
         """Return the mean entropies (J,), the single ones (J, M), likelihoods and visits."""
         return _kernel.hypothetical_entropies(
-            *self._arguments,
+            *self.arguments,
             points,
             *estimator.parameters,
             threads,
@@ -278,8 +263,9 @@ class _GaussianHypotheses(NamedTuple):
 
     def weights(self, drop_negligible: bool) -> FloatArray:
         """Return the posteriors' weights, shape (J, M, N)."""
-        weights = _kernel.hypothetical_weights(*self._arguments, drop_negligible)
-        return weights.reshape(len(self.sizes), self.samples, -1)
+        weights = _kernel.hypothetical_weights(*self.arguments, drop_negligible)
+        _, sizes, _, _, samples, _ = self.arguments
+        return weights.reshape(len(sizes), samples, -1)
 
 
 class _GeneralHypotheses(NamedTuple):
@@ -336,7 +322,7 @@ def _hypotheses(
     if not usable or not numerics.all_finite(predicted):
         for action, (mean, variance) in zip(actions, found, strict=True):
             checked.require_usable(problem, action, mean, variance)
-    return _GaussianHypotheses(belief.weights, sizes, predicted, variances, samples, stream)
+    return _GaussianHypotheses((belief.weights, sizes, predicted, variances, samples, stream.words))
 
 
 def _general_hypotheses(
